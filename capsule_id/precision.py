@@ -1,0 +1,21 @@
+"""Double precision for JAX, switched on once, by whichever room computes first."""
+
+import jax
+import jax.numpy as jnp
+
+
+def require_float64() -> None:
+    """Switch JAX to float64 and make sure that it took effect.
+
+    Raises
+    ------
+    RuntimeError
+        If JAX still computes in float32 afterwards (for instance inside ``jax.enable_x64(False)``).
+    """
+    jax.config.update("jax_enable_x64", True)
+    dtype = jnp.zeros(()).dtype
+    if dtype != jnp.float64:
+        raise RuntimeError(
+            f"float64 is needed, JAX computes in {dtype}: leave the enclosing jax.enable_x64(False) block, "
+            "or unset JAX_ENABLE_X64 = 0, before using capsule_id"
+        )
