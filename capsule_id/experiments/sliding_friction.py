@@ -1,0 +1,64 @@
+"""Steady sliding: friction force, or coefficient, at a held speed, on eq. (1)."""
+
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import Misfit, Start, Theta, no_design
+from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient
+from capsule_id.parameters import Parameter, parameter
+from capsule_id.rig.model import Rig, Table
+
+
+class SlidingFriction(FrictionExperiment):
+    """y = w mu_d(v), w = (m1 + m2) g for a force and 1 for a coefficient.
+
+    Variance: reading errors of y and of v (through the slope of eq. (1)) and the relative scatter of mu.
+    """
+
+    role = "sliding"
+
+    def __init__(self, table: Table, rig: Rig) -> None:
+        super().__init__(table, rig)
+        self.speed = table["speed"]
+        self.column = table.columns["force" if "force" in table.columns else "coefficient"]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return parameter("mu"), parameter("v_s"), parameter("sliding_scatter")
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.column.values
+
+    def _weight(self, theta: Theta) -> Any:
+        return (theta["m1"] + theta["m2"]) * theta["g"] if self.column.name == "force" else 1.0
+
+    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+        mu, v_s, weight = theta["mu"], theta["v_s"], self._weight(theta)
+        predicted = weight * friction_coefficient(self.speed, mu, v_s, xp)
+        slope = -0.5 * weight * mu * xp.exp(-self.speed / v_s) / v_s
+        variance = (
+            self.column.reading_sd**2
+            + (slope * self.table.columns["speed"].reading_sd) ** 2
+            + (theta["sliding_scatter"] * predicted) ** 2
+        )
+        return Misfit(self.column.values - predicted, xp.sqrt(variance), no_design(self.n, xp))
+
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Steady sliding is read as measured."""
+        if self.column.name == "coefficient":
+            return self.speed, self.column.values
+        m1, m2 = self.rig.m1, self.rig.m2
+        assert m1 is not None and m2 is not None, "the schema asks for both masses beside a sliding force"
+        return self.speed, self.column.values / ((m1.value + m2.value) * self.rig.g.value)
+
+    def starts(self) -> dict[str, Start]:
+        speed, coefficient = self.paper_points()
+        return {
+            "mu": Start(float(np.max(coefficient)), 0.3),
+            "v_s": Start(float(np.median(speed)), 0.5),
+            "sliding_scatter": Start(0.02, 0.3),
+        }
