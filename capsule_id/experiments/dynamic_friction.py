@@ -52,3 +52,25 @@ class DynamicFriction(FrictionExperiment):
             "v_s": Start(float(np.median(self.speed)), 0.5),
             "push_scatter": Start(0.02, 0.3),
         }
+
+
+def twin(
+    rng: np.random.Generator,
+    mu: float,
+    v_s: float,
+    g: float,
+    speeds: np.ndarray,
+    speed_sd: float,
+    distance_sd: float,
+    push_scatter: float,
+) -> dict[str, np.ndarray]:
+    """A synthetic table: pushes at ``speeds`` (n,) m/s, read with ``speed_sd`` m/s and ``distance_sd`` m.
+
+    The surface's mu scatters by ``push_scatter`` (relative) from push to push.
+    """
+    surface = mu * (1.0 + push_scatter * rng.standard_normal(len(speeds)))
+    distance = np.asarray(slide_distance(speeds, 1.0, v_s, g, np)) / surface
+    return {
+        "speed [m/s]": speeds + speed_sd * rng.standard_normal(len(speeds)),
+        "distance [mm]": 1e3 * (distance + distance_sd * rng.standard_normal(len(speeds))),
+    }

@@ -1,4 +1,4 @@
-"""Eq. (1), the Coulomb–Stribeck coefficient, the slide that follows from it, and the picture of both (paper, Fig. 2)."""
+"""Eq. (1), the Coulomb–Stribeck coefficient, the slide that follows from it, and the picture of both (Fig. 2)."""
 
 from abc import abstractmethod
 from types import ModuleType
@@ -65,7 +65,7 @@ class FrictionExperiment(Experiment):
 
 
 def friction_comparison(experiments: list[FrictionExperiment], theta: Theta, draws: list[Theta]) -> Comparison:
-    """Friction coefficient against velocity: readings, the paper's curve, ours with its band (counterpart of Fig. 2)."""
+    """Friction coefficient against velocity: readings, the paper's curve, ours with its band (paper, Fig. 2)."""
     points = [Points(e.label, *e.paper_points(), role=e.role) for e in experiments]
     top = max(float(np.max(p.x)) for p in points)
     speed = np.linspace(0.0, 1.15 * top if top > 0 else 1.0, 161)

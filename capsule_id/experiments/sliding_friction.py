@@ -62,3 +62,11 @@ class SlidingFriction(FrictionExperiment):
             "v_s": Start(float(np.median(speed)), 0.5),
             "sliding_scatter": Start(0.02, 0.3),
         }
+
+
+def twin(
+    rng: np.random.Generator, mu: float, v_s: float, speeds: np.ndarray, sliding_scatter: float
+) -> dict[str, np.ndarray]:
+    """A synthetic table of coefficients at ``speeds`` (n,) m/s with relative scatter ``sliding_scatter``."""
+    scatter = 1.0 + sliding_scatter * rng.standard_normal(len(speeds))
+    return {"speed [m/s]": speeds, "coefficient [1]": scatter * friction_coefficient(speeds, mu, v_s, np)}

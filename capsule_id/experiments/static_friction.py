@@ -59,3 +59,11 @@ def _angles(table: Table) -> tuple[np.ndarray, np.ndarray]:
     if table.settings["length_is"] == "board":
         return np.arcsin(ratio), ratio_sd / np.sqrt(1.0 - ratio**2)
     return np.arctan(ratio), ratio_sd / (1.0 + ratio**2)
+
+
+def twin(
+    rng: np.random.Generator, mu: float, trials: int = 4, tilt_sd: float = np.deg2rad(0.5)
+) -> dict[str, np.ndarray]:
+    """A synthetic table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
+    angle = np.arctan(mu) + tilt_sd * rng.standard_normal(trials)
+    return {"angle [deg]": np.rad2deg(angle)}
