@@ -32,6 +32,7 @@ from capsule_id.rig.settings import (
     shown,
 )
 from capsule_id.rig.tables import TableFile, read_table_file
+from capsule_id.rig.text import decode
 from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
@@ -101,14 +102,9 @@ def _read_document(folder: Path) -> tuple[TomlDocument, str]:
                 "rig.toml must lie inside the folder, links followed", "a link", "copy it here", path, 1, 1
             )
         content = path.read_bytes()
-        return parse_toml(content.decode("utf-8-sig"), path), hashlib.sha256(content).hexdigest()
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links
         raise InputError("rig.toml must be readable", str(error), "check path and permissions", path, 1, 1) from None
-    except UnicodeDecodeError as error:
-        line = error.object.count(b"\n", 0, error.start) + 1
-        column = error.start - error.object.rfind(b"\n", 0, error.start)
-        value = f"byte 0x{error.object[error.start]:02x}"
-        raise InputError("rig.toml must be UTF-8 text", value, "save it as UTF-8", path, line, column) from None
+    return parse_toml(decode(content, path), path), hashlib.sha256(content).hexdigest()
 
 
 def _read_priors(document: TomlDocument, tables: tuple[Table, ...]) -> dict[str, PriorOverride]:
