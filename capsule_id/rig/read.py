@@ -32,6 +32,7 @@ from capsule_id.rig.settings import (
     shown,
 )
 from capsule_id.rig.tables import TableFile, read_table_file
+from capsule_id.rig.text import decode
 from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
@@ -90,23 +91,20 @@ def read_rig(folder: str | Path) -> Rig:
 def _read_document(folder: Path) -> tuple[TomlDocument, str]:
     """``rig.toml``, parsed and located, and its sha256."""
     path = folder / "rig.toml"
-    if not folder.is_dir():
-        raise InputError("the rig must be a folder", "no such folder", "name a folder with a rig.toml", folder)
-    if not path.is_file():
-        remedy = "run `capsule-id init DIR` for a commented one"
-        raise InputError("a rig folder must contain rig.toml", "none", remedy, path)
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise InputError("rig.toml must lie inside the folder, links followed", "a link", "copy the file here", path)
     try:
+        if not folder.is_dir():
+            raise InputError("the rig must be a folder", "no such folder", "name a folder with a rig.toml", folder)
+        if not path.is_file():
+            remedy = "run `capsule-id init DIR` for a commented one"
+            raise InputError("a rig folder must contain a file rig.toml", "none", remedy, path, 1, 1)
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise InputError(
+                "rig.toml must lie inside the folder, links followed", "a link", "copy it here", path, 1, 1
+            )
         content = path.read_bytes()
-        return parse_toml(content.decode("utf-8-sig"), path), hashlib.sha256(content).hexdigest()
-    except OSError as error:
-        raise InputError("rig.toml must be readable", str(error.strerror), "check its permissions", path) from None
-    except UnicodeDecodeError as error:
-        line = error.object.count(b"\n", 0, error.start) + 1
-        column = error.start - error.object.rfind(b"\n", 0, error.start)
-        value = f"byte 0x{error.object[error.start]:02x}"
-        raise InputError("rig.toml must be UTF-8 text", value, "save it as UTF-8", path, line, column) from None
+    except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links
+        raise InputError("rig.toml must be readable", str(error), "check path and permissions", path, 1, 1) from None
+    return parse_toml(decode(content, path), path), hashlib.sha256(content).hexdigest()
 
 
 def _read_priors(document: TomlDocument, tables: tuple[Table, ...]) -> dict[str, PriorOverride]:

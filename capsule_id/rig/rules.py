@@ -8,6 +8,7 @@ from capsule_id.rig.model import Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.rig.tables import TableFile
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.rig.windows import decay_window
 
 # Of an experiment's line with force and displacement: which two columns share an sd_ratio
 _LINES = {"motor_current": ("force", "current"), "support_spring": ("force", "deflection")}
@@ -74,9 +75,8 @@ def _check_window(document: TomlDocument, path: KeyPath, table: Table, file: Tab
     edges = {"start": float(time[0]), "stop": float(time[-1])}
     for key in edges:
         value = table.settings.get(key)
-        if value is None:
+        if not isinstance(value, float):
             continue
-        assert isinstance(value, float)
         if not time[0] - step <= value <= time[-1] + step:
             span = f"a time from {time[0]:g} to {time[-1]:g} s"
             raise document.error((*path, key), f"{key} must lie inside the record", f"{value:g} s", f"write {span}")
@@ -85,7 +85,7 @@ def _check_window(document: TomlDocument, path: KeyPath, table: Table, file: Tab
     if edges["start"] >= edges["stop"]:
         value = f"{edges['start']:g} s and {edges['stop']:g} s"
         raise document.error(place, "start must be before stop", value, "correct one of them")
-    inside = int(np.count_nonzero((time >= edges["start"]) & (time <= edges["stop"])))
+    inside = len(decay_window(table)[0])
     if inside < SHORTEST_RECORD:
         rule = f"at least {SHORTEST_RECORD} samples must lie between start and stop"
         raise document.error(place, rule, f"{inside} samples", "widen the window")

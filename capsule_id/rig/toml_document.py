@@ -55,14 +55,13 @@ class TomlDocument:
 
 
 def parse_toml(text: str, path: Path) -> TomlDocument:
-    """Parse ``text`` and locate every key and value.
+    """Parse ``text`` (line ends ``\\n``) and locate every key and value.
 
     Raises
     ------
     InputError
         If it is not TOML 1.0, at the place that tomllib names.
     """
-    text = text.replace("\r\n", "\n")
     try:
         data = tomllib.loads(text)
         scanner = _Scanner(text)

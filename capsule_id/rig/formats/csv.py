@@ -14,10 +14,12 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.text import decode
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[\s*([^\[\]]+?)\s*\]")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_NUMBER_CHARACTERS = frozenset("0123456789+-.eE \t\n")
+_NUMBER_CHARACTERS = frozenset("0123456789+-eE \t\n")  # and the decimal mark
+_SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark must not pass for a decimal mark
 _LONGEST_QUOTED = 40  # characters of a faulty cell that an error line repeats
 
 
@@ -40,7 +42,8 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     if len(lines) == 1:
         raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
     body = "\n".join(lines[1:])
-    decimal = "," if delimiter != "," and "," in body and "." not in body else "."
+    first_mark = re.search("[.,]", body) if delimiter != "," else None
+    decimal = first_mark[0] if first_mark else "."
     values = _read_fast(body, delimiter, decimal, len(names), len(lines) - 1)
     if values is None:
         values = _read_cells(lines, delimiter, decimal, len(names), path)
@@ -54,19 +57,8 @@ def read_csv(content: bytes, path: Path) -> RawTable:
 
 def _lines(content: bytes, path: Path) -> list[str]:
     """The file's lines without their ends; trailing blank lines dropped, a blank line elsewhere is a fault."""
-    nul = content.find(b"\0")
-    if nul >= 0:
-        line, column = content.count(b"\n", 0, nul) + 1, nul - content.rfind(b"\n", 0, nul)
-        raise InputError("a table must be text", "a binary file (NUL byte)", "export it as CSV", path, line, column)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        before = error.object[: error.start]
-        line, column = before.count(b"\n") + 1, len(before[before.rfind(b"\n") + 1 :].decode("utf-8")) + 1
-        byte = f"byte 0x{error.object[error.start]:02x}"
-        raise InputError("a table must be UTF-8 text", byte, "save it as UTF-8", path, line, column) from None
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    while lines and not lines[-1].strip(" "):
+    lines = decode(content, path).split("\n")
+    while lines and not lines[-1].strip():
         lines.pop()
     if not lines:
         remedy = "write a header `name [unit]` per column and a row per reading"
@@ -147,12 +139,13 @@ def _number(cell: str, decimal: str, path: Path, line: int, column: int) -> floa
     if not cell:
         remedy = "fill it, or remove the row"
         raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
-    if _NUMBER.fullmatch(cell.replace(",", ".") if decimal == "," else cell) is None:
+    written = cell.translate(_SWAP_MARKS) if decimal == "," else cell
+    if _NUMBER.fullmatch(written) is None:
         if cell.lower().lstrip("+-") in ("nan", "inf", "infinity"):
             raise InputError("a cell must be a finite number", cell, "remove the row", path, line, column)
         remedy = "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file"
         raise InputError("a cell must be a number", _shown(cell), remedy, path, line, column)
-    value = float(cell.replace(",", "."))
+    value = float(written)
     if not np.isfinite(value):
         remedy = "correct it: it is too large for a float64"
         raise InputError("a cell must be a finite number", _shown(cell), remedy, path, line, column)
