@@ -123,8 +123,10 @@ def least_squares(
     message = []
     for i in range(len(starts)):
         reason = optx.RESULTS[jax.tree.map(lambda code, i=i: code[i], result)]
+        if not _finite(jacobian[i], residuals[i]):
+            reason = "The residuals or their Jacobian are not finite where this start ended: try another start."
         # A solver that only watches its steps takes heavy damping for convergence.
-        if not reason and not _stationary(jacobian[i], residuals[i], tolerance * float(unit[i])):
+        elif not reason and not _stationary(jacobian[i], residuals[i], tolerance * float(unit[i])):
             reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
         message.append(reason)
     return LeastSquaresFit(
@@ -164,13 +166,17 @@ def covariance(jacobian: np.ndarray, residuals: np.ndarray, residual_sd: float |
             )
         residual_sd = float(np.sqrt(residuals @ residuals / (count - parameters)))
     no_answer = np.full((parameters, parameters), np.inf)
-    if not (np.isfinite(jacobian).all() and np.isfinite(residuals).all()):
+    if not _finite(jacobian, residuals):
         return Covariance(no_answer, 0, residual_sd)
     _, singular, right, column_norm = _range(jacobian)
     if len(singular) < parameters:
         return Covariance(no_answer, len(singular), residual_sd)
     root = residual_sd * right.T / singular / column_norm[:, None]
     return Covariance(root @ root.T, parameters, residual_sd)
+
+
+def _finite(jacobian: np.ndarray, residuals: np.ndarray) -> bool:
+    return bool(np.isfinite(jacobian).all() and np.isfinite(residuals).all())
 
 
 def _range(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -186,8 +192,6 @@ def _range(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
 
 def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> bool:
     """The part of the residuals (n,) in the range of J (n, d) is small against the rest, or below ``rounding``."""
-    if not (np.isfinite(jacobian).all() and np.isfinite(residuals).all()):
-        return False
     left = _range(jacobian)[0]
     tangential = float(np.linalg.norm(left.T @ residuals))
     normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))
