@@ -24,6 +24,10 @@ SMALLEST_EFFECT = 0.01
 """Dimensionless. Where changing a parameter by 100 % of its start moves the residuals by less than this share of what
 the strongest parameter does, the parameter's scale is the step that moves them by this share: zero has no size."""
 
+LARGEST_OFFSET = 1e-3
+"""Dimensionless, in radii of the joint confidence region: how far from a stationary point an end counts as converged
+(Bates & Watts, *Technometrics* 23, 1981, 179, the relative offset)."""
+
 
 @dataclass(frozen=True)
 class Covariance:
@@ -53,15 +57,16 @@ class Covariance:
 
 @dataclass(frozen=True)
 class LeastSquaresFit:
-    """Where each start ended, and whether the solver says that it converged there.
+    """Where each start ended, and whether it converged there.
 
     Attributes
     ----------
     x : (s, d) end points, units of the parameters
     cost : (s,) ½ Σ r², units of the residuals squared
-    stalled : (s,) bool, the solver reported no convergence: out of steps, or numbers that are not finite
+    stalled : (s,) bool, no convergence: out of steps, numbers that are not finite, or steps that became tiny short of
+        a stationary point
     steps : (s,) solver steps, rejected ones included
-    message : (s,) the solver's own words, "" where it converged
+    message : (s,) the reason, "" where it converged
     residuals : (s, n) at the end points
     jacobian : (s, n, d) of the residuals at the end points
     """
@@ -98,7 +103,8 @@ def least_squares(
 
     Parameters
     ----------
-    residual : (d,) -> (n,), a JAX function; it may close over arrays
+    residual : (d,) -> (n,), a JAX function; it may close over arrays. A ``jax.tree_util.Partial`` or ``equinox.Module``
+        carries its arrays as arguments instead: other numbers of the same shapes then need no new compilation
     starts : (s, d), units of the parameters
     tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
         tolerance (1 + its size)
@@ -112,16 +118,25 @@ def least_squares(
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    x, residuals, jacobian, steps, result = _solve(residual, jnp.asarray(starts), tolerance, max_steps)
-    message = tuple(optx.RESULTS[jax.tree.map(lambda code, i=i: code[i], result)] for i in range(len(starts)))
+    *arrays, result = _solve(residual, jnp.asarray(starts), tolerance, max_steps)
+    x, residuals, jacobian, unit, steps = (np.asarray(array) for array in arrays)
+    message = []
+    for i in range(len(starts)):
+        reason = optx.RESULTS[jax.tree.map(lambda code, i=i: code[i], result)]
+        if not _finite(jacobian[i], residuals[i]):
+            reason = "The residuals or their Jacobian are not finite where this start ended: try another start."
+        # A solver that only watches its steps takes heavy damping for convergence.
+        elif not reason and not _stationary(jacobian[i], residuals[i], tolerance * float(unit[i])):
+            reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
+        message.append(reason)
     return LeastSquaresFit(
-        x=np.asarray(x),
-        cost=0.5 * np.sum(np.asarray(residuals) ** 2, axis=1),
-        stalled=np.asarray(result != optx.RESULTS.successful),
-        steps=np.asarray(steps),
-        message=message,
-        residuals=np.asarray(residuals),
-        jacobian=np.asarray(jacobian),
+        x=x,
+        cost=0.5 * np.sum(residuals**2, axis=1),
+        stalled=np.array([reason != "" for reason in message]),
+        steps=steps,
+        message=tuple(message),
+        residuals=residuals,
+        jacobian=jacobian,
     )
 
 
@@ -150,26 +165,49 @@ def covariance(jacobian: np.ndarray, residuals: np.ndarray, residual_sd: float |
                 "give the sd of the measurements or more measurements",
             )
         residual_sd = float(np.sqrt(residuals @ residuals / (count - parameters)))
-    column_norm = np.linalg.norm(jacobian, axis=0)
-    undetermined = Covariance(np.full((parameters, parameters), np.inf), 0, residual_sd)
-    if not (np.isfinite(jacobian).all() and np.isfinite(residuals).all()):
-        return undetermined
-    unit = jacobian / np.where(column_norm > 0, column_norm, 1.0)
-    _, singular, right = np.linalg.svd(unit, full_matrices=False)
-    rank = int(np.sum(singular > singular[0] * max(jacobian.shape) * np.finfo(float).eps))
-    if rank < parameters:
-        return Covariance(undetermined.matrix, rank, residual_sd)
+    no_answer = np.full((parameters, parameters), np.inf)
+    if not _finite(jacobian, residuals):
+        return Covariance(no_answer, 0, residual_sd)
+    _, singular, right, column_norm = _range(jacobian)
+    if len(singular) < parameters:
+        return Covariance(no_answer, len(singular), residual_sd)
     root = residual_sd * right.T / singular / column_norm[:, None]
-    return Covariance(root @ root.T, rank, residual_sd)
+    return Covariance(root @ root.T, parameters, residual_sd)
+
+
+def _finite(jacobian: np.ndarray, residuals: np.ndarray) -> bool:
+    return bool(np.isfinite(jacobian).all() and np.isfinite(residuals).all())
+
+
+def _range(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Singular vectors and values of J with unit columns, as far as they are above rounding, and the column norms.
+
+    (n, rank), (rank,), (rank, d), (d,).
+    """
+    column_norm = np.linalg.norm(jacobian, axis=0)
+    left, singular, right = np.linalg.svd(jacobian / np.where(column_norm > 0, column_norm, 1.0), full_matrices=False)
+    rank = int(np.sum(singular > singular[0] * max(jacobian.shape) * np.finfo(float).eps))
+    return left[:, :rank], singular[:rank], right[:rank], column_norm
+
+
+def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> bool:
+    """The part of the residuals (n,) in the range of J (n, d) is small against the rest, or below ``rounding``."""
+    left = _range(jacobian)[0]
+    tangential = float(np.linalg.norm(left.T @ residuals))
+    normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))
+    freedom = max(len(residuals) - left.shape[1], 1)
+    # Bates & Watts: both parts per degree of freedom.
+    radius = normal * np.sqrt(max(left.shape[1], 1) / freedom)
+    return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
 @eqx.filter_jit
 def _solve(
     residual: Residual, starts: jax.Array, tolerance: float, max_steps: int
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, optx.RESULTS]:
-    """Every start in one trace: x (s, d), residuals (s, n), Jacobian (s, n, d), steps (s,), result codes (s,)."""
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array, optx.RESULTS]:
+    """Every start in one trace: x (s, d), residuals (s, n), J (s, n, d), unit (s,), steps (s,), result codes (s,)."""
 
-    def one(start: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, optx.RESULTS]:
+    def one(start: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array, optx.RESULTS]:
         scale, unit = _scales(jax.jacfwd(residual)(start), start)
         solution = optx.least_squares(
             lambda v, _: residual(v * scale) / unit,
@@ -179,7 +217,7 @@ def _solve(
             throw=False,
         )
         x = solution.value * scale
-        return x, residual(x), jax.jacfwd(residual)(x), solution.stats["num_steps"], solution.result
+        return x, residual(x), jax.jacfwd(residual)(x), unit, solution.stats["num_steps"], solution.result
 
     return eqx.filter_vmap(one)(starts)
 
