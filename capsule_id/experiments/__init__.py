@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment, Theta
+from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
@@ -79,9 +79,17 @@ def paper_estimates(experiments: Sequence[Experiment]) -> dict[str, float]:
     return estimates
 
 
-def compare(experiments: Sequence[Experiment], theta: Theta, draws: list[Theta]) -> tuple[Comparison, ...]:
-    """One panel per experiment; the friction experiments share one."""
+def compare(
+    experiments: Sequence[Experiment], values: Mapping[str, float], draws: Sequence[Mapping[str, float]]
+) -> tuple[Comparison, ...]:
+    """One panel per experiment, at ``values`` by name with a band from ``draws``; friction experiments share one."""
     friction = [e for e in experiments if isinstance(e, FrictionExperiment)]
-    panels = [friction_comparison(friction, theta, draws)] if friction else []
-    panels += [e.comparison(theta, draws) for e in experiments if not isinstance(e, FrictionExperiment)]
+    panels = []
+    if friction:
+        # Their local values differ in scatters only; together they know both mu and v_s where one of them does.
+        everything = [{k: v for e in friction for k, v in e.local(point).items()} for point in (values, *draws)]
+        panels.append(friction_comparison(friction, everything[0], everything[1:]))
+    for e in experiments:
+        if not isinstance(e, FrictionExperiment):
+            panels.append(e.comparison(e.local(values), [e.local(draw) for draw in draws]))
     return tuple(panels)

@@ -6,10 +6,11 @@ posterior predictive p-value all follow from that here, once.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,8 @@ from capsule_id.views import Comparison, Finding
 
 require_float64()
 
-#: Parameter values by name (``k1``, ``noise_sd[decay_1]``, and the constants ``g``, ``m1``, ``m2``), SI.
+#: Parameter values, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, and the constants ``g``, ``m1``, ``m2``): what one
+#: experiment sees. ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
 Theta = Mapping[str, Any]
 
 
@@ -63,6 +65,10 @@ class Experiment(ABC):
     scale_known = False
     #: Readings follow each other in time: residuals must be white.
     time_series = False
+    #: Numeric attributes, and the others, that the likelihood reads: experiments of one class that agree in the shapes
+    #: of the former and in the values of the latter are evaluated together, in one batch (see ``signature``).
+    ARRAYS: tuple[str, ...] = ()
+    STATIC: tuple[str, ...] = ()
 
     def __init__(self, table: Table, rig: Rig) -> None:
         self.table = table
@@ -79,7 +85,24 @@ class Experiment(ABC):
     @property
     def n(self) -> int:
         """Number of readings that enter the likelihood."""
-        return len(self.observed)
+        return self.observed.shape[0]
+
+    @property
+    def signature(self) -> Hashable:
+        """Equal for experiments that differ only in numbers."""
+        shapes = tuple(np.shape(getattr(self, name)) for name in self.ARRAYS)
+        return type(self), self.n, shapes, tuple(getattr(self, name) for name in self.STATIC)
+
+    def with_arrays(self, arrays: Mapping[str, Any]) -> Self:
+        """The same experiment with other (traced) numbers in place of ``ARRAYS``."""
+        clone = copy(self)
+        clone.__dict__.update(arrays)
+        return clone
+
+    def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values by symbol out of values by name."""
+        own = {row.symbol: values[row.name] for row in self.parameters}
+        return own | {name: values[name] for name in ("m1", "m2", "g") if name in values}
 
     @property
     @abstractmethod

@@ -11,47 +11,37 @@ import jax.numpy as jnp
 import numpy as np
 
 
-class UniformDecay:
-    """The record once folded into a matrix; ``moments`` is then cheap to evaluate in a batch.
+def fold(values: np.ndarray) -> np.ndarray:
+    """(giant, baby) the record (n,) in rows of about sqrt(n), the last one filled with zeros."""
+    baby = max(int(np.sqrt(len(values))), 1)
+    giant = -(-len(values) // baby)
+    return np.pad(values, (0, baby * giant - len(values))).reshape(giant, baby)
+
+
+def decay_moments(folded: Any, n: int, step: Any, gamma: Any, omega: Any) -> tuple[Any, Any, Any]:
+    """y'y (), A'y (3,) and A'A (3, 3) for A = [Re z^j, Im z^j, 1], j = 0 .. n-1.
 
     Parameters
     ----------
-    values : (n,) readings at 0, h, 2h, ...
+    folded : (giant, baby) of ``fold``
     step : h, s
+    gamma, omega : 1/s and rad/s
     """
+    giant, baby = folded.shape
+    rate = (-gamma + 1j * omega) * step
+    inner = jnp.exp(rate * jnp.arange(baby))
+    outer = jnp.exp(rate * baby * jnp.arange(giant))
+    rows = folded @ jnp.stack([inner.real, inner.imag], axis=-1)
+    projection = jnp.sum(outer * (rows[:, 0] + 1j * rows[:, 1]))
+    plain, squared, modulus = (_series(q, n) for q in (rate, 2.0 * rate, -2.0 * gamma * step))
+    cc, ss, cs = 0.5 * (modulus + squared.real), 0.5 * (modulus - squared.real), 0.5 * squared.imag
+    aa = jnp.array([[cc, cs, plain.real], [cs, ss, plain.imag], [plain.real, plain.imag, n]])
+    return jnp.sum(folded**2), jnp.array([projection.real, projection.imag, jnp.sum(folded)]), aa
 
-    def __init__(self, values: np.ndarray, step: float) -> None:
-        self.n, self.step = len(values), step
-        self.baby = max(int(np.sqrt(self.n)), 1)
-        self.giant = -(-self.n // self.baby)
-        folded = np.zeros(self.baby * self.giant)
-        folded[: self.n] = values
-        self.folded = folded.reshape(self.giant, self.baby)
-        self.sum, self.square = float(np.sum(values)), float(values @ values)
 
-    def moments(self, gamma: Any, omega: Any) -> tuple[Any, Any, Any]:
-        """y'y (), A'y (3,) and A'A (3, 3) for A = [Re z^j, Im z^j, 1]."""
-        rate = (-gamma + 1j * omega) * self.step
-        inner = jnp.exp(rate * jnp.arange(self.baby))
-        outer = jnp.exp(rate * self.baby * jnp.arange(self.giant))
-        rows = self.folded @ jnp.stack([inner.real, inner.imag], axis=-1)
-        projection = jnp.sum(outer * (rows[:, 0] + 1j * rows[:, 1]))
-        plain, squared = self._series(rate), self._series(2.0 * rate)
-        modulus = self._series(-2.0 * gamma * self.step)
-        cc, ss = 0.5 * (modulus + squared.real), 0.5 * (modulus - squared.real)
-        cs = 0.5 * squared.imag
-        aa = jnp.stack(
-            [
-                jnp.stack([cc, cs, plain.real]),
-                jnp.stack([cs, ss, plain.imag]),
-                jnp.stack([plain.real, plain.imag, jnp.full_like(cc, self.n)]),
-            ]
-        )
-        return self.square, jnp.stack([projection.real, projection.imag, jnp.full_like(cc, self.sum)]), aa
-
-    def _series(self, exponent: Any) -> Any:
-        """Sum of exp(exponent j) over j = 0 .. n-1."""
-        return jnp.expm1(exponent * self.n) / jnp.expm1(exponent)
+def _series(exponent: Any, n: int) -> Any:
+    """Sum of exp(exponent j) over j = 0 .. n-1."""
+    return jnp.expm1(exponent * n) / jnp.expm1(exponent)
 
 
 def uniform_step(time: np.ndarray) -> float | None:

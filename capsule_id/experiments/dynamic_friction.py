@@ -19,6 +19,7 @@ class DynamicFriction(FrictionExperiment):
     """
 
     role = "dynamic"
+    ARRAYS = ("speed", "distance", "speed_sd", "distance_sd")
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)

@@ -10,7 +10,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Misfit, Start, Theta, axis_label, band
 from capsule_id.experiments.decay_models import STEP_PHASE, dry_decay, quadratic_decay, rates, viscous_basis
-from capsule_id.experiments.decay_moments import UniformDecay, uniform_step
+from capsule_id.experiments.decay_moments import decay_moments, fold, uniform_step
 from capsule_id.experiments.decrement import Decrement, equilibrium, logarithmic_decrement, noise_level
 from capsule_id.experiments.linear import NUISANCE_WIDTH, marginal_log_density
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -32,6 +32,8 @@ class FreeVibration(Experiment):
     """
 
     time_series = True
+    ARRAYS = ("time", "values", "width", "reading_sd", "side", "folded", "step")
+    STATIC = ("damping", "half_cycles", "substeps", "uniform")
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)
@@ -48,8 +50,11 @@ class FreeVibration(Experiment):
         self.values = self.column.values[window]
         self.damping = str(table.settings.get("damping", "viscous"))
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
+        self.reading_sd = self.column.reading_sd
         step = uniform_step(self.time)
-        self._fast = UniformDecay(self.values, step) if step is not None and self.damping == "viscous" else None
+        self.uniform = step is not None and self.damping == "viscous"
+        self.step = step or 0.0
+        self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
 
     @property
     def observed(self) -> np.ndarray:
@@ -76,12 +81,12 @@ class FreeVibration(Experiment):
 
     def noise_sd(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """Noise and reading error, m."""
-        return xp.sqrt(theta[self.noise_name] ** 2 + self.column.reading_sd**2)
+        return xp.sqrt(theta["noise_sd"] ** 2 + self.reading_sd**2)
 
     def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
         k1, c, m1 = theta["k1"], theta["c"], theta["m1"]
         one = xp.ones((len(self.time), 1))
-        raw, design = xp.asarray(self.values), one
+        raw, design = self.values, one
         if self.damping == "dry":
             raw = raw - self.side * dry_decay(
                 self.time,
@@ -89,22 +94,23 @@ class FreeVibration(Experiment):
                 c,
                 m1,
                 theta["F_dry"],
-                theta[f"amplitude[{self.label}]"],
-                theta[f"turning_time[{self.label}]"],
+                theta["amplitude"],
+                theta["turning_time"],
                 half_cycles=self.half_cycles,
             )
         elif self.damping == "quadratic":
-            start = theta[f"x_start[{self.label}]"], theta[f"y_start[{self.label}]"]
+            start = theta["x_start"], theta["y_start"]
             raw = raw - quadratic_decay(self.time, k1, c, m1, theta["c_q"], *start, substeps=self.substeps)
         else:
             design = xp.concatenate([viscous_basis(self.time, k1, c, m1, xp), one], axis=1)
         return Misfit(raw, self.noise_sd(theta, xp) * xp.ones(self.n), self.width * design)
 
     def log_likelihood(self, theta: Theta) -> Any:
-        if self._fast is None:
+        if not self.uniform:
             return super().log_likelihood(theta)
         sd = self.noise_sd(theta)
-        yy, ay, aa = self._fast.moments(*rates(theta["k1"], theta["c"], theta["m1"]))
+        gamma, omega = rates(theta["k1"], theta["c"], theta["m1"])
+        yy, ay, aa = decay_moments(self.folded, self.n, self.step, gamma, omega)
         scale = self.width / sd
         return marginal_log_density(yy / sd**2, scale / sd * ay, scale**2 * aa, self.n) - self.n * jnp.log(sd)
 
@@ -145,17 +151,17 @@ class FreeVibration(Experiment):
         k1 = self.mass * omega**2
         return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * self.mass)))
 
-    @property
+    @cached_property
     def side(self) -> float:
         """Sign of the first turning point."""
         return float(np.sign(self._rough.peaks[0]))
 
-    @property
+    @cached_property
     def half_cycles(self) -> int:
         """Bound on the half cycles of the record, with room for a frequency half as high again."""
         return int(1.5 * self._rough.Omega_o * self.time[-1] / np.pi) + 4
 
-    @property
+    @cached_property
     def substeps(self) -> int:
         """Runge–Kutta steps between two samples."""
         return max(1, int(np.ceil(self._rough.Omega_o * np.max(np.diff(self.time)) / STEP_PHASE)))

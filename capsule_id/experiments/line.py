@@ -24,10 +24,15 @@ SCATTER_MEDIAN, SCATTER_FACTOR = 0.01, 100.0
 class Line(Experiment):
     """y against x; subclasses name the columns and the slope."""
 
+    ARRAYS = ("x", "y", "x_sd", "y_sd", "width")
+    STATIC = ("scale_known", "sd_ratio")
+
     def __init__(self, table: Table, rig: Rig, x: str, y: str, slope: Parameter) -> None:
         super().__init__(table, rig)
         self.x_column, self.y_column, self.slope = table.columns[x], table.columns[y], slope
         self.x, self.y = self.x_column.values, self.y_column.values
+        self.x_sd, self.y_sd = self.x_column.reading_sd, self.y_column.reading_sd
+        self.width = NUISANCE_WIDTH * float(np.ptp(self.y))
         ratio = table.settings.get("sd_ratio")
         self.sd_ratio = None if ratio is None else float(ratio)  # type: ignore[arg-type]
         self.scale_known = self.x_column.sd is not None and self.y_column.sd is not None
@@ -53,18 +58,18 @@ class Line(Experiment):
         return self.y
 
     def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
-        slope = theta[self.slope.name]
-        variance = self.y_column.reading_sd**2 + (slope * self.x_column.reading_sd) ** 2
+        slope = theta[self.slope.symbol]
+        variance = self.y_sd**2 + (slope * self.x_sd) ** 2
         if not self.scale_known:
-            scatter = theta[f"scatter[{self.label}]"]
+            scatter = theta["scatter"]
             both = 1.0 if self.sd_ratio is None else 1.0 + (slope / self.sd_ratio) ** 2
             variance = variance + scatter**2 * both
-        design = xp.full((self.n, 1), NUISANCE_WIDTH * np.ptp(self.y))
+        design = self.width * xp.ones((self.n, 1))
         return Misfit(self.y - slope * self.x, xp.sqrt(variance) * xp.ones(self.n), design)
 
     def intercept(self, theta: Theta) -> float:
         """Conditional mean of y0, SI."""
-        return float(self.nuisance_mean(theta)[0] * NUISANCE_WIDTH * np.ptp(self.y))
+        return float(self.nuisance_mean(theta)[0] * self.width)
 
     def ordinary_line(self) -> tuple[float, float, float]:
         """Slope, intercept and residual sd of ordinary least squares: the paper's linear fit."""
@@ -85,7 +90,7 @@ class Line(Experiment):
         x = np.linspace(low - 0.04 * (high - low), high + 0.04 * (high - low), 60)
 
         def line(values: Theta) -> np.ndarray:
-            return (self.intercept(values) + values[self.slope.name] * x) * y_unit
+            return (self.intercept(values) + values[self.slope.symbol] * x) * y_unit
 
         lower, upper = band(np.array([line(draw) for draw in draws]))
         slope, intercept, _ = self.ordinary_line()

@@ -19,11 +19,16 @@ class SlidingFriction(FrictionExperiment):
     """
 
     role = "sliding"
+    ARRAYS = ("speed", "values", "speed_sd", "values_sd")
+    STATIC = ("quantity",)
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)
         self.speed = table["speed"]
-        self.column = table.columns["force" if "force" in table.columns else "coefficient"]
+        self.quantity = "force" if "force" in table.columns else "coefficient"
+        self.values = table[self.quantity]
+        self.speed_sd = table.columns["speed"].reading_sd
+        self.values_sd = table.columns[self.quantity].reading_sd
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -31,29 +36,25 @@ class SlidingFriction(FrictionExperiment):
 
     @property
     def observed(self) -> np.ndarray:
-        return self.column.values
+        return self.values
 
     def _weight(self, theta: Theta) -> Any:
-        return (theta["m1"] + theta["m2"]) * theta["g"] if self.column.name == "force" else 1.0
+        return (theta["m1"] + theta["m2"]) * theta["g"] if self.quantity == "force" else 1.0
 
     def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
         mu, v_s, weight = theta["mu"], theta["v_s"], self._weight(theta)
         predicted = weight * friction_coefficient(self.speed, mu, v_s, xp)
         slope = -0.5 * weight * mu * xp.exp(-self.speed / v_s) / v_s
-        variance = (
-            self.column.reading_sd**2
-            + (slope * self.table.columns["speed"].reading_sd) ** 2
-            + (theta["sliding_scatter"] * predicted) ** 2
-        )
-        return Misfit(self.column.values - predicted, xp.sqrt(variance), no_design(self.n, xp))
+        variance = self.values_sd**2 + (slope * self.speed_sd) ** 2 + (theta["sliding_scatter"] * predicted) ** 2
+        return Misfit(self.values - predicted, xp.sqrt(variance), no_design(self.n, xp))
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Steady sliding is read as measured."""
-        if self.column.name == "coefficient":
-            return self.speed, self.column.values
+        if self.quantity == "coefficient":
+            return self.speed, self.values
         m1, m2 = self.rig.m1, self.rig.m2
         assert m1 is not None and m2 is not None, "the schema asks for both masses beside a sliding force"
-        return self.speed, self.column.values / ((m1.value + m2.value) * self.rig.g.value)
+        return self.speed, self.values / ((m1.value + m2.value) * self.rig.g.value)
 
     def starts(self) -> dict[str, Start]:
         speed, coefficient = self.paper_points()

@@ -19,6 +19,7 @@ class StaticFriction(FrictionExperiment):
     """
 
     role = "static"
+    ARRAYS = ("angle", "reading_sd")
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)

@@ -4,8 +4,9 @@ u = log(theta) for positive parameters, theta otherwise. log p(u | data) = sum o
 of theta + log |d theta / du|: natural and normalised, linear nuisances integrated out.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import cached_property
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from capsule_id.experiments.base import Experiment, Start
+from capsule_id.experiments.base import Experiment, Start, Theta
 from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
 from capsule_id.rig.model import PriorOverride, Rig
@@ -98,15 +99,34 @@ class LogPosterior:
         density = -0.5 * (z**2 + LOG_2PI) - jnp.log(p["width"]) + p["constant"] + jnp.where(p["jacobian"], u, 0.0)
         return jnp.sum(density)
 
-    def prior_residuals(self, u: Any) -> Any:
+    def prior_residuals(self, u: Any, xp: ModuleType = jnp) -> Any:
         """(d,) (value - centre)/width: half their sum of squares is the parameter-dependent part of -log prior."""
         p = self._priors
-        return (jnp.where(p["lognormal"] | ~self.positive, u, jnp.exp(u)) - p["centre"]) / p["width"]
+        return (xp.where(p["lognormal"] | ~self.positive, u, xp.exp(u)) - p["centre"]) / p["width"]
+
+    @cached_property
+    def _groups(self) -> list[tuple[Experiment, ...]]:
+        """Experiments that differ only in numbers, together: one traced graph for each group, however many records."""
+        groups: dict[Hashable, list[Experiment]] = {}
+        for experiment in self.experiments:
+            groups.setdefault(experiment.signature, []).append(experiment)
+        return [tuple(group) for group in groups.values()]
+
+    def _per_group(self, function: Callable[[Experiment, Theta], Any], u: Any) -> list[Any]:
+        """``function`` of every experiment, batched: one array (members, ...) per group."""
+        values = self.constrain(u)
+        results = []
+        for group in self._groups:
+            first = group[0]
+            arrays = {name: np.stack([np.asarray(getattr(e, name)) for e in group]) for name in first.ARRAYS}
+            local = [e.local(values) for e in group]
+            theta = {name: jnp.stack([jnp.asarray(values[name]) for values in local]) for name in local[0]}
+            results.append(jax.vmap(lambda a, t, first=first: function(first.with_arrays(a), t))(arrays, theta))
+        return results
 
     def log_likelihood(self, u: Any) -> Any:
         """Sum over the experiments; scalar."""
-        theta = self.constrain(u)
-        return sum(experiment.log_likelihood(theta) for experiment in self.experiments)
+        return sum(jnp.sum(part) for part in self._per_group(lambda e, theta: e.log_likelihood(theta), u))
 
     def __call__(self, u: Any) -> Any:
         """log p(u | data) up to the evidence; -inf where it is not finite (an overdamped decay)."""
@@ -120,9 +140,14 @@ class LogPosterior:
 
     def residuals(self, u: Any) -> Any:
         """All experiments' residuals and the priors', (n,): the least-squares part of -log posterior."""
-        theta = self.constrain(u)
-        parts = [experiment.residuals(theta) for experiment in self.experiments]
-        return jnp.concatenate([*parts, self.prior_residuals(u)])
+        parts = self._per_group(lambda e, theta: e.residuals(theta), u)
+        return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.prior_residuals(u)])
+
+    def plain_residuals(self, u: np.ndarray) -> np.ndarray:
+        """The same residuals as ``residuals`` in NumPy, in the order of the experiments, nothing compiled."""
+        values = self.mapping(self.theta(u))
+        parts = [np.asarray(e.residuals(e.local(values), np)) for e in self.experiments]
+        return np.concatenate([*parts, np.asarray(self.prior_residuals(u, np))])
 
     def starts(self) -> Mapping[str, Start]:
         """Start of every parameter: the mean (geometric where positive) of what the experiments propose."""

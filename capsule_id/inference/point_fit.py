@@ -4,18 +4,18 @@ Least squares first (it finds the basin, with the scatters held at their startin
 joint log-posterior, scatters included, in coordinates whitened by the curvature at the best least-squares end.
 """
 
-from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from capsule_id.inference.curvature import hessian, jacobian, root_of_inverse
 from capsule_id.inference.least_squares import covariance, least_squares
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit
+from capsule_id.parameters import Parameter
 
 STARTS = 5
 #: Ends count as the same where they differ by less than this many posterior standard deviations.
@@ -24,6 +24,11 @@ AGREEMENT = 0.05
 TOLERANCE = 1e-6
 MAX_STEPS = 400
 LEAST_SQUARES_TOLERANCE = 1e-8
+#: Relative step of the difference quotients of residuals: their error is then about 1e-10 relative.
+DIFFERENCE = 1e-5
+#: Symbols of standard deviations.
+SCATTERS = frozenset({"noise_sd", "tilt_sd", "push_scatter", "sliding_scatter", "scatter"})
+QUICK_COMPILE = {"xla_backend_optimization_level": 0}
 
 
 def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -> PointFit:
@@ -34,24 +39,22 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
     seed : of the dispersal
     """
     starts = dispersed_starts(target, seed, number_of_starts)
-    location = np.array([row.physical or not row.positive or row.symbol == "amplitude" for row in target.parameters])
-    centre = starts[0].copy()
-
-    def held(v: Any) -> Any:
-        return target.residuals(jnp.asarray(centre).at[np.flatnonzero(location)].set(v))
-
-    rough = least_squares(held, starts[:, location], tolerance=LEAST_SQUARES_TOLERANCE)
+    located = np.flatnonzero([not is_scatter(row) for row in target.parameters])
+    centre = jnp.asarray(starts[0])
+    rough = least_squares(
+        lambda v: target.residuals(centre.at[located].set(v)),
+        starts[:, located],
+        tolerance=LEAST_SQUARES_TOLERANCE,
+    )
     ends = starts.copy()
-    ends[:, location] = np.where(np.isfinite(rough.x), rough.x, starts[:, location])
-    curvature = jax.jit(jax.hessian(lambda u: -target(u)))
-    whitening = _root_of_inverse(np.asarray(curvature(ends[rough.best])))
-    u, value, result = _polish(target, jnp.asarray(ends), jnp.asarray(whitening))
-    u, value = np.asarray(u), np.asarray(value)
-    stalled = np.asarray(result != optx.RESULTS.successful) | ~np.isfinite(value)
+    ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
+    scale = _information(target, ends[rough.best]) ** -0.5
+    whitening = root_of_inverse(-hessian(target.batch, ends[rough.best], scale))
+    u, value, converged = (np.asarray(part) for part in _polish(target)(ends, whitening))
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
-    root = _root_of_inverse(np.asarray(curvature(u[best])))
+    scale = _information(target, u[best]) ** -0.5
+    root = root_of_inverse(-hessian(target.batch, u[best], scale))
     spread = np.sqrt(np.sum(root**2, axis=1))
-    agree = bool(np.all(np.abs(u - u[best]) < AGREEMENT * spread))
     theta = target.theta(u[best])
     return PointFit(
         names=target.names,
@@ -62,9 +65,14 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
         starts=starts,
         ends=u,
         log_posterior=value,
-        agree=agree,
-        stalled=stalled,
+        agree=bool(np.all(np.abs(u - u[best]) < AGREEMENT * spread)),
+        stalled=~converged | ~np.isfinite(value),
     )
+
+
+def is_scatter(row: Parameter) -> bool:
+    """A standard deviation: it scales residuals, it does not move a prediction."""
+    return row.symbol in SCATTERS
 
 
 def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray:
@@ -79,11 +87,13 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     return centre + spread * z
 
 
-@partial(eqx.filter_jit)
-def _polish(target: LogPosterior, ends: jax.Array, whitening: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
-    """BFGS from every end, (s, d): maxima (s, d), log-posterior (s,), result codes (s,)."""
+def _polish(target: LogPosterior) -> Any:
+    """Jitted BFGS from every end: ((s, d), (d, d) whitening) -> maxima (s, d), log-posterior (s,), converged (s,).
 
-    def one(end: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
+    Compiled with few optimisations: it runs for milliseconds, and compiling it well takes seconds.
+    """
+
+    def one(end: Any, whitening: Any) -> tuple[Any, Any, Any]:
         solution = optx.minimise(
             lambda v, _: -target(end + whitening @ v),
             optx.BFGS(rtol=TOLERANCE, atol=TOLERANCE),
@@ -92,21 +102,26 @@ def _polish(target: LogPosterior, ends: jax.Array, whitening: jax.Array) -> tupl
             throw=False,
         )
         u = end + whitening @ solution.value
-        return u, target(u), solution.result
+        return u, target(u), solution.result == optx.RESULTS.successful
 
-    return eqx.filter_vmap(one)(ends)
+    return jax.jit(jax.vmap(one, in_axes=(0, None)), compiler_options=QUICK_COMPILE)
 
 
-def _root_of_inverse(hessian: np.ndarray) -> np.ndarray:
-    """R (d, d) with R R' = H^-1; directions without positive curvature get the weakest positive one instead.
+def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(d,) rough diagonal information: squared residual Jacobian, and 2n for the scatter of n readings."""
+    jacobian = _residual_jacobian(target, u)
+    count = np.zeros(target.dimension)
+    for experiment in target.experiments:
+        for row in experiment.parameters:
+            if is_scatter(row):
+                count[target.names.index(row.name)] += 2.0 * experiment.n
+    located = np.array([not is_scatter(row) for row in target.parameters])
+    return np.maximum(np.where(located, np.sum(jacobian**2, axis=0), count), 1e-2)
 
-    Away from the maximum H may be indefinite; it only serves as a metric there.
-    """
-    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), 1e-12))
-    eigenvalues, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    positive = eigenvalues > 1e-8 * eigenvalues[-1]
-    eigenvalues = np.where(positive, eigenvalues, np.min(eigenvalues[positive]))
-    return scale[:, None] * vectors / np.sqrt(eigenvalues)
+
+def _residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(n, d) Jacobian of the standardised residuals, scatters in the denominator included."""
+    return jacobian(target.plain_residuals, u, np.full(len(u), DIFFERENCE))
 
 
 def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> dict[str, float]:
@@ -114,9 +129,9 @@ def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> 
 
     The error of a parameter sampled through its logarithm is its relative error times its value.
     """
-    jacobian = np.asarray(jax.jit(jax.jacfwd(target.residuals))(u))
-    physical = np.array([row.physical for row in target.parameters])
-    matrix = covariance(jacobian[:, physical], np.zeros(len(jacobian)), residual_sd=1.0)
+    located = np.array([not is_scatter(row) for row in target.parameters])
+    at_fit = _residual_jacobian(target, u)[:, located]
     errors = np.full(len(u), np.nan)
-    errors[physical] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[physical]
+    matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
+    errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
     return dict(zip(target.names, (float(e) for e in errors), strict=True))
