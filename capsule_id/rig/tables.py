@@ -86,6 +86,7 @@ def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: str,
         remedy = "check its permissions"
         raise document.error(path, "file must be readable", f"{shown(name)} ({error.strerror})", remedy) from None
     raw = READERS[file.suffix.lower()](content, file)
+    raw.rows.flags.writeable = False
     table = TableFile(file, hashlib.sha256(content).hexdigest(), raw, {})
     _check_names(table, kind, rule)
     columns = {column: _to_si(table, index, rule.columns[column]) for index, column in enumerate(raw.names)}
