@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import (
@@ -47,8 +48,27 @@ def test_gain_is_what_the_filter_does_to_cosines(samples: int, order: int) -> No
         cosine = np.cos(2.0 * np.pi * frequency * (np.arange(401) - 200))
         filtered = savitzky_golay(time, cosine, samples * STEP, order)
         assert filtered[200] == pytest.approx(float(gain(frequency, samples, order)), abs=1e-12)
-    # SciPy solves for the coefficients in powers of the sample number: rounding grows to 4.5e-13 at order 4
-    assert gain(np.array([0.0, 0.0]), samples, order) == pytest.approx([1.0, 1.0], abs=1e-12)
+    assert gain(np.array([0.0, 0.0]), samples, order) == pytest.approx([1.0, 1.0], abs=1e-14)
+
+
+@pytest.mark.parametrize(("samples", "order"), [(1, 0), (3, 0), (5, 4), (11, 2), (31, 3), (31, 4)])
+def test_short_windows_agree_with_scipy(samples: int, order: int) -> None:
+    time = STEP * np.arange(100)
+    values = np.random.default_rng(4).normal(size=100)
+    for derivative in range(min(order, 3) + 1):
+        found = savitzky_golay(time, values, samples * STEP, order, derivative)
+        expected = savgol_filter(values, samples, order, deriv=derivative, delta=STEP, mode="interp")
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10 * np.max(np.abs(expected)))
+
+
+def test_long_windows_keep_their_digits_where_powers_lose_them() -> None:
+    time = STEP * np.arange(1500)
+    t = time / time[-1]
+    quintic = 1.0 + t - 3.0 * t**2 + t**5
+    assert np.max(np.abs(savitzky_golay(time, quintic, 1001 * STEP, 5) - quintic)) < 1e-13
+    powers = (np.arange(1001.0) - 500.0) ** np.arange(6.0)[:, None]
+    weights = np.linalg.lstsq(powers, np.eye(6)[0], rcond=None)[0]  # as SciPy has it
+    assert abs(weights @ quintic[:1001] - quintic[500]) > 1e-3
 
 
 def test_the_chosen_window_is_the_longest_that_passes_the_motion() -> None:
@@ -60,7 +80,16 @@ def test_the_chosen_window_is_the_longest_that_passes_the_motion() -> None:
         window = choose_window(time, values, order)
         samples = window_samples(window, STEP)
         seen = dominant_frequency(time, values) * STEP
-        assert gain(seen, samples, order) >= PASSED > gain(seen, samples + 2, order)
+        passing = [n for n in range(order + 1 + order % 2, 1000, 2) if gain(seen, n, order) >= PASSED]
+        assert samples == passing[-1]
+        assert passing == list(range(passing[0], samples + 2, 2))  # what lets the search halve
+
+
+def test_the_chosen_window_is_bounded_by_the_record() -> None:
+    time = STEP * np.arange(60)
+    for n in (59, 60):
+        once = np.sin(2.0 * np.pi * time / STEP / 60.0)
+        assert window_samples(choose_window(time[:n], once[:n], 12), STEP) == 59
 
 
 def test_dominant_frequency_of_a_pure_tone() -> None:
