@@ -14,7 +14,8 @@ TEMPLATE = """\
 #: A stated quantity is { value = ..., sd = ..., unit = "..." }; without sd the value counts as exact.
 #: A table is a CSV file with a header `name [unit]` per column, dimensionless [1], then a row of numbers per reading;
 #: comma, semicolon or tab between the cells; a decimal comma only with semicolon or tab.
-#: On every experiment, <column>_sd states a reading error and <column>_resolution a reading step; both optional.
+#: On every experiment, label = "..." names it (default: its file without suffix, which must then be unique),
+#: <column>_sd states a reading error and <column>_resolution a reading step; all optional.
 
 [rig]
 name = "@NAME@"
@@ -44,6 +45,8 @@ name = "@NAME@"
 # capsule = "held"
 #: "viscous" (default), or "dry" or "quadratic" damping beside the viscous one
 # damping = "viscous"
+#: window of the filter that the paper's estimator looks through; default: chosen by a rule
+# smoothing_window = { value = 10, unit = "ms" }
 # x_rel_sd = { value = 0.02, unit = "mm" }
 #: a support spring within reach: both of spring = "L60" and gap = { value = 1.0, sd = 0.02, unit = "mm" }
 

@@ -1,7 +1,7 @@
 """What a rig folder may say: every kind of experiment with its columns and settings, as data.
 
 One reader (``read.py``, ``tables.py``) interprets these declarations; a new kind
-needs a new entry here and nothing else there.
+needs an entry here, and in ``rules.py`` what ties its settings together.
 """
 
 from collections.abc import Mapping

@@ -33,12 +33,17 @@ def shown(value: object) -> str:
     return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…"
 
 
+def closest(word: str, known: Collection[str]) -> str | None:
+    """The one of ``known`` that ``word`` may be a slip of."""
+    return next(iter(get_close_matches(word[:_LONGEST_SHOWN], known, n=1)), None)
+
+
 def refuse_unknown_keys(document: TomlDocument, path: KeyPath, entry: dict[str, Any], known: Collection[str]) -> None:
     """Raise at the first key of ``entry`` that is not ``known``."""
     for key in entry:
         if key not in known:
-            close = get_close_matches(key, known, n=1)
-            remedy = f"write {close[0]}" if close else "remove it"
+            close = closest(key, known)
+            remedy = f"write {close}" if close else "remove it"
             remedy += f"; known: {' '.join(known)}"
             raise document.error((*path, key), "unknown key", shown(key), remedy, of_key=True)
 

@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -13,7 +12,7 @@ from capsule_id.rig.formats import READERS
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import Column
 from capsule_id.rig.schema import ColumnRule, KindRule
-from capsule_id.rig.settings import shown
+from capsule_id.rig.settings import closest, shown
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
@@ -86,6 +85,7 @@ def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: str,
         remedy = "check its permissions"
         raise document.error(path, "file must be readable", f"{shown(name)} ({error.strerror})", remedy) from None
     raw = READERS[file.suffix.lower()](content, file)
+    raw.rows.flags.writeable = False
     table = TableFile(file, hashlib.sha256(content).hexdigest(), raw, {})
     _check_names(table, kind, rule)
     columns = {column: _to_si(table, index, rule.columns[column]) for index, column in enumerate(raw.names)}
@@ -97,10 +97,10 @@ def _check_names(table: TableFile, kind: str, rule: KindRule) -> None:
     names = table.raw.names
     for name in names:
         if name not in rule.columns:
-            close = get_close_matches(name, rule.columns, n=1)
-            remedy = f"rename it to {close[0]}" if close else "remove it"
+            close = closest(name, rule.columns)
+            remedy = f"rename it to {close}" if close else "remove it"
             known = " ".join(rule.columns)
-            raise table.error(None, name, f"unknown column in {kind}", name, f"{remedy}; known: {known}")
+            raise table.error(None, name, f"unknown column in {kind}", shown(name), f"{remedy}; known: {known}")
     stated = {name for name in names if name not in rule.channels}
     if stated not in [set(columns) for columns in rule.sets]:
         wanted = ", or ".join(" and ".join(columns) for columns in rule.sets)

@@ -1,5 +1,6 @@
 """Bytes of a text file, decoded; the place of the first byte that cannot be."""
 
+import re
 from pathlib import Path
 
 from capsule_id.errors import InputError
@@ -27,5 +28,5 @@ def decode(content: bytes, path: Path) -> str:
 
 def _place(content: bytes, offset: int) -> tuple[int, int]:
     """1-based line and character of a byte; what precedes it on its line may be broken too."""
-    start = content.rfind(b"\n", 0, offset) + 1
-    return content.count(b"\n", 0, offset) + 1, len(content[start:offset].decode("utf-8", "replace")) + 1
+    lines = re.split(rb"\r\n?|\n", content[:offset])
+    return len(lines), len(lines[-1].decode("utf-8", "replace")) + 1

@@ -40,7 +40,7 @@ TABLE_FAULTS = [
     (
         "dynamic_friction.csv",
         "speed [m/s],‸distanc [mm]\n0.1,1\n",
-        "unknown column in dynamic_friction, distanc, rename it to distance",
+        "unknown column in dynamic_friction, 'distanc', rename it to distance",
     ),
     (
         "dynamic_friction.csv",
@@ -84,7 +84,7 @@ TABLE_FAULTS = [
     ("free_vibration_1.csv", "time [ms],x_rel [mm]\n0,1\n‸9,2\n", "a record must have at least 8 samples, 2 samples"),
     ("run_01.csv", "‸time [s]\n1\n", "forced_run must have a channel beside time"),
     ("run_01.csv", "‸x_rel [mm]\n1\n", "forced_run must have the columns time"),
-    ("run_01.csv", "time [s],‸x_rod [mm]\n1,2\n", "unknown column in forced_run, x_rod"),
+    ("run_01.csv", "time [s],‸x_rod [mm]\n1,2\n", "unknown column in forced_run, 'x_rod'"),
 ]
 
 

@@ -1,5 +1,6 @@
 """Every fault of rig.toml: its full place, its rule, on one line. The mark ‸ stands where the place must be."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -191,6 +192,9 @@ def test_rig_toml_itself(tmp_path: Path) -> None:
     (folder / "rig.toml").symlink_to(tmp_path / "rig.toml")
     assert_fault(fault_of(folder), folder / "rig.toml", (1, 1), "rig.toml must lie inside the folder, links followed")
     (folder / "rig.toml").unlink()
+    (folder / "rig.toml").mkdir()
+    assert_fault(fault_of(folder), folder / "rig.toml", (1, 1), "a rig folder must contain a file rig.toml")
+    (folder / "rig.toml").rmdir()
     for text, rule in (
         ("", "must have a table [rig]"),
         ('rig = { name = "a" }', "at least one [[experiment]]"),
@@ -200,3 +204,27 @@ def test_rig_toml_itself(tmp_path: Path) -> None:
     ):
         (folder / "rig.toml").write_text(text)
         assert rule in str(fault_of(folder))
+
+
+def test_a_pipe_is_no_table(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "rig")
+    (folder / "static_friction.csv").unlink()
+    os.mkfifo(folder / "static_friction.csv")  # opening it would wait for a writer for ever
+    place = place_of(RIG_TOML, '"static_friction.csv"')
+    assert_fault(fault_of(folder), folder / "rig.toml", place, "file must be a regular file")
+
+
+@pytest.mark.parametrize(("name", "at"), [("rig.toml", None), ("static_friction.csv", '"static_friction.csv"')])
+def test_a_file_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, at: str | None) -> None:
+    folder = write_folder(tmp_path / "rig")
+    read_bytes = Path.read_bytes
+
+    def refuse(path: Path) -> bytes:
+        """As the system does for another user's file; tests may run as root, whom nothing is refused."""
+        if path.name == name:
+            raise PermissionError(13, "Permission denied")
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    place = place_of(RIG_TOML, at) if at else (1, 1)
+    assert_fault(fault_of(folder), folder / "rig.toml", place, "must be readable")

@@ -16,7 +16,7 @@ from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.text import decode
 
-_HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[\s*([^\[\]]+?)\s*\]")
+_HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE \t\n")  # and the decimal mark
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark must not pass for a decimal mark
@@ -91,14 +91,14 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
         if not bare:
             raise InputError("every column must have a header", "an empty cell", remedy, path, 1, column)
         found = _HEADER_CELL.fullmatch(bare)
-        if found is None:
+        if found is None or not found[2].strip():
             raise InputError("the first line must be headers `name [unit]`", _shown(bare), remedy, path, 1, column)
         if found[1] in names:
             raise InputError(
                 "column names must be unique", f"a second {found[1]}", "remove or rename it", path, 1, column
             )
         names.append(found[1])
-        units.append(found[2])
+        units.append(found[2].strip())
     return tuple(names), tuple(units)
 
 
