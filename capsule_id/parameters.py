@@ -15,6 +15,10 @@ from scipy import stats
 QUANTILE_975 = float(stats.norm.ppf(0.975))
 
 
+#: Symbols of standard deviations.
+SCATTERS = frozenset({"noise_sd", "tilt_sd", "push_scatter", "sliding_scatter", "scatter"})
+
+
 @dataclass(frozen=True)
 class Prior:
     """A proper prior density that can be evaluated and sampled.
@@ -69,6 +73,11 @@ class Parameter:
     def label(self) -> str:
         """LaTeX label with the bracket as a subscript text."""
         return f"${self.latex}$ [{self.of}]" if self.of else f"${self.latex}$"
+
+    @property
+    def scatter(self) -> bool:
+        """A standard deviation, absolute or relative: it scales residuals, it moves no prediction."""
+        return self.symbol in SCATTERS
 
     @property
     def positive(self) -> bool:

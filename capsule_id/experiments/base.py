@@ -131,13 +131,13 @@ class Experiment(ABC):
         del theta
         return []
 
-    def log_likelihood(self, theta: Theta) -> Any:
+    def log_likelihood(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings, linear nuisances integrated out; scalar."""
-        misfit = self.misfit(theta)
+        misfit = self.misfit(theta, xp)
         if misfit.design.shape[1] == 0:
             y = misfit.raw / misfit.sd
-            return -0.5 * (self.n * LOG_2PI + y @ y) - jnp.sum(jnp.log(misfit.sd))
-        return marginal_log_density(*misfit.moments(), self.n) - jnp.sum(jnp.log(misfit.sd))
+            return -0.5 * (self.n * LOG_2PI + y @ y) - xp.sum(xp.log(misfit.sd))
+        return marginal_log_density(*misfit.moments(), self.n, xp) - xp.sum(xp.log(misfit.sd))
 
     def residuals(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """(n + p,) residuals in units of the noise at the conditional mean of the p linear nuisances, then those.

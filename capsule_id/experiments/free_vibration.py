@@ -1,5 +1,6 @@
 """Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
 
+from dataclasses import replace
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -16,6 +17,7 @@ from capsule_id.experiments.linear import NUISANCE_WIDTH, marginal_log_density
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.windows import decay_window
 from capsule_id.views import Comparison, Curve, Finding, Points
 
 #: Default prior of a record's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
@@ -38,16 +40,9 @@ class FreeVibration(Experiment):
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)
         self.column = table.columns["x_rel"]
-        time, start, stop = table["time"], table.settings.get("start"), table.settings.get("stop")
-        window = np.ones(len(time), dtype=bool)
-        if start is not None:
-            window &= time >= start
-        if stop is not None:
-            window &= time <= stop
-        self.rows = table.rows[window]
-        self.time0 = float(time[window][0])
-        self.time = time[window] - self.time0
-        self.values = self.column.values[window]
+        time, self.values = decay_window(table)
+        self.time0 = float(time[0])
+        self.time = time - self.time0
         self.damping = str(table.settings.get("damping", "viscous"))
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.reading_sd = self.column.reading_sd
@@ -55,6 +50,11 @@ class FreeVibration(Experiment):
         self.uniform = step is not None and self.damping == "viscous"
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
+
+    def with_damping(self, damping: str) -> "FreeVibration":
+        """The same record under another damping model."""
+        table = replace(self.table, settings={**self.table.settings, "damping": damping})
+        return FreeVibration(table, self.rig)
 
     @property
     def observed(self) -> np.ndarray:
@@ -105,9 +105,9 @@ class FreeVibration(Experiment):
             design = xp.concatenate([viscous_basis(self.time, k1, c, m1, xp), one], axis=1)
         return Misfit(raw, self.noise_sd(theta, xp) * xp.ones(self.n), self.width * design)
 
-    def log_likelihood(self, theta: Theta) -> Any:
-        if not self.uniform:
-            return super().log_likelihood(theta)
+    def log_likelihood(self, theta: Theta, xp: ModuleType = jnp) -> Any:
+        if not self.uniform or xp is np:
+            return super().log_likelihood(theta, xp)
         sd = self.noise_sd(theta)
         gamma, omega = rates(theta["k1"], theta["c"], theta["m1"])
         yy, ay, aa = decay_moments(self.folded, self.n, self.step, gamma, omega)

@@ -15,7 +15,7 @@ NUISANCE_WIDTH = 10.0
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int) -> Any:
+def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp) -> Any:
     """log N(y; 0, I + A A') from the moments.
 
     Parameters
@@ -25,10 +25,10 @@ def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int) -> Any:
     aa : (p, p) A'A
     n : length of y
     """
-    chol = jnp.linalg.cholesky(jnp.eye(aa.shape[-1]) + aa)
-    half = jnp.linalg.solve(chol, ay) if aa.shape[-1] > 1 else ay / chol[..., 0]
-    log_det = 2.0 * jnp.sum(jnp.log(jnp.diagonal(chol)))
-    return -0.5 * (n * LOG_2PI + log_det + yy - jnp.sum(half**2))
+    chol = xp.linalg.cholesky(xp.eye(aa.shape[-1]) + aa)
+    half = xp.linalg.solve(chol, ay) if aa.shape[-1] > 1 else ay / chol[..., 0]
+    log_det = 2.0 * xp.sum(xp.log(xp.diagonal(chol)))
+    return -0.5 * (n * LOG_2PI + log_det + yy - xp.sum(half**2))
 
 
 def conditional_mean(ay: Any, aa: Any, xp: ModuleType = jnp) -> Any:

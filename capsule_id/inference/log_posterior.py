@@ -55,6 +55,11 @@ class LogPosterior:
         return np.array([row.positive for row in self.parameters])
 
     @cached_property
+    def scatter(self) -> np.ndarray:
+        """(d,) which parameters are standard deviations: they scale residuals, they move no prediction."""
+        return np.array([row.scatter for row in self.parameters])
+
+    @cached_property
     def _priors(self) -> dict[str, np.ndarray]:
         """Kinds and numbers of the priors as arrays, so that the density is one expression."""
         priors = [_prior(row) for row in self.parameters]
@@ -73,6 +78,15 @@ class LogPosterior:
         return {
             "lognormal": lognormal, "centre": centre, "width": width, "constant": constant, "jacobian": jacobian,
         }  # fmt: skip
+
+    @cached_property
+    def prior_sd(self) -> np.ndarray:
+        """(d,) sd of u under the prior (half-normal: of its logarithm, pi/sqrt(8))."""
+        kinds = np.array([_prior(row).kind for row in self.parameters])
+        location = np.array([_prior(row).location for row in self.parameters])
+        width = self._priors["width"]
+        sd = np.where(kinds == "positive_normal", width / np.where(location == 0.0, 1.0, location), width)
+        return np.where(kinds == "halfnormal", np.pi / np.sqrt(8.0), sd)
 
     def constrain(self, u: Any) -> dict[str, Any]:
         """Parameter values by name, constants included, from u (d,)."""

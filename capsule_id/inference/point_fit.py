@@ -15,7 +15,6 @@ from capsule_id.inference.curvature import hessian, jacobian, root_of_inverse
 from capsule_id.inference.least_squares import covariance, least_squares
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit
-from capsule_id.parameters import Parameter
 
 STARTS = 5
 #: Ends count as the same where they differ by less than this many posterior standard deviations.
@@ -26,8 +25,6 @@ MAX_STEPS = 400
 LEAST_SQUARES_TOLERANCE = 1e-8
 #: Relative step of the difference quotients of residuals: their error is then about 1e-10 relative.
 DIFFERENCE = 1e-5
-#: Symbols of standard deviations.
-SCATTERS = frozenset({"noise_sd", "tilt_sd", "push_scatter", "sliding_scatter", "scatter"})
 QUICK_COMPILE = {"xla_backend_optimization_level": 0}
 
 
@@ -39,7 +36,7 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
     seed : of the dispersal
     """
     starts = dispersed_starts(target, seed, number_of_starts)
-    located = np.flatnonzero([not is_scatter(row) for row in target.parameters])
+    located = np.flatnonzero(~target.scatter)
     centre = jnp.asarray(starts[0])
     rough = least_squares(
         lambda v: target.residuals(centre.at[located].set(v)),
@@ -68,11 +65,6 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
         agree=bool(np.all(np.abs(u - u[best]) < AGREEMENT * spread)),
         stalled=~converged | ~np.isfinite(value),
     )
-
-
-def is_scatter(row: Parameter) -> bool:
-    """A standard deviation: it scales residuals, it does not move a prediction."""
-    return row.symbol in SCATTERS
 
 
 def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray:
@@ -113,10 +105,9 @@ def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     count = np.zeros(target.dimension)
     for experiment in target.experiments:
         for row in experiment.parameters:
-            if is_scatter(row):
+            if row.scatter:
                 count[target.names.index(row.name)] += 2.0 * experiment.n
-    located = np.array([not is_scatter(row) for row in target.parameters])
-    return np.maximum(np.where(located, np.sum(jacobian**2, axis=0), count), 1e-2)
+    return np.maximum(np.where(target.scatter, count, np.sum(jacobian**2, axis=0)), 1e-2)
 
 
 def _residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
@@ -129,7 +120,7 @@ def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> 
 
     The error of a parameter sampled through its logarithm is its relative error times its value.
     """
-    located = np.array([not is_scatter(row) for row in target.parameters])
+    located = ~target.scatter
     at_fit = _residual_jacobian(target, u)[:, located]
     errors = np.full(len(u), np.nan)
     matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)

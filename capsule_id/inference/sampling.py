@@ -83,7 +83,7 @@ def sample(
         names=target.names,
         draws=target.theta(draws),
         lp=np.stack([sampler.get_log_prob()[: draws.shape[1]] for sampler in samplers]),
-        acceptance=np.stack([sampler.backend.accepted / (sampler.iteration * schedule.thin) for sampler in samplers]),
+        acceptance=np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers]),
         tau=np.max(tau, axis=0),
         rhat=split_rhat(target.theta(draws)),
         ess=effective_sample_size(draws, integrated_time(target.theta(draws))),
