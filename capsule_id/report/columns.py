@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capsule_id.inference.result import Posterior, Result
-from capsule_id.report.typography import plain_symbol, prefix_for, unit_suffix
+from capsule_id.report.typography import plain_symbol, prefix_for
 
 
 @dataclass(frozen=True)
@@ -15,13 +15,14 @@ class Columns:
     Attributes
     ----------
     names : (n,) as in the summary
-    labels : (n,) symbol and display unit
+    symbols, units : (n,) for display
     draws : (ensemble, draw, walker, n) in display units
     map, paper : (n,) point fit and the paper's estimate (NaN where it has none), display units
     """
 
     names: tuple[str, ...]
-    labels: tuple[str, ...]
+    symbols: tuple[str, ...]
+    units: tuple[str, ...]
     draws: np.ndarray
     map: np.ndarray
     paper: np.ndarray
@@ -46,7 +47,8 @@ def sampled_columns(result: Result) -> Columns:
     scale = np.array([factor for factor, _ in display])
     return Columns(
         names=names,
-        labels=tuple(plain_symbol(name) + unit_suffix(unit) for name, (_, unit) in zip(names, display, strict=True)),
+        symbols=tuple(plain_symbol(name) for name in names),
+        units=tuple(unit for _, unit in display),
         draws=result.posterior.draws[..., [place[name] for name in names]] * scale,
         map=centre * scale,
         paper=summary["paper"].to_numpy(float) * scale,

@@ -146,9 +146,19 @@ def _axes(ax: Axes, columns: Columns, low: np.ndarray, high: np.ndarray) -> None
                 y = n - 1 - i + place
                 ticks.append(((0.0, y), (-0.03, y)))
                 ax.text(-0.05, y, text, ha="right", va="center", **small)
-        ax.text(i + _SIDE / 2, -0.6, columns.labels[i], ha="center", va="top", **label)
+        name = f"{columns.symbols[i]}\n[{columns.units[i]}]"
+        ax.text(i + _SIDE / 2, -0.5, name, ha="center", va="top", **label)
         if i > 0:
-            ax.text(-0.62, n - 1 - i + _SIDE / 2, columns.labels[i], ha="right", va="center", rotation=90, **label)
+            ax.text(
+                -0.5,
+                n - 1 - i + _SIDE / 2,
+                name,
+                ha="right",
+                va="center",
+                rotation=90,
+                multialignment="center",
+                **label,
+            )
     ax.add_collection(LineCollection(ticks, colors=GREY, lw=0.8, clip_on=False))
 
 
@@ -156,12 +166,10 @@ def _ticks(low: float, high: float) -> list[tuple[float, str]]:
     """Two to four round values inside the panel, with the decimals that tell them apart."""
     start, stop = low + _TICK_MARGIN * (high - low), high - _TICK_MARGIN * (high - low)
     power = math.floor(math.log10(high - low))
-    for exponent, digit in ((power - e, d) for e in (0, 1) for d in (5, 2, 1)):
-        step = digit * 10.0**exponent
-        first, last = math.ceil(start / step), math.floor(stop / step)
-        if last > first:
-            break
-    return [(k * step, fixed(k * step, max(-exponent, 0))) for k in range(first, last + 1)]
+    steps = ((exponent, digit * 10.0**exponent) for exponent in (power, power - 1) for digit in (5, 2, 1))
+    exponent, step = next((e, step) for e, step in steps if math.floor(stop / step) > math.ceil(start / step))
+    multiples = range(math.ceil(start / step), math.floor(stop / step) + 1)
+    return [(k * step, fixed(k * step, max(-exponent, 0))) for k in multiples]
 
 
 def _key() -> tuple[Patch | Line2D, ...]:

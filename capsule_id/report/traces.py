@@ -35,7 +35,7 @@ def traces(result: Result) -> Figure:
             continue
         for e, ensemble in enumerate(shown[..., i]):
             ax.plot(step, ensemble, color=CYCLE[e % len(CYCLE)], lw=0.6, alpha=0.8)
-        ax.set_ylabel(columns.labels[i], fontsize=SMALL, parse_math=False)
+        ax.set_ylabel(f"{columns.symbols[i]} [{columns.units[i]}]", fontsize=SMALL, parse_math=False)
         ax.tick_params(labelsize=SMALL, length=3)
         ax.yaxis.set_major_locator(MaxNLocator(3))
         ax.ticklabel_format(axis="y", useOffset=False, style="plain")
@@ -43,7 +43,7 @@ def traces(result: Result) -> Figure:
         ax.margins(x=0.01)
     for ax in axes[-1]:
         ax.set_xlabel("step after burn-in [1]", fontsize=TEXT)
-    if n % 2:
+    if n % 2 and n > 1:
         # The last panel on the right is empty: the axis above it takes its place at the foot of the column.
         axes[-2, -1].tick_params(labelbottom=True)
         axes[-2, -1].set_xlabel("step after burn-in [1]", fontsize=TEXT)
