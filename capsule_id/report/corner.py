@@ -42,7 +42,7 @@ def corner(result: Result) -> Figure:
     """
     columns = sampled_columns(result)
     n = len(columns.names)
-    panel = 1.25 if n > 4 else 1.9
+    panel = 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
     size = 1.25 + panel * n
     figure = new_figure(size, size)
     ax = figure.add_axes((1.1 / size, 1.0 / size, panel * n / size, panel * n / size), frameon=False)

@@ -53,7 +53,9 @@ def comparison(item: Comparison, ax: Axes | None = None) -> Axes:
     for points in item.points:
         _draw_points(ax, points)
     set_text(ax, item.x_label, item.y_label, item.title)
-    set_legend(ax)
+    # Finding the best place means testing every point: for a record that takes longer than drawing it.
+    long = any(points.x.size > _MANY for points in item.points)
+    set_legend(ax, place="upper right" if long else "best")
     return ax
 
 

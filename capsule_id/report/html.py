@@ -70,7 +70,8 @@ def _starts(result: Result) -> list[tuple[int, str, str, bool]]:
 def _note(note: NoteTable) -> dict[str, object]:
     frame = note.frame
     named = not isinstance(frame.index, pd.RangeIndex)
-    header = ([str(frame.index.name or "")] if named else []) + [str(column) for column in frame.columns]
+    header = [(str(frame.index.name or ""), False)] if named else []
+    header += [(str(column), pd.api.types.is_numeric_dtype(frame[column])) for column in frame.columns]
     rows = [
         ([index] if named else []) + list(row)
         for index, row in zip(frame.index, frame.itertuples(index=False), strict=True)
