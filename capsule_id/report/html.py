@@ -71,7 +71,8 @@ def _note(note: NoteTable) -> dict[str, object]:
     frame = note.frame
     named = not isinstance(frame.index, pd.RangeIndex)
     header = [(str(frame.index.name or ""), False)] if named else []
-    header += [(str(column), pd.api.types.is_numeric_dtype(frame[column])) for column in frame.columns]
+    numeric = [pd.api.types.is_numeric_dtype(kind) for kind in frame.dtypes]
+    header += [(str(column), number) for column, number in zip(frame.columns, numeric, strict=True)]
     rows = [
         ([index] if named else []) + list(row)
         for index, row in zip(frame.index, frame.itertuples(index=False), strict=True)
