@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from capsule_id.inference.result import Comparison, Curve, PointFit, Points
+from capsule_id.inference.result import PointFit
 from capsule_id.report.style import (
     BLACK,
     BLUE,
@@ -25,6 +25,7 @@ from capsule_id.report.style import (
     set_text,
 )
 from capsule_id.report.typography import plain_symbol
+from capsule_id.views import Comparison, Curve, Points
 
 # Beyond this many points a record is a cloud of dots, not single readings with bars.
 _MANY = 100

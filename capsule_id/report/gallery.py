@@ -7,11 +7,12 @@ from typing import Literal
 
 from matplotlib.figure import Figure
 
-from capsule_id.inference.result import Comparison, Result
+from capsule_id.inference.result import Result
 from capsule_id.report import figures
 from capsule_id.report.corner import corner
 from capsule_id.report.style import figure_of, mark, png
 from capsule_id.report.traces import traces
+from capsule_id.views import Comparison
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 _KINDS = {

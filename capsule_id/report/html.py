@@ -10,10 +10,11 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from capsule_id.inference.result import Finding, Level, NoteTable, Result
+from capsule_id.inference.result import Result
 from capsule_id.report.gallery import Picture
 from capsule_id.report.rows import table_rows
 from capsule_id.report.typography import MISSING, symbol_parts
+from capsule_id.views import Finding, Level, NoteTable
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from capsule_id.inference.result import Finding, Result
+from capsule_id.inference.result import Result
 from capsule_id.report.gallery import pictures
 from capsule_id.report.html import render
 from capsule_id.report.netcdf import write_posterior
+from capsule_id.views import Finding
 
 
 def write_result(result: Result, directory: Path) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from capsule_id.inference.result import Comparison, Curve, Finding, NoteTable, PointFit, Points, Posterior, Result
+from capsule_id.inference.result import PointFit, Posterior, Result
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.rig.model import Quantity, Rig
+from capsule_id.views import Comparison, Curve, Finding, NoteTable, Points
 
 PHYSICAL = {
     # name: (unit, meaning, value, sd, paper)

@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from capsule_id.inference.result import Finding, NoteTable, Result
+from capsule_id.inference.result import Result
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
+from capsule_id.views import Finding, NoteTable
 
 EMPTY = {"meta", "img", "br"}
 

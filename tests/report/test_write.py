@@ -13,9 +13,10 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from capsule_id.inference.result import Finding, Result
+from capsule_id.inference.result import Result
 from capsule_id.report.netcdf import write_posterior
 from capsule_id.report.write import parameters_json, write_result
+from capsule_id.views import Finding
 
 
 @pytest.fixture(scope="module")
