@@ -1,13 +1,15 @@
 """Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
 
-Every panel is ``(thing, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own; labels are set as plain text.
+Every panel is ``(thing, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own; labels are plain text.
 """
+
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from capsule_id.inference.result import Comparison, Curve, PointFit, Points
+from capsule_id.inference.result import PointFit
 from capsule_id.report.style import (
     BLACK,
     BLUE,
@@ -16,24 +18,26 @@ from capsule_id.report.style import (
     GREY,
     PURPLE,
     VERMILION,
+    figure_of,
     new_figure,
     own_axes,
     set_legend,
     set_text,
 )
 from capsule_id.report.typography import plain_symbol
+from capsule_id.views import Comparison, Curve, Points
 
 # Beyond this many points a record is a cloud of dots, not single readings with bars.
 _MANY = 100
 _TWO_SIDED_95 = 1.96
 
-_POINT_STYLES = {
+_POINT_STYLES: dict[str, dict[str, Any]] = {
     "static": {"marker": "o", "mfc": "none", "color": BLACK},
     "dynamic": {"marker": "x", "color": VERMILION},
     "sliding": {"marker": "^", "mfc": "none", "color": GREEN},
     "data": {"marker": "o", "mfc": "none", "color": BLACK},
 }
-_CURVE_STYLES = {
+_CURVE_STYLES: dict[str, dict[str, Any]] = {
     "ours": {"color": BLUE, "ls": "-", "lw": 1.8},
     "paper": {"color": VERMILION, "ls": "--", "lw": 1.6},
     "predictive": {"color": GREEN, "ls": "-.", "lw": 1.6},
@@ -50,7 +54,9 @@ def comparison(item: Comparison, ax: Axes | None = None) -> Axes:
     for points in item.points:
         _draw_points(ax, points)
     set_text(ax, item.x_label, item.y_label, item.title)
-    set_legend(ax)
+    # Finding the best place means testing every point: for a record that takes longer than drawing it.
+    long = any(points.x.size > _MANY for points in item.points)
+    set_legend(ax, place="upper right" if long else "best")
     return ax
 
 
@@ -111,8 +117,7 @@ def comparison_figure(item: Comparison) -> Figure:
         figure.subplots_adjust(left=0.09, right=0.98, bottom=0.1, top=0.93)
         return figure
     if item.residuals is None:
-        axes = comparison(item)
-        return axes.get_figure(root=True)
+        return figure_of(comparison(item, own_axes(None, height=5.6)))
     figure = new_figure(6.4, 5.6)
     top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (2.4, 1.0), "hspace": 0.12})
     comparison(item, top)
@@ -133,17 +138,18 @@ def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
     d, height = len(fit.names), 1.3 + 0.25 * len(fit.names)
     if ax is None:
         ax = own_axes(None, 7.2, height)
-        ax.get_figure(root=True).subplots_adjust(left=0.36, right=0.97, bottom=0.7 / height, top=1 - 0.35 / height)
+        figure_of(ax).subplots_adjust(left=0.36, right=0.97, bottom=0.7 / height, top=1 - 0.35 / height)
     variance = np.diag(fit.covariance)
     sd = np.sqrt(np.where(np.isfinite(variance) & (variance > 0), variance, 1.0))
     rows = np.arange(d)[::-1]
     shifts = np.linspace(0.25, -0.25, len(fit.starts))
     stalled = np.asarray(fit.stalled, dtype=bool)
     ax.set_xscale("symlog", linthresh=1.0)
+    ax.xaxis.set_major_formatter("{x:g}")
     for i, (start, end, shift) in enumerate(zip(fit.starts, fit.ends, shifts, strict=True)):
         marker, size, text = ("x", 7, "end, stalled") if stalled[i] else ("o", 4, "end")
         first = not np.any(stalled[:i] == stalled[i])
-        style = {"ls": "", "color": CYCLE[i % len(CYCLE)]}
+        style: dict[str, Any] = {"ls": "", "color": CYCLE[i % len(CYCLE)]}
         ax.plot((start - fit.u) / sd, rows + shift, marker="o", mfc="none", ms=5, label="" if i else "start", **style)
         ax.plot((end - fit.u) / sd, rows + shift, marker=marker, ms=size, label=text if first else "", **style)
     ax.axvline(0.0, color=GREY, lw=0.8, zorder=0)

@@ -7,9 +7,12 @@ from typing import Literal
 
 from matplotlib.figure import Figure
 
-from capsule_id.inference.result import Comparison, Result
-from capsule_id.report import figures, sample_figures
-from capsule_id.report.style import mark, png
+from capsule_id.inference.result import Result
+from capsule_id.report import figures
+from capsule_id.report.corner import corner
+from capsule_id.report.style import figure_of, mark, png
+from capsule_id.report.traces import traces
+from capsule_id.views import Comparison
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 _KINDS = {
@@ -54,9 +57,9 @@ def pictures(result: Result) -> tuple[Picture, ...]:
         trace_caption = (
             f"A few walkers of each ensemble, one colour per ensemble ({len(result.posterior.draws)} ensembles)."
         )
-        drawn.append(_picture(result, "corner", "sample", "Corner plot", corner_caption, sample_figures.corner(result)))
-        drawn.append(_picture(result, "traces", "sample", "Traces", trace_caption, sample_figures.traces(result)))
-    starts = figures.point_fit_starts(result.point_fit).get_figure(root=True)
+        drawn.append(_picture(result, "corner", "sample", "Corner plot", corner_caption, corner(result)))
+        drawn.append(_picture(result, "traces", "sample", "Traces", trace_caption, traces(result)))
+    starts = figure_of(figures.point_fit_starts(result.point_fit))
     starts_caption = "Where each start began and where it ended, in standard deviations of the Laplace approximation."
     drawn.append(_picture(result, "point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts))
     return tuple(drawn)

@@ -10,10 +10,11 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from capsule_id.inference.result import Finding, Level, NoteTable, Result
+from capsule_id.inference.result import Result
 from capsule_id.report.gallery import Picture
 from capsule_id.report.rows import table_rows
 from capsule_id.report.typography import MISSING, symbol_parts
+from capsule_id.views import Finding, Level, NoteTable
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
@@ -70,7 +71,9 @@ def _starts(result: Result) -> list[tuple[int, str, str, bool]]:
 def _note(note: NoteTable) -> dict[str, object]:
     frame = note.frame
     named = not isinstance(frame.index, pd.RangeIndex)
-    header = ([str(frame.index.name or "")] if named else []) + [str(column) for column in frame.columns]
+    header = [(str(frame.index.name or ""), False)] if named else []
+    numeric = [pd.api.types.is_numeric_dtype(kind) for kind in frame.dtypes]
+    header += [(str(column), number) for column, number in zip(frame.columns, numeric, strict=True)]
     rows = [
         ([index] if named else []) + list(row)
         for index, row in zip(frame.index, frame.itertuples(index=False), strict=True)

@@ -16,9 +16,9 @@ _DIMENSIONS = {"k2": "spring"}
 def write_posterior(result: Result, path: Path) -> None:
     """Write the sample of ``result`` as netCDF (h5netcdf), to be opened by ``arviz.from_netcdf``.
 
-    Groups: ``posterior`` and ``sample_stats`` (dimensions ``chain``: every walker of every ensemble, with the coordinate
-    ``ensemble``; and ``draw``), ``observed_data``, ``log_likelihood`` and ``prior`` where the result has them. A family
-    of names such as ``k2[soft]``, ``k2[stiff]`` is one variable with one dimension more.
+    Groups: ``posterior`` and ``sample_stats`` (dimensions ``chain``: every walker of every ensemble, with the
+    coordinate ``ensemble``; and ``draw``), ``observed_data``, ``log_likelihood`` and ``prior`` where the result has
+    them. A family of names such as ``k2[soft]``, ``k2[stiff]`` is one variable with one dimension more.
 
     Raises
     ------

@@ -1,6 +1,8 @@
 """Parameter tables as strings: every number rounded to its uncertainty, once, for standard output and HTML alike."""
 
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 
@@ -36,7 +38,7 @@ def table_rows(frame: pd.DataFrame) -> list[Row]:
     All numbers of a row keep two digits of the posterior sd (without a sample: of the standard error), the point fit
     those of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m).
     """
-    return [_row(str(name), row) for name, row in frame.iterrows()]
+    return [_row(str(name), row) for name, row in frame.to_dict("index").items()]
 
 
 def has_sample(frame: pd.DataFrame) -> bool:
@@ -44,7 +46,7 @@ def has_sample(frame: pd.DataFrame) -> bool:
     return bool(frame["mean"].notna().any())
 
 
-def _row(name: str, row: pd.Series) -> Row:
+def _row(name: str, row: Mapping[Hashable, Any]) -> Row:
     scale, unit = prefix_for(str(row["unit"]), float(row["map"]))
 
     def number(column: str) -> float:

@@ -5,6 +5,7 @@ Nothing here touches pyplot: figures are plain ``matplotlib.figure.Figure`` obje
 
 import io
 import warnings
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -38,6 +39,14 @@ def own_axes(ax: Axes | None, width: float = 6.4, height: float = 4.4) -> Axes:
     return axes
 
 
+def figure_of(ax: Axes) -> Figure:
+    """The figure that ``ax`` stands in."""
+    figure = ax.get_figure(root=True)
+    if figure is None:
+        raise ValueError("these axes have been removed from their figure")
+    return figure
+
+
 def set_text(ax: Axes, x_label: str, y_label: str, title: str = "") -> None:
     """Labels and title as plain text: a ``$`` in somebody's file name is no mathematics."""
     ax.set_xlabel(x_label, fontsize=TEXT, parse_math=False)
@@ -47,12 +56,12 @@ def set_text(ax: Axes, x_label: str, y_label: str, title: str = "") -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def set_legend(ax: Axes, columns: int = 1, place: str = "best") -> None:
+def set_legend(ax: Axes, place: Literal["best", "upper right", "lower right"] = "best") -> None:
     """A legend of the labelled artists, as plain text."""
     handles, labels = ax.get_legend_handles_labels()
     if not handles:
         return
-    legend = ax.legend(handles, labels, fontsize=SMALL, frameon=False, ncols=columns, loc=place, handlelength=1.8)
+    legend = ax.legend(handles, labels, fontsize=SMALL, frameon=False, loc=place, handlelength=1.8)
     for text in legend.get_texts():
         text.set_parse_math(False)
 

@@ -15,6 +15,10 @@ _PREFIXABLE = re.compile(r"(N|m|s|A|rad|Hz|J|W|V)(?![A-Za-z^0-9²³])")
 _NAME = re.compile(r"(?P<base>[A-Za-z]+?)(?:_?(?P<index>\d+|(?<=_)[A-Za-z0-9]+))?(?:\[(?P<label>.*)\])?")
 
 
+# A longer name of a spring or an experiment would push the axis off the picture.
+_LONGEST_LABEL = 24
+
+
 def decimals_for(sd: float) -> int | None:
     """Decimal places (negative: places before the point) that leave two significant digits of ``sd``.
 
@@ -47,11 +51,6 @@ def prefix_for(unit: str, magnitude: float) -> tuple[float, str]:
     return 10.0**-power, _PREFIXES[power] + unit
 
 
-def unit_suffix(unit: str) -> str:
-    """`` [N/m]`` behind an axis label; ``[1]`` for the dimensionless."""
-    return f" [{unit or '1'}]"
-
-
 def symbol_parts(name: str) -> tuple[str, str, str]:
     """Split a parameter name as the paper sets it: symbol, index, label.
 
@@ -77,4 +76,5 @@ def plain_symbol(name: str) -> str:
     small = index.translate(str.maketrans("0123456789s", "₀₁₂₃₄₅₆₇₈₉ₛ"))
     if index and small.isascii():
         small = f"_{index}"
-    return f"{base}{small} {label}".rstrip()
+    short = label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + "…"
+    return f"{base}{small} {short}".rstrip()

@@ -3,16 +3,18 @@
 import json
 import math
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from capsule_id.inference.result import Finding, Result
+from capsule_id.inference.result import Result
 from capsule_id.report.gallery import pictures
 from capsule_id.report.html import render
 from capsule_id.report.netcdf import write_posterior
+from capsule_id.views import Finding
 
 
 def write_result(result: Result, directory: Path) -> None:
@@ -41,7 +43,7 @@ def parameters_json(result: Result) -> dict[str, object]:
     return {
         "rig": result.rig.name,
         "synthetic": result.rig.synthetic,
-        "parameters": {str(name): _parameter(row) for name, row in result.summary.iterrows()},
+        "parameters": {str(name): _parameter(row) for name, row in result.summary.to_dict("index").items()},
         "verdict": {
             "clean": result.clean,
             "findings": [{"check": f.check, "level": f.level, "text": finding_text(f)} for f in result.findings],
@@ -58,14 +60,14 @@ def finding_text(finding: Finding) -> str:
 
 
 def table_frame(result: Result) -> pd.DataFrame:
-    """Physical parameters and nuisances in one table, SI; ``role`` tells them apart, ``synthetic`` goes with every row."""
+    """Physical parameters and nuisances in one table, SI; ``role`` tells them apart, every row says ``synthetic``."""
     parts = [result.summary.assign(role="physical"), result.nuisances.assign(role="nuisance")]
     frame = pd.concat([part for part in parts if len(part)])
     frame.index.name = "name"
     return frame.assign(synthetic=result.rig.synthetic)
 
 
-def _parameter(row: pd.Series) -> dict[str, object]:
+def _parameter(row: Mapping[Hashable, Any]) -> dict[str, object]:
     ends = [_plain(row["lower"]), _plain(row["upper"])]
     return {
         "unit": row["unit"],

@@ -8,8 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from capsule_id.inference.result import Comparison, Curve, Finding, NoteTable, PointFit, Points, Posterior, Result
+from capsule_id.inference.result import PointFit, Posterior, Result
+from capsule_id.report.gallery import Picture, pictures
 from capsule_id.rig.model import Quantity, Rig
+from capsule_id.views import Comparison, Curve, Finding, NoteTable, Points
 
 PHYSICAL = {
     # name: (unit, meaning, value, sd, paper)
@@ -125,7 +127,8 @@ def _posterior(rng: np.random.Generator, ensembles: int, draws: int, walkers: in
     d = len(names)
     return Posterior(
         names, centre + sd * z, 1234.5 - 0.5 * (z**2).sum(-1), np.full((ensembles, walkers), 0.28),
-        np.full(d, 3.0), np.full(d, 1.002), np.full(d, 4100.0), True, {"DE + snooker": 61.0, "stretch": 142.0}, 10000, 20,
+        np.full(d, 3.0), np.full(d, 1.002), np.full(d, 4100.0), True, {"DE + snooker": 61.0, "stretch": 142.0},
+        steps=10000, thin=20,
     )  # fmt: skip
 
 
@@ -142,46 +145,85 @@ def _groups(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> di
     }
 
 
+def _findings() -> tuple[Finding, ...]:
+    white = "expected a white record, seen Ljung-Box p = 0.3"
+    outlier = (
+        "expected |residual| < 3 sd, seen 4.1 sd in row 5 of the table; look at that row: "
+        "k2 is 56410 N/m with and 56350 N/m without it"
+    )
+    return (
+        Finding("starts agree", "ok", "all 6 starts ended at the same maximum, log-posterior within 1e-7"),
+        Finding("chains converged", "ok", "every parameter has N > 50 tau and R-hat ≤ 1.01 (largest 1.002)"),
+        *(Finding("residuals white", "ok", white, f"free_vibration_{i}") for i in (1, 2, 3)),
+        Finding("outliers", "warn", outlier, "support_spring_stiff"),
+        Finding("linearity", "ok", "quadratic term 0.3 ± 0.5 N/A², line adequate", "motor_current"),
+        Finding("parameters informed", "warn", "m1 and m2 are known from the weighing only"),
+    )
+
+
+def _notes() -> tuple[NoteTable, ...]:
+    rows = {"k2 [N/m]": [56410.123, 56350.2], "sd [N/m]": [46.0, 31.0]}
+    priors = {
+        "parameter": ["k1", "mu"],
+        "prior": ["log-normal"] * 2,
+        "median": [1000.0, 0.4],
+        "factor": [100.0, np.nan],
+    }
+    return (
+        NoteTable(
+            "With and without the flagged row",
+            "Nothing is dropped by itself.",
+            pd.DataFrame(rows, index=["all rows", "without row 5"]),
+        ),
+        NoteTable("Priors", "Log-normal: 95 % within median/factor to median × factor.", pd.DataFrame(priors)),
+    )
+
+
 def make_result(seed: int = 0, ensembles: int = 4, draws: int = 60, walkers: int = 8) -> Result:
     """The whole fake; the same seed gives the same result."""
     rng = np.random.default_rng(seed)
     files = {f"free_vibration_{i}.csv": f"{i:x}" * 64 for i in (1, 2, 3)}
     rig = Rig("twin", True, Quantity(0.11, 2e-4), Quantity(0.53, 5e-4), Quantity(9.81), {}, (), files, Path("data"))
+    springs = (("soft", 2.42), ("medium", 18.96), ("stiff", 56.41))
     comparisons = (
         _friction(rng),
         _line("motor_current", "motor_current", 2.0, rng),
-        *(_line("support_spring", f"support_spring_{s}", k, rng) for s, k in (("soft", 2.42), ("medium", 18.96), ("stiff", 56.41))),
+        *(_line("support_spring", f"support_spring_{name}", slope, rng) for name, slope in springs),
         *(_decay(i, rng) for i in (1, 2, 3)),
-    )  # fmt: skip
-    findings = (
-        Finding("starts agree", "ok", "all 6 starts ended at the same maximum, log-posterior within 1e-7"),
-        Finding("chains converged", "ok", "every parameter has N > 50 tau and R-hat ≤ 1.01 (largest 1.002)"),
-        *(Finding("residuals white", "ok", "expected a white record, seen Ljung-Box p = 0.3", f"free_vibration_{i}") for i in (1, 2, 3)),
-        Finding("outliers", "warn", "expected |residual| < 3 sd, seen 4.1 sd in row 5 of the table; look at that row: k2 is 56410 N/m with "
-                "and 56350 N/m without it", "support_spring_stiff"),
-        Finding("linearity", "ok", "quadratic term 0.3 ± 0.5 N/A², line adequate", "motor_current"),
-        Finding("parameters informed", "warn", "m1 and m2 are known from the weighing only"),
-    )  # fmt: skip
-    notes = (
-        NoteTable("With and without the flagged row", "Nothing is dropped by itself.",
-                  pd.DataFrame({"k2 [N/m]": [56410.123, 56350.2], "sd [N/m]": [46.0, 31.0]}, index=["all rows", "without row 5"])),
-        NoteTable("Default priors", "Log-normal: 95 % within median/factor to median × factor.",
-                  pd.DataFrame({"parameter": ["k1", "mu"], "prior": ["log-normal", "log-normal"], "median": [1000.0, 0.4], "factor": [100.0, np.nan]})),
-    )  # fmt: skip
+    )
     provenance = {
-        "seed": seed, "experiments": "bench", "versions": {"capsule_id": "0.1.0", "jax": "0.10.2", "emcee": "3.1.6"}, "files": files,
-        "command": "fit-params data --seed 0", "budget": np.float64(np.nan), "counts": np.arange(3),
-    }  # fmt: skip
+        "seed": seed,
+        "experiments": "bench",
+        "versions": {"capsule_id": "0.1.0", "jax": "0.10.2", "emcee": "3.1.6"},
+        "files": files,
+        "command": "fit-params data --seed 0",
+        "budget": np.float64(np.nan),
+        "counts": np.arange(3),
+    }
     return Result(
-        rig, _frame(PHYSICAL, rng), _frame(NUISANCES, rng), _point_fit(rng), _posterior(rng, ensembles, draws, walkers), findings,
-        comparisons, notes, provenance, _groups(rng, comparisons),
-    )  # fmt: skip
+        rig=rig,
+        summary=_frame(PHYSICAL, rng),
+        nuisances=_frame(NUISANCES, rng),
+        point_fit=_point_fit(rng),
+        posterior=_posterior(rng, ensembles, draws, walkers),
+        findings=_findings(),
+        comparisons=comparisons,
+        notes=_notes(),
+        provenance=provenance,
+        groups=_groups(rng, comparisons),
+    )
 
 
 @pytest.fixture(scope="session")
 def result() -> Result:
     """Synthetic rig, sampled, clean with two warnings."""
     return make_result()
+
+
+@pytest.fixture(scope="session")
+def drawn(result: Result) -> tuple[Picture, ...]:
+    """Its pictures."""
+    return pictures(result)
 
 
 @pytest.fixture(scope="session")
