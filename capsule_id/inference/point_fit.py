@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 
 from capsule_id.inference.curvature import hessian, jacobian, root_of_inverse
-from capsule_id.inference.least_squares import covariance, least_squares
+from capsule_id.inference.least_squares import QUICK_COMPILE, covariance, least_squares
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit
 
@@ -22,10 +22,9 @@ AGREEMENT = 0.05
 #: Of a quasi-Newton step, in posterior standard deviations, and of the log-posterior.
 TOLERANCE = 1e-6
 MAX_STEPS = 400
-LEAST_SQUARES_TOLERANCE = 1e-8
+LEAST_SQUARES_TOLERANCE = 1e-6
 #: Relative step of the difference quotients of residuals: their error is then about 1e-10 relative.
 DIFFERENCE = 1e-5
-QUICK_COMPILE = {"xla_backend_optimization_level": 0}
 
 
 def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -> PointFit:
@@ -42,12 +41,14 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
         lambda v: target.residuals(centre.at[located].set(v)),
         starts[:, located],
         tolerance=LEAST_SQUARES_TOLERANCE,
+        normal_equations=True,
     )
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
     scale = _information(target, ends[rough.best]) ** -0.5
     whitening = root_of_inverse(-hessian(target.batch, ends[rough.best], scale))
-    u, value, converged = (np.asarray(part) for part in _polish(target)(ends, whitening))
+    polish = _polish(target)
+    u, value, converged = (np.stack(part) for part in zip(*(polish(end, whitening) for end in ends), strict=True))
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     scale = _information(target, u[best]) ** -0.5
     root = root_of_inverse(-hessian(target.batch, u[best], scale))
@@ -80,7 +81,7 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
 
 
 def _polish(target: LogPosterior) -> Any:
-    """Jitted BFGS from every end: ((s, d), (d, d) whitening) -> maxima (s, d), log-posterior (s,), converged (s,).
+    """Jitted BFGS: (end (d,), whitening (d, d)) -> maximum (d,), log-posterior there, converged.
 
     Compiled with few optimisations: it runs for milliseconds, and compiling it well takes seconds.
     """
@@ -96,7 +97,7 @@ def _polish(target: LogPosterior) -> Any:
         u = end + whitening @ solution.value
         return u, target(u), solution.result == optx.RESULTS.successful
 
-    return jax.jit(jax.vmap(one, in_axes=(0, None)), compiler_options=QUICK_COMPILE)
+    return jax.jit(one, compiler_options=QUICK_COMPILE)
 
 
 def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
