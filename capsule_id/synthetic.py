@@ -1,6 +1,7 @@
 """A rig folder with known truth: a twin of the paper's rig (Table 1), measured by the paper's own protocol."""
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from capsule_id.experiments import (
     static_friction,
     support_spring,
 )
+from capsule_id.rig.schema import NAME_PATTERN
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,10 @@ MASS_SD = {"m1": 0.2e-3, "m2": 0.5e-3}
 LENGTH, LENGTH_OF, LENGTH_SD = 60e-3, 18960.0, 0.1e-3
 
 
-def synthesize(folder: Path, seed: int, truth: Truth | None = None) -> Truth:
+def synthesize(folder: Path, seed: int, truth: Truth | None = None, name: str | None = None) -> Truth:
     """Write a rig folder measured on ``truth`` and, beside it, ``<folder>.truth.json``.
+
+    ``name`` is the rig's, by default the folder's.
 
     Raises
     ------
@@ -84,13 +88,16 @@ def synthesize(folder: Path, seed: int, truth: Truth | None = None) -> Truth:
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError("synthesize writes a new folder", "it exists and is not empty", "choose another name", folder)
+    name = name or folder.resolve().name
+    if not re.fullmatch(NAME_PATTERN, name):
+        raise InputError(f"the name of a rig matches {NAME_PATTERN}", name, "choose another with --name")
     rng = np.random.default_rng(seed)
     tables, entries = _measure(rng, truth)
     masses = {name: getattr(truth, name) + sd * rng.standard_normal() for name, sd in MASS_SD.items()}
     folder.mkdir(parents=True, exist_ok=True)
     for name, columns in tables.items():
         _write_csv(folder / name, columns)
-    (folder / "rig.toml").write_text(_rig_toml(folder.resolve().name, seed, truth.g, masses, entries), encoding="utf-8")
+    (folder / "rig.toml").write_text(_rig_toml(name, seed, truth.g, masses, entries), encoding="utf-8")
     beside = folder.resolve().with_name(folder.resolve().name + ".truth.json")
     beside.write_text(json.dumps({"seed": seed, "parameters": truth.flat()}, indent=1) + "\n", encoding="utf-8")
     return truth

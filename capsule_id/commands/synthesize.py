@@ -10,6 +10,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """DIR --seed N --set NAME=VALUE ..."""
     parser.add_argument("directory", metavar="DIR", type=Path, help="new folder to write")
     parser.add_argument("--seed", type=int, default=0, help="of the reading errors (default 0)")
+    parser.add_argument("--name", help="name of the rig (default: the folder's)")
     parser.add_argument(
         "--set", nargs="+", default=[], metavar="NAME=VALUE", help="true values, SI: k1=1500 'k2[soft]=2500'"
     )
@@ -26,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.synthetic import Truth, synthesize
 
     truth = Truth().with_values(dict(_assignment(text) for text in args.set))
-    synthesize(args.directory, args.seed, truth)
+    synthesize(args.directory, args.seed, truth, args.name)
     print(f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and its truth beside it")
     return 0
 
