@@ -57,7 +57,7 @@ def corner(result: Result) -> Figure:
     _frames(ax, n)
     _marks(ax, (columns.map - low) / (high - low), BLACK, "+", "-")
     _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
-    _axes(ax, columns, low, high)
+    _axes(ax, columns, low, high, panel)
     figure.legend(
         handles=_key(), fontsize=TEXT, frameon=False, loc="upper right", bbox_to_anchor=(1 - 0.1 / size, 1 - 0.1 / size)
     )
@@ -131,34 +131,30 @@ def _marks(ax: Axes, place: np.ndarray, color: str, marker: str, line: str) -> N
     ax.vlines(x, n - 1.0 - shown, n - 1.0 - shown + _SIDE, color=color, ls=line, lw=1.3, zorder=4)
 
 
-def _axes(ax: Axes, columns: Columns, low: np.ndarray, high: np.ndarray) -> None:
-    """Ticks and labels along the bottom, and on the left from the second row on (a histogram has no y-axis)."""
+def _axes(ax: Axes, columns: Columns, low: np.ndarray, high: np.ndarray, panel: float) -> None:
+    """Ticks and labels along the bottom, and on the left from the second row on (a histogram has no y-axis).
+
+    ``panel`` is the width of a cell in inches: text keeps its distance in inches whatever the size of the cells.
+    """
     n = len(columns.names)
+    length, gap, away = 0.035 / panel, 0.06 / panel, 0.6 / panel
     ticks: list[tuple[tuple[float, float], tuple[float, float]]] = []
     small: dict[str, Any] = {"fontsize": SMALL - 0.5}
-    label: dict[str, Any] = {"fontsize": TEXT, "parse_math": False}
+    label: dict[str, Any] = {"fontsize": TEXT * min(1.0, panel), "parse_math": False}
     for i in range(n):
         for value, text in _ticks(low[i], high[i]):
             place = _SIDE * (value - low[i]) / (high[i] - low[i])
-            ticks.append(((i + place, 0.0), (i + place, -0.03)))
-            ax.text(i + place + 0.04, -0.05, text, rotation=40, ha="right", va="top", rotation_mode="anchor", **small)
+            ticks.append(((i + place, 0.0), (i + place, -length)))
+            ax.text(i + place + gap, -gap, text, rotation=40, ha="right", va="top", rotation_mode="anchor", **small)
             if i > 0:
                 y = n - 1 - i + place
-                ticks.append(((0.0, y), (-0.03, y)))
-                ax.text(-0.05, y, text, ha="right", va="center", **small)
+                ticks.append(((0.0, y), (-length, y)))
+                ax.text(-gap, y, text, ha="right", va="center", **small)
         name = f"{columns.symbols[i]}\n[{columns.units[i]}]"
-        ax.text(i + _SIDE / 2, -0.5, name, ha="center", va="top", **label)
+        ax.text(i + _SIDE / 2, -away, name, ha="center", va="top", **label)
         if i > 0:
-            ax.text(
-                -0.5,
-                n - 1 - i + _SIDE / 2,
-                name,
-                ha="right",
-                va="center",
-                rotation=90,
-                multialignment="center",
-                **label,
-            )
+            y = n - 1 - i + _SIDE / 2
+            ax.text(-away, y, name, ha="right", va="center", rotation=90, multialignment="center", **label)
     ax.add_collection(LineCollection(ticks, colors=GREY, lw=0.8, clip_on=False))
 
 
