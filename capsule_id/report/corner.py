@@ -42,10 +42,12 @@ def corner(result: Result) -> Figure:
     """
     columns = sampled_columns(result)
     n = len(columns.names)
-    panel = 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
-    size = 1.25 + panel * n
-    figure = new_figure(size, size)
-    ax = figure.add_axes((1.1 / size, 1.0 / size, panel * n / size, panel * n / size), frameon=False)
+    panel = 2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
+    # The key stands in the empty upper triangle, or above the panels where that is too small.
+    head = 0.8 if n <= 2 else 0.0
+    width, height = 1.25 + panel * n, 1.25 + panel * n + head
+    figure = new_figure(width, height)
+    ax = figure.add_axes((1.1 / width, 1.0 / height, panel * n / width, panel * n / height), frameon=False)
     ax.set(xlim=(0, n), ylim=(0, n), xticks=[], yticks=[])
     low, high = _limits(columns)
     flat = columns.draws.reshape(-1, n)
@@ -58,9 +60,8 @@ def corner(result: Result) -> Figure:
     _marks(ax, (columns.map - low) / (high - low), BLACK, "+", "-")
     _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
     _axes(ax, columns, low, high, panel)
-    figure.legend(
-        handles=_key(), fontsize=TEXT, frameon=False, loc="upper right", bbox_to_anchor=(1 - 0.1 / size, 1 - 0.1 / size)
-    )
+    corner_place = (1 - 0.1 / width, 1 - 0.1 / height)
+    figure.legend(handles=_key(), fontsize=TEXT, frameon=False, loc="upper right", bbox_to_anchor=corner_place)
     return figure
 
 
