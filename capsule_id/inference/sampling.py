@@ -8,6 +8,7 @@ from typing import Any
 import emcee
 import numpy as np
 
+from capsule_id.inference.chain_store import ChainStore
 from capsule_id.inference.curvature import in_batches
 from capsule_id.inference.diagnostics import effective_sample_size, integrated_time, split_rhat
 from capsule_id.inference.log_posterior import LogPosterior
@@ -57,13 +58,14 @@ def sample(
     ----------
     seed : the same seed gives the same draws, also when the run was interrupted and goes on from ``store``
     budget : emcee steps of an ensemble after burn-in
-    store : HDF5 file that holds the chains while they run; chains found in it are continued
+    store : HDF5 file that holds the chains while they run; the draws in its saved copy are taken up
     progress : called with (draws done, draws until the next check, what is being done)
     """
     report = progress or (lambda done, total, text: None)
     report(0, 1, "pilot")
     seeds = np.random.SeedSequence(seed).generate_state(ENSEMBLES + 1)
     schedule = pilot(target, fit, int(seeds[0]))
+    chains = None if store is None else ChainStore(store)
     samplers = [_sampler(target, fit, schedule, int(s), i, store) for i, s in enumerate(seeds[1:])]
     last = max(budget // schedule.thin, 2)
     draws = np.empty(0)
@@ -73,6 +75,8 @@ def sample(
             continue
         for sampler in samplers:
             for _ in _advance(sampler, goal, schedule.thin):
+                if chains is not None:
+                    chains.between_draws()
                 report(sum(s.iteration for s in samplers), ENSEMBLES * goal, schedule.move)
         draws = np.stack([sampler.get_chain()[:goal] for sampler in samplers])
         tau, rhat = integrated_time(draws), split_rhat(draws)
@@ -124,7 +128,10 @@ def _advance(sampler: emcee.EnsembleSampler, goal: int, thin: int) -> Iterator[e
     """Run until ``goal`` draws are stored; every draw is saved as it is made."""
     missing = goal - sampler.iteration
     if missing > 0:
-        yield from sampler.sample(sampler._previous_state, iterations=missing, thin_by=thin, store=True)
+        for state in sampler.sample(sampler._previous_state, iterations=missing, thin_by=thin, store=True):
+            # emcee keeps no state of a run that is iterated over: the next call would start from the same one again.
+            sampler._previous_state = state
+            yield state
 
 
 def _sampler(
