@@ -93,10 +93,10 @@ def synthesize(folder: Path, seed: int, truth: Truth | None = None, name: str | 
         raise InputError(f"the name of a rig matches {NAME_PATTERN}", name, "choose another with --name")
     rng = np.random.default_rng(seed)
     tables, entries = _measure(rng, truth)
-    masses = {name: getattr(truth, name) + sd * rng.standard_normal() for name, sd in MASS_SD.items()}
+    masses = {symbol: getattr(truth, symbol) + sd * rng.standard_normal() for symbol, sd in MASS_SD.items()}
     folder.mkdir(parents=True, exist_ok=True)
-    for name, columns in tables.items():
-        _write_csv(folder / name, columns)
+    for file, columns in tables.items():
+        _write_csv(folder / file, columns)
     (folder / "rig.toml").write_text(_rig_toml(name, seed, truth.g, masses, entries), encoding="utf-8")
     beside = folder.resolve().with_name(folder.resolve().name + ".truth.json")
     beside.write_text(json.dumps({"seed": seed, "parameters": truth.flat()}, indent=1) + "\n", encoding="utf-8")

@@ -83,6 +83,8 @@ def sample(
         converged = bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
         if converged:
             break
+    if chains is not None:
+        chains.save()
     return Posterior(
         names=target.names,
         draws=target.theta(draws),
