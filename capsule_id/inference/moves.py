@@ -9,8 +9,6 @@ import numpy as np
 
 #: Degrees of freedom of the independence proposal: tails heavier than the posterior's keep its weights bounded.
 DEGREES_OF_FREEDOM = 8.0
-#: The independence proposal is wider than the pilot's sample by this factor.
-INFLATION = 1.1
 PILOT_STEPS = 150
 
 BatchedLogDensity = Callable[[np.ndarray], np.ndarray]
@@ -51,9 +49,17 @@ def differential_evolution() -> Moves:
     return [(emcee.moves.DEMove(), 0.9), (emcee.moves.DESnookerMove(), 0.1)]
 
 
-def candidates(sample: np.ndarray) -> Mapping[str, Moves]:
-    """The moves that the pilot compares; ``sample`` (m, d) from the posterior shapes the independence proposal."""
-    root = np.sqrt(INFLATION) * np.linalg.cholesky(np.atleast_2d(np.cov(sample.T)))
+def candidates(sample: np.ndarray, laplace: np.ndarray) -> Mapping[str, Moves]:
+    """The moves that the pilot compares.
+
+    Parameters
+    ----------
+    sample : (m, d) of the pilot's burnt-in ensemble: the independence proposal's centre and widths
+    laplace : (d, d) Laplace covariance: its correlations, which a short pilot would give only roughly
+    """
+    laplace_sd = np.sqrt(np.diag(laplace))
+    stretch = np.maximum(np.std(sample, axis=0) / laplace_sd, 1.0)
+    root = np.linalg.cholesky(laplace * np.outer(stretch, stretch))
     independence = emcee.moves.MHMove(StudentProposal(np.mean(sample, axis=0), root))
     return {
         "independence + differential evolution": [(independence, 0.6), (emcee.moves.DEMove(), 0.4)],

@@ -107,7 +107,7 @@ def pilot(target: LogPosterior, fit: PointFit, seed: int) -> Schedule:
     sampler = _ensemble(target, state.coords.shape[0], differential_evolution())
     state = sampler.run_mcmc(state, 2 * PILOT_STEPS)
     sample = sampler.get_chain(discard=PILOT_STEPS, flat=True)
-    measured, moves = {}, candidates(sample)
+    measured, moves = {}, candidates(sample, fit.covariance)
     for name, candidate in moves.items():
         sampler = _ensemble(target, state.coords.shape[0], candidate)
         state = sampler.run_mcmc(state, PILOT_STEPS)
