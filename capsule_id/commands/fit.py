@@ -87,7 +87,7 @@ class Progress:
 
     def __init__(self, enabled: bool) -> None:
         self._enabled = enabled and sys.stderr is not None
-        self._terminal = self._enabled and sys.stderr.isatty()
+        self._terminal = sys.stderr is not None and sys.stderr.isatty()
         self._stage, self._began, self._first, self._shown = "", 0.0, 0, 0.0
         self._open = False
 
