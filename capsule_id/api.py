@@ -6,7 +6,8 @@ from pathlib import Path
 from capsule_id.inference.fit import fit_rig
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET
-from capsule_id.output import check_directory, open_partial, publish
+from capsule_id.output import check_directory, publish, work_in_progress
+from capsule_id.report.write import write_result
 from capsule_id.rig.model import Rig
 
 
@@ -24,8 +25,9 @@ class Fit(Result):
         """
         path = Path(directory)
         check_directory(path)
-        open_partial(path, {}, resume=False)
-        publish(self, path)
+        with work_in_progress(path, {}, resume=False) as partial:
+            write_result(self, partial)
+            publish(partial, path)
 
 
 def fit(rig: Rig, seed: int = 0, experiments: str = "all", budget: int | None = DEFAULT_BUDGET) -> Fit:

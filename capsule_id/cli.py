@@ -1,12 +1,15 @@
 """The two commands: parse, call, exit code. ``fit-params DATA`` fits; ``capsule-id`` does everything else."""
 
 import argparse
+import io
 import signal
 import sys
 import tempfile
+import threading
 import traceback
-from collections.abc import Callable, Sequence
-from pathlib import Path
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
@@ -14,13 +17,15 @@ from capsule_id.commands import check, fit, init, report, synthesize
 from capsule_id.errors import InputError
 
 BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
+_RESUME = "; --resume goes on from the saved state"
+_LONGEST_REASON = 300  # characters of an exception's message that the one line repeats
 
 
 class _Parser(argparse.ArgumentParser):
     """Wrong usage is one line on standard error and exit code 2."""
 
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        print(" ".join(f"{self.prog}: {message}; see {self.prog} --help".split()), file=sys.stderr)
         raise SystemExit(BAD_INPUT)
 
 
@@ -58,31 +63,59 @@ def _run(
         args = parser.parse_args(arguments)
     except SystemExit as stop:
         return int(stop.code or 0)
-    signal.signal(signal.SIGTERM, _interrupt)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a locale without ± is no failure
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # what a user should know is a finding
     try:
-        code = action(args)
-        sys.stdout.flush()
-        return code
+        with _interruptible():
+            return action(args)
     except InputError as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print(f"{program}: interrupted; --resume goes on from the saved state", file=sys.stderr)
+        print(f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
-        print(f"{program}: internal failure: {_one_line(error)}; traceback in {_save_traceback()}", file=sys.stderr)
+        print(f"{program}: internal failure: {_one_line(error)}; {_save_traceback()}", file=sys.stderr)
         return INTERNAL
 
 
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    raise KeyboardInterrupt
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM ends the block as Ctrl-C does; a second signal does not disturb the end that the first has begun."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = {number: signal.getsignal(number) for number in numbers}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+    return " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_REASON]
 
 
-def _save_traceback() -> Path:
-    with tempfile.NamedTemporaryFile("w", prefix="capsule-id-", suffix=".txt", delete=False, encoding="utf-8") as file:
-        traceback.print_exc(file=file)
-    return Path(file.name)
+def _save_traceback() -> str:
+    """Where the traceback of the exception that is being handled was saved."""
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="capsule-id-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:
+            traceback.print_exc(file=file)
+    except OSError as error:
+        return f"its traceback could not be saved: {_one_line(error)}"
+    return f"traceback in {file.name}"

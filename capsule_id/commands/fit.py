@@ -1,13 +1,18 @@
 """``fit-params DATA``: from a rig folder to parameters, posterior and report."""
 
 import argparse
+import os
+import shutil
 import sys
 import time
 from pathlib import Path
 
 from capsule_id.errors import InputError
+from capsule_id.output import CHAINS, check_directory, publish, work_in_progress
 from capsule_id.rig.read import read_rig
 
+#: Seconds between two updates of the progress, on a terminal and in a file.
+TERMINAL_INTERVAL, FILE_INTERVAL = 0.1, 10.0
 DEFAULT_MAX_STEPS = 20_000
 
 
@@ -39,13 +44,13 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--max-steps must be positive", str(args.max_steps), "give 1 or more")
     rig = read_rig(args.data)
     directory = args.out if args.out is not None else Path("results") / rig.name
+    check_directory(directory)
     # Heavy rooms only now: a wrong folder is answered at once.
     from capsule_id.experiments import make_experiments
     from capsule_id.inference.fit import PACKAGES, fit_rig, package_versions
-    from capsule_id.output import CHAINS, check_directory, open_partial, publish
     from capsule_id.report.text import table_text
+    from capsule_id.report.write import write_result
 
-    check_directory(directory)
     make_experiments(rig, args.experiments)
     fingerprint = {
         "data": dict(rig.files),
@@ -53,54 +58,76 @@ def run(args: argparse.Namespace) -> int:
         "experiments": args.experiments,
         "versions": package_versions(PACKAGES),
     }
-    partial = open_partial(directory, fingerprint, args.resume)
-    progress = ProgressBar(enabled=not args.quiet)
     budget = None if args.no_sample else args.max_steps
-    try:
+    with work_in_progress(directory, fingerprint, args.resume) as partial, Progress(not args.quiet) as progress:
         result = fit_rig(rig, args.seed, args.experiments, budget, partial / CHAINS, progress)
-    finally:
-        progress.close()
-    publish(result, directory)
-    print(table_text(result.summary, synthetic=rig.synthetic, clean=result.clean))
-    print(f"report: {directory / 'report.html'}")
+        progress(0, 1, "report")
+        write_result(result, partial)
+        publish(partial, directory)
+    report = directory / "report.html"
+    _print(f"{table_text(result.summary, synthetic=rig.synthetic, clean=result.clean)}\nreport: {report}")
     if result.clean:
         return 0
     failed = sorted({finding.check for finding in result.findings if finding.level == "fail"})
-    print(f"fit-params: verdict not clean: {', '.join(failed)}; see {directory / 'report.html'}", file=sys.stderr)
+    print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
     return 3
 
 
-class ProgressBar:
-    """Stage, rate and time left on standard error."""
+def _print(text: str) -> None:
+    """Print to standard output; a reader who has heard enough (``| head``) is no failure of a finished fit."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # The interpreter flushes once more at its end, and would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class Progress:
+    """Stage, rate and time left on standard error: a bar on a terminal, a line now and then in a file."""
 
     def __init__(self, enabled: bool) -> None:
-        self._enabled = enabled
-        self._bar = None
-        self._stage = ""
-        self._shown = 0.0
+        self._enabled = enabled and sys.stderr is not None
+        self._terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._stage, self._began, self._first, self._shown = "", 0.0, 0, 0.0
+        self._open = False
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_line()
 
     def __call__(self, done: int, total: int, stage: str) -> None:
-        """``done`` of ``total`` draws in ``stage``."""
+        """``done`` of ``total`` draws in ``stage``; a stage that cannot be counted has a total of 1."""
         if not self._enabled:
             return
+        now = time.monotonic()
+        if stage != self._stage:
+            self._end_line()
+            self._stage, self._began, self._first = stage, now, done
+        elif now - self._shown < (TERMINAL_INTERVAL if self._terminal else FILE_INTERVAL):
+            return
+        self._shown = now
+        self._show(self._line(done, total, now - self._began))
+
+    def _line(self, done: int, total: int, elapsed: float) -> str:
+        if total <= 1:
+            return f"{self._stage} ..."
         from tqdm import tqdm
 
-        if stage != self._stage:
-            self.close()
-            self._stage = stage
-            unit = "draw" if total > 1 else "stage"
-            self._bar = tqdm(total=total, desc=stage, unit=unit, file=sys.stderr, dynamic_ncols=True, initial=done)
-        now = time.monotonic()
-        if self._bar is not None and (done != self._bar.n or total != self._bar.total) and now - self._shown > 0.05:
-            self._shown = now
-            self._bar.total = total
-            self._bar.n = done
-            self._bar.refresh()
+        width = shutil.get_terminal_size().columns - 1 if self._terminal else None
+        plain = not self._terminal
+        return tqdm.format_meter(done, total, elapsed, width, self._stage, plain, "draw", initial=self._first)
 
-    def close(self) -> None:
-        """Leave the last line standing."""
-        if self._bar is not None:
-            if self._bar.total == 1:
-                self._bar.n = 1
-            self._bar.close()
-            self._bar = None
+    def _show(self, line: str) -> None:
+        try:
+            sys.stderr.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
+            sys.stderr.flush()
+        except OSError:
+            self._enabled = False  # nobody reads
+        self._open = self._terminal
+
+    def _end_line(self) -> None:
+        if self._open and self._enabled:
+            sys.stderr.write("\n")
+            self._open = False

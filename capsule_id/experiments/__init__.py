@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.base import Experiment, Theta
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
@@ -87,7 +87,9 @@ def compare(
     panels = []
     if friction:
         # Their local values differ in scatters only; together they know both mu and v_s where one of them does.
-        everything = [{k: v for e in friction for k, v in e.local(point).items()} for point in (values, *draws)]
+        everything: list[Theta] = [
+            {k: v for e in friction for k, v in e.local(point).items()} for point in (values, *draws)
+        ]
         panels.append(friction_comparison(friction, everything[0], everything[1:]))
     for e in experiments:
         if not isinstance(e, FrictionExperiment):

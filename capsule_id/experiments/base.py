@@ -96,7 +96,7 @@ class Experiment(ABC):
     def with_arrays(self, arrays: Mapping[str, Any]) -> Self:
         """The same experiment with other (traced) numbers in place of ``ARRAYS``."""
         clone = copy(self)
-        clone.__dict__.update(arrays)
+        vars(clone).update(arrays)
         return clone
 
     def local(self, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from capsule_id.experiments.decrement import Decrement, equilibrium, logarithmic
 from capsule_id.experiments.linear import NUISANCE_WIDTH, marginal_log_density
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.windows import decay_window
 from capsule_id.views import Comparison, Curve, Finding, Points
 
@@ -217,8 +217,8 @@ class FreeVibration(Experiment):
                 )
                 findings.append(Finding("free decay", "fail", text, self.label))
         gap = self.table.settings.get("gap")
-        if gap is not None:
-            reach, limit = float(np.max(self.values - equilibrium(self.values))), float(getattr(gap, "value", gap))
+        if isinstance(gap, Quantity):
+            reach, limit = float(np.max(self.values - equilibrium(self.values))), gap.value
             if reach >= limit:
                 text = (
                     f"{self.label}: x_rel reaches {reach:.3g} m, the support spring stands at {limit:.3g} m, so the "

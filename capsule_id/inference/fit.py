@@ -42,7 +42,7 @@ def fit_rig(
     seed : every random number follows from it
     which : "bench", "runs" or "all" experiments
     budget : emcee steps of an ensemble; None draws no sample
-    store : HDF5 file for the chains; chains found there are continued
+    store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
     progress : see ``capsule_id.inference.sampling.sample``
 
     Raises

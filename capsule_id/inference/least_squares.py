@@ -218,13 +218,15 @@ def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) ->
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
-@eqx.filter_jit(compiler_options=QUICK_COMPILE)
+# Equinox hands the options of jax.jit on; its annotations leave them out.
+@eqx.filter_jit(compiler_options=QUICK_COMPILE)  # pyright: ignore[reportCallIssue]
 def _linearise(residual: Residual, points: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Residuals (s, n) and Jacobians (s, n, d) at points (s, d)."""
     return eqx.filter_vmap(lambda x: (residual(x), jax.jacfwd(residual)(x)))(points)
 
 
-@eqx.filter_jit(compiler_options=QUICK_COMPILE)
+# Equinox hands the options of jax.jit on; its annotations leave them out.
+@eqx.filter_jit(compiler_options=QUICK_COMPILE)  # pyright: ignore[reportCallIssue]
 def _solve(
     residual: Residual,
     start: jax.Array,

@@ -8,6 +8,7 @@ from typing import Any
 import emcee
 import numpy as np
 
+from capsule_id.inference.chain_store import ChainStore
 from capsule_id.inference.curvature import in_batches
 from capsule_id.inference.diagnostics import effective_sample_size, integrated_time, split_rhat
 from capsule_id.inference.log_posterior import LogPosterior
@@ -57,32 +58,37 @@ def sample(
     ----------
     seed : the same seed gives the same draws, also when the run was interrupted and goes on from ``store``
     budget : emcee steps of an ensemble after burn-in
-    store : HDF5 file that holds the chains while they run; chains found in it are continued
+    store : HDF5 file that holds the chains while they run; the draws in its saved copy are taken up
     progress : called with (draws done, draws until the next check, what is being done)
     """
     report = progress or (lambda done, total, text: None)
     report(0, 1, "pilot")
     seeds = np.random.SeedSequence(seed).generate_state(ENSEMBLES + 1)
     schedule = pilot(target, fit, int(seeds[0]))
+    chains = None if store is None else ChainStore(store)
     samplers = [_sampler(target, fit, schedule, int(s), i, store) for i, s in enumerate(seeds[1:])]
     last = max(budget // schedule.thin, 2)
-    draws = np.empty(0)
-    tau, rhat, converged = np.empty(0), np.empty(0), False
+    draws = np.empty((ENSEMBLES, 0, 0, target.dimension))
+    tau, converged = np.empty((ENSEMBLES, target.dimension)), False
     for goal in _checks(last):
         if goal < last and all(sampler.iteration > goal for sampler in samplers):
             continue
         for sampler in samplers:
             for _ in _advance(sampler, goal, schedule.thin):
+                if chains is not None:
+                    chains.between_draws()
                 report(sum(s.iteration for s in samplers), ENSEMBLES * goal, schedule.move)
-        draws = np.stack([sampler.get_chain()[:goal] for sampler in samplers])
+        draws = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
         tau, rhat = integrated_time(draws), split_rhat(draws)
         converged = bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
         if converged:
             break
+    if chains is not None:
+        chains.save()
     return Posterior(
         names=target.names,
         draws=target.theta(draws),
-        lp=np.stack([sampler.get_log_prob()[: draws.shape[1]] for sampler in samplers]),
+        lp=np.stack([np.asarray(sampler.get_log_prob())[: draws.shape[1]] for sampler in samplers]),
         acceptance=np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers]),
         tau=np.max(tau, axis=0),
         rhat=split_rhat(target.theta(draws)),
@@ -97,15 +103,15 @@ def sample(
 def pilot(target: LogPosterior, fit: PointFit, seed: int) -> Schedule:
     """Burn in one ensemble, then measure the autocorrelation time of every candidate move on it."""
     random = np.random.RandomState(seed)
-    state = emcee.State(_initial(target, fit, random), random_state=random.get_state())
+    state: Any = emcee.State(_initial(target, fit, random), random_state=random.get_state())
     sampler = _ensemble(target, state.coords.shape[0], differential_evolution())
     state = sampler.run_mcmc(state, 2 * PILOT_STEPS)
-    sample = sampler.get_chain(discard=PILOT_STEPS, flat=True)
+    sample = np.asarray(sampler.get_chain(discard=PILOT_STEPS, flat=True))
     measured, moves = {}, candidates(sample, fit.covariance)
     for name, candidate in moves.items():
         sampler = _ensemble(target, state.coords.shape[0], candidate)
         state = sampler.run_mcmc(state, PILOT_STEPS)
-        measured[name] = float(np.max(integrated_time(sampler.get_chain()[None])))
+        measured[name] = float(np.max(integrated_time(np.asarray(sampler.get_chain())[None])))
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     return Schedule(best, moves[best], measured, max(1, round(tau)), int(np.ceil(BURN_IN_IN_TAU * tau)))
@@ -124,7 +130,10 @@ def _advance(sampler: emcee.EnsembleSampler, goal: int, thin: int) -> Iterator[e
     """Run until ``goal`` draws are stored; every draw is saved as it is made."""
     missing = goal - sampler.iteration
     if missing > 0:
-        yield from sampler.sample(sampler._previous_state, iterations=missing, thin_by=thin, store=True)
+        for state in sampler.sample(sampler._previous_state, iterations=missing, thin_by=thin, store=True):
+            # emcee keeps no state of a run that is iterated over: the next call would start from the same one again.
+            sampler._previous_state = state
+            yield state
 
 
 def _sampler(
@@ -134,7 +143,7 @@ def _sampler(
     random = np.random.RandomState(seed)
     start = _initial(target, fit, random)
     backend = None if store is None else emcee.backends.HDFBackend(str(store), name=f"ensemble_{number}")
-    if backend is not None and backend.initialized and backend.iteration > 0:
+    if backend is not None and backend.initialized and int(backend.iteration) > 0:
         sampler = _ensemble(target, len(start), schedule.moves, backend)
         sampler._previous_state = backend.get_last_sample()
         return sampler

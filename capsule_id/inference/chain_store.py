@@ -1,0 +1,49 @@
+"""Chains on disk that a kill at any moment cannot spoil.
+
+emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter), so a process that dies
+between two of them leaves a file that opens and is wrong. Runs are therefore taken up from a copy made between draws,
+which carries its own digest; the file that emcee writes is never trusted after an interruption.
+"""
+
+import hashlib
+import time
+from pathlib import Path
+
+#: Seconds between two copies.
+SAVE_EVERY = 5.0
+_DIGEST = hashlib.sha256().digest_size
+
+
+def saved_copy(store: Path) -> Path:
+    """The copy of ``store`` that an interrupted run is taken up from."""
+    return store.with_suffix(".saved")
+
+
+class ChainStore:
+    """The HDF5 file that emcee writes, and its copy.
+
+    Parameters
+    ----------
+    store : the file; whatever stands in it is replaced by the last copy, or removed where there is no sound one
+    """
+
+    def __init__(self, store: Path) -> None:
+        self._store, self._copy, self._next = store, saved_copy(store), time.monotonic() + SAVE_EVERY
+        store.unlink(missing_ok=True)
+        saved = self._copy.read_bytes() if self._copy.exists() else b""
+        content = saved[_DIGEST:]
+        if content and hashlib.sha256(content).digest() == saved[:_DIGEST]:
+            store.write_bytes(content)
+
+    def between_draws(self) -> None:
+        """Copy the file, if the last copy is old enough; to be called while emcee has it closed."""
+        if time.monotonic() >= self._next:
+            self.save()
+
+    def save(self) -> None:
+        """Copy the file now; the copy appears by one rename."""
+        content = self._store.read_bytes()
+        temporary = self._copy.with_suffix(".saved-new")
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
+        temporary.replace(self._copy)
+        self._next = time.monotonic() + SAVE_EVERY
