@@ -153,17 +153,23 @@ class FreeVibration(Experiment):
 
     @cached_property
     def side(self) -> float:
-        """Sign of the first turning point."""
+        """Sign of the first turning point; 1 where not needed."""
+        if self.damping != "dry":
+            return 1.0
         return float(np.sign(self._rough.peaks[0]))
 
     @cached_property
     def half_cycles(self) -> int:
-        """Bound on the half cycles of the record, with room for a frequency half as high again."""
+        """Bound on the half cycles of the record, with room for a frequency half as high again; 0 where not needed."""
+        if self.damping != "dry":
+            return 0
         return int(1.5 * self._rough.Omega_o * self.time[-1] / np.pi) + 4
 
     @cached_property
     def substeps(self) -> int:
-        """Runge–Kutta steps between two samples."""
+        """Runge–Kutta steps between two samples; 0 where not needed."""
+        if self.damping != "quadratic":
+            return 0
         return max(1, int(np.ceil(self._rough.Omega_o * np.max(np.diff(self.time)) / STEP_PHASE)))
 
     def starts(self) -> dict[str, Start]:

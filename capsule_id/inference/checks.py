@@ -285,7 +285,7 @@ def _informed(s: Setting) -> list[Finding]:
 
 def _boundary(s: Setting) -> list[Finding]:
     """Posteriors in the tail of a prior."""
-    z = np.abs(np.asarray(s.target.prior_residuals(s.fit.u, np)))
+    z = np.abs(s.target.prior_residuals(s.fit.u))
     names = [row.name for row, pull in zip(s.target.parameters, z, strict=True) if pull > PRIOR_PULL]
     if not names:
         return [Finding("boundary effects", "ok", "no parameter ends in the tail of its prior")]

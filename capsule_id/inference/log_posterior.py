@@ -4,18 +4,16 @@ u = log(theta) for positive parameters, theta otherwise. log p(u | data) = sum o
 of theta + log |d theta / du|: natural and normalised, linear nuisances integrated out.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from types import ModuleType
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from capsule_id.experiments.base import Experiment, Start, Theta
-from capsule_id.experiments.linear import LOG_2PI
+from capsule_id.experiments.base import Experiment, Start
+from capsule_id.inference import density
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
 from capsule_id.rig.model import PriorOverride, Rig
 
@@ -44,15 +42,17 @@ class LogPosterior:
                 rows.setdefault(row.name, _override(row, rig.priors.get(row.name)))
         self.parameters = tuple(rows.values())
         self.names = tuple(rows)
+        groups, self._arrays = density.make_groups(self.experiments, self.names, self.fixed)
+        self.structure = density.Structure(self.names, tuple(row.positive for row in self.parameters), groups)
 
     @property
     def dimension(self) -> int:
         return len(self.names)
 
-    @cached_property
+    @property
     def positive(self) -> np.ndarray:
         """(d,) which parameters are sampled through their logarithm."""
-        return np.array([row.positive for row in self.parameters])
+        return np.array(self.structure.positive)
 
     @cached_property
     def scatter(self) -> np.ndarray:
@@ -88,14 +88,9 @@ class LogPosterior:
         sd = np.where(kinds == "positive_normal", width / np.where(location == 0.0, 1.0, location), width)
         return np.where(kinds == "halfnormal", np.pi / np.sqrt(8.0), sd)
 
-    def constrain(self, u: Any) -> dict[str, Any]:
-        """Parameter values by name, constants included, from u (d,)."""
-        theta = jnp.where(self.positive, jnp.exp(u), u)
-        return {**self.fixed, **{name: theta[i] for i, name in enumerate(self.names)}}
-
     def theta(self, u: np.ndarray) -> np.ndarray:
         """(..., d) constrained values from u (..., d), NumPy."""
-        return np.where(self.positive, np.exp(u), u)
+        return density.constrain(self.structure, u, np)
 
     def unconstrain(self, theta: np.ndarray) -> np.ndarray:
         """(..., d) u from constrained values (..., d), NumPy."""
@@ -105,63 +100,42 @@ class LogPosterior:
         """Constrained values (d,) by name, constants included."""
         return {**self.fixed, **dict(zip(self.names, (float(v) for v in theta), strict=True))}
 
+    @cached_property
+    def numbers(self) -> dict[str, Any]:
+        """Readings, priors and constants, on the device."""
+        prior = {name: jnp.asarray(value) for name, value in self._priors.items()}
+        fixed = {name: jnp.asarray(value) for name, value in self.fixed.items()}
+        return {"arrays": self._arrays, "prior": prior, "fixed": fixed}
+
     def log_prior(self, u: Any) -> Any:
         """Normalised log prior density of u (d,), Jacobian included; scalar."""
-        p = self._priors
-        value = jnp.where(p["lognormal"] | ~self.positive, u, jnp.exp(u))
-        z = (value - p["centre"]) / p["width"]
-        density = -0.5 * (z**2 + LOG_2PI) - jnp.log(p["width"]) + p["constant"] + jnp.where(p["jacobian"], u, 0.0)
-        return jnp.sum(density)
-
-    def prior_residuals(self, u: Any, xp: ModuleType = jnp) -> Any:
-        """(d,) (value - centre)/width: half their sum of squares is the parameter-dependent part of -log prior."""
-        p = self._priors
-        return (xp.where(p["lognormal"] | ~self.positive, u, xp.exp(u)) - p["centre"]) / p["width"]
-
-    @cached_property
-    def _groups(self) -> list[tuple[Experiment, ...]]:
-        """Experiments that differ only in numbers, together: one traced graph for each group, however many records."""
-        groups: dict[Hashable, list[Experiment]] = {}
-        for experiment in self.experiments:
-            groups.setdefault(experiment.signature, []).append(experiment)
-        return [tuple(group) for group in groups.values()]
-
-    def _per_group(self, function: Callable[[Experiment, Theta], Any], u: Any) -> list[Any]:
-        """``function`` of every experiment, batched: one array (members, ...) per group."""
-        values = self.constrain(u)
-        results = []
-        for group in self._groups:
-            first = group[0]
-            arrays = {name: np.stack([np.asarray(getattr(e, name)) for e in group]) for name in first.ARRAYS}
-            local = [e.local(values) for e in group]
-            theta = {name: jnp.stack([jnp.asarray(values[name]) for values in local]) for name in local[0]}
-            results.append(jax.vmap(lambda a, t, first=first: function(first.with_arrays(a), t))(arrays, theta))
-        return results
+        return density.log_prior(self.structure, self.numbers, u)
 
     def log_likelihood(self, u: Any) -> Any:
-        """Sum over the experiments; scalar."""
-        return sum(jnp.sum(part) for part in self._per_group(lambda e, theta: e.log_likelihood(theta), u))
+        """Sum over the experiments at u (d,); scalar."""
+        return density.log_likelihood(self.structure, self.numbers, u)
 
     def __call__(self, u: Any) -> Any:
-        """log p(u | data) up to the evidence; -inf where it is not finite (an overdamped decay)."""
-        value = self.log_prior(u) + self.log_likelihood(u)
-        return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+        """log p(u | data) up to the evidence, u (d,); -inf where it is not finite (an overdamped decay)."""
+        return density.log_posterior(self.structure, self.numbers, u)
 
-    @cached_property
-    def batch(self) -> Any:
-        """Jitted (w, d) -> (w,)."""
-        return jax.jit(jax.vmap(self))
+    def batch(self, u: Any) -> Any:
+        """Compiled, (w, d) -> (w,)."""
+        return density.batched_log_posterior(self.structure, self.numbers, u)
 
     def residuals(self, u: Any) -> Any:
         """All experiments' residuals and the priors', (n,): the least-squares part of -log posterior."""
-        parts = self._per_group(lambda e, theta: e.residuals(theta), u)
-        return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.prior_residuals(u)])
+        return density.residuals(self.structure, self.numbers, u)
+
+    def prior_residuals(self, u: np.ndarray) -> np.ndarray:
+        """(d,) (value - centre)/width: half their sum of squares is the parameter-dependent part of -log prior."""
+        return np.asarray(density.prior_residuals(self.structure, self._priors, u, np))
 
     def plain_residuals(self, u: np.ndarray) -> np.ndarray:
         """The same residuals as ``residuals`` in NumPy, in the order of the experiments, nothing compiled."""
         values = self.mapping(self.theta(u))
         parts = [np.asarray(e.residuals(e.local(values), np)) for e in self.experiments]
-        return np.concatenate([*parts, np.asarray(self.prior_residuals(u, np))])
+        return np.concatenate([*parts, self.prior_residuals(u)])
 
     def starts(self) -> Mapping[str, Start]:
         """Start of every parameter: the mean (geometric where positive) of what the experiments propose."""

@@ -4,6 +4,7 @@ Least squares first (it finds the basin, with the scatters held at their startin
 joint log-posterior, scatters included, in coordinates whitened by the curvature at the best least-squares end.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import numpy as np
 import optimistix as optx
 
 from capsule_id.inference.curvature import hessian, jacobian, root_of_inverse
+from capsule_id.inference.density import HeldResiduals, Numbers, Structure, log_posterior
 from capsule_id.inference.least_squares import QUICK_COMPILE, covariance, least_squares
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit
@@ -36,9 +38,8 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
     """
     starts = dispersed_starts(target, seed, number_of_starts)
     located = np.flatnonzero(~target.scatter)
-    centre = jnp.asarray(starts[0])
     rough = least_squares(
-        lambda v: target.residuals(centre.at[located].set(v)),
+        HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(starts[0])),
         starts[:, located],
         tolerance=LEAST_SQUARES_TOLERANCE,
         normal_equations=True,
@@ -47,8 +48,8 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
     scale = _information(target, ends[rough.best]) ** -0.5
     whitening = root_of_inverse(-hessian(target.batch, ends[rough.best], scale))
-    polish = _polish(target)
-    u, value, converged = (np.stack(part) for part in zip(*(polish(end, whitening) for end in ends), strict=True))
+    polished = [_polish(target.structure, target.numbers, end, whitening) for end in ends]
+    u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     scale = _information(target, u[best]) ** -0.5
     root = root_of_inverse(-hessian(target.batch, u[best], scale))
@@ -80,24 +81,21 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     return centre + spread * z
 
 
-def _polish(target: LogPosterior) -> Any:
-    """Jitted BFGS: (end (d,), whitening (d, d)) -> maximum (d,), log-posterior there, converged.
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILE)
+def _polish(structure: Structure, numbers: Numbers, end: Any, whitening: Any) -> tuple[Any, Any, Any]:
+    """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged.
 
     Compiled with few optimisations: it runs for milliseconds, and compiling it well takes seconds.
     """
-
-    def one(end: Any, whitening: Any) -> tuple[Any, Any, Any]:
-        solution = optx.minimise(
-            lambda v, _: -target(end + whitening @ v),
-            optx.BFGS(rtol=TOLERANCE, atol=TOLERANCE),
-            jnp.zeros(end.shape),
-            max_steps=MAX_STEPS,
-            throw=False,
-        )
-        u = end + whitening @ solution.value
-        return u, target(u), solution.result == optx.RESULTS.successful
-
-    return jax.jit(one, compiler_options=QUICK_COMPILE)
+    solution = optx.minimise(
+        lambda v, _: -log_posterior(structure, numbers, end + whitening @ v),
+        optx.BFGS(rtol=TOLERANCE, atol=TOLERANCE),
+        jnp.zeros(end.shape),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    u = end + whitening @ solution.value
+    return u, log_posterior(structure, numbers, u), solution.result == optx.RESULTS.successful
 
 
 def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:

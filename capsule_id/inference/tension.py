@@ -45,7 +45,7 @@ def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
         u[free] = v
         values = target.mapping(target.theta(u))
         likelihood = sum(float(e.log_likelihood(e.local(values), np)) for e in target.experiments)
-        penalty = 0.5 * float(np.sum(np.asarray(target.prior_residuals(u, np))[free] ** 2))
+        penalty = 0.5 * float(np.sum(target.prior_residuals(u)[free] ** 2))
         jacobian = float(np.sum(u[target.scatter]))
         return penalty - likelihood - jacobian
 

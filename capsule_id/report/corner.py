@@ -42,10 +42,12 @@ def corner(result: Result) -> Figure:
     """
     columns = sampled_columns(result)
     n = len(columns.names)
-    panel = 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
-    size = 1.25 + panel * n
-    figure = new_figure(size, size)
-    ax = figure.add_axes((1.1 / size, 1.0 / size, panel * n / size, panel * n / size), frameon=False)
+    panel = 2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
+    # The key stands in the empty upper triangle, or above the panels where that is too small.
+    head = 0.8 if n <= 2 else 0.0
+    width, height = 1.25 + panel * n, 1.25 + panel * n + head
+    figure = new_figure(width, height)
+    ax = figure.add_axes((1.1 / width, 1.0 / height, panel * n / width, panel * n / height), frameon=False)
     ax.set(xlim=(0, n), ylim=(0, n), xticks=[], yticks=[])
     low, high = _limits(columns)
     flat = columns.draws.reshape(-1, n)
@@ -57,10 +59,9 @@ def corner(result: Result) -> Figure:
     _frames(ax, n)
     _marks(ax, (columns.map - low) / (high - low), BLACK, "+", "-")
     _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
-    _axes(ax, columns, low, high)
-    figure.legend(
-        handles=_key(), fontsize=TEXT, frameon=False, loc="upper right", bbox_to_anchor=(1 - 0.1 / size, 1 - 0.1 / size)
-    )
+    _axes(ax, columns, low, high, panel)
+    corner_place = (1 - 0.1 / width, 1 - 0.1 / height)
+    figure.legend(handles=_key(), fontsize=TEXT, frameon=False, loc="upper right", bbox_to_anchor=corner_place)
     return figure
 
 
@@ -131,34 +132,30 @@ def _marks(ax: Axes, place: np.ndarray, color: str, marker: str, line: str) -> N
     ax.vlines(x, n - 1.0 - shown, n - 1.0 - shown + _SIDE, color=color, ls=line, lw=1.3, zorder=4)
 
 
-def _axes(ax: Axes, columns: Columns, low: np.ndarray, high: np.ndarray) -> None:
-    """Ticks and labels along the bottom, and on the left from the second row on (a histogram has no y-axis)."""
+def _axes(ax: Axes, columns: Columns, low: np.ndarray, high: np.ndarray, panel: float) -> None:
+    """Ticks and labels along the bottom, and on the left from the second row on (a histogram has no y-axis).
+
+    ``panel`` is the width of a cell in inches: text keeps its distance in inches whatever the size of the cells.
+    """
     n = len(columns.names)
+    length, gap, away = 0.035 / panel, 0.06 / panel, 0.6 / panel
     ticks: list[tuple[tuple[float, float], tuple[float, float]]] = []
     small: dict[str, Any] = {"fontsize": SMALL - 0.5}
-    label: dict[str, Any] = {"fontsize": TEXT, "parse_math": False}
+    label: dict[str, Any] = {"fontsize": TEXT * min(1.0, panel), "parse_math": False}
     for i in range(n):
         for value, text in _ticks(low[i], high[i]):
             place = _SIDE * (value - low[i]) / (high[i] - low[i])
-            ticks.append(((i + place, 0.0), (i + place, -0.03)))
-            ax.text(i + place + 0.04, -0.05, text, rotation=40, ha="right", va="top", rotation_mode="anchor", **small)
+            ticks.append(((i + place, 0.0), (i + place, -length)))
+            ax.text(i + place + gap, -gap, text, rotation=40, ha="right", va="top", rotation_mode="anchor", **small)
             if i > 0:
                 y = n - 1 - i + place
-                ticks.append(((0.0, y), (-0.03, y)))
-                ax.text(-0.05, y, text, ha="right", va="center", **small)
+                ticks.append(((0.0, y), (-length, y)))
+                ax.text(-gap, y, text, ha="right", va="center", **small)
         name = f"{columns.symbols[i]}\n[{columns.units[i]}]"
-        ax.text(i + _SIDE / 2, -0.5, name, ha="center", va="top", **label)
+        ax.text(i + _SIDE / 2, -away, name, ha="center", va="top", **label)
         if i > 0:
-            ax.text(
-                -0.5,
-                n - 1 - i + _SIDE / 2,
-                name,
-                ha="right",
-                va="center",
-                rotation=90,
-                multialignment="center",
-                **label,
-            )
+            y = n - 1 - i + _SIDE / 2
+            ax.text(-away, y, name, ha="right", va="center", rotation=90, multialignment="center", **label)
     ax.add_collection(LineCollection(ticks, colors=GREY, lw=0.8, clip_on=False))
 
 

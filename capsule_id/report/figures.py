@@ -135,10 +135,10 @@ def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
     The standard deviation is that of the Laplace approximation in the unconstrained space; a parameter for which it is
     not a positive number is shown in the bare unconstrained unit. Starts that stalled end in a cross.
     """
-    d, height = len(fit.names), 1.3 + 0.25 * len(fit.names)
+    d, height = len(fit.names), 1.5 + 0.25 * len(fit.names)
     if ax is None:
         ax = own_axes(None, 7.2, height)
-        figure_of(ax).subplots_adjust(left=0.36, right=0.97, bottom=0.7 / height, top=1 - 0.35 / height)
+        figure_of(ax).subplots_adjust(left=0.36, right=0.97, bottom=0.7 / height, top=1 - 0.6 / height)
     variance = np.diag(fit.covariance)
     sd = np.sqrt(np.where(np.isfinite(variance) & (variance > 0), variance, 1.0))
     rows = np.arange(d)[::-1]
@@ -156,7 +156,7 @@ def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
     ax.set_yticks(rows, [plain_symbol(name) for name in fit.names], parse_math=False)
     ax.set_ylim(-0.8, d - 0.2)
     set_text(ax, "distance from the best maximum [Laplace sd]", "", "Starts of the point fit")
-    set_legend(ax, place="lower right")
+    set_legend(ax, place="above")
     return ax
 
 

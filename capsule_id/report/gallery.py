@@ -15,6 +15,8 @@ from capsule_id.report.traces import traces
 from capsule_id.views import Comparison
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
+# Wider than this (CSS pixels) does not go in pairs.
+_HALF_PAGE = 650
 _KINDS = {
     "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours.",
     "motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K.",
@@ -43,6 +45,11 @@ class Picture:
     width: int
     height: int
     png: bytes
+
+    @property
+    def wide(self) -> bool:
+        """Takes the whole width of the page."""
+        return self.width > _HALF_PAGE
 
 
 def pictures(result: Result) -> tuple[Picture, ...]:

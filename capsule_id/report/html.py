@@ -33,7 +33,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
     environment.filters |= {"symbol": _symbol, "number": _number, "embed": _embed}
     return environment.get_template("report.html.j2").render(
         result=result,
-        sections={name: [p for p in pictures if p.section == name] for name in ("measured", "sample", "point_fit")},
+        sections={name: _section(pictures, name) for name in ("measured", "sample", "point_fit")},
         parameters=table_rows(result.summary),
         nuisances=table_rows(result.nuisances),
         checks=_checks(result.findings),
@@ -46,6 +46,11 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         tables={key: value for key, value in result.provenance.items() if isinstance(value, Mapping)},
         missing=MISSING,
     )
+
+
+def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
+    """Narrow pictures first: they stand in pairs, and a wide one between them would leave a hole."""
+    return sorted((picture for picture in pictures if picture.section == name), key=lambda picture: picture.wide)
 
 
 def _checks(findings: Sequence[Finding]) -> list[tuple[str, Level, int]]:

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from capsule_id.inference.result import Posterior, Result
+from capsule_id.parameters import TABLE
 
 # The extra dimension of bracketed names; every other family gets "<base>_of".
 _DIMENSIONS = {"k2": "spring"}
@@ -27,9 +28,10 @@ def write_posterior(result: Result, path: Path) -> None:
     """
     if result.posterior is None:
         raise ValueError("nothing was sampled (point fit only): there is no posterior to write")
-    units = {
-        str(name): str(unit) for frame in (result.summary, result.nuisances) for name, unit in frame["unit"].items()
-    }
+    # Exact masses and g need no row in the tables of the result.
+    units = {symbol: row.unit for symbol, row in TABLE.items()} | {"g": "m/s^2"}
+    for frame in (result.summary, result.nuisances):
+        units |= {str(name): str(unit) for name, unit in frame["unit"].items()}
     groups = {
         "posterior": _posterior(result.posterior, cast("Mapping[str, float]", result.groups.get("fixed", {})), units),
         "sample_stats": _sample_stats(result.posterior),

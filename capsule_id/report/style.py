@@ -5,7 +5,7 @@ Nothing here touches pyplot: figures are plain ``matplotlib.figure.Figure`` obje
 
 import io
 import warnings
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,7 +35,8 @@ def own_axes(ax: Axes | None, width: float = 6.4, height: float = 4.4) -> Axes:
         return ax
     figure = new_figure(width, height)
     axes = figure.subplots()
-    figure.subplots_adjust(left=0.14, right=0.97, bottom=0.14, top=0.91)
+    # Room for labels and title in inches: it does not shrink with the panel.
+    figure.subplots_adjust(left=0.9 / width, right=1 - 0.2 / width, bottom=0.62 / height, top=1 - 0.39 / height)
     return axes
 
 
@@ -56,12 +57,15 @@ def set_text(ax: Axes, x_label: str, y_label: str, title: str = "") -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def set_legend(ax: Axes, place: Literal["best", "upper right", "lower right"] = "best") -> None:
-    """A legend of the labelled artists, as plain text."""
+def set_legend(ax: Axes, place: Literal["best", "upper right", "above"] = "best") -> None:
+    """A legend of the labelled artists, as plain text; ``above``: in one row over the axes, at the right."""
     handles, labels = ax.get_legend_handles_labels()
     if not handles:
         return
-    legend = ax.legend(handles, labels, fontsize=SMALL, frameon=False, loc=place, handlelength=1.8)
+    where: dict[str, Any] = {"loc": place}
+    if place == "above":
+        where = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": len(handles), "borderaxespad": 0.1}
+    legend = ax.legend(handles, labels, fontsize=SMALL, frameon=False, handlelength=1.8, **where)
     for text in legend.get_texts():
         text.set_parse_math(False)
 

@@ -136,7 +136,7 @@ def _groups(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> di
     chains, draws = np.arange(0, 8, 2), np.arange(0, 20, 4)
     observed = {item.label: item.points[0].y for item in comparisons}
     return {
-        "fixed": {"m3": 0.64},
+        "fixed": {"g": 9.81},
         "observed": observed,
         "log_likelihood": {label: rng.normal(size=(len(chains), len(draws), y.size)) for label, y in observed.items()},
         "log_likelihood_chain": chains,
