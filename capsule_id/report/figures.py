@@ -49,13 +49,13 @@ def comparison(item: Comparison, ax: Axes | None = None) -> Axes:
     """Measured points with the predicted curves and their 95 % bands."""
     ax = own_axes(ax)
     banded = [curve for curve in item.curves if curve.lower is not None and curve.upper is not None]
+    long = any(points.x.size > _MANY for points in item.points)
     for curve in item.curves:
-        _draw_curve(ax, curve, band_label="95 % band" if banded and curve is banded[0] else None)
+        _draw_curve(ax, curve, "95 % band" if banded and curve is banded[0] else None, over_cloud=long)
     for points in item.points:
         _draw_points(ax, points)
     set_text(ax, item.x_label, item.y_label, item.title)
     # Finding the best place means testing every point: for a record that takes longer than drawing it.
-    long = any(points.x.size > _MANY for points in item.points)
     set_legend(ax, place="upper right" if long else "best")
     return ax
 
@@ -102,7 +102,8 @@ def autocorrelation(item: Comparison, ax: Axes | None = None) -> Axes:
     limit = 1.25 * max(largest, 2.0 * (bound or 0.0), 0.05)
     ax.set_ylim(-limit, limit)
     set_text(ax, "lag [samples]", "autocorrelation [1]")
-    set_legend(ax, place="upper right")
+    rises = float(np.nansum(item.autocorrelation)) > 0.0
+    set_legend(ax, place="lower right" if rises else "upper right")
     return ax
 
 
@@ -160,8 +161,10 @@ def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _draw_curve(ax: Axes, curve: Curve, band_label: str | None) -> None:
-    style = _CURVE_STYLES[curve.role]
+def _draw_curve(ax: Axes, curve: Curve, band_label: str | None, over_cloud: bool) -> None:
+    style = dict(_CURVE_STYLES[curve.role])
+    if over_cloud:  # a line as wide as the dots would hide a record that leaves it by less than that
+        style["lw"] *= 0.5
     ax.plot(curve.x, curve.y, label=curve.label, zorder=3, **style)
     if curve.lower is not None and curve.upper is not None:
         ax.fill_between(
@@ -172,7 +175,7 @@ def _draw_curve(ax: Axes, curve: Curve, band_label: str | None) -> None:
 def _draw_points(ax: Axes, points: Points) -> None:
     style = _POINT_STYLES[points.role]
     if points.x.size > _MANY:
-        ax.plot(points.x, points.y, ls="", marker=".", ms=2.5, color=GREY, label=points.label, zorder=2)
+        ax.plot(points.x, points.y, ls="", marker=".", ms=3.5, color=GREY, label=points.label, zorder=2)
     else:
         ax.errorbar(
             points.x,

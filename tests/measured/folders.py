@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from capsule_id.inference.result import Result
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
+from capsule_id.views import NoteTable
 
 
 @dataclass(frozen=True)
@@ -38,3 +40,9 @@ def make_rig(folder: Path, *entries: Entry, head: Mapping[str, str] | None = Non
         (folder / f"{entry.label}.csv").write_text(text, encoding="utf-8")
     (folder / "rig.toml").write_text("\n".join(lines), encoding="utf-8")
     return read_rig(folder)
+
+
+def note(result: Result, title: str) -> NoteTable:
+    """The result's only note table with this title."""
+    (found,) = [table for table in result.notes if table.title == title]
+    return found

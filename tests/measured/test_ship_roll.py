@@ -1,0 +1,94 @@
+"""Roll decay of a ship model (KVLCC2, scale 1:68, 0 kn, run 21337): stiffness known independently, damping not viscous.
+
+Relabelled: roll angle, rad, as x_rel, m; moment of inertia with added mass, 135.0 kg m², as m1, kg. So k1 is in N m/rad,
+c in N m s/rad and c_q in N m s²/rad². The inertia is the authors' own value, so k1 tests the frequency and the
+bookkeeping; it is no independent measurement of the stiffness.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import find_peaks
+
+from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.result import Result
+from tests.measured.folders import Entry, make_rig, note, quantity
+from tests.measured.sources import ship_roll, ship_roll_stiffness
+
+INERTIA = 135.0
+#: From just after the release; the record goes on to 91.6 s, where the last third says the same once more.
+START, STOP = 25.0, 70.0
+
+
+@pytest.fixture(scope="module")
+def roll(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    time, angle = ship_roll()
+    entry = Entry(
+        "free_vibration",
+        "roll_21337",
+        {"time [s]": time, "x_rel [m]": angle},
+        {"start": quantity(START, "s"), "stop": quantity(STOP, "s")},
+    )
+    folder: Path = tmp_path_factory.mktemp("roll")
+    return fit_rig(make_rig(folder, entry, head={"m1": quantity(INERTIA, "kg")}), budget=None)
+
+
+def _peaks() -> tuple[np.ndarray, np.ndarray]:
+    """Times and heights of the positive and negative extremes inside the window, by SciPy, raw."""
+    time, angle = ship_roll()
+    inside = (time >= START) & (time <= STOP)
+    time, angle = time[inside], angle[inside]
+    index = np.sort(np.concatenate([find_peaks(side * angle, distance=150, height=0.02)[0] for side in (1.0, -1.0)]))
+    return time[index], np.abs(angle[index])
+
+
+def test_the_hydrostatic_stiffness_comes_out(roll: Result) -> None:
+    assert ship_roll_stiffness() == pytest.approx(821.96, abs=0.005)  # as the authors print it
+    k1 = roll.summary.loc["k1"]
+    assert k1["map"] == pytest.approx(ship_roll_stiffness(), rel=0.01)
+    assert k1["paper"] == pytest.approx(ship_roll_stiffness(), rel=0.01)
+    assert all(finding.level == "ok" for finding in roll.findings if finding.check == "starts agree")
+
+
+def test_the_viscous_model_is_reported_as_inadequate(roll: Result) -> None:
+    assert not roll.clean
+    (finding,) = [f for f in roll.findings if f.check == "residuals white"]
+    assert (finding.level, finding.experiment) == ("fail", "roll_21337")
+    assert "the damping grows with amplitude" in finding.text
+    # The authors' cubic stiffness term is positive as well.
+    assert "the stiffness grows with amplitude" in finding.text
+
+
+def test_the_decrements_told_are_those_of_the_peaks(roll: Result) -> None:
+    (finding,) = [f for f in roll.findings if f.check == "residuals white"]
+    told = re.search(r"logarithmic decrement goes from ([\d.]+) to ([\d.]+)", finding.text)
+    assert told is not None
+    _, heights = _peaks()
+    size = np.log(heights[:-1] + heights[1:])  # of neighbours: the heel drops out
+    early = -2.0 * np.polyfit(np.arange(8), size[:8], 1)[0]
+    late = -2.0 * np.polyfit(np.arange(8), size[-8:], 1)[0]
+    assert float(told[1]) == pytest.approx(early, rel=0.15)
+    assert float(told[2]) == pytest.approx(late, rel=0.15)
+
+
+def test_quadratic_damping_is_preferred_and_explains_the_decrements(roll: Result) -> None:
+    models = note(roll, "Damping models compared")
+    frame = models.frame
+    assert frame["BIC"].idxmin() == "quadratic"
+    assert (frame["BIC"].drop("quadratic") > 100.0).all()
+    assert "the damping grows with amplitude" in models.caption
+    # Not all is well then either: the stiffness is not linear, and the report says so.
+    assert "None of the three leaves white residuals" in models.caption
+    c, k1 = frame.loc["quadratic", ["c, N s/m", "k1, N/m"]]
+    told = re.match(r"c_q = ([\d.]+) ", str(frame.loc["quadratic", "further"]))
+    assert told is not None
+    c_q, omega = float(told[1]), np.sqrt(k1 / INERTIA)
+    # Energy lost in a cycle of amplitude A: decrement = pi / (m1 omega) (c + 8/(3 pi) c_q omega A).
+    _, heights = _peaks()
+    for part in (slice(0, 9), slice(-9, None)):
+        size = 0.5 * (heights[part][:-1] + heights[part][1:])
+        seen = -2.0 * np.polyfit(np.arange(8), np.log(size), 1)[0]
+        expected = np.pi / (INERTIA * omega) * (c + 8.0 / (3.0 * np.pi) * c_q * omega * np.exp(np.mean(np.log(size))))
+        assert seen == pytest.approx(expected, rel=0.1)
