@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bench import M1, C, K1, released
+from bench import K1, M1, C, released
 from scipy.integrate import solve_ivp
 
 from capsule_id.experiments.decay_models import dry_decay, quadratic_decay, rates, viscous_basis

@@ -16,7 +16,7 @@ from tests.measured.sources import load_cells
 
 #: From and to, s after the first sample, and load, lb.
 PLATEAUS = (
-    (0.0, 15.0, 0), (18.0, 31.0, 10), (35.5, 48.0, 20), (52.0, 61.5, 30), (68.0, 75.0, 40), (78.5, 88.0, 30),
+    (0.0, 15.0, 0), (18.0, 31.0, 10), (35.5, 48.0, 20), (55.0, 63.0, 30), (68.0, 75.0, 40), (78.5, 88.0, 30),
     (92.0, 101.0, 20), (105.0, 111.0, 10), (115.0, 133.0, 0),
 )  # fmt: skip
 DROPPED_OUT = -1e6  # counts; a drop-out reads -8.39e6
