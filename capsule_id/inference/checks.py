@@ -16,6 +16,7 @@ from capsule_id.experiments.free_vibration import FreeVibration, autocorrelation
 from capsule_id.experiments.line import Line
 from capsule_id.experiments.support_spring import cantilever_exponent
 from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.point_fit import AGREEMENT
 from capsule_id.inference.regression_checks import MOST_FLAGGED, curvature_test, outliers, refit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
@@ -27,6 +28,8 @@ from capsule_id.views import Finding
 LEVEL = 0.002
 #: A parameter is informed where its posterior sd (in u) is at most this part of its prior's.
 INFORMED_RATIO = 0.9
+#: A maximum lower than the best by this much in log-posterior holds no mass worth the name.
+NEGLIGIBLE_MODE = 20.0
 #: Lags of the whiteness test.
 LAGS = 20
 #: A physical parameter that ends this many prior sds from the prior's centre is pulled by it.
@@ -75,14 +78,22 @@ def _starts(s: Setting) -> list[Finding]:
     if fit.agree and not fit.stalled.any():
         return [Finding("starts agree", "ok", f"all {number} starts of the point fit ended at the same maximum")]
     spread = np.sqrt(np.diag(fit.covariance))
-    distance = np.max(np.abs(fit.ends - fit.u) / spread, axis=1)
-    names = [fit.names[int(np.argmax(np.abs(end - fit.u) / spread))] for end in fit.ends]
-    worst = int(np.argmax(np.where(np.isfinite(distance), distance, np.inf)))
-    text = (
-        f"expected {number} starts to end at the same maximum; {int(fit.stalled.sum())} stalled and the furthest end "
-        f"lies {distance[worst]:.2g} posterior sd away in {names[worst]}: look at the records for a second explanation, "
-        "or narrow the prior of that parameter in rig.toml"
+    distance = np.abs(fit.ends - fit.u) / spread
+    away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
+    elsewhere = away > AGREEMENT
+    # How much less probable the other ends are: a mode that far down holds no posterior mass.
+    below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
+    inferior = elsewhere & (below > NEGLIGIBLE_MODE)
+    worst = int(np.argmax(away))
+    name = fit.names[int(np.argmax(distance[worst]))]
+    seen = (
+        f"expected {number} starts to end at the same maximum; {int(fit.stalled.sum())} stalled, {int(elsewhere.sum())} "
+        f"ended elsewhere, the furthest {away[worst]:.2g} posterior sd away in {name}"
     )
+    if np.all(inferior | ~elsewhere) and np.sum(~elsewhere) >= 2 and not fit.stalled[~elsewhere].any():
+        text = f"{seen}; those ends are lower by {np.min(below[inferior]):.0f} in log-posterior, so they hold no mass"
+        return [Finding("starts agree", "warn", text)]
+    text = f"{seen}: look at the records for a second explanation, or narrow the prior of that parameter in rig.toml"
     return [Finding("starts agree", "fail", text)]
 
 
