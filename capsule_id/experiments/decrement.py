@@ -9,6 +9,8 @@ import numpy as np
 PEAK_NOISE_RATIO = 4.0
 #: ... and by this part of the record's range, so that a noiseless tail does not count.
 PEAK_RANGE_RATIO = 0.005
+#: The end of a record still swings where its range is this part of the whole record's.
+SWINGING_RATIO = 0.05
 
 
 @dataclass(frozen=True)
@@ -38,13 +40,21 @@ def noise_level(values: np.ndarray) -> float:
 
 
 def equilibrium(values: np.ndarray) -> float:
-    """Rest position: the mean of the last fifth of the record, a whole number of its swings where it still swings."""
-    tail = values[-max(len(values) // 5, 4) :]
-    crossings = np.flatnonzero(np.diff(np.signbit(tail - np.mean(tail))))
-    if len(crossings) >= 3:
-        last = len(crossings) - 1 - (len(crossings) - 1) % 2
-        tail = tail[crossings[0] + 1 : crossings[last] + 1]
-    return float(np.mean(tail))
+    """Rest position: the mean of the last fifth of the record, a whole number of its swings where it still swings.
+
+    A record of few cycles that is cut before it comes to rest holds no whole swing in its last fifth: as much more of
+    it is taken as one whole swing needs.
+    """
+    length = max(len(values) // 5, 4)
+    while True:
+        tail = values[-length:]
+        crossings = np.flatnonzero(np.diff(np.signbit(tail - np.mean(tail))))
+        if len(crossings) >= 3:
+            last = len(crossings) - 1 - (len(crossings) - 1) % 2
+            return float(np.mean(tail[crossings[0] + 1 : crossings[last] + 1]))
+        if length >= len(values) or np.ptp(tail) < SWINGING_RATIO * np.ptp(values):
+            return float(np.mean(tail))
+        length += max(length // 4, 1)
 
 
 def half_cycle_extremes(

@@ -12,6 +12,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Misfit, Start, Theta, axis_label, band
 from capsule_id.experiments.decay_models import STEP_PHASE, dry_decay, quadratic_decay, rates, viscous_basis
 from capsule_id.experiments.decay_moments import decay_moments, fold, uniform_step
+from capsule_id.experiments.decay_trend import describe_trend
 from capsule_id.experiments.decrement import Decrement, equilibrium, logarithmic_decrement, noise_level
 from capsule_id.experiments.linear import NUISANCE_WIDTH, marginal_log_density
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -198,6 +199,16 @@ class FreeVibration(Experiment):
         return starts
 
     # -- what the report and the checks see -------------------------------------------------------------------------
+
+    @property
+    def largest_deflection(self) -> float:
+        """Largest distance of a sample from the rest position, m."""
+        return float(np.max(np.abs(self.values - equilibrium(self.values))))
+
+    def damping_trend(self) -> str:
+        """What the peaks say of damping and frequency against amplitude; "" where nothing drifts."""
+        decrement = self.paper_decrement()
+        return "" if decrement is None else describe_trend(decrement, noise_level(self.values))
 
     def largest_force(self, theta: Theta) -> float:
         """max |f|, f = k1 x_rel + c d(x_rel)/dt, over the record, N."""

@@ -16,7 +16,8 @@ from capsule_id.experiments.free_vibration import FreeVibration, autocorrelation
 from capsule_id.experiments.line import Line
 from capsule_id.experiments.support_spring import cantilever_exponent
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.regression_checks import curvature_test, outliers, refit
+from capsule_id.inference.point_fit import AGREEMENT
+from capsule_id.inference.regression_checks import MOST_FLAGGED, curvature_test, outliers, refit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.tension import tension
@@ -27,6 +28,8 @@ from capsule_id.views import Finding
 LEVEL = 0.002
 #: A parameter is informed where its posterior sd (in u) is at most this part of its prior's.
 INFORMED_RATIO = 0.9
+#: A maximum lower than the best by this much in log-posterior holds no mass worth the name.
+NEGLIGIBLE_MODE = 20.0
 #: Lags of the whiteness test.
 LAGS = 20
 #: A physical parameter that ends this many prior sds from the prior's centre is pulled by it.
@@ -75,14 +78,22 @@ def _starts(s: Setting) -> list[Finding]:
     if fit.agree and not fit.stalled.any():
         return [Finding("starts agree", "ok", f"all {number} starts of the point fit ended at the same maximum")]
     spread = np.sqrt(np.diag(fit.covariance))
-    distance = np.max(np.abs(fit.ends - fit.u) / spread, axis=1)
-    names = [fit.names[int(np.argmax(np.abs(end - fit.u) / spread))] for end in fit.ends]
-    worst = int(np.argmax(np.where(np.isfinite(distance), distance, np.inf)))
-    text = (
-        f"expected {number} starts to end at the same maximum; {int(fit.stalled.sum())} stalled and the furthest end "
-        f"lies {distance[worst]:.2g} posterior sd away in {names[worst]}: look at the records for a second explanation, "
-        "or narrow the prior of that parameter in rig.toml"
+    distance = np.abs(fit.ends - fit.u) / spread
+    away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
+    elsewhere = away > AGREEMENT
+    # How much less probable the other ends are: a mode that far down holds no posterior mass.
+    below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
+    inferior = elsewhere & (below > NEGLIGIBLE_MODE)
+    worst = int(np.argmax(away))
+    name = fit.names[int(np.argmax(distance[worst]))]
+    seen = (
+        f"expected {number} starts to end at the same maximum; {int(fit.stalled.sum())} stalled, {int(elsewhere.sum())} "
+        f"ended elsewhere, the furthest {away[worst]:.2g} posterior sd away in {name}"
     )
+    if np.all(inferior | ~elsewhere) and np.sum(~elsewhere) >= 2 and not fit.stalled[~elsewhere].any():
+        text = f"{seen}; those ends are lower by {np.min(below[inferior]):.0f} in log-posterior, so they hold no mass"
+        return [Finding("starts agree", "warn", text)]
+    text = f"{seen}: look at the records for a second explanation, or narrow the prior of that parameter in rig.toml"
     return [Finding("starts agree", "fail", text)]
 
 
@@ -108,13 +119,14 @@ def _whiteness(s: Setting) -> list[Finding]:
     records = [e for e in s.experiments if e.time_series]
     findings = []
     for e in records:
-        residuals = np.asarray(e.residuals(e.local(s.values), np))[: e.n]
-        q, p = ljung_box(residuals, min(LAGS, e.n // 5))
+        q, p, lags = whiteness(e, s.values)
         if p * len(records) < LEVEL:
+            drift = e.damping_trend() if isinstance(e, FreeVibration) else ""
             text = (
-                f"{e.label}: expected white residuals; Ljung–Box Q = {q:.0f} over {min(LAGS, e.n // 5)} lags "
+                f"{e.label}: expected white residuals; Ljung–Box Q = {q:.0f} over {lags} lags "
                 f"(p = {p:.1g}), so the model misses something or the noise is coloured, and the intervals are too "
-                "narrow: compare the damping models below, cut the record to free decay with start/stop"
+                f"narrow{'; ' + drift if drift else ''}: compare the damping models below, cut the record to free decay "
+                "with start/stop"
             )
             findings.append(Finding("residuals white", "fail", text, e.label))
     if not records:
@@ -122,6 +134,13 @@ def _whiteness(s: Setting) -> list[Finding]:
     return _or_ok(
         findings, "residuals white", f"residuals of {len(records)} records are white (Ljung–Box, {LAGS} lags)"
     )
+
+
+def whiteness(experiment: Experiment, values: Mapping[str, float]) -> tuple[float, float, int]:
+    """Ljung–Box Q of the experiment's residuals at ``values`` by name, its p-value, and the number of lags."""
+    residuals = np.asarray(experiment.residuals(experiment.local(values), np))[: experiment.n]
+    lags = min(LAGS, experiment.n // 5)
+    return *ljung_box(residuals, lags), lags
 
 
 def ljung_box(residuals: np.ndarray, lags: int) -> tuple[float, float]:
@@ -142,16 +161,24 @@ def _outliers(s: Setting, flagged: dict[str, list[int]]) -> list[Finding]:
             continue
         rows = [o.row for o in found]
         flagged[e.label] = rows
-        lines = ", ".join(str(int(e.table.rows[o.row])) for o in found)
+        several, most = len(found) > 1, len(found) == MOST_FLAGGED
+        numbers = [str(line) for line in sorted(int(e.table.rows[o.row]) for o in found)]
+        lines = (
+            f"lines {', '.join(numbers[:-1])} and {numbers[-1]} stand up to" if several else f"line {numbers[0]} stands"
+        )
+        more = (
+            f" (no more than {MOST_FLAGGED} rows are named: if more stand off, look at the whole table)" if most else ""
+        )
         physical = [row for row in e.parameters if row.physical]
         without = refit(e, theta, rows)
         change = "; ".join(
-            f"{row.name} = {s.values[row.name]:.5g} {row.unit} with it, {without[row.symbol][0]:.5g} without"
+            f"{row.name} = {s.values[row.name]:.5g} {row.unit} with {'them' if several else 'it'}, "
+            f"{without[row.symbol][0]:.5g} without"
             for row in physical
         )
         text = (
-            f"{e.label}: {e.table.file} line {lines} stands {abs(found[0].score):.1f} studentised residuals off the others "
-            f"(p = {found[0].p:.1g}); {change}. Nothing was dropped: check the reading, correct or remove the line yourself"
+            f"{e.label}: {e.table.file} {lines} {abs(found[0].score):.3g} studentised residuals off the others "
+            f"(p = {found[0].p:.1g}){more}; {change}. Nothing was dropped: check the reading, correct or remove it yourself"
         )
         findings.append(Finding("outliers", "fail", text, e.label))
     return _or_ok(findings, "outliers", "no reading stands apart from the others of its table") if tables else []
@@ -161,7 +188,8 @@ def _linearity(s: Setting, flagged: Mapping[str, list[int]]) -> list[Finding]:
     lines = [e for e in s.experiments if isinstance(e, Line)]
     findings = []
     for e in lines:
-        slope = e.ordinary_line()[0]
+        # A single wild reading can tilt the whole line: that is the outlier's finding, not this one's.
+        slope = refit(e, e.local(s.values), flagged.get(e.label, []))[e.slope.symbol][0]
         if slope <= 0.0:
             text = (
                 f"{e.label}: {e.slope.name} is positive, the line falls ({slope:.3g} {e.slope.unit}): check the signs of "
@@ -222,7 +250,7 @@ def stiffness_by_record(
     """k1, its standard error and the largest deflection of every record, (records,) SI."""
     estimates = [refit(e, e.local(values), [])["k1"] for e in records]
     k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
-    return k1, sd, np.array([np.max(np.abs(e.values - np.mean(e.values[-len(e.values) // 5 :]))) for e in records])
+    return k1, sd, np.array([e.largest_deflection for e in records])
 
 
 def _friction(s: Setting) -> list[Finding]:

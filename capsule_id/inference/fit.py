@@ -19,7 +19,7 @@ from capsule_id.inference.result import PointFit, Posterior, Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, Progress, sample
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig
-from capsule_id.views import Comparison
+from capsule_id.views import Comparison, NoteTable
 
 #: Posterior draws behind bands and predictive p-values, and behind the pointwise log-likelihood.
 BAND_DRAWS = 200
@@ -73,7 +73,7 @@ def fit_rig(
         posterior=posterior,
         findings=tuple(findings),
         comparisons=_comparisons(experiments, values, draws, flagged, rng),
-        notes=tuple(make_notes(setting, findings, flagged, seeds[0])),
+        notes=(*make_notes(setting, findings, flagged, seeds[0]), *_predictive(experiments, draws, rng)),
         provenance={
             "seed": seed,
             "experiments": which,
@@ -117,6 +117,21 @@ def _comparisons(
         p = None if own is None else own.predictive_p([own.local(d) for d in draws], rng)
         panels.append(replace(panel, points=tuple(points), predictive_p=p))
     return tuple(panels)
+
+
+def _predictive(
+    experiments: Sequence[Experiment], draws: list[dict[str, float]], rng: np.random.Generator
+) -> list[NoteTable]:
+    """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
+    if not draws:
+        return []
+    rows = {e.label: (e.kind, e.n, e.predictive_p([e.local(d) for d in draws], rng)) for e in experiments}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"]).rename_axis("experiment")
+    caption = (
+        "Chance that a replicate would miss the model by more than the readings do (chi-square discrepancy). Near 0: the "
+        "readings scatter more than the fit allows; where the scatter itself is estimated, it is near 0.5 by construction."
+    )
+    return [NoteTable("Posterior predictive checks", caption, frame)]
 
 
 def _tables(

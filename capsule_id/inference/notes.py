@@ -7,15 +7,22 @@ import pandas as pd
 
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.line import Line
+from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.experiments.support_spring import SupportSpring
-from capsule_id.inference.checks import Setting, stiffness_by_record
+from capsule_id.inference.checks import LEVEL, Setting, stiffness_by_record, whiteness
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.regression_checks import refit
+from capsule_id.inference.result import PointFit
 from capsule_id.views import Finding, NoteTable
 
 #: The damping models that are compared when the residuals of a decay are not white.
 DAMPING_MODELS = ("viscous", "dry", "quadratic")
+_VERDICTS = {
+    "viscous": "Neither dry nor quadratic damping describes the decays better than viscous damping alone.",
+    "dry": "Dry friction beside the viscous damping fits best: it takes off the same amount every cycle.",
+    "quadratic": "Quadratic beside viscous damping fits best: the damping grows with amplitude.",
+}
 
 
 def make_notes(
@@ -67,8 +74,8 @@ def damping_models(setting: Setting, records: Sequence[FreeVibration], seed: int
     for damping in DAMPING_MODELS:
         target = LogPosterior(setting.rig, [record.with_damping(damping) for record in records])
         fit = point_fit(target, seed)
-        likelihood = float(target.log_likelihood(fit.u))
-        count = sum(record.n for record in records)
+        values = target.mapping(target.theta(fit.u))
+        white = all(whiteness(e, values)[1] * len(records) >= LEVEL for e in target.experiments)
         extra = [name for name in ("F_dry", "c_q") if name in fit.values]
         rows.append(
             {
@@ -79,17 +86,39 @@ def damping_models(setting: Setting, records: Sequence[FreeVibration], seed: int
                     f"{name} = {fit.values[name]:.4g} ± {fit.standard_errors[name]:.2g}" for name in extra
                 ),
                 "noise, m": float(np.mean([fit.values[f"noise_sd[{record.label}]"] for record in records])),
-                "BIC": target.dimension * np.log(count) - 2.0 * likelihood,
+                "BIC": bic(target, fit),
+                "residuals white": "yes" if white else "no",
                 "starts agree": "yes" if fit.agree else "no",
             }
         )
     frame = pd.DataFrame(rows).set_index("damping")
     frame["BIC"] -= frame["BIC"].min()
+    best = str(frame["BIC"].idxmin())
+    verdict = _VERDICTS[best]
+    if not (frame["residuals white"] == "yes").any():
+        verdict += " None of the three leaves white residuals, so something else is at work beside the damping."
     caption = (
-        "The viscous model leaves structure in the residuals. Dry friction takes off the same amount every cycle, quadratic "
-        'damping grows with amplitude; BIC is relative to the best. Ask for one with damping = "dry" or "quadratic".'
+        "The damping model asked for leaves structure in the residuals; here are all three, fitted to the decays alone. BIC "
+        f'is relative to the best. {verdict} Ask for a model with damping = "viscous", "dry" or "quadratic".'
     )
     return NoteTable("Damping models compared", caption, frame)
+
+
+def bic(target: LogPosterior, fit: PointFit) -> float:
+    """Schwarz's criterion p log n - 2 log L at the point fit, linear nuisances at their best and counted in p.
+
+    Likelihoods that have integrated out different numbers of nuisances must not be compared by it: each integral
+    brings its own Occam factor.
+    """
+    values = target.mapping(target.theta(fit.u))
+    unknowns, readings, deviance = target.dimension, 0, 0.0
+    for e in target.experiments:
+        theta = e.local(values)
+        misfit, rest = e.misfit(theta, np), np.asarray(e.residuals(theta, np))[: e.n]
+        deviance += float(rest @ rest + e.n * LOG_2PI + 2.0 * np.sum(np.log(np.asarray(misfit.sd))))
+        unknowns += misfit.design.shape[1]
+        readings += e.n
+    return unknowns * float(np.log(readings)) + deviance
 
 
 def _lines(lines: Sequence[Line], values: Mapping[str, float], flagged: Mapping[str, list[int]]) -> NoteTable:

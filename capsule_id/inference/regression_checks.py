@@ -107,24 +107,31 @@ def curvature_test(line: Line, theta: Theta, left_out: list[int]) -> tuple[float
 def refit(experiment: Experiment, theta: Theta, left_out: list[int]) -> dict[str, tuple[float, float]]:
     """Estimate and standard error of the experiment's physical parameters without some readings, SI.
 
-    Scatters stay at the point fit when nothing is left out, and are rescaled by the remaining misfit otherwise.
+    Scatters stay at the point fit when nothing is left out, and are rescaled by the remaining misfit otherwise. The
+    slope of a line may come out negative: then it says that the line falls.
     """
     symbols = [row.symbol for row in experiment.parameters if row.physical]
     keep = np.setdiff1d(np.arange(experiment.n), left_out)
+    falls = isinstance(experiment, Line)
+    at = np.array([float(theta[s]) for s in symbols])
 
-    def residuals(log_v: np.ndarray) -> np.ndarray:
-        moved = {**theta, **dict(zip(symbols, np.exp(log_v), strict=True))}
+    def values_of(w: np.ndarray) -> np.ndarray:
+        return at * w if falls else at * np.exp(w)
+
+    def residuals(w: np.ndarray) -> np.ndarray:
+        moved = {**theta, **dict(zip(symbols, values_of(w), strict=True))}
         misfit = experiment.misfit(moved, np)
         sd = np.asarray(misfit.sd)[keep]
         y = np.asarray(misfit.raw)[keep] / sd
         a = np.asarray(misfit.design)[keep] / sd[:, None]
         return y - a @ np.linalg.lstsq(a, y, rcond=None)[0] if a.shape[1] else y
 
-    start = np.log([float(theta[s]) for s in symbols])
+    start = np.ones(len(at)) if falls else np.zeros(len(at))
     solution = least_squares(residuals, start, method="lm", x_scale="jac")
     nuisances = experiment.misfit(theta, np).design.shape[1]
     freedom = len(keep) - len(symbols) - nuisances
     scale = 1.0 if experiment.scale_known else float(2.0 * solution.cost / max(freedom, 1))
     covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * scale
-    values = np.exp(solution.x)
-    return {s: (float(v), float(v * e)) for s, v, e in zip(symbols, values, np.sqrt(np.diag(covariance)), strict=True)}
+    values = values_of(solution.x)
+    errors = (at if falls else values) * np.sqrt(np.diag(covariance))
+    return {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)}

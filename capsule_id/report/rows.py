@@ -11,7 +11,7 @@ from capsule_id.report.typography import MISSING, decimals_for, fixed, prefix_fo
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter, every number a string; ``informed`` is None where nothing was sampled."""
+    """One parameter, every number a string; ``informed`` is "yes", "no", "weighed", or "" where nothing was sampled."""
 
     name: str
     unit: str
@@ -23,7 +23,7 @@ class Row:
     interval: str
     ess: str
     rhat: str
-    informed: bool | None
+    informed: str
 
 
 def plus_minus(value: float, sd: float, decimals: int | None) -> str:
@@ -68,5 +68,14 @@ def _row(name: str, row: Mapping[Hashable, Any]) -> Row:
         interval=MISSING if MISSING in (lower, upper) else f"{lower} to {upper}",
         ess=fixed(float(row["ess"]), 0),
         rhat=fixed(float(row["rhat"]), 3),
-        informed=None if pd.isna(row["informed"]) else bool(row["informed"]),
+        informed=_informed(name, row["informed"]),
     )
+
+
+def _informed(name: str, informed: object) -> str:
+    """A mass has its weighing for a prior: that the bench tests do not narrow it further is nothing to worry about."""
+    if pd.isna(informed):
+        return ""
+    if informed:
+        return "yes"
+    return "weighed" if name in ("m1", "m2") else "no"

@@ -44,7 +44,7 @@ def _cells(row: Row, sampled: bool) -> list[str]:
             row.interval,
             row.ess,
             row.rhat,
-            "" if row.informed is None else "yes" if row.informed else "NO",
+            row.informed.upper() if row.informed == "no" else row.informed,
         ]
     return cells
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -69,7 +70,14 @@ def test_every_number_of_the_table_is_there(result: Result, page: str) -> None:
     assert "0.302 ± 0.033" in text
     # The nuisance in micrometres, its unit beside it.
     assert re.search(r"µm 20\.20 ± 0\.45", text)
-    assert page.count('<td class="warn">no</td>') == 2
+    assert page.count("<td>weighed</td>") == 2
+
+
+def test_uninformed_parameter_stands_out(result: Result, drawn: tuple[Picture, ...]) -> None:
+    summary = result.summary.copy()
+    summary.loc["K", "informed"] = False
+    page = render(replace(result, summary=summary), drawn)
+    assert page.count('<td class="warn">no</td>') == 1
 
 
 def test_symbols_are_set_as_in_the_paper(page: str) -> None:

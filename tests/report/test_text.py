@@ -27,8 +27,11 @@ def test_row_holds_both_estimates_rounded_to_the_sd(result: Result) -> None:
 
 
 def test_uninformed_parameter_is_marked(result: Result) -> None:
-    text = table_text(result.summary, synthetic=False, clean=True)
-    assert [line.split()[0] for line in text.splitlines() if line.endswith("NO")] == ["m1", "m2"]
+    summary = result.summary.copy()
+    summary.loc["K", "informed"] = False
+    lines = table_text(summary, synthetic=False, clean=True).splitlines()
+    assert [line.split()[0] for line in lines if line.endswith("NO")] == ["K"]
+    assert [line.split()[0] for line in lines if line.endswith("weighed")] == ["m1", "m2"]
 
 
 @pytest.mark.parametrize("synthetic", [True, False])

@@ -1,0 +1,53 @@
+"""``capsule-id report DIR``: what a result says, read back from its parameters.json."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from capsule_id.errors import InputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """DIR."""
+    parser.add_argument("directory", metavar="DIR", type=Path, help="result directory of fit-params")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the parameter table and the findings; 0 where the verdict is clean, 3 where it is not.
+
+    Raises
+    ------
+    InputError
+        If DIR holds no result.
+    """
+    path = args.directory / "parameters.json"
+    try:
+        saved = json.loads(path.read_text(encoding="utf-8"))
+        findings, clean = saved["verdict"]["findings"], bool(saved["verdict"]["clean"])
+        rows = {name: _row(entry) for name, entry in saved["parameters"].items()}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        rule, remedy = "DIR must be a result of fit-params", "run fit-params first"
+        raise InputError(rule, type(error).__name__, remedy, path) from error
+    import pandas as pd
+
+    from capsule_id.report.text import table_text
+
+    frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
+    print(table_text(frame, synthetic=bool(saved["synthetic"]), clean=clean))
+    for finding in findings:
+        print(f"{finding['level']:4} {finding['check']}: {finding['text']}")
+    return 0 if clean else 3
+
+
+def _row(entry: dict[str, Any]) -> dict[str, Any]:
+    """One row of the parameter table; the standard error of the point fit is not in the file."""
+    lower, upper = entry["ci95"] or (None, None)
+    numbers = {key: entry[key] for key in ("paper", "map", "mean", "sd", "median", "ess", "rhat")}
+    values = {key: float("nan") if value is None else float(value) for key, value in numbers.items()}
+    bounds = {
+        "lower": float("nan") if lower is None else float(lower),
+        "upper": float("nan") if upper is None else float(upper),
+    }
+    words = {"unit": entry["unit"], "meaning": "", "standard_error": float("nan"), "informed": entry["informed"]}
+    return {**words, **values, **bounds}

@@ -1,0 +1,249 @@
+"""Every likelihood equals a sum of SciPy densities, with the integrated nuisances in the covariance."""
+
+from typing import Any
+
+import bench
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from capsule_id.experiments import KINDS
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.decay_models import dry_decay, quadratic_decay
+from capsule_id.experiments.free_vibration import FreeVibration
+from capsule_id.rig.model import Table
+
+MASSES = {"m1": bench.M1, "m2": bench.M2, "g": bench.G}
+RNG = np.random.default_rng(41)
+CURRENT = np.linspace(0.2, 2.0, 9)
+FORCE = 2.0 * CURRENT + 0.1 + 0.05 * RNG.standard_normal(9)
+UNIFORM = np.arange(160) / 1000.0
+UNEVEN = np.sort(RNG.uniform(0.0, 0.16, 160))
+
+
+def make(table: Table) -> Experiment:
+    return KINDS[table.kind](table, bench.rig(table))
+
+
+def coefficient(speed: np.ndarray, mu: float, v_s: float) -> np.ndarray:
+    return 0.5 * mu * (1.0 + np.exp(-speed / v_s))
+
+
+def wide(sd: np.ndarray, columns: np.ndarray, observed: np.ndarray) -> Any:
+    """SciPy's normal density of ``observed``: noise ``sd``, nuisances ``columns`` with sd ten times the range."""
+    width = 10.0 * np.ptp(observed)
+    return stats.multivariate_normal(np.zeros(len(observed)), np.diag(sd**2) + width**2 * columns @ columns.T)
+
+
+def assert_log_likelihood(experiment: Experiment, theta: dict[str, float], expected: float) -> None:
+    """Both routes: NumPy, and JAX with the fast path where there is one."""
+    assert float(experiment.log_likelihood(theta, np)) == pytest.approx(expected, rel=1e-10)
+    assert float(experiment.log_likelihood(theta, jnp)) == pytest.approx(expected, rel=1e-10)
+
+
+def test_tilts() -> None:
+    angle = np.deg2rad([33.1, 33.9, 32.7, 33.4])
+    experiment = make(bench.table("static_friction", [bench.column("angle", angle, 2e-3, 5e-3)]))
+    sd = np.sqrt(0.01**2 + 2e-3**2 + 5e-3**2 / 12.0)
+    expected = stats.norm.logpdf(angle, np.arctan(0.66), sd).sum()
+    assert_log_likelihood(experiment, {"mu": 0.66, "tilt_sd": 0.01, **MASSES}, expected)
+
+
+@pytest.mark.parametrize("length_is", ["board", "base"])
+def test_tilts_by_height_and_length(length_is: str) -> None:
+    height, length = np.array([0.331, 0.329, 0.30]), np.array([0.6, 0.6, 0.55])
+    columns = [bench.column("height", height, 1e-3), bench.column("length", length, 2e-3)]
+    experiment = make(bench.table("static_friction", columns, length_is=length_is))
+    # Errors of both readings through the derivatives of the angle: the sd differs from trial to trial.
+    if length_is == "board":
+        other = np.sqrt(length**2 - height**2)
+        angle, by_height, by_length = np.arcsin(height / length), 1.0 / other, height / (length * other)
+    else:
+        square = length**2 + height**2
+        angle, by_height, by_length = np.arctan(height / length), length / square, height / square
+    sd = np.sqrt(0.008**2 + (by_height * 1e-3) ** 2 + (by_length * 2e-3) ** 2)
+    expected = stats.norm.logpdf(angle, np.arctan(0.6), sd).sum()
+    assert_log_likelihood(experiment, {"mu": 0.6, "tilt_sd": 0.008, **MASSES}, expected)
+
+
+def test_pushes() -> None:
+    speed, distance = np.array([0.15, 0.3, 0.5, 1.0]), np.array([1.9e-3, 9e-3, 0.026, 0.12])
+    columns = [bench.column("speed", speed, 5e-3), bench.column("distance", distance, 3e-4)]
+    experiment = make(bench.table("dynamic_friction", columns))
+    mu, v_s, scatter = 0.63, 0.35, 0.02
+    slide = [
+        integrate.quad(lambda u: u / (bench.G * coefficient(u, mu, v_s)), 0.0, v, epsabs=0.0, epsrel=1e-13)[0]
+        for v in speed
+    ]
+    slope = speed / (bench.G * coefficient(speed, mu, v_s))
+    sd = np.sqrt(3e-4**2 + (slope * 5e-3) ** 2 + (scatter * np.array(slide)) ** 2)
+    expected = stats.norm.logpdf(distance, slide, sd).sum()
+    assert_log_likelihood(experiment, {"mu": mu, "v_s": v_s, "push_scatter": scatter, **MASSES}, expected)
+
+
+@pytest.mark.parametrize("quantity", ["force", "coefficient"])
+def test_steady_sliding(quantity: str) -> None:
+    speed = np.array([0.05, 0.2, 0.6])
+    weight = (bench.M1 + bench.M2) * bench.G if quantity == "force" else 1.0
+    values = weight * np.array([0.6, 0.49, 0.37])
+    columns = [bench.column("speed", speed, 0.01), bench.column(quantity, values, 0.004 * weight)]
+    experiment = make(bench.table("sliding_friction", columns))
+    mu, v_s, scatter = 0.64, 0.28, 0.03
+    mean = weight * coefficient(speed, mu, v_s)
+    slope = weight * mu / (2.0 * v_s) * np.exp(-speed / v_s)
+    sd = np.sqrt((0.004 * weight) ** 2 + (slope * 0.01) ** 2 + (scatter * mean) ** 2)
+    expected = stats.norm.logpdf(values, mean, sd).sum()
+    assert_log_likelihood(experiment, {"mu": mu, "v_s": v_s, "sliding_scatter": scatter, **MASSES}, expected)
+
+
+@pytest.mark.parametrize(
+    ("force_sd", "current_sd", "ratio", "variance"),
+    [
+        (1.0, 0.5, None, 1.0 + 2.1**2 * 0.5**2),
+        (None, None, 3.0, 1.2**2 * (1.0 + (2.1 / 3.0) ** 2)),
+        (None, None, None, 1.2**2),
+        (0.7, None, None, 0.7**2 + 1.2**2),
+    ],
+    ids=["both sds", "ratio", "none", "one sd"],
+)
+def test_lines(force_sd: float | None, current_sd: float | None, ratio: float | None, variance: float) -> None:
+    """Errors as large as the range: SciPy's covariance of the wide intercept is then still well conditioned."""
+    columns = [bench.column("force", FORCE, force_sd), bench.column("current", CURRENT, current_sd)]
+    settings = {} if ratio is None else {"sd_ratio": ratio}
+    experiment = make(bench.table("motor_current", columns, **settings))
+    sd = np.sqrt(variance) * np.ones(9)
+    expected = wide(sd, np.ones((9, 1)), FORCE).logpdf(FORCE - 2.1 * CURRENT)
+    assert_log_likelihood(experiment, {"K": 2.1, "scatter": 1.2, **MASSES}, expected)
+
+
+def test_support_spring() -> None:
+    deflection = np.linspace(0.0, 1e-3, 11)
+    force = 2420.0 * deflection + 0.01 * np.sin(np.arange(11))
+    columns = [bench.column("deflection", deflection), bench.column("force", force, None, 2.0)]
+    experiment = make(bench.table("support_spring", columns, spring="soft"))
+    sd = np.sqrt(1.5**2 + 2.0**2 / 12.0) * np.ones(11)
+    expected = wide(sd, np.ones((11, 1)), force).logpdf(force - 2400.0 * deflection)
+    assert_log_likelihood(experiment, {"k2": 2400.0, "scatter": 1.5, **MASSES}, expected)
+
+
+def basis(time: np.ndarray, k1: float, c: float) -> np.ndarray:
+    """(n, 3) the two viscous solutions and the offset, from the complex exponential."""
+    root = -c / (2 * bench.M1) + 1j * np.sqrt(k1 / bench.M1 - (c / (2 * bench.M1)) ** 2)
+    z = np.exp(root * time)
+    return np.stack([z.real, z.imag, np.ones(len(time))], axis=1)
+
+
+def record(time: np.ndarray, damping: str = "viscous", sd: float | None = None) -> FreeVibration:
+    noise = 2e-5 * np.random.default_rng(5).standard_normal(len(time))
+    columns = [bench.column("time", time), bench.column("x_rel", bench.released(time, 2e-3) + 1e-4 + noise, sd)]
+    built = make(bench.table("free_vibration", columns, damping=damping))
+    assert isinstance(built, FreeVibration)
+    return built
+
+
+@pytest.mark.parametrize("time", [UNIFORM, UNEVEN], ids=["fast path", "uneven"])
+def test_decay_against_scipy(time: np.ndarray) -> None:
+    """Noise as large as the record: SciPy's covariance of the wide nuisances is then still well conditioned."""
+    experiment = record(time, sd=1e-3)
+    assert experiment.uniform == (time is UNIFORM)
+    sd = np.hypot(2e-3, 1e-3) * np.ones(len(time))
+    expected = wide(sd, basis(experiment.time, 1450.0, 3.5), experiment.values).logpdf(experiment.values)
+    assert_log_likelihood(experiment, {"k1": 1450.0, "c": 3.5, "noise_sd": 2e-3, **MASSES}, expected)
+
+
+@pytest.mark.parametrize("time", [UNIFORM, UNEVEN], ids=["fast path", "uneven"])
+def test_decay_at_its_true_noise(time: np.ndarray) -> None:
+    """1 % noise, where that covariance loses digits: the same density by orthogonal factors of [A; I]."""
+    experiment = record(time)
+    sd, n = 2e-5, len(time)
+    a = 10.0 * np.ptp(experiment.values) / sd * basis(experiment.time, 1430.0, 3.8)
+    y = np.concatenate([experiment.values / sd, np.zeros(3)])
+    q, r = np.linalg.qr(np.concatenate([a, np.eye(3)]))
+    square = np.sum((y - q @ (q.T @ y)) ** 2)
+    log_det = 2.0 * np.sum(np.log(np.abs(np.diag(r))))
+    expected = -0.5 * (n * np.log(2.0 * np.pi) + log_det + square) - n * np.log(sd)
+    assert_log_likelihood(experiment, {"k1": 1430.0, "c": 3.8, "noise_sd": sd, **MASSES}, expected)
+
+
+def test_decay_with_dry_friction() -> None:
+    experiment = record(UNIFORM, "dry")
+    theta = {"k1": 1430.0, "c": 3.8, "F_dry": 0.02, "noise_sd": 1e-3, "amplitude": 1.9e-3, "turning_time": 0.001}
+    moving = [theta[name] for name in ("F_dry", "amplitude", "turning_time")]
+    x = experiment.side * np.asarray(dry_decay(UNIFORM, 1430.0, 3.8, bench.M1, *moving, half_cycles=12))
+    assert experiment.half_cycles >= 6  # the record's length, in half cycles of 28 ms
+    expected = wide(1e-3 * np.ones(160), np.ones((160, 1)), experiment.values).logpdf(experiment.values - x)
+    assert_log_likelihood(experiment, {**theta, **MASSES}, expected)
+
+
+def test_decay_with_quadratic_damping() -> None:
+    experiment = record(UNIFORM, "quadratic")
+    theta = {"k1": 1430.0, "c": 3.8, "c_q": 5.0, "noise_sd": 1e-3, "x_start": 2e-3, "y_start": 0.01}
+    x = quadratic_decay(UNIFORM, 1430.0, 3.8, bench.M1, 5.0, 2e-3, 0.01, substeps=experiment.substeps)
+    sd = 1e-3 * np.ones(160)
+    expected = wide(sd, np.ones((160, 1)), experiment.values).logpdf(experiment.values - np.asarray(x))
+    assert_log_likelihood(experiment, {**theta, **MASSES}, expected)
+
+
+def test_a_wrong_width_is_seen() -> None:
+    """Negative control: nuisances twice as wide move the density by far more than the bound of these tests."""
+    experiment = record(UNIFORM)
+    theta = {"k1": 1430.0, "c": 3.8, "noise_sd": 2e-5, **MASSES}
+    before = float(experiment.log_likelihood(theta, np))
+    experiment.width *= 2.0
+    assert float(experiment.log_likelihood(theta, np)) == pytest.approx(before - 3.0 * np.log(2.0), abs=2e-3)
+
+
+class TestPointwise:
+    """Densities of single readings, conditional on a draw of the linear nuisances."""
+
+    THETA = {"k1": 1430.0, "c": 3.8, "noise_sd": 5e-5, **MASSES}  # noqa: RUF012
+
+    def test_chib_identity(self) -> None:
+        """log p(y) = log p(y|b) + log p(b) - log p(b|y) for whichever b was drawn."""
+        experiment = record(UNIFORM)
+        misfit = experiment.misfit(self.THETA, np)
+        y, a = misfit.raw / misfit.sd, misfit.design / misfit.sd[:, None]
+        covariance = np.linalg.inv(np.eye(3) + a.T @ a)
+        marginal = float(experiment.log_likelihood(self.THETA, np))
+        for seed in range(5):
+            pointwise = experiment.pointwise(self.THETA, np.random.default_rng(seed))
+            # The same generator gives the same draw b by another route.
+            z = np.random.default_rng(seed).standard_normal(3)
+            b = covariance @ (a.T @ y) + np.linalg.solve(np.linalg.cholesky(np.linalg.inv(covariance)).T, z)
+            np.testing.assert_allclose(
+                pointwise, stats.norm.logpdf(misfit.raw, misfit.design @ b, misfit.sd), rtol=1e-7
+            )
+            prior = stats.norm.logpdf(b).sum()
+            given = -0.5 * (z @ z + 3.0 * np.log(2.0 * np.pi)) - 0.5 * np.linalg.slogdet(covariance)[1]
+            assert pointwise.sum() + prior - given == pytest.approx(marginal, rel=1e-10)
+
+    def test_mean_over_draws(self) -> None:
+        """E sum log p(y_i|b) over b|y: the residual sum of squares at the mean, and 3 degrees of freedom less."""
+        experiment = record(UNIFORM)
+        misfit = experiment.misfit(self.THETA, np)
+        a = misfit.design / misfit.sd[:, None]
+        at_mean = np.sum(np.asarray(experiment.residuals(self.THETA, np))[:160] ** 2)
+        spread = np.trace(np.linalg.solve(np.eye(3) + a.T @ a, a.T @ a))
+        expected = -0.5 * (at_mean + spread + 160 * np.log(2.0 * np.pi)) - np.sum(np.log(misfit.sd))
+        rng = np.random.default_rng(8)
+        sums = np.array([experiment.pointwise(self.THETA, rng).sum() for _ in range(4000)])
+        error = np.std(sums) / np.sqrt(4000)
+        assert abs(np.mean(sums) - expected) < 3.5 * error
+        assert abs(np.mean(sums) - (expected + 0.5 * spread)) > 20.0 * error  # negative control: a plug-in mean
+
+
+def test_predictive_p_counts_replicates() -> None:
+    """The closed tail of chi-square against replicates drawn and compared one by one."""
+    experiment = record(UNIFORM)
+    rng = np.random.default_rng(9)
+    draws = [{"k1": 1420.0, "c": 3.89, "noise_sd": s, **MASSES} for s in (1.8e-5, 2e-5, 2.2e-5)]
+    exceed = []
+    for theta in draws:
+        misfit = experiment.misfit(theta, np)
+        b = np.linalg.lstsq(misfit.design, misfit.raw, rcond=None)[0]
+        observed = np.sum(((misfit.raw - misfit.design @ b) / misfit.sd) ** 2)
+        exceed.append(np.mean(np.sum(rng.standard_normal((4000, 160)) ** 2, axis=1) > observed + 3.0))
+    found = experiment.predictive_p(draws * 200, rng)
+    assert found == pytest.approx(np.mean(exceed), abs=0.03)
+    assert experiment.predictive_p([], rng) is None
