@@ -12,12 +12,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-<<<<<<< HEAD
 from capsule_id import console
-from capsule_id.commands import check, fit, init, synthesize
-=======
 from capsule_id.commands import check, fit, init, report, synthesize
->>>>>>> main
 from capsule_id.errors import InputError
 
 BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130

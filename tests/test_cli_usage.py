@@ -25,7 +25,11 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str, program: str = "fit
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("fit_params", ()), ("capsule_id", ()), *(("capsule_id", (sub,)) for sub in ("init", "check", "synthesize"))],
+    [
+        ("fit_params", ()),
+        ("capsule_id", ()),
+        *(("capsule_id", (sub,)) for sub in ("init", "check", "synthesize", "report")),
+    ],
 )
 def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ...]) -> None:
     report = "import atexit, os, sys\natexit.register(lambda: print('loaded', *sys.modules, file=sys.stderr))\n"

@@ -23,7 +23,7 @@ def set_up_commands() -> list[list[str]]:
 def rows(header: str) -> dict[str, list[str]]:
     """The table of README whose header line is ``header``: cells by the first one."""
     lines = README.split(header + "\n", 1)[1].splitlines()[1:]
-    table = [line for line in lines[: lines.index("") if "" in lines else None]]
+    table = lines[: lines.index("") if "" in lines else None]
     cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table]
     return {first.strip("`| "): [cell.strip("| ") for cell in rest] for first, *rest in cells}
 
