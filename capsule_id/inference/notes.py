@@ -95,7 +95,7 @@ def damping_models(setting: Setting, records: Sequence[FreeVibration], seed: int
     frame["BIC"] -= frame["BIC"].min()
     best = str(frame["BIC"].idxmin())
     verdict = _VERDICTS[best]
-    if not (frame["residuals white"] == "yes").any():
+    if "yes" not in set(frame["residuals white"]):
         verdict += " None of the three leaves white residuals, so something else is at work beside the damping."
     caption = (
         "The damping model asked for leaves structure in the residuals; here are all three, fitted to the decays alone. BIC "
