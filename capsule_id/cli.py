@@ -1,7 +1,6 @@
 """The two commands: parse, call, exit code. ``fit-params DATA`` fits; ``capsule-id`` does everything else."""
 
 import argparse
-import io
 import signal
 import sys
 import tempfile
@@ -13,6 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
+from capsule_id import console
 from capsule_id.commands import check, fit, init, report, synthesize
 from capsule_id.errors import InputError
 
@@ -59,12 +59,12 @@ def _run(
     arguments: Sequence[str] | None,
 ) -> int:
     """Parse and act; every way to end becomes an exit code and at most one line on standard error."""
+    console.prepare()
     try:
         args = parser.parse_args(arguments)
     except SystemExit as stop:
+        console.finish()
         return int(stop.code or 0)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a locale without ± is no failure
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # what a user should know is a finding
     try:

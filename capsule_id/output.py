@@ -40,9 +40,8 @@ def check_directory(directory: Path) -> None:
             raise InputError(rule, "it is a file or a link", remedy, directory)
         _check_parents(directory, remedy)
         names = {entry.name for entry in directory.iterdir()} if directory.exists() else set()
-    except (OSError, ValueError) as error:  # ValueError: a null character
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError("the output directory must be usable", reason, remedy, directory) from None
+    except OSError as error:
+        raise InputError("the output directory must be usable", str(error.strerror), remedy, directory) from None
     if names and not _is_result(directory):
         foreign = sorted(names - CONTENTS - SCRATCH)
         raise InputError(rule, f"it holds {foreign[0]}" if foreign else "it is not one", remedy, directory)

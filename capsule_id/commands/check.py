@@ -2,6 +2,7 @@
 
 import argparse
 
+from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.lint import lint
@@ -23,13 +24,11 @@ def run(args: argparse.Namespace) -> int:
         If the folder is no valid rig.
     """
     rig = read_rig(args.data)
-    print(f"{rig.name}: {len(rig.tables)} experiments{', SYNTHETIC data' if rig.synthetic else ''}")
-    for table in rig.tables:
-        print(_summary(table))
+    lines = [f"{rig.name}: {len(rig.tables)} experiments{', SYNTHETIC data' if rig.synthetic else ''}"]
+    lines += [_summary(table) for table in rig.tables]
     findings = lint(rig)
-    for finding in findings:
-        print(f"lint: {finding}")
-    print(f"{len(findings)} findings" if findings else "no findings")
+    lines += [f"lint: {finding}" for finding in findings]
+    say("\n".join([*lines, f"{len(findings)} findings" if findings else "no findings"]))
     return 0
 
 

@@ -1,12 +1,12 @@
 """``fit-params DATA``: from a rig folder to parameters, posterior and report."""
 
 import argparse
-import os
 import shutil
 import sys
 import time
 from pathlib import Path
 
+from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress
 from capsule_id.rig.read import read_rig
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         write_result(result, partial)
         publish(partial, directory)
     report = directory / "report.html"
-    _print(f"{table_text(result.summary, synthetic=rig.synthetic, clean=result.clean)}\nreport: {report}")
+    say(f"{table_text(result.summary, synthetic=rig.synthetic, clean=result.clean)}\nreport: {report}")
     if result.clean:
         return 0
     failed = sorted({finding.check for finding in result.findings if finding.level == "fail"})
@@ -73,21 +73,12 @@ def run(args: argparse.Namespace) -> int:
     return 3
 
 
-def _print(text: str) -> None:
-    """Print to standard output; a reader who has heard enough (``| head``) is no failure of a finished fit."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        # The interpreter flushes once more at its end, and would complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 class Progress:
     """Stage, rate and time left on standard error: a bar on a terminal, a line now and then in a file."""
 
     def __init__(self, enabled: bool) -> None:
-        self._enabled = enabled and sys.stderr is not None
-        self._terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._enabled = enabled
+        self._terminal = sys.stderr.isatty()
         self._stage, self._began, self._first, self._shown = "", 0.0, 0, 0.0
         self._open = False
 

@@ -4,6 +4,7 @@ import argparse
 import re
 from pathlib import Path
 
+from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.rig.schema import NAME_PATTERN
 
@@ -120,5 +121,5 @@ def run(args: argparse.Namespace) -> int:
         (folder / "rig.toml").write_text(TEMPLATE.replace("@NAME@", name if usable else "rig"), encoding="utf-8")
     except OSError as error:
         raise InputError("DIR must be writable", str(error.strerror), "name another one", folder) from None
-    print(f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of what they need, then capsule-id check {folder}")
+    say(f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of what they need, then capsule-id check {folder}")
     return 0

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from capsule_id.console import say
 from capsule_id.errors import InputError
 
 
@@ -26,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
         saved = json.loads(path.read_text(encoding="utf-8"))
         findings, clean = saved["verdict"]["findings"], bool(saved["verdict"]["clean"])
         rows = {name: _row(entry) for name, entry in saved["parameters"].items()}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         rule, remedy = "DIR must be a result of fit-params", "run fit-params first"
         raise InputError(rule, type(error).__name__, remedy, path) from error
     import pandas as pd
@@ -34,9 +35,8 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.report.text import table_text
 
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
-    print(table_text(frame, synthetic=bool(saved["synthetic"]), clean=clean))
-    for finding in findings:
-        print(f"{finding['level']:4} {finding['check']}: {finding['text']}")
+    lines = [table_text(frame, synthetic=bool(saved["synthetic"]), clean=clean)]
+    say("\n".join([*lines, *(f"{finding['level']:4} {finding['check']}: {finding['text']}" for finding in findings)]))
     return 0 if clean else 3
 
 

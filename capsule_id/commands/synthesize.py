@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from capsule_id.console import say
 from capsule_id.errors import InputError
 
 
@@ -24,11 +25,16 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If DIR exists, or a value cannot be set.
     """
+    if args.seed < 0:
+        raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
     from capsule_id.synthetic import Truth, synthesize
 
     truth = Truth().with_values(dict(_assignment(text) for text in args.set))
-    synthesize(args.directory, args.seed, truth, args.name)
-    print(f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and its truth beside it")
+    try:
+        synthesize(args.directory, args.seed, truth, args.name)
+    except OSError as error:
+        raise InputError("DIR must be writable", str(error.strerror), "name another one", args.directory) from None
+    say(f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and its truth beside it")
     return 0
 
 

@@ -46,11 +46,14 @@ class Misfit:
     raw : (n,) measured minus predicted
     sd : (n,) its standard deviation
     design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
+    log_measure : () or (n,) what the measure of an integrated true abscissa adds to the log-density of each reading
+        (errors in both columns, see ``capsule_id.experiments.line``)
     """
 
     raw: Any
     sd: Any
     design: Any
+    log_measure: Any = 0.0
 
     def moments(self) -> tuple[Any, Any, Any]:
         """y'y, A'y, A'A in units of the noise."""
@@ -134,10 +137,11 @@ class Experiment(ABC):
     def log_likelihood(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings, linear nuisances integrated out; scalar."""
         misfit = self.misfit(theta, xp)
+        scale = xp.sum(misfit.log_measure - xp.log(misfit.sd))
         if misfit.design.shape[1] == 0:
             y = misfit.raw / misfit.sd
-            return -0.5 * (self.n * LOG_2PI + y @ y) - xp.sum(xp.log(misfit.sd))
-        return marginal_log_density(*misfit.moments(), self.n, xp) - xp.sum(xp.log(misfit.sd))
+            return -0.5 * (self.n * LOG_2PI + y @ y) + scale
+        return marginal_log_density(*misfit.moments(), self.n, xp) + scale
 
     def residuals(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """(n + p,) residuals in units of the noise at the conditional mean of the p linear nuisances, then those.
@@ -163,7 +167,7 @@ class Experiment(ABC):
         if misfit.design.shape[1]:
             _, ay, aa = misfit.moments()
             raw = raw - misfit.design @ conditional_draw(ay, aa, rng)
-        return -0.5 * (raw / misfit.sd) ** 2 - np.log(misfit.sd) - 0.5 * LOG_2PI
+        return -0.5 * (raw / misfit.sd) ** 2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
 
     def predictive_p(self, draws: list[Theta], rng: np.random.Generator) -> float | None:
         """Posterior predictive p-value of the chi-square discrepancy; None without draws.
@@ -176,7 +180,7 @@ class Experiment(ABC):
         tails = []
         for theta in draws:
             misfit = self.misfit(theta, np)
-            square = -2.0 * np.sum(self.pointwise(theta, rng) + np.log(misfit.sd) + 0.5 * LOG_2PI)
+            square = -2.0 * np.sum(self.pointwise(theta, rng) + np.log(misfit.sd) + 0.5 * LOG_2PI - misfit.log_measure)
             tails.append(stats.chi2.sf(square, self.n))
         return float(np.mean(tails))
 

@@ -1,9 +1,11 @@
 """A calibration line y = y0 + slope x: motor current and support spring share it.
 
 Errors in both columns where both reading errors are stated, or their ratio; otherwise one total scatter about the line
-(the reading errors that are stated come on top of it). With a flat prior on the true x, integrating it out gives
-exactly N(y - y0 - slope x; 0, sd_y^2 + slope^2 sd_x^2) (structural errors-in-variables; Fuller 1987, section 1.2).
-The intercept is integrated out under a wide normal prior.
+(the reading errors that are stated come on top of it). The true point of a reading is integrated out along the line
+with a prior that is flat in its length, measured in units of the reading errors: then neither column is preferred, and
+the slope is that of orthogonal (Deming) regression (Hogg, Bovy & Lang 2010, section 7; Fuller 1987, section 1.3). A
+prior flat in x instead would draw the slope to that of ordinary least squares, low by (sd_x / sd of the x's)^2. The
+intercept is integrated out under a wide normal prior.
 """
 
 from types import ModuleType
@@ -59,13 +61,15 @@ class Line(Experiment):
 
     def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
         slope = theta[self.slope.symbol]
-        variance = self.y_sd**2 + (slope * self.x_sd) ** 2
+        y_variance, x_variance = self.y_sd**2, self.x_sd**2
         if not self.scale_known:
-            scatter = theta["scatter"]
-            both = 1.0 if self.sd_ratio is None else 1.0 + (slope / self.sd_ratio) ** 2
-            variance = variance + scatter**2 * both
+            y_variance = y_variance + theta["scatter"] ** 2
+            if self.sd_ratio is not None:
+                x_variance = x_variance + (theta["scatter"] / self.sd_ratio) ** 2
+        variance = y_variance + slope**2 * x_variance
         design = self.width * xp.ones((self.n, 1))
-        return Misfit(self.y - slope * self.x, xp.sqrt(variance) * xp.ones(self.n), design)
+        along = 0.5 * xp.log(variance / y_variance) * xp.ones(self.n)
+        return Misfit(self.y - slope * self.x, xp.sqrt(variance) * xp.ones(self.n), design, along)
 
     def intercept(self, theta: Theta) -> float:
         """Conditional mean of y0, SI."""

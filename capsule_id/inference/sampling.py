@@ -142,8 +142,8 @@ def _sampler(
     """One ensemble: burnt in from its own overdispersed start, or taken up where ``store`` left it."""
     random = np.random.RandomState(seed)
     start = _initial(target, fit, random)
-    backend = None if store is None else emcee.backends.HDFBackend(str(store), name=f"ensemble_{number}")
-    if backend is not None and backend.initialized and int(backend.iteration) > 0:
+    backend: Any = None if store is None else emcee.backends.HDFBackend(str(store), name=f"ensemble_{number}")
+    if backend is not None and backend.initialized and backend.iteration > 0:
         sampler = _ensemble(target, len(start), schedule.moves, backend)
         sampler._previous_state = backend.get_last_sample()
         return sampler

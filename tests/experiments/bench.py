@@ -18,6 +18,9 @@ def column(name: str, values: ArrayLike, sd: float | None = None, resolution: fl
     return Column(name, "SI", 1.0, np.asarray(values, dtype=float), sd, resolution)
 
 
+ROD, CAPSULE = Quantity(M1), Quantity(M2)
+
+
 def table(kind: str, columns: Sequence[Column], label: str = "", **settings: object) -> Table:
     """An ``[[experiment]]`` of these columns."""
     rows = np.arange(2, 2 + len(columns[0].values))
@@ -26,8 +29,8 @@ def table(kind: str, columns: Sequence[Column], label: str = "", **settings: obj
 
 def rig(
     *tables: Table,
-    m1: Quantity | None = Quantity(M1),
-    m2: Quantity | None = Quantity(M2),
+    m1: Quantity | None = ROD,
+    m2: Quantity | None = CAPSULE,
     priors: Mapping[str, PriorOverride] | None = None,
 ) -> Rig:
     """A rig of these tables; masses are exact unless stated otherwise."""

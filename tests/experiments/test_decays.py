@@ -60,7 +60,7 @@ def dry_reference(time: np.ndarray, F_dry: float, amplitude: float) -> np.ndarra
         def rate(t: float, s: np.ndarray, side: float = side) -> list[float]:
             return [s[1], -(K1 * s[0] + C * s[1] + F_dry * side) / M1]
 
-        def turning(t: float, s: np.ndarray, start: float = start) -> float:
+        def turning(t: float, s: np.ndarray, start: float = start, side: float = side) -> float:
             return s[1] if t > start + 1e-3 else side
 
         turning.terminal = True  # type: ignore[attr-defined]

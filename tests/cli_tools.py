@@ -1,0 +1,67 @@
+"""Commands as a user calls them: in a process of their own, or in this one where the process does not matter."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import capsule_id
+
+ROOT = Path(capsule_id.__file__).resolve().parents[1]
+DATA = ROOT / "data"
+#: Ctrl-C reaches the command even where the tests themselves run in the background of a shell.
+CODE = """\
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from capsule_id.cli import {name}
+sys.exit({name}())
+"""
+
+
+def argv(*words: str, name: str = "fit_params", before: str = "") -> list[str]:
+    """The command line of a command of this checkout; ``before`` is Python run ahead of it."""
+    return [sys.executable, "-c", before + CODE.format(name=name), *words]
+
+
+def environment(**changes: str | None) -> dict[str, str]:
+    """This process's environment with this checkout first, and ``changes``; None removes a variable."""
+    merged = {**os.environ, "PYTHONPATH": str(ROOT), **changes}
+    return {name: value for name, value in merged.items() if value is not None}
+
+
+def run(
+    *words: str, cwd: Path, name: str = "fit_params", before: str = "", env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        argv(*words, name=name, before=before),
+        cwd=cwd,
+        env=env or environment(),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        stdin=subprocess.DEVNULL,
+        check=False,
+    )
+
+
+def small_rig(folder: Path, name: str = "small", tables: tuple[str, ...] = ("static_friction",)) -> Path:
+    """A rig of one or two small tables of ``data/``, quick to fit; its folder."""
+    folder.mkdir(parents=True)
+    lines = ["[rig]", f'name = "{name}"']
+    for table in tables:
+        kind = "support_spring" if table.startswith("support_spring") else table
+        lines += ["[[experiment]]", f'kind = "{kind}"', f'file = "{table}.csv"']
+        lines += ['spring = "soft"'] if kind == "support_spring" else []
+        shutil.copy(DATA / f"{table}.csv", folder)
+    (folder / "rig.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    """Everything below ``folder`` with its content."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"-"
+        for path in sorted(folder.rglob("*"))
+    }

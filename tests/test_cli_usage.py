@@ -1,0 +1,212 @@
+"""Exit codes and standard error of both commands, where no fit is needed to know them."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from capsule_id.cli import capsule_id, fit_params
+from tests.cli_tools import DATA, argv, environment, listing, run, small_rig
+
+HELP_BUDGET = 1.0  # s, of processor time
+HEAVY = ("jax", "matplotlib", "pandas", "emcee", "optimistix", "xarray")
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str, program: str = "fit_params") -> str:
+    """The one line with which a command refuses ``words``."""
+    code = {"fit_params": fit_params, "capsule_id": capsule_id}[program](words)
+    out, err = capsys.readouterr()
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    return err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("fit_params", ()),
+        ("capsule_id", ()),
+        *(("capsule_id", (sub,)) for sub in ("init", "check", "synthesize", "report")),
+    ],
+)
+def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ...]) -> None:
+    report = "import atexit, os, sys\natexit.register(lambda: print('loaded', *sys.modules, file=sys.stderr))\n"
+    report += "atexit.register(lambda: print('seconds', sum(os.times()[:2]), file=sys.stderr))\n"
+    done = run(*words, "--help", cwd=tmp_path, name=name, before=report)
+    assert done.returncode == 0
+    assert done.stdout.startswith("usage: " + name.replace("_", "-"))
+    seconds, loaded = done.stderr.splitlines()
+    assert not set(loaded.split()) & set(HEAVY)
+    assert float(seconds.split()[1]) < HELP_BUDGET
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ((), "DATA"),
+        (("a", "b"), "b"),
+        (("a", "--colour"), "--colour"),
+        (("a", "--seed", "x"), "--seed"),
+        (("a", "--seed", "1.5"), "--seed"),
+        (("a", "--seed", "-1"), "-1"),
+        (("a", "--seed", ""), "--seed"),
+        (("a", "--max-steps", "0"), "--max-steps"),
+        (("a", "--experiments", "some"), "bench"),
+        (("a", "--out"), "--out"),
+        (("a", "two\nlines"), "two lines"),
+    ],
+)
+def test_wrong_usage_is_one_line(capsys: pytest.CaptureFixture[str], words: tuple[str, ...], named: str) -> None:
+    assert named in refused(capsys, *words)
+
+
+@pytest.mark.parametrize("words", [(), ("fit",), ("init",), ("check", "a", "b"), ("synthesize", "a", "--seed", "x")])
+def test_wrong_usage_of_the_second_command(capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
+    assert "--help" in refused(capsys, *words, program="capsule_id")
+
+
+def test_synthesize_refuses_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "full" / "of").mkdir(parents=True)
+    before = listing(tmp_path)
+    for words, named in (
+        (("rig", "--set", "k1"), "NAME=VALUE"),
+        (("rig", "--set", "k1=x"), "number"),
+        (("rig", "--set", "k3=1"), "k3"),
+        (("rig", "--set", "k1=-1"), "positive"),
+        (("rig", "--set", "k1=nan"), "positive"),
+        (("rig", "--name", "a b"), "a b"),
+        (("a b",), "--name"),
+        (("rig", "--seed", "-1"), "--seed"),
+        (("file",), "file"),
+        (("file/below",), "file"),
+        (("full",), "full"),
+    ):
+        assert named in refused(capsys, "synthesize", *words, program="capsule_id")
+        assert listing(tmp_path) == before
+
+
+def test_data_that_is_no_rig(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small_rig(tmp_path / "rig")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    before = listing(tmp_path)
+    for data in (
+        "rig/rig.toml",
+        "rig/static_friction.csv",
+        "missing",
+        "empty",
+        "loop",
+        "",
+        "a\0b",
+        "x" * 5000,
+        "rig/x",
+    ):
+        line = refused(capsys, data)
+        assert line.count(", ") >= 2  # rule, value, remedy
+        assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "../a", "a b", "a\\nb", "é", "a\u0000"])
+def test_a_rig_name_that_is_no_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small_rig(tmp_path / "rig", name=name)
+    before = listing(tmp_path)
+    assert "rig.toml:2" in refused(capsys, "rig")
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["a.partial", "a.partial.old"])
+def test_a_rig_name_that_work_in_progress_needs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small_rig(tmp_path / "rig", name=name)
+    assert "must not end in .partial" in refused(capsys, "rig")
+
+
+def test_experiments_that_are_not_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small_rig(tmp_path / "rig")
+    before = listing(tmp_path)
+    assert "--experiments runs" in refused(capsys, "rig", "--experiments", "runs")
+    assert listing(tmp_path) == before
+
+
+def test_an_internal_failure_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(folder: str) -> None:
+        raise ZeroDivisionError("first line\nsecond line")
+
+    monkeypatch.setattr("capsule_id.commands.check.read_rig", fail)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert capsule_id(["check", "rig"]) == 1
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert "ZeroDivisionError: first line second line" in line
+    (saved,) = tmp_path.iterdir()
+    assert str(saved) in line
+    assert saved.read_text().startswith("Traceback")
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+    assert capsule_id(["check", "rig"]) == 1
+    line = capsys.readouterr().err
+    assert (line.count("\n"), "could not be saved" in line) == (1, True)
+
+
+def test_commands_in_a_bare_surrounding(tmp_path: Path) -> None:
+    """No HOME, no locale, closed standard streams: the code stays right and nobody sees a traceback."""
+    small_rig(tmp_path / "rig ü")
+    bare = environment(HOME=None, LC_ALL="C", LANG=None, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
+    done = run("check", "rig ü", cwd=tmp_path, name="capsule_id", env=bare)
+    assert (done.returncode, done.stderr) == (0, "")
+    closed = " ".join(map(_quoted, argv("check", "rig ü", name="capsule_id")))
+    for redirection, code in (("<&-", 0), (">&-", 0), ("2>&-", 0), ("<&- >&- 2>&-", 0)):
+        shell = subprocess.run(
+            ["/bin/sh", "-c", f"{closed} {redirection}"],
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            check=False,
+        )
+        assert (shell.returncode, shell.stderr) == (code, b"")
+    missing = subprocess.run(
+        ["/bin/sh", "-c", f"{' '.join(map(_quoted, argv('missing')))} 2>&-"],
+        cwd=tmp_path, env=environment(), capture_output=True, check=False,
+    )  # fmt: skip
+    assert (missing.returncode, missing.stdout) == (2, b"")
+
+
+def test_a_reader_that_leaves_is_no_failure(tmp_path: Path) -> None:
+    for words in (("check", str(DATA)), ("--help",)):
+        reader, writer = os.pipe()
+        os.close(reader)
+        done = subprocess.run(
+            argv(*words, name="capsule_id"),
+            env=environment(), stdout=writer, stderr=subprocess.PIPE, check=False, cwd=tmp_path,
+        )  # fmt: skip
+        os.close(writer)
+        assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_entry_points_are_installed() -> None:
+    for name in ("fit-params", "capsule-id"):
+        assert shutil.which(name, path=str(Path(sys.executable).parent))
+
+
+def _quoted(word: str) -> str:
+    return "'" + word.replace("'", "'\\''") + "'"

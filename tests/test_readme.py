@@ -1,0 +1,83 @@
+"""README says what is so: its commands run, its tables are those of the package."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+from capsule_id.commands.init import TEMPLATE
+from capsule_id.parameters import TABLE
+from capsule_id.rig.schema import KINDS
+from tests.cli_tools import DATA, ROOT, environment
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def set_up_commands() -> list[list[str]]:
+    """The fenced commands of README's opening, each split at &&."""
+    return [[part.strip() for part in block.split("&&")] for block in re.findall(r"```sh\n(.*?)\n```", README)[:2]]
+
+
+def rows(header: str) -> dict[str, list[str]]:
+    """The table of README whose header line is ``header``: cells by the first one."""
+    lines = README.split(header + "\n", 1)[1].splitlines()[1:]
+    table = lines[: lines.index("") if "" in lines else None]
+    cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table]
+    return {first.strip("`| "): [cell.strip("| ") for cell in rest] for first, *rest in cells}
+
+
+def test_the_two_commands_set_up_and_run() -> None:
+    fit, test = set_up_commands()
+    venv = "python3 -m venv .venv"
+    assert fit == [venv, ".venv/bin/pip install .", ".venv/bin/fit-params data/"]
+    assert test == [venv, ".venv/bin/pip install '.[test]'", ".venv/bin/python -m pytest"]
+    assert "fit-params" in PROJECT["scripts"]
+    assert "test" in PROJECT["optional-dependencies"]
+
+
+def test_the_installed_command_reads_the_folder_that_readme_names(tmp_path: Path) -> None:
+    """The entry point itself; what it computes is looked at with the main job."""
+    (tmp_path / "data").symlink_to(DATA)
+    command = set_up_commands()[0][-1].replace(".venv/bin", str(Path(sys.executable).parent))
+    done = subprocess.run(
+        [*command.split(), "--no-sample", "--quiet"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    report = re.findall(r"`(results/\S+/report\.html)`", README)[0]
+    assert (tmp_path / report).is_file()
+
+
+def test_the_parameter_table_is_the_packages() -> None:
+    expected = {
+        symbol: [row.unit, row.meaning, row.prior.describe() if row.prior else "by the experiment"]
+        for symbol, row in TABLE.items()
+    }
+    assert rows("| symbol | unit | meaning | default prior |") == expected
+
+
+def test_the_kinds_of_experiments_are_the_packages() -> None:
+    table = rows("| kind | columns | tells |")
+    assert set(table) <= set(KINDS)
+    for kind, (columns, _) in table.items():
+        named = re.findall(r"`(\w+) \[", columns)
+        assert set(named) <= set(KINDS[kind].columns)
+        assert f'kind = "{kind}"' in TEMPLATE
+
+
+def test_every_path_that_readme_names_exists() -> None:
+    named = set(re.findall(r"`((?:capsule_id|data)/[\w/.]*)`", README))
+    assert len(named) >= 8
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_the_exit_codes_are_those_of_the_command() -> None:
+    from capsule_id import cli
+
+    assert set(rows("| exit code | meaning |")) == {"0", "3", *map(str, (cli.BAD_INPUT, cli.INTERNAL, cli.INTERRUPTED))}
