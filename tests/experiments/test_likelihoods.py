@@ -9,7 +9,7 @@ import pytest
 from scipy import integrate, stats
 
 from capsule_id.experiments import KINDS
-from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.base import Experiment, Theta
 from capsule_id.experiments.decay_models import dry_decay, quadratic_decay
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.rig.model import Table
@@ -110,8 +110,7 @@ def test_steady_sliding(quantity: str) -> None:
 def test_lines(force_sd: float | None, current_sd: float | None, ratio: float | None, variance: float) -> None:
     """Errors as large as the range: SciPy's covariance of the wide intercept is then still well conditioned."""
     columns = [bench.column("force", FORCE, force_sd), bench.column("current", CURRENT, current_sd)]
-    settings = {} if ratio is None else {"sd_ratio": ratio}
-    experiment = make(bench.table("motor_current", columns, **settings))
+    experiment = make(bench.table("motor_current", columns, sd_ratio=ratio))
     sd = np.sqrt(variance) * np.ones(9)
     expected = wide(sd, np.ones((9, 1)), FORCE).logpdf(FORCE - 2.1 * CURRENT)
     assert_log_likelihood(experiment, {"K": 2.1, "scatter": 1.2, **MASSES}, expected)
@@ -237,7 +236,7 @@ def test_predictive_p_counts_replicates() -> None:
     """The closed tail of chi-square against replicates drawn and compared one by one."""
     experiment = record(UNIFORM)
     rng = np.random.default_rng(9)
-    draws = [{"k1": 1420.0, "c": 3.89, "noise_sd": s, **MASSES} for s in (1.8e-5, 2e-5, 2.2e-5)]
+    draws: list[Theta] = [{"k1": 1420.0, "c": 3.89, "noise_sd": s, **MASSES} for s in (1.8e-5, 2e-5, 2.2e-5)]
     exceed = []
     for theta in draws:
         misfit = experiment.misfit(theta, np)
