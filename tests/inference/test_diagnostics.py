@@ -1,6 +1,7 @@
 """R-hat, autocorrelation time and effective sample size: against arviz, and against chains with known answers."""
 
 import arviz
+import emcee
 import numpy as np
 import pytest
 
@@ -56,11 +57,22 @@ def test_integrated_time_and_ess(rho: float) -> None:
     """(1 + rho)/(1 - rho), and arviz's effective sample size of the walkers as chains (they are independent here)."""
     x = autoregressive(rho, (4, 600, 32, 2), 5)
     tau = integrated_time(x)
-    np.testing.assert_allclose(tau, (1.0 + rho) / (1.0 - rho), rtol=0.1)
+    # Sokal (1997): relative variance 2 (2M + 1)/n, here of 8 x 600 x 32 draws and M = 5 tau.
+    known = (1.0 + rho) / (1.0 - rho)
+    bound = 4.0 * np.sqrt(2.0 * (10.0 * known + 1.0) / x.size)
+    assert np.mean(tau) == pytest.approx(known, rel=bound)
     ess = effective_sample_size(x, tau)
     chains = x.transpose(0, 2, 1, 3).reshape(128, 600, 2)
     expected = [float(arviz.ess(chains[..., i], method="mean")) for i in range(2)]
     np.testing.assert_allclose(ess, expected, rtol=0.1)
+
+
+def test_each_walkers_own_mean_would_understate() -> None:
+    """Negative control: about walkers' own means (emcee's estimator) a chain of 50 tau loses a fifth of its tau."""
+    x = autoregressive(0.8, (8, 450, 64, 1), 6)
+    theirs = np.mean([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in x])
+    assert theirs == pytest.approx(0.8 * 9.0, rel=0.06)
+    assert np.mean(integrated_time(x)) == pytest.approx(9.0, rel=0.06)
 
 
 def test_ess_predicts_the_error_of_a_mean() -> None:

@@ -61,7 +61,7 @@ def test_a_wrong_gaussian_fails(posterior: Posterior, fault: str) -> None:
         covariance[2] *= 1.0 + error
         covariance[:, 2] *= 1.0 + error
     else:
-        covariance[0, 1] = covariance[1, 0] = (0.95 - 0.2 * error) * SD[0] * SD[1]
+        covariance[2, 3] = covariance[3, 2] = (error - 0.5) * SD[2] * SD[3]
     assert np.max(np.abs(scores(posterior.draws, Gaussian(mean, covariance)))) > LIMIT
 
 
