@@ -3,15 +3,34 @@
 import emcee
 import numpy as np
 
+#: Autocorrelation times after which autocovariances are noise.
+WINDOW = 5.0
+
 
 def integrated_time(draws: np.ndarray) -> np.ndarray:
-    """(ensemble, d) integrated autocorrelation time, in draws, of every ensemble: emcee's estimator.
+    """(ensemble, d) integrated autocorrelation time, in draws, of every ensemble: emcee's estimator, for the ESS."""
+    return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
+
+
+def ensemble_time(draws: np.ndarray) -> np.ndarray:
+    """(ensemble, d) the same without emcee's bias in short chains: what decides whether a chain is long enough.
+
+    Autocovariances are about the mean of the whole ensemble and averaged over its walkers. About each walker's own
+    mean, as in emcee, tau comes out low by 10 tau/N of itself: by 20 % where N is just 50 tau (tested). The sum stops
+    at the first lag above ``WINDOW`` tau (Sokal 1997, section 3).
 
     Parameters
     ----------
     draws : (ensemble, draw, walker, d)
     """
-    return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
+    n = draws.shape[1]
+    centred = draws - np.mean(draws, axis=(1, 2), keepdims=True)
+    spectrum = np.abs(np.fft.rfft(centred, n=2 * n, axis=1)) ** 2
+    covariance = np.mean(np.fft.irfft(spectrum, n=2 * n, axis=1)[:, :n], axis=2) / np.arange(n, 0, -1)[:, None]
+    sums = 2.0 * np.cumsum(covariance / covariance[:, :1], axis=1) - 1.0
+    enough = np.arange(n)[:, None] >= WINDOW * sums
+    enough[:, -1] = True
+    return np.take_along_axis(sums, np.argmax(enough, axis=1)[:, None], axis=1)[:, 0]
 
 
 def split_rhat(draws: np.ndarray) -> np.ndarray:

@@ -46,8 +46,7 @@ def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
         values = target.mapping(target.theta(u))
         likelihood = sum(float(e.log_likelihood(e.local(values), np)) for e in target.experiments)
         penalty = 0.5 * float(np.sum(target.prior_residuals(u)[free] ** 2))
-        jacobian = float(np.sum(u[target.scatter]))
-        return penalty - likelihood - jacobian
+        return penalty - likelihood
 
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         best = minimize(objective, start[free], method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-7})

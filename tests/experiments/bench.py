@@ -11,6 +11,7 @@ from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Table
 G = 9.81
 M1, M2 = 0.110, 0.530
 K1, C = 1420.0, 3.89
+ROD, CAPSULE = Quantity(M1), Quantity(M2)
 
 
 def column(name: str, values: ArrayLike, sd: float | None = None, resolution: float | None = None) -> Column:
@@ -29,8 +30,13 @@ def table(kind: str, columns: Sequence[Column], label: str = "", **settings: obj
 
 def rig(
     *tables: Table,
+<<<<<<< HEAD
     m1: Quantity | None = ROD,
     m2: Quantity | None = CAPSULE,
+=======
+    m1: Quantity = ROD,
+    m2: Quantity = CAPSULE,
+>>>>>>> t-stats
     priors: Mapping[str, PriorOverride] | None = None,
 ) -> Rig:
     """A rig of these tables; masses are exact unless stated otherwise."""

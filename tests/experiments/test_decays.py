@@ -16,11 +16,9 @@ GAMMA, OMEGA = C / (2 * M1), np.sqrt(K1 / M1 - (C / (2 * M1)) ** 2)
 Rate = Callable[[float, np.ndarray], list[float]]
 
 
-def integrate(rate: Rate, state: list[float], time: np.ndarray, **options: object) -> np.ndarray:
+def integrate(rate: Rate, state: list[float], time: np.ndarray) -> np.ndarray:
     """(n,) x at ``time``."""
-    solution = solve_ivp(
-        rate, (time[0], time[-1]), state, method="DOP853", t_eval=time, rtol=1e-11, atol=1e-16, **options
-    )  # type: ignore[call-overload]
+    solution = solve_ivp(rate, (time[0], time[-1]), state, method="DOP853", t_eval=time, rtol=1e-11, atol=1e-16)
     return solution.y[0]
 
 
@@ -60,8 +58,8 @@ def dry_reference(time: np.ndarray, F_dry: float, amplitude: float) -> np.ndarra
         def rate(t: float, s: np.ndarray, side: float = side) -> list[float]:
             return [s[1], -(K1 * s[0] + C * s[1] + F_dry * side) / M1]
 
-        def turning(t: float, s: np.ndarray, start: float = start, side: float = side) -> float:
-            return s[1] if t > start + 1e-3 else side
+        def turning(t: float, s: np.ndarray, start: float = start) -> float:
+            return s[1] if t > start + 1e-3 else 1.0
 
         turning.terminal = True  # type: ignore[attr-defined]
         part = solve_ivp(

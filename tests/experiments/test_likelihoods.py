@@ -9,7 +9,7 @@ import pytest
 from scipy import integrate, stats
 
 from capsule_id.experiments import KINDS
-from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.base import Experiment, Theta
 from capsule_id.experiments.decay_models import dry_decay, quadratic_decay
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.rig.model import Table
@@ -98,22 +98,28 @@ def test_steady_sliding(quantity: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("force_sd", "current_sd", "ratio", "variance"),
+    ("force_sd", "current_sd", "ratio", "force_variance", "current_variance"),
     [
-        (1.0, 0.5, None, 1.0 + 2.1**2 * 0.5**2),
-        (None, None, 3.0, 1.2**2 * (1.0 + (2.1 / 3.0) ** 2)),
-        (None, None, None, 1.2**2),
-        (0.7, None, None, 0.7**2 + 1.2**2),
+        (1.0, 0.5, None, 1.0, 0.5**2),
+        (None, None, 3.0, 1.2**2, (1.2 / 3.0) ** 2),
+        (None, None, None, 1.2**2, 0.0),
+        (0.7, None, None, 0.7**2 + 1.2**2, 0.0),
     ],
     ids=["both sds", "ratio", "none", "one sd"],
 )
-def test_lines(force_sd: float | None, current_sd: float | None, ratio: float | None, variance: float) -> None:
-    """Errors as large as the range: SciPy's covariance of the wide intercept is then still well conditioned."""
+def test_lines(
+    force_sd: float | None, current_sd: float | None, ratio: float | None, force_variance: float, current_variance: float
+) -> None:
+    """Errors as large as the range: SciPy's covariance of the wide intercept is then still well conditioned.
+
+    The density of a force is multiplied by the length along the line, in units of the errors, that a current covers.
+    """
+    variance = force_variance + 2.1**2 * current_variance
     columns = [bench.column("force", FORCE, force_sd), bench.column("current", CURRENT, current_sd)]
-    settings = {} if ratio is None else {"sd_ratio": ratio}
-    experiment = make(bench.table("motor_current", columns, **settings))
+    experiment = make(bench.table("motor_current", columns, sd_ratio=ratio))
     sd = np.sqrt(variance) * np.ones(9)
     expected = wide(sd, np.ones((9, 1)), FORCE).logpdf(FORCE - 2.1 * CURRENT)
+    expected += 9 * np.log(np.sqrt(variance / force_variance))
     assert_log_likelihood(experiment, {"K": 2.1, "scatter": 1.2, **MASSES}, expected)
 
 
@@ -237,7 +243,7 @@ def test_predictive_p_counts_replicates() -> None:
     """The closed tail of chi-square against replicates drawn and compared one by one."""
     experiment = record(UNIFORM)
     rng = np.random.default_rng(9)
-    draws = [{"k1": 1420.0, "c": 3.89, "noise_sd": s, **MASSES} for s in (1.8e-5, 2e-5, 2.2e-5)]
+    draws: list[Theta] = [{"k1": 1420.0, "c": 3.89, "noise_sd": s, **MASSES} for s in (1.8e-5, 2e-5, 2.2e-5)]
     exceed = []
     for theta in draws:
         misfit = experiment.misfit(theta, np)

@@ -1,0 +1,48 @@
+"""Calibration in the small: do 95 % intervals cover 95 %, is z standard normal, and do clean rigs come out clean?
+
+All numbers of a rig share its masses and its friction curve, so bounds count rigs, not numbers.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration import Outcome, study, summarise
+from scipy import stats
+
+
+def test_ten_rigs(tmp_path: Path) -> None:
+    """A small version of the next test at a fixed seed: 100 numbers, of which 5 lie outside their intervals."""
+    outcomes = list(study(tmp_path, range(10), budget=800))
+    found = summarise(outcomes)
+    print(found.describe())
+    assert found.numbers == 100
+    # Two-sided 99.9 % of a binomial and of chi; the mean of ten rigs likewise.
+    low, high = stats.binom.ppf([0.0005, 0.9995], 100, 0.95) / 100
+    assert low <= found.coverage <= high
+    low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], 100) / 100)
+    assert low < found.sd < high
+    assert abs(found.mean) < 0.33
+    # The budget is short: chains may be found wanting, nothing else.
+    assert {check for outcome in outcomes for check, _ in outcome.failed} <= {"chains converged"}
+
+
+@pytest.mark.slow
+def test_hundred_rigs(tmp_path: Path) -> None:
+    outcomes = list(study(tmp_path, range(1000, 1100)))
+    found = summarise(outcomes)
+    print(found.describe())
+    assert 0.92 <= found.coverage <= 0.98
+    assert 0.9 <= found.sd <= 1.1
+    assert found.clean >= 0.95
+
+
+@pytest.mark.parametrize(("shift", "scale"), [(0.0, 1.4), (0.0, 0.7), (0.6, 1.0)], ids=["narrow", "wide", "biased"])
+def test_wrong_intervals_fail(shift: float, scale: float) -> None:
+    """Negative control on perfect scores: intervals 30 % narrow or wide, or off by 0.6 sd, leave the bounds."""
+    z = stats.norm.ppf((np.arange(1000) + 0.5) / 1000)
+    perfect = summarise([Outcome({str(i): float(v) for i, v in enumerate(z)}, ())])
+    assert 0.92 <= perfect.coverage <= 0.98
+    assert perfect.sd == pytest.approx(1.0, abs=0.01)
+    wrong = summarise([Outcome({str(i): float(shift + scale * v) for i, v in enumerate(z)}, ())])
+    assert not (0.92 <= wrong.coverage <= 0.98 and 0.9 <= wrong.sd <= 1.1)

@@ -1,0 +1,49 @@
+"""Do tilts and slides agree? The p-value on rigs where they do, and on rigs where they do not."""
+
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.experiments import KINDS, dynamic_friction, static_friction
+from capsule_id.inference.tension import tension
+from capsule_id.rig.model import Column, Quantity, Rig, Table
+from capsule_id.synthetic import (
+    PUSH_DISTANCE_SD,
+    PUSH_SCATTER,
+    PUSH_SPEED_SD,
+    PUSH_SPEEDS,
+    TILT_SD,
+    TILTS,
+    Truth,
+)
+
+TRUTH = Truth()
+
+
+def column(name: str, values: np.ndarray, sd: float | None = None) -> Column:
+    return Column(name, "SI", 1.0, values, sd)
+
+
+def table(kind: str, *columns: Column) -> Table:
+    rows = np.arange(2, 2 + len(columns[0].values))
+    return Table(kind, kind, f"{kind}.csv", {c.name: c for c in columns}, {}, rows)
+
+
+def p_value(seed: int, tilted_mu: float = TRUTH.mu) -> float:
+    """Of a surface measured by the twin's protocol; the tilts on one of ``tilted_mu``."""
+    rng = np.random.default_rng(seed)
+    tilts = static_friction.twin(rng, tilted_mu, TILTS, TILT_SD)
+    pushes = dynamic_friction.twin(
+        rng, TRUTH.mu, TRUTH.v_s, TRUTH.g, PUSH_SPEEDS, PUSH_SPEED_SD, PUSH_DISTANCE_SD, PUSH_SCATTER
+    )
+    tables = (
+        table("static_friction", column("angle", np.deg2rad(tilts["angle [deg]"]))),
+        table(
+            "dynamic_friction",
+            column("speed", pushes["speed [m/s]"], PUSH_SPEED_SD),
+            column("distance", 1e-3 * pushes["distance [mm]"], PUSH_DISTANCE_SD),
+        ),
+    )
+    rig = Rig("bench", True, Quantity(TRUTH.m1), Quantity(TRUTH.m2), Quantity(TRUTH.g), {}, tables, {}, Path("bench"))
+    tilt, push = (KINDS[t.kind](t, rig) for t in tables)
+    return tension(rig, [tilt], [push]).p
