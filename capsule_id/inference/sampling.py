@@ -10,7 +10,7 @@ import numpy as np
 
 from capsule_id.inference.chain_store import ChainStore
 from capsule_id.inference.curvature import in_batches
-from capsule_id.inference.diagnostics import effective_sample_size, integrated_time, split_rhat
+from capsule_id.inference.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.moves import PILOT_STEPS, Moves, candidates, differential_evolution
 from capsule_id.inference.result import PointFit, Posterior
@@ -79,7 +79,7 @@ def sample(
                     chains.between_draws()
                 report(sum(s.iteration for s in samplers), ENSEMBLES * goal, schedule.move)
         draws = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
-        tau, rhat = integrated_time(draws), split_rhat(draws)
+        tau, rhat = ensemble_time(draws), split_rhat(draws)
         converged = bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
         if converged:
             break
@@ -111,7 +111,7 @@ def pilot(target: LogPosterior, fit: PointFit, seed: int) -> Schedule:
     for name, candidate in moves.items():
         sampler = _ensemble(target, state.coords.shape[0], candidate)
         state = sampler.run_mcmc(state, PILOT_STEPS)
-        measured[name] = float(np.max(integrated_time(np.asarray(sampler.get_chain())[None])))
+        measured[name] = float(np.max(ensemble_time(np.asarray(sampler.get_chain())[None])))
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     return Schedule(best, moves[best], measured, max(1, round(tau)), int(np.ceil(BURN_IN_IN_TAU * tau)))

@@ -19,9 +19,6 @@ def column(name: str, values: ArrayLike, sd: float | None = None, resolution: fl
     return Column(name, "SI", 1.0, np.asarray(values, dtype=float), sd, resolution)
 
 
-ROD, CAPSULE = Quantity(M1), Quantity(M2)
-
-
 def table(kind: str, columns: Sequence[Column], label: str = "", **settings: object) -> Table:
     """An ``[[experiment]]`` of these columns."""
     rows = np.arange(2, 2 + len(columns[0].values))
@@ -30,13 +27,8 @@ def table(kind: str, columns: Sequence[Column], label: str = "", **settings: obj
 
 def rig(
     *tables: Table,
-<<<<<<< HEAD
-    m1: Quantity | None = ROD,
-    m2: Quantity | None = CAPSULE,
-=======
     m1: Quantity = ROD,
     m2: Quantity = CAPSULE,
->>>>>>> t-stats
     priors: Mapping[str, PriorOverride] | None = None,
 ) -> Rig:
     """A rig of these tables; masses are exact unless stated otherwise."""

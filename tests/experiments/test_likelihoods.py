@@ -108,7 +108,11 @@ def test_steady_sliding(quantity: str) -> None:
     ids=["both sds", "ratio", "none", "one sd"],
 )
 def test_lines(
-    force_sd: float | None, current_sd: float | None, ratio: float | None, force_variance: float, current_variance: float
+    force_sd: float | None,
+    current_sd: float | None,
+    ratio: float | None,
+    force_variance: float,
+    current_variance: float,
 ) -> None:
     """Errors as large as the range: SciPy's covariance of the wide intercept is then still well conditioned.
 

@@ -5,7 +5,7 @@ import emcee
 import numpy as np
 import pytest
 
-from capsule_id.inference.diagnostics import effective_sample_size, integrated_time, split_rhat
+from capsule_id.inference.diagnostics import effective_sample_size, ensemble_time, split_rhat
 
 
 def autoregressive(rho: float, shape: tuple[int, int, int, int], seed: int) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_rhat_sees_a_drift() -> None:
 def test_integrated_time_and_ess(rho: float) -> None:
     """(1 + rho)/(1 - rho), and arviz's effective sample size of the walkers as chains (they are independent here)."""
     x = autoregressive(rho, (4, 600, 32, 2), 5)
-    tau = integrated_time(x)
+    tau = ensemble_time(x)
     # Sokal (1997): relative variance 2 (2M + 1)/n, here of 8 x 600 x 32 draws and M = 5 tau.
     known = (1.0 + rho) / (1.0 - rho)
     bound = 4.0 * np.sqrt(2.0 * (10.0 * known + 1.0) / x.size)
@@ -72,7 +72,7 @@ def test_each_walkers_own_mean_would_understate() -> None:
     x = autoregressive(0.8, (8, 450, 64, 1), 6)
     theirs = np.mean([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in x])
     assert theirs == pytest.approx(0.8 * 9.0, rel=0.06)
-    assert np.mean(integrated_time(x)) == pytest.approx(9.0, rel=0.06)
+    assert np.mean(ensemble_time(x)) == pytest.approx(9.0, rel=0.06)
 
 
 def test_ess_predicts_the_error_of_a_mean() -> None:
@@ -81,7 +81,7 @@ def test_ess_predicts_the_error_of_a_mean() -> None:
     for seed in range(400):
         x = autoregressive(0.8, (2, 300, 8, 1), seed)
         means.append(np.mean(x))
-        promised.append(1.0 / np.sqrt(effective_sample_size(x, integrated_time(x))[0]))
+        promised.append(1.0 / np.sqrt(effective_sample_size(x, ensemble_time(x))[0]))
     seen = np.std(means)
     assert seen == pytest.approx(np.mean(promised), rel=4.0 / np.sqrt(2 * 400))
     assert seen > 2.5 / np.sqrt(x.size)

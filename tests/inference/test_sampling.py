@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stub import Gaussian
 
-from capsule_id.inference.diagnostics import effective_sample_size, integrated_time
+from capsule_id.inference.diagnostics import effective_sample_size, ensemble_time
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling import ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
 
@@ -31,7 +31,7 @@ def scores(draws: np.ndarray, known: Gaussian) -> np.ndarray:
     rows, columns = np.triu_indices(known.dimension, 1)
     products = y[..., rows] * y[..., columns] - (known.covariance / np.outer(sd, sd))[rows, columns]
     functions = np.concatenate([y, y**2 - 1.0, products], axis=-1)
-    ess = effective_sample_size(functions, integrated_time(functions))
+    ess = effective_sample_size(functions, ensemble_time(functions))
     flat = functions.reshape(-1, functions.shape[-1])
     return np.mean(flat, axis=0) / (np.std(flat, axis=0) / np.sqrt(ess))
 

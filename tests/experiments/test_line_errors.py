@@ -1,0 +1,65 @@
+"""Errors in both columns of a calibration line: the slope must not be drawn to ordinary least squares."""
+
+import bench
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from capsule_id.experiments.motor_current import MotorCurrent
+
+K, CURRENT_SD, FORCE_SD = 2.0, 0.15, 0.1
+CURRENTS = np.linspace(0.0, 2.0, 40)
+
+
+def slopes(replicates: int, along: bool) -> np.ndarray:
+    """MAP slopes of replicates; ``along=False`` leaves the measure along the line out, a prior flat in the current."""
+    rng = np.random.default_rng(11)
+    found = []
+    for _ in range(replicates):
+        force = K * CURRENTS + FORCE_SD * rng.standard_normal(CURRENTS.size)
+        current = CURRENTS + CURRENT_SD * rng.standard_normal(CURRENTS.size)
+        columns = [bench.column("force", force, FORCE_SD), bench.column("current", current, CURRENT_SD)]
+        line = MotorCurrent(table := bench.table("motor_current", columns), bench.rig(table))
+
+        def objective(slope: float, line: MotorCurrent = line) -> float:
+            theta = {"K": slope}
+            value = float(line.log_likelihood(theta, np))
+            return -(value if along else value - float(np.sum(line.misfit(theta, np).log_measure)))
+
+        found.append(minimize_scalar(objective, bounds=(1.0, 3.0), method="bounded").x)
+    return np.array(found)
+
+
+def test_slope_is_unbiased_under_errors_in_both_columns() -> None:
+    found = slopes(300, along=True)
+    error = np.std(found, ddof=1) / np.sqrt(found.size)
+    assert np.mean(found) == pytest.approx(K, abs=3.0 * error)
+
+
+def test_a_prior_flat_in_the_current_would_bias_it() -> None:
+    """Negative control: low by (sd_x / sd of the currents)^2 = 6 %, as ordinary least squares."""
+    found = slopes(300, along=False)
+    expected = K * (1.0 - CURRENT_SD**2 / (np.var(CURRENTS) + CURRENT_SD**2))
+    assert np.mean(found) == pytest.approx(expected, abs=0.02)
+    assert np.mean(found) < K - 0.05
+
+
+def test_deming_regression_by_hand() -> None:
+    """With both errors stated the MAP slope is the closed form of Deming regression (Fuller 1987, section 1.3)."""
+    rng = np.random.default_rng(3)
+    force = K * CURRENTS + FORCE_SD * rng.standard_normal(CURRENTS.size)
+    current = CURRENTS + CURRENT_SD * rng.standard_normal(CURRENTS.size)
+    columns = [bench.column("force", force, FORCE_SD), bench.column("current", current, CURRENT_SD)]
+    line = MotorCurrent(table := bench.table("motor_current", columns), bench.rig(table))
+    ratio = (FORCE_SD / CURRENT_SD) ** 2
+    (sxx, sxy), (_, syy) = np.cov(current, force)
+    deming = (syy - ratio * sxx + np.sqrt((syy - ratio * sxx) ** 2 + 4.0 * ratio * sxy**2)) / (2.0 * sxy)
+
+    def objective(slope: float) -> float:
+        # Deming regression maximises over the intercept; integrating it out multiplies by its conditional sd.
+        spread = 0.5 * np.log(FORCE_SD**2 + (slope * CURRENT_SD) ** 2)
+        return spread - float(line.log_likelihood({"K": slope}, np))
+
+    found = minimize_scalar(objective, bounds=(1.0, 3.0), method="bounded", options={"xatol": 1e-9})
+    # The intercept's prior is wide, not flat: it moves the slope by about (noise / prior width)^2.
+    assert found.x == pytest.approx(deming, rel=1e-5)
