@@ -88,14 +88,6 @@ class LogPosterior:
         sd = np.where(kinds == "positive_normal", width / np.where(location == 0.0, 1.0, location), width)
         return np.where(kinds == "halfnormal", np.pi / np.sqrt(8.0), sd)
 
-    def block_of(self, index: int) -> np.ndarray:
-        """Indices of the parameters linked to parameter ``index`` through shared experiments, masses aside."""
-        linked = {self.names[index]}
-        groups = [{row.name for row in experiment.parameters} for experiment in self.experiments]
-        for _ in groups:
-            linked |= {name for group in groups if group & linked for name in group}
-        return np.array([i for i, name in enumerate(self.names) if name in linked])
-
     def theta(self, u: np.ndarray) -> np.ndarray:
         """(..., d) constrained values from u (..., d), NumPy."""
         return density.constrain(self.structure, u, np)

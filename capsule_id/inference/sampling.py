@@ -100,9 +100,8 @@ def pilot(target: LogPosterior, fit: PointFit, seed: int) -> Schedule:
     state = emcee.State(_initial(target, fit, random), random_state=random.get_state())
     sampler = _ensemble(target, state.coords.shape[0], differential_evolution())
     state = sampler.run_mcmc(state, 2 * PILOT_STEPS)
-    slowest = int(np.argmax(integrated_time(sampler.get_chain(discard=PILOT_STEPS)[None])))
     sample = sampler.get_chain(discard=PILOT_STEPS, flat=True)
-    measured, moves = {}, candidates(sample, target.block_of(slowest))
+    measured, moves = {}, candidates(sample)
     for name, candidate in moves.items():
         sampler = _ensemble(target, state.coords.shape[0], candidate)
         state = sampler.run_mcmc(state, PILOT_STEPS)

@@ -66,9 +66,6 @@ class Gaussian:
     def theta(self, u: np.ndarray) -> np.ndarray:
         return u
 
-    def block_of(self, index: int) -> np.ndarray:
-        return np.arange(self.dimension)
-
     def fit(self, off: float = 0.5, wide: float = 1.3) -> PointFit:
         """A Laplace approximation that is ``off`` sds off and ``wide`` times too wide."""
         sd = np.sqrt(np.diag(self.covariance))
