@@ -13,7 +13,7 @@ from scipy import stats
 
 def test_ten_rigs(tmp_path: Path) -> None:
     """A small version of the next test at a fixed seed: 100 numbers, of which 5 lie outside their intervals."""
-    outcomes = list(study(tmp_path, range(10), budget=800))
+    outcomes = list(study(tmp_path, range(10), budget=400))
     found = summarise(outcomes)
     print(found.describe())
     assert found.numbers == 100

@@ -24,7 +24,7 @@ TRUTH = Truth()
 OUTLIER = 0.03  # of full scale, where the noise is 0.2 %
 DRY_FORCE = 0.05  # N, beside a release force of 2 to 3.5 N
 BEND = 0.05  # of the range at mid range, where the force is read to 0.9 % of it
-OTHER_SURFACE = 0.15  # less mu on the tilted surface
+OTHER_SURFACE = 0.25  # less mu on the tilted surface; at 0.15 the check names 2 rigs in 10, at 0.20 9 in 10
 
 
 def read(file: Path) -> tuple[str, np.ndarray]:
