@@ -72,6 +72,8 @@ class Experiment(ABC):
     #: of the former and in the values of the latter are evaluated together, in one batch (see ``signature``).
     ARRAYS: tuple[str, ...] = ()
     STATIC: tuple[str, ...] = ()
+    #: Masses that the likelihood reads.
+    masses: tuple[str, ...] = ()
 
     def __init__(self, table: Table, rig: Rig) -> None:
         self.table = table
@@ -105,7 +107,7 @@ class Experiment(ABC):
     def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Values by symbol out of values by name."""
         own = {row.symbol: values[row.name] for row in self.parameters}
-        return own | {name: values[name] for name in ("m1", "m2", "g") if name in values}
+        return own | {name: values[name] for name in (*self.masses, "g") if name in values}
 
     @property
     @abstractmethod

@@ -35,6 +35,7 @@ class FreeVibration(Experiment):
     """
 
     time_series = True
+    masses = ("m1",)
     ARRAYS = ("time", "values", "width", "reading_sd", "side", "folded", "step")
     STATIC = ("damping", "half_cycles", "substeps", "uniform")
 

@@ -27,6 +27,7 @@ class SlidingFriction(FrictionExperiment):
         self.speed = table["speed"]
         self.quantity = "force" if "force" in table.columns else "coefficient"
         self.values = table[self.quantity]
+        self.masses = ("m1", "m2") if self.quantity == "force" else ()
         self.speed_sd = table.columns["speed"].reading_sd
         self.values_sd = table.columns[self.quantity].reading_sd
 

@@ -65,7 +65,7 @@ def run_checks(setting: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
         *_boundary(setting),
     ]
     for experiment in setting.experiments:
-        findings += experiment.lint(experiment.local(setting.values))
+        findings += experiment.lint(setting.values)
     return findings, flagged
 
 

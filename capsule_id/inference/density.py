@@ -59,7 +59,7 @@ def make_groups(
     groups, arrays = [], []
     for signature, group in members.items():
         first = group[0]
-        sampled = [row.symbol for row in first.parameters] + [m for m in ("m1", "m2") if m in names]
+        sampled = [row.symbol for row in first.parameters] + [m for m in first.masses if m in names]
         own = [{row.symbol: row.name for row in e.parameters} for e in group]
         entries = tuple((s, tuple(names.index(table.get(s, s)) for table in own)) for s in sampled)
         groups.append(Group(signature, entries, tuple(sorted(fixed)), first))

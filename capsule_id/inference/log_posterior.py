@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
+from scipy.sparse.csgraph import connected_components
 
 from capsule_id.experiments.base import Experiment, Start
 from capsule_id.inference import density
@@ -99,6 +100,17 @@ class LogPosterior:
     def mapping(self, theta: np.ndarray) -> dict[str, float]:
         """Constrained values (d,) by name, constants included."""
         return {**self.fixed, **dict(zip(self.names, (float(v) for v in theta), strict=True))}
+
+    @cached_property
+    def blocks(self) -> list[np.ndarray]:
+        """Indices of parameters that some experiment ties together: between blocks the posterior is a product."""
+        adjacent = np.eye(self.dimension, dtype=bool)
+        for experiment in self.experiments:
+            own = {row.name for row in experiment.parameters} | set(experiment.masses)
+            member = np.array([name in own for name in self.names])
+            adjacent |= np.outer(member, member)
+        count, label = connected_components(adjacent, directed=False)
+        return [np.flatnonzero(label == i) for i in range(count)]
 
     @cached_property
     def numbers(self) -> dict[str, Any]:

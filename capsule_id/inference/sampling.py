@@ -12,7 +12,7 @@ from capsule_id.inference.chain_store import ChainStore
 from capsule_id.inference.curvature import in_batches
 from capsule_id.inference.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.moves import PILOT_STEPS, Moves, candidates, differential_evolution
+from capsule_id.inference.moves import Moves, candidates, differential_evolution
 from capsule_id.inference.result import PointFit, Posterior
 
 ENSEMBLES = 4
@@ -25,10 +25,15 @@ MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first check, and between the checks that follow.
 FIRST_CHECK, CHECK_EVERY = 120, 60
 #: Autocorrelation times (of the pilot) that every ensemble runs before its first stored draw.
-BURN_IN_IN_TAU = 20.0
+BURN_IN_IN_TAU = 8.0
 #: Walkers start this much wider than the Laplace approximation.
 OVERDISPERSION = 1.2
 DEFAULT_BUDGET = 20_000
+#: One draw is stored per this part of the pilot's autocorrelation time, but at least one per MAX_THIN steps: a short
+#: pilot knows that time only roughly.
+DRAWS_PER_TAU, MAX_THIN = 5.0, 15
+#: Steps of the pilot's burn-in, and of each candidate move that it times.
+PILOT_BURN_IN, PILOT_STEPS = 300, 300
 
 Progress = Callable[[int, int, str], None]
 
@@ -105,16 +110,17 @@ def pilot(target: LogPosterior, fit: PointFit, seed: int) -> Schedule:
     random = np.random.RandomState(seed)
     state: Any = emcee.State(_initial(target, fit, random), random_state=random.get_state())
     sampler = _ensemble(target, state.coords.shape[0], differential_evolution())
-    state = sampler.run_mcmc(state, 2 * PILOT_STEPS)
-    sample = np.asarray(sampler.get_chain(discard=PILOT_STEPS, flat=True))
-    measured, moves = {}, candidates(sample, fit.covariance)
+    state = sampler.run_mcmc(state, 2 * PILOT_BURN_IN)
+    sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN, flat=True))
+    measured, moves = {}, candidates(sample, target.blocks)
     for name, candidate in moves.items():
         sampler = _ensemble(target, state.coords.shape[0], candidate)
         state = sampler.run_mcmc(state, PILOT_STEPS)
         measured[name] = float(np.max(ensemble_time(np.asarray(sampler.get_chain())[None])))
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
-    return Schedule(best, moves[best], measured, max(1, round(tau)), int(np.ceil(BURN_IN_IN_TAU * tau)))
+    thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
+    return Schedule(best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
 
 
 def _checks(last: int) -> Iterator[int]:
