@@ -8,8 +8,12 @@ WINDOW = 5.0
 
 
 def integrated_time(draws: np.ndarray) -> np.ndarray:
-    """(ensemble, d) integrated autocorrelation time, in draws, of every ensemble: emcee's estimator, for the ESS."""
-    return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
+    """(ensemble, d) integrated autocorrelation time, in draws, of every ensemble: emcee's estimator, for the ESS.
+
+    NaN, not known, where a walker never moved (a budget of a few draws).
+    """
+    with np.errstate(invalid="ignore"):
+        return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
 
 
 def ensemble_time(draws: np.ndarray) -> np.ndarray:
@@ -48,5 +52,8 @@ def split_rhat(draws: np.ndarray) -> np.ndarray:
 
 
 def effective_sample_size(draws: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """(d,) draws divided by the integrated autocorrelation time ``tau`` (ensemble, d), summed over ensembles."""
-    return np.sum(draws.shape[1] * draws.shape[2] / tau, axis=0)
+    """(d,) draws divided by the integrated autocorrelation time ``tau`` (ensemble, d), summed over ensembles.
+
+    Never more than there are draws: the estimate of tau from a few draws may be 0.
+    """
+    return np.sum(draws.shape[1] * draws.shape[2] / np.maximum(tau, 1.0), axis=0)

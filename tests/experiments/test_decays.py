@@ -58,8 +58,8 @@ def dry_reference(time: np.ndarray, F_dry: float, amplitude: float) -> np.ndarra
         def rate(t: float, s: np.ndarray, side: float = side) -> list[float]:
             return [s[1], -(K1 * s[0] + C * s[1] + F_dry * side) / M1]
 
-        def turning(t: float, s: np.ndarray, start: float = start) -> float:
-            return s[1] if t > start + 1e-3 else 1.0
+        def turning(t: float, s: np.ndarray, start: float = start, away: float = side) -> float:
+            return s[1] if t > start + 1e-3 else away
 
         turning.terminal = True  # type: ignore[attr-defined]
         part = solve_ivp(
