@@ -1,0 +1,118 @@
+"""Forward and reverse mode through a march, on the grid of steps that the march itself has chosen.
+
+``jax.custom_jvp`` states the tangent of a run; the tangent map T is linear and is handed to JAX together with its
+transpose, so that ``jax.jvp``, ``jacfwd``, ``grad`` and ``vjp`` all work and cost a loop over the steps really taken.
+(A plain while loop has no reverse mode; a bounded scan would pay for ``max_steps`` steps in every batched run.)
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from capsule_id.capsule.march import Problem, Record, checkpoints, inside, replay, run, segment
+from capsule_id.capsule.rosenbrock import State, derivative
+
+Tangent = tuple[Any, State]  # of (theta, initial state)
+
+
+@jax.custom_jvp
+def _first_order_only(tree: Any) -> Any:  # noqa: ANN401
+    return tree
+
+
+@_first_order_only.defjvp
+def _refuse(_primals: tuple[Any], _tangents: tuple[Any]) -> Any:  # noqa: ANN401
+    raise NotImplementedError("the smoothed model has first derivatives only: take differences of jax.grad instead")
+
+
+def _tangent_maps(
+    problem: Problem,
+    inputs: tuple[Any, jax.Array, State],
+    max_steps: int,
+) -> tuple[Callable[[Tangent], jax.Array], Callable[[jax.Array], Tangent]]:
+    """The linear map from tangents of (theta, initial state) to those of the samples (4, L, n), and its transpose."""
+    theta, times, y = inputs
+    end = times[:, -1]
+    count, store = checkpoints(problem, theta, times, y, max_steps)
+
+    def piece(k: jax.Array) -> tuple[Callable[[Any, State], tuple[State, jax.Array]], State, jax.Array]:
+        """Segment k as a function of (theta, state at its start), that state, and which samples it holds."""
+        start = jax.tree.map(lambda rows: rows[k], store)
+        rows, lanes = segment(problem, theta, end, start, max_steps)
+        return lambda a, b: replay(problem, a, b, rows[:, 0], times), start.y, inside(lanes, rows, times)
+
+    def forward(tangent: Tangent) -> jax.Array:
+        def body(carry: tuple[jax.Array, State, jax.Array]) -> tuple[jax.Array, State, jax.Array]:
+            k, d_y, out = carry
+            function, start, held = piece(k)
+            d_y, d_samples = jax.jvp(function, (theta, start), (tangent[0], d_y))[1]
+            return k + 1, d_y, jnp.where(held, d_samples, out)
+
+        first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(jnp.stack(tangent[1]))
+        return jax.lax.while_loop(lambda c: c[0] < count, body, (jnp.int32(0), tangent[1], first))[2]
+
+    def backward(cotangent: jax.Array) -> Tangent:
+        def body(carry: tuple[jax.Array, Any, State]) -> tuple[jax.Array, Any, State]:
+            k, c_theta, c_y = carry
+            function, start, held = piece(k - 1)
+            pull = jax.vjp(function, theta, start)[1]
+            more, c_y = pull((c_y, jnp.where(held, cotangent, 0.0)))
+            return k - 1, jax.tree.map(jnp.add, c_theta, more), c_y
+
+        none = jax.tree.map(jnp.zeros_like, (theta, y))
+        _, c_theta, c_y = jax.lax.while_loop(lambda c: c[0] > 0, body, (count, *none))
+        first = cotangent[:, :, 0]
+        return c_theta, (c_y[0] + first[0], c_y[1] + first[1], c_y[2] + first[2], c_y[3] + first[3])
+
+    return forward, backward
+
+
+def _apply_linear(
+    forward: Callable[[Tangent], jax.Array], backward: Callable[[jax.Array], Tangent], tangent: Tangent, like: jax.Array
+) -> jax.Array:
+    """``forward(tangent)``, transposed by ``backward``.
+
+    JAX's carrier of a linear map with a transpose of one's own that also batches is ``custom_linear_solve``: the
+    solution of [[1, 0], [-T, 1]] (u, v) = (tangent, 0) is (tangent, T tangent). Its ``matvec`` is consulted only for
+    derivatives of the matrix, so for second derivatives, which ``_first_order_only`` refuses; the identity stands in.
+    """
+
+    def solve(_: Callable[[Any], Any], b: tuple[Tangent, jax.Array]) -> tuple[Tangent, jax.Array]:
+        return b[0], b[1] + forward(b[0])
+
+    def transposed(_: Callable[[Any], Any], b: tuple[Tangent, jax.Array]) -> tuple[Tangent, jax.Array]:
+        return jax.tree.map(jnp.add, b[0], backward(b[1])), b[1]
+
+    right_hand_side = (tangent, jnp.zeros_like(like))
+    return jax.lax.custom_linear_solve(lambda u: u, right_hand_side, solve, transposed)[1]
+
+
+def differentiable_run(problem: Problem, max_steps: int) -> Callable[[Any, jax.Array, State], Record]:
+    """``march.run`` with first derivatives in theta, times and the initial state, forward and reverse mode.
+
+    A lane that fails has NaN derivatives wherever its samples are NaN.
+    """
+
+    @jax.custom_jvp
+    def function(theta: Any, times: jax.Array, y: State) -> Record:  # noqa: ANN401
+        return run(problem, theta, times, y, max_steps)
+
+    @function.defjvp
+    def _(primals: tuple[Any, jax.Array, State], tangents: tuple[Any, jax.Array, State]) -> tuple[Record, Record]:
+        record = function(*primals)
+        theta, times, y = _first_order_only(primals)
+        d_theta, d_times, d_y = tangents
+        samples = _first_order_only(record.samples)
+        field = problem.field(jax.tree.map(lambda leaf: leaf[..., None], theta))
+        rate = jnp.stack(derivative(field, times, (samples[0], samples[1], samples[2], samples[3])))
+        # A later start from the same state is the same start from a state moved back along the field.
+        d_y = tuple(leaf - rate[i, :, 0] * d_times[:, 0] for i, leaf in enumerate(d_y))
+        forward, backward = _tangent_maps(problem, (theta, times, y), max_steps)
+        d_samples = _apply_linear(forward, backward, (d_theta, d_y), samples) + rate * d_times
+        d_samples = d_samples * jnp.where(jnp.isfinite(samples), 1.0, jnp.nan)
+        counts = [jnp.zeros(leaf.shape, jax.dtypes.float0) for leaf in record[1:]]
+        return record, Record(d_samples, *counts)
+
+    return function
