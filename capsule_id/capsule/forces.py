@@ -30,14 +30,12 @@ require_float64()
 Array = jax.Array | float
 
 
-# ---------------------------------------------------------------- smoothed Heaviside, its integral, sign and |x|
+# ------------------------------------------- smoothed Heaviside, its integral, sign and |x|; every width is positive
 
 
-def _scaled(x: Array, width: Array) -> tuple[jax.Array, jax.Array]:
-    """x / width clipped to [-1, 1], and a width without zeros (a zero width leaves the exact function)."""
-    safe = jnp.where(jnp.asarray(width) > 0.0, width, 1.0)
-    steep = jnp.where(jnp.asarray(width) > 0.0, x / safe, jnp.sign(x))
-    return jnp.clip(steep, -1.0, 1.0), safe
+def _scaled(x: Array, width: Array) -> jax.Array:
+    """x / width clipped to [-1, 1]."""
+    return jnp.minimum(jnp.maximum(x / width, -1.0), 1.0)
 
 
 def smooth_sign(x: Array, width: Array) -> jax.Array:
@@ -45,9 +43,9 @@ def smooth_sign(x: Array, width: Array) -> jax.Array:
 
     At 0: value 0, slope 15 / (8 width), curvature 0. At and beyond +-width, so at +-infinity: +-1, all derivatives 0.
     """
-    s, _ = _scaled(x, width)
+    s = _scaled(x, width)
     q = s * s
-    return s * (15.0 - 10.0 * q + 3.0 * q * q) / 8.0
+    return s * (1.875 + q * (0.375 * q - 1.25))
 
 
 def smooth_heaviside(x: Array, width: Array) -> jax.Array:
@@ -66,10 +64,10 @@ def smooth_ramp(x: Array, width: Array) -> jax.Array:
     At 0: 5 width / 32, slope 1/2, curvature 15 / (16 width). At -infinity 0 with slope 0; at +infinity x with slope 1
     (exactly, from +-width on). With H_w it makes a support force that has a potential: contact conserves energy.
     """
-    s, safe = _scaled(x, width)
+    s = _scaled(x, width)
     q = s * s
-    inside = safe * (5.0 + 16.0 * s + q * (15.0 - 5.0 * q + q * q)) / 32.0
-    return jnp.where(jnp.abs(x) < width, inside, jnp.maximum(x, 0.0))
+    rounded = (0.03125 * width) * (5.0 + 16.0 * s + q * (15.0 + q * (q - 5.0)))
+    return rounded + jnp.maximum(x - width, 0.0)
 
 
 # ---------------------------------------------------------------- rod to capsule
@@ -165,7 +163,19 @@ def friction(law: FrictionLaw, Y2: Array, f: Array) -> jax.Array:
     return jnp.where(Y2 == 0.0, jnp.clip(f, -backward, forward), sliding)
 
 
-def friction_smooth(law: FrictionLaw, Y2: Array, f: Array, velocity: Array, rounding: Array) -> jax.Array:
+def breakaway(law: FrictionLaw) -> jax.Array:
+    """F_b, N: the law's resistance at speed 0, the mean of both directions."""
+    still = jnp.zeros(())
+    return 0.5 * (law.forward(still) + law.backward(still))
+
+
+def _corner(rounding: Array, F_b: Array) -> jax.Array:
+    """Width of the threshold's corner, N. Without friction any width gives zero force; 1 N keeps quotients finite."""
+    width = jnp.asarray(rounding * F_b)
+    return jnp.where(width > 0.0, width, 1.0)
+
+
+def friction_smooth(law: FrictionLaw, F_b: Array, Y2: Array, f: Array, widths: tuple[Array, Array]) -> jax.Array:
     """Smoothed stick-slip rule: a gate in velocity *and* force without creep.
 
     friction = x clipped softly to [-backward, forward],   x = f + sqrt(F_b^2 + f^2) Y2 / velocity.
@@ -180,28 +190,27 @@ def friction_smooth(law: FrictionLaw, Y2: Array, f: Array, velocity: Array, roun
     Y2 -> +-infinity; at f -> +-infinity with Y2 = 0 the threshold with the sign of f. Limit velocity -> 0: ``friction``,
     for every ``rounding``.
 
-    velocity : width, m/s                rounding : the clip's corner, as a fraction of the threshold F_b
+    F_b : ``breakaway(law)``, computed once per run
+    widths : (velocity, m/s; rounding: the half-width of the clip's corner as a fraction of F_b)
     """
+    velocity, rounding = widths
     speed = smooth_abs(Y2, velocity)
     forward, backward = law.forward(speed), law.backward(speed)
-    still = jnp.zeros_like(speed)
-    F_b = 0.5 * (law.forward(still) + law.backward(still))
     square = F_b * F_b + f * f
     # At f = 0 without friction the root has no derivative: nothing holds the capsule, the pull is zero.
     pull = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
     x = f + pull * Y2 / velocity
-    corner = rounding * F_b
+    corner = _corner(rounding, F_b)
     return x - smooth_ramp(x - forward, corner) + smooth_ramp(-x - backward, corner)
 
 
-def force_gate(law: FrictionLaw, f: Array, rounding: Array) -> jax.Array:
+def force_gate(law: FrictionLaw, F_b: Array, f: Array, rounding: Array) -> jax.Array:
     """H2 (1 - H1) + H3 H1 of eq. (2), smoothed: 1 where |f| exceeds the threshold, 0 below, in force alone.
 
     With f the whole force on the capsule, contact included, H2 and H3 are one function, H(|f| - F_b).
     At f = 0 and f inside (1 - rounding) of the threshold 0, at the threshold 1/2 with slope 15 / (16 rounding F_b),
     at +-infinity 1 with slope 0. This is the gate of eq. (2) to the letter, whose limit is not the stick-slip rule.
     """
-    still = jnp.zeros_like(jnp.asarray(f))
-    forward, backward = law.forward(still), law.backward(still)
-    corner = 0.5 * rounding * (forward + backward)
-    return smooth_heaviside(f - forward, corner) + smooth_heaviside(-f - backward, corner)
+    still = jnp.zeros(())
+    corner = _corner(rounding, F_b)
+    return smooth_heaviside(f - law.forward(still), corner) + smooth_heaviside(-f - law.backward(still), corner)

@@ -1,14 +1,9 @@
-"""Adaptive march of lanes through a smooth field, with samples at any times and derivatives in both modes.
+"""Adaptive march of lanes through a smooth field, with samples at any times; differentiated in ``march_tangents``.
 
-    segment = at most SEGMENT steps, whose states are kept -> samples inside it by interpolation -> next segment
+    segment = a bounded number of steps, whose states are kept -> samples inside it by interpolation -> next segment
 
 Every lane has its own time, state and step; lanes are coupled only through "is anybody still running", so a lane's
 numbers do not depend on its neighbours. The memory does not grow with the length of the run.
-
-Derivatives: of the discrete solution on its own grid. The grid (times of the accepted steps) is held fixed, each step
-and the interpolation are differentiated exactly, so forward and reverse mode agree to rounding, and both agree with
-the derivative of the smooth model within the solver's tolerance. Only the state at the start of each segment is
-stored; both sweeps march through a segment again to recover its grid. First derivatives only.
 """
 
 from collections.abc import Callable
@@ -20,26 +15,25 @@ import jax.numpy as jnp
 from capsule_id.capsule.model import Status
 from capsule_id.capsule.rosenbrock import Field, State, derivative, step, step_factor
 
-# Steps between two interpolations of samples: the states of 64 lanes then fill about half of a second-level cache.
-SEGMENT = 256
-# A step never spans more than this angle of the drive, so that no stage pair can alias it.
-_DRIVE_ANGLE = 0.5
-# First step, as a fraction of the fastest time scale known before the run.
-_FIRST_STEP = 0.05
-# A lane whose step is rejected as not finite below this fraction of its run cannot be saved by a smaller step.
+# Steps between two interpolations of samples: one or two segments hold ten periods; 64 lanes of them fill 5 MB.
+SEGMENT = 2048
+# A lane whose step is rejected as not finite below this fraction of its time cannot be saved by a smaller step.
 _LEAST_STEP = 1e-13
 
 
 class Problem(NamedTuple):
-    """What a run is made of besides its inputs; all of it depends on ``theta``, the pytree that is differentiated."""
+    """What a run is made of besides its inputs; every array is (L,) or ()."""
 
-    field: Callable[[Any], Field]
-    gap: Callable[[Any], jax.Array]  # (L,), m: a closing is r - gap turning from negative to not negative
-    fastest: Callable[[Any], jax.Array]  # (L,), 1/s: estimate of the fastest rate
-    drive: Callable[[Any], jax.Array]  # (L,), rad/s
-    floors: Callable[[Any], tuple[jax.Array, jax.Array]]  # scales below which velocity and position need no accuracy
-    tolerance: Callable[[Any], jax.Array]
-    valid: Callable[[Any], jax.Array]  # (L,) bool
+    field: Field
+    gap: jax.Array  # m: a closing is r - gap turning from negative to not negative
+    first: jax.Array  # s: length of the first step tried
+    longest: jax.Array  # s: no step is longer (infinity: no bound)
+    floors: tuple[jax.Array, jax.Array]  # m/s and m: scales below which velocity and r need no accuracy
+    tolerance: jax.Array  # 1: error of a step over the scale reached so far
+    valid: jax.Array  # bool: whether the lane may start
+
+
+Build = Callable[[Any], Problem]  # from theta, the pytree in which a run is differentiated
 
 
 class Lanes(NamedTuple):
@@ -55,8 +49,15 @@ class Lanes(NamedTuple):
     status: jax.Array
 
 
+class Rows(NamedTuple):
+    """Times and states of the tried steps of a segment, (steps + 1, L) each; t = infinity past the last one."""
+
+    t: jax.Array
+    y: State
+
+
 class Record(NamedTuple):
-    """Samples y (4, L, n), and per lane closings of the gap, steps tried and status."""
+    """Samples (X1, Y1, X2, Y2) of shape (4, L, n); per lane the closings of the gap, the steps tried, the status."""
 
     samples: jax.Array
     closings: jax.Array
@@ -64,45 +65,44 @@ class Record(NamedTuple):
     status: jax.Array
 
 
-def _scales(lanes_speed: jax.Array, lanes_stretch: jax.Array, y: State) -> tuple[jax.Array, jax.Array]:
-    speed = jnp.maximum(lanes_speed, jnp.maximum(jnp.abs(y[1]), jnp.abs(y[3])))
-    return speed, jnp.maximum(lanes_stretch, jnp.abs(y[0] - y[2]))
+def _grown(speed: jax.Array, stretch: jax.Array, y: State) -> tuple[jax.Array, jax.Array]:
+    largest = jnp.maximum(jnp.abs(y[1]), jnp.abs(y[3]))
+    return jnp.maximum(speed, largest), jnp.maximum(stretch, jnp.abs(y[0] - y[2]))
 
 
-def _start(problem: Problem, theta: Any, t: jax.Array, end: jax.Array, y: State) -> Lanes:  # noqa: ANN401
-    speed, stretch = _scales(*(jnp.broadcast_to(x, t.shape) for x in problem.floors(theta)), y)
+def start(problem: Problem, times: jax.Array, y: State) -> Lanes:
+    """Lanes at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
+    t = times[:, 0]
+    speed, stretch = _grown(*(jnp.broadcast_to(floor, t.shape) for floor in problem.floors), y)
+    finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(jnp.stack(y)), axis=0)
+    status = jnp.where(finite & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
     zero = jnp.zeros(t.shape, jnp.int32)
-    finite = jnp.isfinite(t) & jnp.isfinite(end) & jnp.all(jnp.isfinite(jnp.stack(y)), axis=0)
-    status = jnp.where(finite & problem.valid(theta), Status.OK, Status.INVALID).astype(jnp.int32)
-    h = _FIRST_STEP / problem.fastest(theta)
-    return Lanes(t, y, h, speed, stretch, zero, zero, status)
+    return Lanes(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, zero, status)
 
 
-def _advance(problem: Problem, theta: Any, end: jax.Array, lanes: Lanes, max_steps: int) -> Lanes:  # noqa: ANN401
+def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> Lanes:
     """Try one step in every lane that is still running."""
     t, y = lanes.t, lanes.y
     running = (t < end) & (lanes.status == Status.OK)
-    longest = jnp.minimum(lanes.h, _DRIVE_ANGLE / jnp.maximum(problem.drive(theta), problem.fastest(theta) * 1e-9))
+    h = jnp.minimum(lanes.h, problem.longest)
     # A rest shorter than a hundredth of a step is taken along, so that no sliver of a step is left at the end.
-    last = longest * 1.01 >= end - t
-    h = jnp.where(running, jnp.where(last, end - t, longest), 1.0)
-    y_new, defect = step(problem.field(theta), t, y, h)
-    speed, stretch = _scales(lanes.speed, lanes.stretch, y_new)
+    last = h * 1.01 >= end - t
+    h = jnp.where(running, jnp.where(last, end - t, h), 1.0)
+    y_new, defect = step(problem.field, t, y, h)
+    speed, stretch = _grown(lanes.speed, lanes.stretch, y_new)
     velocity_error = jnp.maximum(jnp.abs(defect[1]), jnp.abs(defect[3])) / speed
-    error = jnp.maximum(velocity_error, jnp.abs(defect[0] - defect[2]) / stretch) / problem.tolerance(theta)
-    factor = step_factor(error)
+    error = jnp.maximum(velocity_error, jnp.abs(defect[0] - defect[2]) / stretch) / problem.tolerance
+    h_next = h * step_factor(error)
     accepted = running & (error <= 1.0)
-    h_next = jnp.where(accepted & last, jnp.maximum(lanes.h, h * factor), h * factor)
-    gap = problem.gap(theta)
-    closing = accepted & (y[0] - y[2] < gap) & (y_new[0] - y_new[2] >= gap)
+    closing = accepted & (y[0] - y[2] < problem.gap) & (y_new[0] - y_new[2] >= problem.gap)
     steps = lanes.steps + running
-    hopeless = running & ~jnp.isfinite(error) & (h < _LEAST_STEP * (jnp.abs(t) + jnp.abs(end)))
     t_new = jnp.where(accepted, jnp.where(last, end, t + h), t)
+    hopeless = running & ~jnp.isfinite(error) & (h < _LEAST_STEP * (jnp.abs(t) + jnp.abs(end)))
     status = jnp.where(hopeless, Status.NOT_FINITE, lanes.status)
     status = jnp.where(running & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
     return Lanes(
         t=t_new,
-        y=_where(accepted, y_new, y),
+        y=where(accepted, y_new, y),
         h=jnp.where(running, h_next, lanes.h),
         speed=jnp.where(accepted, speed, lanes.speed),
         stretch=jnp.where(accepted, stretch, lanes.stretch),
@@ -112,127 +112,112 @@ def _advance(problem: Problem, theta: Any, end: jax.Array, lanes: Lanes, max_ste
     )
 
 
-def _where(chosen: jax.Array, new: State, old: State) -> State:
+def where(chosen: jax.Array, new: State, old: State) -> State:
+    """Elementwise choice between two states."""
     return tuple(jnp.where(chosen, a, b) for a, b in zip(new, old, strict=True))  # pyright: ignore[reportReturnType]
-
-
-def segment(
-    problem: Problem,
-    theta: Any,  # noqa: ANN401
-    end: jax.Array,
-    lanes: Lanes,
-    max_steps: int,
-) -> tuple[jax.Array, Lanes]:
-    """Up to SEGMENT tried steps; rows (SEGMENT + 1, 5, L) of (t, X1, Y1, X2, Y2), t = infinity past the last one."""
-    rows = jnp.full((SEGMENT + 1, 5, *end.shape), jnp.inf)
-
-    def put(rows: jax.Array, i: jax.Array, lanes: Lanes) -> jax.Array:
-        return rows.at[i].set(jnp.stack([lanes.t, *lanes.y]))
-
-    def body(carry: tuple[jax.Array, jax.Array, Lanes]) -> tuple[jax.Array, jax.Array, Lanes]:
-        i, rows, lanes = carry
-        lanes = _advance(problem, theta, end, lanes, max_steps)
-        return i + 1, put(rows, i + 1, lanes), lanes
-
-    def more(carry: tuple[jax.Array, jax.Array, Lanes]) -> jax.Array:
-        return (carry[0] < SEGMENT) & _running(end, carry[2])
-
-    start = (jnp.int32(0), put(rows, jnp.int32(0), lanes), lanes)
-    _, rows, lanes = jax.lax.while_loop(more, body, start)
-    return rows, lanes
 
 
 def _running(end: jax.Array, lanes: Lanes) -> jax.Array:
     return jnp.any((lanes.t < end) & (lanes.status == Status.OK))
 
 
-def _interpolate(t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
-    """States (4, n) of one lane at ``times`` (n,), from rows t (S,) and y (S, 4), wherever t[0] < times <= last t.
+def segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, length: int) -> tuple[Rows, Lanes]:
+    """Try up to ``length`` steps; the rows on the way and where the lanes then stand."""
+
+    def put(rows: Rows, i: jax.Array, lanes: Lanes) -> Rows:
+        return jax.tree.map(lambda row, leaf: row.at[i].set(leaf), rows, Rows(lanes.t, lanes.y))
+
+    def body(carry: tuple[jax.Array, Rows, Lanes]) -> tuple[jax.Array, Rows, Lanes]:
+        i, rows, lanes = carry
+        lanes = _advance(problem, end, lanes, max_steps)
+        return i + 1, put(rows, i + 1, lanes), lanes
+
+    def more(carry: tuple[jax.Array, Rows, Lanes]) -> jax.Array:
+        return (carry[0] < length) & _running(end, carry[2])
+
+    shape = (length + 1, *end.shape)
+    blank = jnp.zeros(shape)
+    rows = put(Rows(jnp.full(shape, jnp.inf), (blank, blank, blank, blank)), jnp.int32(0), lanes)
+    _, rows, lanes = jax.lax.while_loop(more, body, (jnp.int32(0), rows, lanes))
+    return rows, lanes
+
+
+def _interpolate(rows: Rows, times: jax.Array) -> jax.Array:
+    """States (4, n) of one lane at ``times`` (n,), from rows (steps + 1,), wherever t[0] < times <= last finite t.
 
     Positions: the cubic through both ends with their velocities; velocities: its derivative. That needs no
     acceleration, which in the stiff phases of rest would be far larger than what the step has used.
     """
-    right = jnp.clip(jnp.searchsorted(t, times, side="left"), 1, t.shape[0] - 1)
+    right = jnp.clip(jnp.searchsorted(rows.t, times, side="left"), 1, rows.t.shape[0] - 1)
     left = right - 1
-    h = t[right] - t[left]
+    h = rows.t[right] - rows.t[left]
     h = jnp.where((h > 0.0) & jnp.isfinite(h), h, 1.0)
-    s = (times - t[left]) / h
-    a, b = y[left].T, y[right].T
+    s = (times - rows.t[left]) / h
     w, v0, v1 = s * s * (3.0 - 2.0 * s), s * (1.0 - s) ** 2, s * s * (s - 1.0)
     d, e0, e1 = 6.0 * s * (1.0 - s) / h, (1.0 - s) * (1.0 - 3.0 * s), s * (3.0 * s - 2.0)
 
-    def pair(x: int) -> tuple[jax.Array, jax.Array]:
-        rise = b[x] - a[x]
-        return a[x] + w * rise + h * (v0 * a[x + 1] + v1 * b[x + 1]), d * rise + e0 * a[x + 1] + e1 * b[x + 1]
+    def pair(X: jax.Array, Y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        X0, Y0, Y1, rise = X[left], Y[left], Y[right], X[right] - X[left]
+        return X0 + w * rise + h * (v0 * Y0 + v1 * Y1), d * rise + e0 * Y0 + e1 * Y1
 
-    return jnp.stack([*pair(0), *pair(2)])
-
-
-_interpolate_lanes = jax.vmap(_interpolate, in_axes=(1, 2, 0), out_axes=1)
+    return jnp.stack([*pair(rows.y[0], rows.y[1]), *pair(rows.y[2], rows.y[3])])
 
 
-def inside(lanes: Lanes, rows: jax.Array, times: jax.Array) -> jax.Array:
+# Lanes stand last in rows, first in times: rows are written by lane, times are searched by lane.
+interpolate = jax.vmap(_interpolate, in_axes=(1, 0), out_axes=1)
+
+
+def inside(rows: Rows, lanes: Lanes, times: jax.Array) -> jax.Array:
     """Which samples (L, n) fall into the segment that led to ``lanes``."""
-    return (times > rows[0, 0][:, None]) & (times <= lanes.t[:, None])
+    return (times > rows.t[0][:, None]) & (times <= lanes.t[:, None])
 
 
-def _first_sample(times: jax.Array, y: State, status: jax.Array) -> jax.Array:
-    """(4, L, n): the initial state at times[0] of lanes that may start, NaN elsewhere."""
-    nothing = jnp.full((4, *times.shape), jnp.nan)
-    return nothing.at[:, :, 0].set(jnp.where(status == Status.OK, jnp.stack(y), jnp.nan))
-
-
-def run(problem: Problem, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:  # noqa: ANN401
+def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:  # noqa: ANN401
     """March all lanes from times[:, 0] to times[:, -1]; samples after a lane's failure are NaN. No derivatives."""
-    end = times[:, -1]
-    lanes = _start(problem, theta, times[:, 0], end, y)
+    problem, end = build(theta), times[:, -1]
+    lanes = start(problem, times, y)
 
     def body(carry: tuple[Lanes, jax.Array]) -> tuple[Lanes, jax.Array]:
-        rows, lanes = segment(problem, theta, end, carry[0], max_steps)
-        states = _interpolate_lanes(rows[:, 0], rows[:, 1:], times)
-        return lanes, jnp.where(inside(lanes, rows, times), states, carry[1])
+        rows, lanes = segment(problem, end, carry[0], max_steps, SEGMENT)
+        return lanes, jnp.where(inside(rows, lanes, times), interpolate(rows, times), carry[1])
 
-    samples = _first_sample(times, y, lanes.status)
+    nothing = jnp.full((4, *times.shape), jnp.nan)
+    samples = nothing.at[:, :, 0].set(jnp.where(lanes.status == Status.OK, jnp.stack(y), jnp.nan))
     lanes, samples = jax.lax.while_loop(lambda carry: _running(end, carry[0]), body, (lanes, samples))
     return Record(samples, lanes.closings, lanes.steps, lanes.status)
 
 
 def checkpoints(
-    problem: Problem,
-    theta: Any,  # noqa: ANN401
-    times: jax.Array,
-    y: State,
-    max_steps: int,
+    problem: Problem, times: jax.Array, y: State, max_steps: int, length: int
 ) -> tuple[jax.Array, Lanes]:
-    """The number of segments, and the lanes at the start of each, (segments, L) each. No derivatives."""
+    """The number of segments of a run, and the lanes at the start of each, (segments, L) each. No derivatives."""
     end = times[:, -1]
-    lanes = _start(problem, theta, times[:, 0], end, y)
-    most = -(-max_steps // SEGMENT)
-    store = jax.tree.map(lambda leaf: jnp.zeros((most, *leaf.shape), leaf.dtype), lanes)
+    lanes = start(problem, times, y)
+    store = jax.tree.map(lambda leaf: jnp.zeros((-(-max_steps // length), *leaf.shape), leaf.dtype), lanes)
 
     def body(carry: tuple[jax.Array, Lanes, Lanes]) -> tuple[jax.Array, Lanes, Lanes]:
         k, lanes, store = carry
         store = jax.tree.map(lambda rows, leaf: rows.at[k].set(leaf), store, lanes)
-        return k + 1, segment(problem, theta, end, lanes, max_steps)[1], store
+        return k + 1, segment(problem, end, lanes, max_steps, length)[1], store
 
     count, _, store = jax.lax.while_loop(lambda c: _running(end, c[1]), body, (jnp.int32(0), lanes, store))
     return count, store
 
 
-def replay(problem: Problem, theta: Any, y: State, t: jax.Array, times: jax.Array) -> tuple[State, jax.Array]:  # noqa: ANN401
-    """One segment on its known grid: state at its end and samples (4, L, n), differentiable in theta and y.
+def replay(problem: Problem, y: State, t: jax.Array, times: jax.Array) -> tuple[State, jax.Array]:
+    """One segment on its known grid: state at its end and samples (4, L, n); differentiable in the problem and y.
 
-    t : (SEGMENT + 1, L), the times of the tried steps; no step where the time did not grow.
+    t : (steps + 1, L), the times of the tried steps; no step where the time did not grow.
     """
 
     @jax.checkpoint
-    def one(y: State, span: tuple[jax.Array, jax.Array]) -> tuple[State, jax.Array]:
+    def one(y: State, span: tuple[jax.Array, jax.Array]) -> tuple[State, State]:
         t, h = span
         taken = jnp.isfinite(h) & (h > 0.0)
-        y = _where(taken, step(problem.field(theta), t, y, jnp.where(taken, h, 1.0))[0], y)
-        return y, jnp.stack(y)
+        y = where(taken, step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)
+        return y, y
 
-    h = jnp.diff(t, axis=0)
-    y_end, rows = jax.lax.scan(one, y, (jnp.where(jnp.isfinite(t[:-1]), t[:-1], 0.0), h))
-    rows = jnp.concatenate([jnp.stack(y)[None], rows])
-    return y_end, _interpolate_lanes(t, rows, times)
+    spans = (jnp.where(jnp.isfinite(t[:-1]), t[:-1], 0.0), jnp.diff(t, axis=0))
+    y_end, ends = jax.lax.scan(one, y, spans)
+    rows = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y, ends)
+    return y_end, interpolate(Rows(t, rows), times)

@@ -3,6 +3,11 @@
 ``jax.custom_jvp`` states the tangent of a run; the tangent map T is linear and is handed to JAX together with its
 transpose, so that ``jax.jvp``, ``jacfwd``, ``grad`` and ``vjp`` all work and cost a loop over the steps really taken.
 (A plain while loop has no reverse mode; a bounded scan would pay for ``max_steps`` steps in every batched run.)
+
+The derivative is that of the discrete solution: the grid is held fixed, each step and the interpolation are
+differentiated exactly. So both modes agree to rounding, and both agree with the derivative of the smoothed model to
+the accuracy of the solution. The state is stored once a segment; the sweeps march through a segment again to recover
+its grid. First derivatives only.
 """
 
 from collections.abc import Callable
@@ -11,9 +16,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from capsule_id.capsule.march import Problem, Record, checkpoints, inside, replay, run, segment
+from capsule_id.capsule.march import Build, Record, checkpoints, inside, replay, run, segment
 from capsule_id.capsule.rosenbrock import State, derivative
 
+# Steps per checkpoint: the sweeps hold that many states at a time, and at most that many idle steps at the end.
+SEGMENT = 256
 Tangent = tuple[Any, State]  # of (theta, initial state)
 
 
@@ -28,20 +35,20 @@ def _refuse(_primals: tuple[Any], _tangents: tuple[Any]) -> Any:  # noqa: ANN401
 
 
 def _tangent_maps(
-    problem: Problem,
+    build: Build,
     inputs: tuple[Any, jax.Array, State],
     max_steps: int,
 ) -> tuple[Callable[[Tangent], jax.Array], Callable[[jax.Array], Tangent]]:
     """The linear map from tangents of (theta, initial state) to those of the samples (4, L, n), and its transpose."""
     theta, times, y = inputs
-    end = times[:, -1]
-    count, store = checkpoints(problem, theta, times, y, max_steps)
+    problem, end = build(theta), times[:, -1]
+    count, store = checkpoints(problem, times, y, max_steps, SEGMENT)
 
     def piece(k: jax.Array) -> tuple[Callable[[Any, State], tuple[State, jax.Array]], State, jax.Array]:
         """Segment k as a function of (theta, state at its start), that state, and which samples it holds."""
         start = jax.tree.map(lambda rows: rows[k], store)
-        rows, lanes = segment(problem, theta, end, start, max_steps)
-        return lambda a, b: replay(problem, a, b, rows[:, 0], times), start.y, inside(lanes, rows, times)
+        rows, lanes = segment(problem, end, start, max_steps, SEGMENT)
+        return lambda a, b: replay(build(a), b, rows.t, times), start.y, inside(rows, lanes, times)
 
     def forward(tangent: Tangent) -> jax.Array:
         def body(carry: tuple[jax.Array, State, jax.Array]) -> tuple[jax.Array, State, jax.Array]:
@@ -85,11 +92,15 @@ def _apply_linear(
     def transposed(_: Callable[[Any], Any], b: tuple[Tangent, jax.Array]) -> tuple[Tangent, jax.Array]:
         return jax.tree.map(jnp.add, b[0], backward(b[1])), b[1]
 
-    right_hand_side = (tangent, jnp.zeros_like(like))
+    leaves, structure = jax.tree.flatten((tangent, jnp.zeros_like(like)))
+    # The transpose rule wants every part of the right-hand side to depend on the tangents, also those that are zero.
+    # A select that never selects makes them so without spreading a NaN from one lane to the others.
+    link = jnp.where(False, sum(jnp.sum(leaf) for leaf in leaves), 0.0)
+    right_hand_side = jax.tree.unflatten(structure, [leaf + link for leaf in leaves])
     return jax.lax.custom_linear_solve(lambda u: u, right_hand_side, solve, transposed)[1]
 
 
-def differentiable_run(problem: Problem, max_steps: int) -> Callable[[Any, jax.Array, State], Record]:
+def differentiable_run(build: Build, max_steps: int) -> Callable[[Any, jax.Array, State], Record]:
     """``march.run`` with first derivatives in theta, times and the initial state, forward and reverse mode.
 
     A lane that fails has NaN derivatives wherever its samples are NaN.
@@ -97,7 +108,7 @@ def differentiable_run(problem: Problem, max_steps: int) -> Callable[[Any, jax.A
 
     @jax.custom_jvp
     def function(theta: Any, times: jax.Array, y: State) -> Record:  # noqa: ANN401
-        return run(problem, theta, times, y, max_steps)
+        return run(build, theta, times, y, max_steps)
 
     @function.defjvp
     def _(primals: tuple[Any, jax.Array, State], tangents: tuple[Any, jax.Array, State]) -> tuple[Record, Record]:
@@ -105,11 +116,11 @@ def differentiable_run(problem: Problem, max_steps: int) -> Callable[[Any, jax.A
         theta, times, y = _first_order_only(primals)
         d_theta, d_times, d_y = tangents
         samples = _first_order_only(record.samples)
-        field = problem.field(jax.tree.map(lambda leaf: leaf[..., None], theta))
+        field = build(jax.tree.map(lambda leaf: leaf[..., None], theta)).field
         rate = jnp.stack(derivative(field, times, (samples[0], samples[1], samples[2], samples[3])))
         # A later start from the same state is the same start from a state moved back along the field.
         d_y = tuple(leaf - rate[i, :, 0] * d_times[:, 0] for i, leaf in enumerate(d_y))
-        forward, backward = _tangent_maps(problem, (theta, times, y), max_steps)
+        forward, backward = _tangent_maps(build, (theta, times, y), max_steps)
         d_samples = _apply_linear(forward, backward, (d_theta, d_y), samples) + rate * d_times
         d_samples = d_samples * jnp.where(jnp.isfinite(samples), 1.0, jnp.nan)
         counts = [jnp.zeros(leaf.shape, jax.dtypes.float0) for leaf in record[1:]]

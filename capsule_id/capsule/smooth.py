@@ -29,6 +29,10 @@ require_float64()
 
 Semantics = Literal["stick-slip", "eq2"]
 Friction = Callable[[CapsuleParameters], FrictionLaw]
+# First step, as a fraction of the fastest time scale known before the run.
+FIRST_STEP = 0.05
+# A step never spans more than this angle of the drive (rad), so that no pair of stages can alias it.
+DRIVE_ANGLE = 0.5
 # (p, e, smoothing): what the field depends on, so what a derivative can be taken in.
 Theta = tuple[CapsuleParameters, Excitation, "Smoothing"]
 
@@ -56,10 +60,11 @@ def stick_slip_field(theta: Theta, friction: Friction) -> Field:
     """The field whose limit is the exact model."""
     p, e, widths = theta
     law = friction(p)
+    F_b = forces.breakaway(law)
 
     def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         f = _rod_on_capsule(p, widths, r, Y1 - Y2)
-        held = forces.friction_smooth(law, Y2, f, widths.velocity, widths.rounding)
+        held = forces.friction_smooth(law, F_b, Y2, f, (widths.velocity, widths.rounding))
         return (_drive(e, t) - f) / p.m1, Y2, (f - held) / p.m2
 
     return field
@@ -69,10 +74,11 @@ def eq2_field(theta: Theta, friction: Friction) -> Field:
     """The field of eq. (2) to the letter, with its force gate smoothed over ``rounding``: for comparison only."""
     p, e, widths = theta
     law = friction(p)
+    F_b = forces.breakaway(law)
 
     def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         f = _rod_on_capsule(p, widths, r, Y1 - Y2)
-        gate = forces.force_gate(law, f, widths.rounding)
+        gate = forces.force_gate(law, F_b, f, widths.rounding)
         forth = forces.smooth_heaviside(Y2, widths.velocity)
         speed = forces.smooth_abs(Y2, widths.velocity)
         sliding = forth * law.forward(speed) - (1.0 - forth) * law.backward(speed)
@@ -90,13 +96,6 @@ def _rod_on_capsule(p: CapsuleParameters, widths: Smoothing, r: jax.Array, v: ja
     return jnp.asarray(forces.spring(p.k1, r) + forces.damper(p.c, v) + contact)
 
 
-def _fastest(theta: Theta) -> jax.Array:
-    """Upper estimate of the rates of springs, damper and drive, 1/s; the friction's own rate needs no small first step."""
-    p, e, _ = theta
-    lightness = 1.0 / p.m1 + 1.0 / p.m2
-    return jnp.sqrt((p.k1 + p.k2) * lightness) + p.c * lightness + jnp.abs(e.Omega) + p.g / p.v_s
-
-
 def _valid(theta: Theta) -> jax.Array:
     p, e, widths = theta
     positive = (p.m1, p.m2, p.v_s, widths.velocity, widths.penetration, widths.rounding, widths.tolerance)
@@ -109,22 +108,25 @@ def _valid(theta: Theta) -> jax.Array:
     return ok
 
 
-def _problem(semantics: Semantics, friction: Friction) -> Problem:
-    field = stick_slip_field if semantics == "stick-slip" else eq2_field
+def _problem(theta: Theta, semantics: Semantics, friction: Friction) -> Problem:
+    p, e, widths = theta
+    lightness = 1.0 / p.m1 + 1.0 / p.m2
+    # Rates of springs, damper, drive and Stribeck curve, 1/s; the switch's own rate needs no small first step.
+    fastest = jnp.sqrt((p.k1 + p.k2) * lightness) + p.c * lightness + jnp.abs(e.Omega) + p.g / p.v_s
     return Problem(
-        field=lambda theta: field(theta, friction),
-        gap=lambda theta: theta[0].G,
-        fastest=_fastest,
-        drive=lambda theta: jnp.abs(theta[1].Omega),
-        floors=lambda theta: (theta[2].velocity, theta[2].penetration),
-        tolerance=lambda theta: theta[2].tolerance,
-        valid=_valid,
+        field=(stick_slip_field if semantics == "stick-slip" else eq2_field)(theta, friction),
+        gap=jnp.asarray(p.G),
+        first=FIRST_STEP / fastest,
+        longest=DRIVE_ANGLE / jnp.abs(e.Omega),
+        floors=(jnp.asarray(widths.velocity), jnp.asarray(widths.penetration)),
+        tolerance=jnp.asarray(widths.tolerance),
+        valid=_valid(theta),
     )
 
 
 @lru_cache(maxsize=32)
 def _compiled(semantics: Semantics, max_steps: int, friction: Friction) -> Callable[..., Trajectory]:
-    march = differentiable_run(_problem(semantics, friction), max_steps)
+    march = differentiable_run(partial(_problem, semantics=semantics, friction=friction), max_steps)
 
     @jax.jit
     def lanes(
