@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from capsule_id.capsule.model import Status
-from capsule_id.capsule.rosenbrock import Field, State, derivative, step, step_factor
+from capsule_id.capsule.rosenbrock import Field, State, step, step_factor
 
 # Steps between two interpolations of samples: one or two segments hold ten periods; 64 lanes of them fill 5 MB.
 SEGMENT = 2048
@@ -37,7 +37,7 @@ Build = Callable[[Any], Problem]  # from theta, the pytree in which a run is dif
 
 
 class Lanes(NamedTuple):
-    """Where every lane stands, (L,) each."""
+    """Where every lane stands: y is (4, L), the others (L,)."""
 
     t: jax.Array
     y: State
@@ -47,13 +47,6 @@ class Lanes(NamedTuple):
     steps: jax.Array
     closings: jax.Array
     status: jax.Array
-
-
-class Rows(NamedTuple):
-    """Times and states of the tried steps of a segment, (steps + 1, L) each; t = infinity past the last one."""
-
-    t: jax.Array
-    y: State
 
 
 class Record(NamedTuple):
@@ -74,7 +67,7 @@ def start(problem: Problem, times: jax.Array, y: State) -> Lanes:
     """Lanes at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
     t = times[:, 0]
     speed, stretch = _grown(*(jnp.broadcast_to(floor, t.shape) for floor in problem.floors), y)
-    finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(jnp.stack(y)), axis=0)
+    finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(y), axis=0)
     status = jnp.where(finite & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
     zero = jnp.zeros(t.shape, jnp.int32)
     return Lanes(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, zero, status)
@@ -102,7 +95,7 @@ def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> 
     status = jnp.where(running & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
     return Lanes(
         t=t_new,
-        y=where(accepted, y_new, y),
+        y=jnp.where(accepted, y_new, y),
         h=jnp.where(running, h_next, lanes.h),
         speed=jnp.where(accepted, speed, lanes.speed),
         stretch=jnp.where(accepted, stretch, lanes.stretch),
@@ -112,47 +105,43 @@ def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> 
     )
 
 
-def where(chosen: jax.Array, new: State, old: State) -> State:
-    """Elementwise choice between two states."""
-    return tuple(jnp.where(chosen, a, b) for a, b in zip(new, old, strict=True))  # pyright: ignore[reportReturnType]
-
-
 def _running(end: jax.Array, lanes: Lanes) -> jax.Array:
     return jnp.any((lanes.t < end) & (lanes.status == Status.OK))
 
 
-def segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, length: int) -> tuple[Rows, Lanes]:
-    """Try up to ``length`` steps; the rows on the way and where the lanes then stand."""
+def segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, length: int) -> tuple[jax.Array, Lanes]:
+    """Try up to ``length`` steps; the rows (t, X1, Y1, X2, Y2) on the way, and where the lanes then stand.
 
-    def put(rows: Rows, i: jax.Array, lanes: Lanes) -> Rows:
-        return jax.tree.map(lambda row, leaf: row.at[i].set(leaf), rows, Rows(lanes.t, lanes.y))
+    Rows: (length + 1, 5, L), infinite past the last step tried.
+    """
 
-    def body(carry: tuple[jax.Array, Rows, Lanes]) -> tuple[jax.Array, Rows, Lanes]:
+    def put(rows: jax.Array, i: jax.Array, lanes: Lanes) -> jax.Array:
+        return rows.at[i].set(jnp.concatenate([lanes.t[None], lanes.y]))
+
+    def body(carry: tuple[jax.Array, jax.Array, Lanes]) -> tuple[jax.Array, jax.Array, Lanes]:
         i, rows, lanes = carry
         lanes = _advance(problem, end, lanes, max_steps)
         return i + 1, put(rows, i + 1, lanes), lanes
 
-    def more(carry: tuple[jax.Array, Rows, Lanes]) -> jax.Array:
+    def more(carry: tuple[jax.Array, jax.Array, Lanes]) -> jax.Array:
         return (carry[0] < length) & _running(end, carry[2])
 
-    shape = (length + 1, *end.shape)
-    blank = jnp.zeros(shape)
-    rows = put(Rows(jnp.full(shape, jnp.inf), (blank, blank, blank, blank)), jnp.int32(0), lanes)
+    rows = put(jnp.full((length + 1, 5, *end.shape), jnp.inf), jnp.int32(0), lanes)
     _, rows, lanes = jax.lax.while_loop(more, body, (jnp.int32(0), rows, lanes))
     return rows, lanes
 
 
-def _interpolate(rows: Rows, times: jax.Array) -> jax.Array:
-    """States (4, n) of one lane at ``times`` (n,), from rows (steps + 1,), wherever t[0] < times <= last finite t.
+def _interpolate(t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
+    """States (4, n) of one lane at ``times`` (n,), from rows t (N,) and y (N, 4), where t[0] < times <= last finite t.
 
     Positions: the cubic through both ends with their velocities; velocities: its derivative. That needs no
     acceleration, which in the stiff phases of rest would be far larger than what the step has used.
     """
-    right = jnp.clip(jnp.searchsorted(rows.t, times, side="left"), 1, rows.t.shape[0] - 1)
+    right = jnp.clip(jnp.searchsorted(t, times, side="left"), 1, t.shape[0] - 1)
     left = right - 1
-    h = rows.t[right] - rows.t[left]
+    h = t[right] - t[left]
     h = jnp.where((h > 0.0) & jnp.isfinite(h), h, 1.0)
-    s = (times - rows.t[left]) / h
+    s = (times - t[left]) / h
     w, v0, v1 = s * s * (3.0 - 2.0 * s), s * (1.0 - s) ** 2, s * s * (s - 1.0)
     d, e0, e1 = 6.0 * s * (1.0 - s) / h, (1.0 - s) * (1.0 - 3.0 * s), s * (3.0 * s - 2.0)
 
@@ -160,16 +149,16 @@ def _interpolate(rows: Rows, times: jax.Array) -> jax.Array:
         X0, Y0, Y1, rise = X[left], Y[left], Y[right], X[right] - X[left]
         return X0 + w * rise + h * (v0 * Y0 + v1 * Y1), d * rise + e0 * Y0 + e1 * Y1
 
-    return jnp.stack([*pair(rows.y[0], rows.y[1]), *pair(rows.y[2], rows.y[3])])
+    return jnp.stack([*pair(y[:, 0], y[:, 1]), *pair(y[:, 2], y[:, 3])])
 
 
 # Lanes stand last in rows, first in times: rows are written by lane, times are searched by lane.
-interpolate = jax.vmap(_interpolate, in_axes=(1, 0), out_axes=1)
+interpolate = jax.vmap(_interpolate, in_axes=(1, 2, 0), out_axes=1)
 
 
-def inside(rows: Rows, lanes: Lanes, times: jax.Array) -> jax.Array:
+def inside(rows: jax.Array, lanes: Lanes, times: jax.Array) -> jax.Array:
     """Which samples (L, n) fall into the segment that led to ``lanes``."""
-    return (times > rows.t[0][:, None]) & (times <= lanes.t[:, None])
+    return (times > rows[0, 0][:, None]) & (times <= lanes.t[:, None])
 
 
 def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:  # noqa: ANN401
@@ -179,10 +168,10 @@ def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) ->
 
     def body(carry: tuple[Lanes, jax.Array]) -> tuple[Lanes, jax.Array]:
         rows, lanes = segment(problem, end, carry[0], max_steps, SEGMENT)
-        return lanes, jnp.where(inside(rows, lanes, times), interpolate(rows, times), carry[1])
+        return lanes, jnp.where(inside(rows, lanes, times), interpolate(rows[:, 0], rows[:, 1:], times), carry[1])
 
     nothing = jnp.full((4, *times.shape), jnp.nan)
-    samples = nothing.at[:, :, 0].set(jnp.where(lanes.status == Status.OK, jnp.stack(y), jnp.nan))
+    samples = nothing.at[:, :, 0].set(jnp.where(lanes.status == Status.OK, y, jnp.nan))
     lanes, samples = jax.lax.while_loop(lambda carry: _running(end, carry[0]), body, (lanes, samples))
     return Record(samples, lanes.closings, lanes.steps, lanes.status)
 
@@ -214,10 +203,9 @@ def replay(problem: Problem, y: State, t: jax.Array, times: jax.Array) -> tuple[
     def one(y: State, span: tuple[jax.Array, jax.Array]) -> tuple[State, State]:
         t, h = span
         taken = jnp.isfinite(h) & (h > 0.0)
-        y = where(taken, step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)
+        y = jnp.where(taken, step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)
         return y, y
 
     spans = (jnp.where(jnp.isfinite(t[:-1]), t[:-1], 0.0), jnp.diff(t, axis=0))
     y_end, ends = jax.lax.scan(one, y, spans)
-    rows = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y, ends)
-    return y_end, interpolate(Rows(t, rows), times)
+    return y_end, interpolate(t, jnp.concatenate([y[None], ends]), times)

@@ -48,7 +48,7 @@ def _tangent_maps(
         """Segment k as a function of (theta, state at its start), that state, and which samples it holds."""
         start = jax.tree.map(lambda rows: rows[k], store)
         rows, lanes = segment(problem, end, start, max_steps, SEGMENT)
-        return lambda a, b: replay(build(a), b, rows.t, times), start.y, inside(rows, lanes, times)
+        return lambda a, b: replay(build(a), b, rows[:, 0], times), start.y, inside(rows, lanes, times)
 
     def forward(tangent: Tangent) -> jax.Array:
         def body(carry: tuple[jax.Array, State, jax.Array]) -> tuple[jax.Array, State, jax.Array]:
@@ -57,7 +57,7 @@ def _tangent_maps(
             d_y, d_samples = jax.jvp(function, (theta, start), (tangent[0], d_y))[1]
             return k + 1, d_y, jnp.where(held, d_samples, out)
 
-        first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(jnp.stack(tangent[1]))
+        first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(tangent[1])
         return jax.lax.while_loop(lambda c: c[0] < count, body, (jnp.int32(0), tangent[1], first))[2]
 
     def backward(cotangent: jax.Array) -> Tangent:
@@ -70,8 +70,7 @@ def _tangent_maps(
 
         none = jax.tree.map(jnp.zeros_like, (theta, y))
         _, c_theta, c_y = jax.lax.while_loop(lambda c: c[0] > 0, body, (count, *none))
-        first = cotangent[:, :, 0]
-        return c_theta, (c_y[0] + first[0], c_y[1] + first[1], c_y[2] + first[2], c_y[3] + first[3])
+        return c_theta, c_y + cotangent[:, :, 0]
 
     return forward, backward
 
@@ -117,9 +116,9 @@ def differentiable_run(build: Build, max_steps: int) -> Callable[[Any, jax.Array
         d_theta, d_times, d_y = tangents
         samples = _first_order_only(record.samples)
         field = build(jax.tree.map(lambda leaf: leaf[..., None], theta)).field
-        rate = jnp.stack(derivative(field, times, (samples[0], samples[1], samples[2], samples[3])))
+        rate = derivative(field, times, samples)
         # A later start from the same state is the same start from a state moved back along the field.
-        d_y = tuple(leaf - rate[i, :, 0] * d_times[:, 0] for i, leaf in enumerate(d_y))
+        d_y = d_y - rate[:, :, 0] * d_times[:, 0]
         forward, backward = _tangent_maps(build, (theta, times, y), max_steps)
         d_samples = _apply_linear(forward, backward, (d_theta, d_y), samples) + rate * d_times
         d_samples = d_samples * jnp.where(jnp.isfinite(samples), 1.0, jnp.nan)

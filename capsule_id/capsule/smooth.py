@@ -132,7 +132,7 @@ def _compiled(semantics: Semantics, max_steps: int, friction: Friction) -> Calla
     def lanes(
         smoothing: Smoothing, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial
     ) -> Trajectory:
-        floats = jax.tree.map(partial(jnp.asarray, dtype=float), ((p, e, smoothing), times, tuple(initial)))
+        floats = jax.tree.map(partial(jnp.asarray, dtype=float), ((p, e, smoothing), times, jnp.stack(initial)))
         record = march(*floats)
         X1, Y1, X2, Y2 = record.samples
         none = jnp.zeros_like(record.steps)
