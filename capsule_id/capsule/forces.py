@@ -187,7 +187,7 @@ def friction_smooth(law: FrictionLaw, F_b: Array, Y2: Array, f: Array, widths: t
 
     At Y2 = 0: f inside the thresholds, the threshold outside; slope in Y2 there sqrt(F_b^2 + f^2) / velocity inside,
     0 outside. |Y2| >= sqrt(2) velocity (1 + rounding): exactly the law's resistance with the sign of Y2, so also at
-    Y2 -> +-infinity; at f -> +-infinity with Y2 = 0 the threshold with the sign of f. Limit velocity -> 0: ``friction``,
+    Y2 -> +-infinity; at f -> +-infinity with Y2 = 0 the threshold with the sign of f. Limit velocity -> 0: the exact rule,
     for every ``rounding``.
 
     F_b : ``breakaway(law)``, computed once per run

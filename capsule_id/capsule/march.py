@@ -76,27 +76,29 @@ def start(problem: Problem, times: jax.Array, y: State) -> Lanes:
 def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> Lanes:
     """Try one step in every lane that is still running."""
     t, y = lanes.t, lanes.y
-    running = (t < end) & (lanes.status == Status.OK)
+    active = (t < end) & (lanes.status == Status.OK)
     h = jnp.minimum(lanes.h, problem.longest)
     # A rest shorter than a hundredth of a step is taken along, so that no sliver of a step is left at the end.
     last = h * 1.01 >= end - t
-    h = jnp.where(running, jnp.where(last, end - t, h), 1.0)
+    h = jnp.where(active, jnp.where(last, end - t, h), 1.0)
     y_new, defect = step(problem.field, t, y, h)
     speed, stretch = _grown(lanes.speed, lanes.stretch, y_new)
-    velocity_error = jnp.maximum(jnp.abs(defect[1]), jnp.abs(defect[3])) / speed
-    error = jnp.maximum(velocity_error, jnp.abs(defect[0] - defect[2]) / stretch) / problem.tolerance
+    velocity_error = jnp.maximum(jnp.abs(defect[1]), jnp.abs(defect[3]))
+    # max(velocity_error / speed, r_error / stretch) / tolerance, in one division.
+    worse = jnp.maximum(velocity_error * stretch, jnp.abs(defect[0] - defect[2]) * speed)
+    error = worse / (speed * stretch * problem.tolerance)
     h_next = h * step_factor(error)
-    accepted = running & (error <= 1.0)
+    accepted = active & (error <= 1.0)
     closing = accepted & (y[0] - y[2] < problem.gap) & (y_new[0] - y_new[2] >= problem.gap)
-    steps = lanes.steps + running
+    steps = lanes.steps + active
     t_new = jnp.where(accepted, jnp.where(last, end, t + h), t)
-    hopeless = running & ~jnp.isfinite(error) & (h < _LEAST_STEP * (jnp.abs(t) + jnp.abs(end)))
+    hopeless = active & ~jnp.isfinite(error) & (h < _LEAST_STEP * (jnp.abs(t) + jnp.abs(end)))
     status = jnp.where(hopeless, Status.NOT_FINITE, lanes.status)
-    status = jnp.where(running & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
+    status = jnp.where(active & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
     return Lanes(
         t=t_new,
         y=jnp.where(accepted, y_new, y),
-        h=jnp.where(running, h_next, lanes.h),
+        h=jnp.where(active, h_next, lanes.h),
         speed=jnp.where(accepted, speed, lanes.speed),
         stretch=jnp.where(accepted, stretch, lanes.stretch),
         steps=steps,
@@ -105,7 +107,8 @@ def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> 
     )
 
 
-def _running(end: jax.Array, lanes: Lanes) -> jax.Array:
+def running(end: jax.Array, lanes: Lanes) -> jax.Array:
+    """Whether any lane has to go on."""
     return jnp.any((lanes.t < end) & (lanes.status == Status.OK))
 
 
@@ -116,7 +119,8 @@ def segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, leng
     """
 
     def put(rows: jax.Array, i: jax.Array, lanes: Lanes) -> jax.Array:
-        return rows.at[i].set(jnp.concatenate([lanes.t[None], lanes.y]))
+        row = jnp.concatenate([lanes.t[None], lanes.y])
+        return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
 
     def body(carry: tuple[jax.Array, jax.Array, Lanes]) -> tuple[jax.Array, jax.Array, Lanes]:
         i, rows, lanes = carry
@@ -124,7 +128,7 @@ def segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, leng
         return i + 1, put(rows, i + 1, lanes), lanes
 
     def more(carry: tuple[jax.Array, jax.Array, Lanes]) -> jax.Array:
-        return (carry[0] < length) & _running(end, carry[2])
+        return (carry[0] < length) & running(end, carry[2])
 
     rows = put(jnp.full((length + 1, 5, *end.shape), jnp.inf), jnp.int32(0), lanes)
     _, rows, lanes = jax.lax.while_loop(more, body, (jnp.int32(0), rows, lanes))
@@ -172,13 +176,11 @@ def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) ->
 
     nothing = jnp.full((4, *times.shape), jnp.nan)
     samples = nothing.at[:, :, 0].set(jnp.where(lanes.status == Status.OK, y, jnp.nan))
-    lanes, samples = jax.lax.while_loop(lambda carry: _running(end, carry[0]), body, (lanes, samples))
+    lanes, samples = jax.lax.while_loop(lambda carry: running(end, carry[0]), body, (lanes, samples))
     return Record(samples, lanes.closings, lanes.steps, lanes.status)
 
 
-def checkpoints(
-    problem: Problem, times: jax.Array, y: State, max_steps: int, length: int
-) -> tuple[jax.Array, Lanes]:
+def checkpoints(problem: Problem, times: jax.Array, y: State, max_steps: int, length: int) -> tuple[jax.Array, Lanes]:
     """The number of segments of a run, and the lanes at the start of each, (segments, L) each. No derivatives."""
     end = times[:, -1]
     lanes = start(problem, times, y)
@@ -189,7 +191,7 @@ def checkpoints(
         store = jax.tree.map(lambda rows, leaf: rows.at[k].set(leaf), store, lanes)
         return k + 1, segment(problem, end, lanes, max_steps, length)[1], store
 
-    count, _, store = jax.lax.while_loop(lambda c: _running(end, c[1]), body, (jnp.int32(0), lanes, store))
+    count, _, store = jax.lax.while_loop(lambda c: running(end, c[1]), body, (jnp.int32(0), lanes, store))
     return count, store
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from capsule_id.capsule.march import Build, Record, checkpoints, inside, replay, run, segment
+from capsule_id.capsule.march import Build, Lanes, Record, checkpoints, inside, replay, run, running, segment, start
 from capsule_id.capsule.rosenbrock import State, derivative
 
 # Steps per checkpoint: the sweeps hold that many states at a time, and at most that many idle steps at the end.
@@ -42,30 +42,31 @@ def _tangent_maps(
     """The linear map from tangents of (theta, initial state) to those of the samples (4, L, n), and its transpose."""
     theta, times, y = inputs
     problem, end = build(theta), times[:, -1]
-    count, store = checkpoints(problem, times, y, max_steps, SEGMENT)
 
-    def piece(k: jax.Array) -> tuple[Callable[[Any, State], tuple[State, jax.Array]], State, jax.Array]:
-        """Segment k as a function of (theta, state at its start), that state, and which samples it holds."""
-        start = jax.tree.map(lambda rows: rows[k], store)
-        rows, lanes = segment(problem, end, start, max_steps, SEGMENT)
-        return lambda a, b: replay(build(a), b, rows[:, 0], times), start.y, inside(rows, lanes, times)
+    def piece(begin: Lanes) -> tuple[Callable[[Any, State], tuple[State, jax.Array]], Lanes, jax.Array]:
+        """The segment from ``begin`` as a function of (theta, state there), its end, and which samples it holds."""
+        rows, lanes = segment(problem, end, begin, max_steps, SEGMENT)
+        return lambda a, b: replay(build(a), b, rows[:, 0], times), lanes, inside(rows, lanes, times)
 
     def forward(tangent: Tangent) -> jax.Array:
-        def body(carry: tuple[jax.Array, State, jax.Array]) -> tuple[jax.Array, State, jax.Array]:
-            k, d_y, out = carry
-            function, start, held = piece(k)
-            d_y, d_samples = jax.jvp(function, (theta, start), (tangent[0], d_y))[1]
-            return k + 1, d_y, jnp.where(held, d_samples, out)
+        def body(carry: tuple[Lanes, State, jax.Array]) -> tuple[Lanes, State, jax.Array]:
+            lanes, d_y, out = carry
+            function, after, held = piece(lanes)
+            d_y, d_samples = jax.jvp(function, (theta, lanes.y), (tangent[0], d_y))[1]
+            return after, d_y, jnp.where(held, d_samples, out)
 
         first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(tangent[1])
-        return jax.lax.while_loop(lambda c: c[0] < count, body, (jnp.int32(0), tangent[1], first))[2]
+        carry = (start(problem, times, y), tangent[1], first)
+        return jax.lax.while_loop(lambda c: running(end, c[0]), body, carry)[2]
 
     def backward(cotangent: jax.Array) -> Tangent:
+        count, store = checkpoints(problem, times, y, max_steps, SEGMENT)
+
         def body(carry: tuple[jax.Array, Any, State]) -> tuple[jax.Array, Any, State]:
             k, c_theta, c_y = carry
-            function, start, held = piece(k - 1)
-            pull = jax.vjp(function, theta, start)[1]
-            more, c_y = pull((c_y, jnp.where(held, cotangent, 0.0)))
+            begin = jax.tree.map(lambda rows: rows[k - 1], store)
+            function, _, held = piece(begin)
+            more, c_y = jax.vjp(function, theta, begin.y)[1]((c_y, jnp.where(held, cotangent, 0.0)))
             return k - 1, jax.tree.map(jnp.add, c_theta, more), c_y
 
         none = jax.tree.map(jnp.zeros_like, (theta, y))
