@@ -1,0 +1,176 @@
+"""The event-driven engine: Taylor steps inside a mode, located changes of mode, a clock of its own for every lane.
+
+    mode_at -> [series -> trusted -> first_event -> advance -> met -> mode_at] ... -> samples read off the polynomials
+
+Each lane has its own time, mode and step; one loop runs them all. Derivatives: forward mode goes through the loop. Step
+lengths and located times are held constant; at an event the state and the time get one implicit-function correction,
+dt = -dg/g', whose value is zero and whose tangent is the event's own (the saltation matrix).
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.lax import stop_gradient
+
+from capsule_id.capsule.dense import WIDTH, Samples, read_off, row_of, samples_at
+from capsule_id.capsule.events import GAP, LOWER, NONE, UPPER, VELOCITY, first_event, mode_at
+from capsule_id.capsule.model import CapsuleParameters, Excitation, Initial, Status, Trajectory
+from capsule_id.capsule.taylor import Mode, Motion, Rig, State, advance, friction, rig_of, series, size, trusted
+from capsule_id.precision import require_float64
+
+require_float64()
+
+# Steps kept before samples are read off them; a buffer of this many rows stays in the second-level cache.
+ROWS = 64
+# An event whose function falls slower than this, relative to the size of its rate on the step, counts as grazing.
+GRAZING_RATE = 1e-6
+
+Kernel = Callable[[CapsuleParameters, Excitation, jax.Array, Initial], Trajectory]
+
+
+class Lanes(NamedTuple):
+    """Everything that a step changes, every leaf (L,): the state, its mode, and how the run stands."""
+
+    state: State
+    mode: Mode
+    active: jax.Array
+    status: jax.Array
+    contacts: jax.Array
+    events: jax.Array
+    steps: jax.Array
+
+
+def met(rig: Rig, mode: Mode, motion: Motion, at: State, kind: jax.Array) -> tuple[State, jax.Array]:
+    """(the state on the event's surface with the event time's tangent, whether the event is grazing).
+
+    at : the state at the located time, in the mode before the event
+    """
+    stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
+    f = rig.k1 * rig.G + stiffness * at.d + rig.c * at.w
+    a2 = jnp.where(mode.sigma != 0.0, (f - friction(rig, mode.sigma, at.v)[0]) / rig.m2, 0.0)
+    drive = rig.P_d * jnp.cos(rig.Omega * at.t + rig.phase)
+    w_rate = (drive - f) / rig.m1 - a2
+    f_rate = stiffness * at.w + rig.c * w_rate
+    level = jnp.where(kind == UPPER, -rig.F_b, rig.F_b)
+    g = jnp.where(kind == GAP, at.d, jnp.where(kind == VELOCITY, at.v, f + level))
+    rate = jnp.where(kind == GAP, at.w, jnp.where(kind == VELOCITY, a2, f_rate))
+    typical = jnp.where(
+        kind == GAP, size(motion.w), jnp.where(kind == VELOCITY, size(motion.v), size(motion.f)) / motion.h
+    )
+    rate, a2, w_rate, w, v, typical = stop_gradient((rate, a2, w_rate, at.w, at.v, typical))
+    grazing = (kind != NONE) & ~(jnp.abs(rate) > GRAZING_RATE * typical)
+    dt = (stop_gradient(g) - g) / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
+    d = jnp.where(kind == GAP, 0.0, at.d + w * dt)
+    Y2 = jnp.where(kind == VELOCITY, 0.0, at.v + a2 * dt)
+    return State(at.t + dt, d, at.w + w_rate * dt, at.X2 + v * dt, Y2), grazing
+
+
+def step(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes) -> tuple[Lanes, Motion]:
+    """One step of every active lane."""
+    state, mode, active = lanes.state, lanes.mode, lanes.active
+    left = t_end - stop_gradient(state.t)
+    motion = series(rig, state, mode, left)
+    held = stop_gradient(motion)
+    s_end = trusted(held)
+    s, kind = first_event(stop_gradient(rig), mode, held, s_end, active)
+    new, grazing = met(rig, mode, motion, advance(state, motion, s), kind)
+    event = kind != NONE
+    finished = ~event & (s >= 1.0) & (held.h >= left)
+    new = new._replace(t=jnp.where(finished, t_end, new.t))
+    after = mode_at(stop_gradient(rig), stop_gradient(new), (kind == UPPER) | (kind == LOWER))
+    after = Mode(*(jnp.where(event, x, y) for x, y in zip(after, mode, strict=True)))
+    steps = lanes.steps + active
+    finite = jnp.isfinite(new.d + new.w + new.X2 + new.v)
+    finished = finished | (finite & (new.t >= t_end))
+    status = jnp.where(active & grazing, jnp.maximum(lanes.status, Status.GRAZING), lanes.status)
+    status = jnp.where(active & ~finished & (steps >= max_steps), jnp.int32(Status.TOO_MANY_STEPS), status)
+    status = jnp.where(active & ~finite, jnp.int32(Status.NOT_FINITE), status)
+    moved = active & finite
+    return Lanes(
+        State(*(jnp.where(moved, x, y) for x, y in zip(new, state, strict=True))),
+        Mode(*(jnp.where(moved, x, y) for x, y in zip(after, mode, strict=True))),
+        active & ~finished & (status <= Status.GRAZING),
+        status,
+        lanes.contacts + (moved & after.contact & ~mode.contact),
+        lanes.events + (moved & event),
+        steps,
+    ), motion
+
+
+def start(rig: Rig, times: jax.Array, initial: Initial) -> Lanes:
+    """Lanes at times[:, 0]: an initial state that rounding alone keeps off the gap's closing point is put onto it."""
+    X1, Y1, X2, Y2 = (jnp.asarray(x) for x in initial)
+    d = (X1 - X2) - rig.G
+    rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2) + rig.G)
+    d = jnp.where(jnp.abs(d) <= rounding, d - stop_gradient(d), d)
+    state = State(times[:, 0], d, Y1 - Y2, X2, Y2)
+    given = jnp.stack([*rig, *state, times[:, -1]])
+    positive = (rig.m1 > 0.0) & (rig.m2 > 0.0) & (rig.v_s > 0.0)
+    not_negative = jnp.all(jnp.stack([rig.k1, rig.k2, rig.c, rig.F_b, rig.G]) >= 0.0, axis=0)
+    valid = jnp.all(jnp.isfinite(given), axis=0) & positive & not_negative
+    zero = jnp.zeros(d.shape, jnp.int32)
+    status = jnp.where(valid, jnp.int32(Status.OK), jnp.int32(Status.INVALID))
+    mode = mode_at(stop_gradient(rig), stop_gradient(state), jnp.zeros(d.shape, bool))
+    return Lanes(state, mode, valid & (times[:, 0] < times[:, -1]), status, zero, zero, zero)
+
+
+def run(max_steps: int, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial) -> Trajectory:
+    """The motion of lanes: every leaf (L,), times (L, n)."""
+    rig = rig_of(p, e)
+    lanes = start(rig, times, initial)
+    samples = samples_at(times, initial, lanes.status == Status.OK)
+    L, n = times.shape
+    t_end = stop_gradient(times[:, -1])
+
+    def fill(carry: tuple[Lanes, jax.Array, jax.Array, jax.Array]) -> tuple[Lanes, jax.Array, jax.Array, jax.Array]:
+        lanes, rows, starts, row = carry
+        after, motion = step(rig, t_end, max_steps, lanes)
+        begin = jnp.where(lanes.active, stop_gradient(lanes.state.t), jnp.inf)
+        rows = jax.lax.dynamic_update_index_in_dim(rows, row_of(lanes.state, motion), row, 0)
+        return after, rows, jax.lax.dynamic_update_index_in_dim(starts, begin, row, 0), row + 1
+
+    def stretch(carry: tuple[Lanes, Samples]) -> tuple[Lanes, Samples]:
+        lanes, samples = carry
+        blank = (jnp.zeros((ROWS, WIDTH, L)), jnp.full((ROWS, L), jnp.inf), jnp.int32(0))
+        lanes, rows, starts, _ = jax.lax.while_loop(
+            lambda c: (c[3] < ROWS) & jnp.any(c[0].active), fill, (lanes, *blank)
+        )
+        return lanes, read_off(samples, rows, starts, lanes.state.t, rig.G)
+
+    lanes, samples = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
+    X1, Y1, X2, Y2 = (samples.values[:, i, :n] for i in range(4))
+    return Trajectory(times, X1, Y1, X2, Y2, lanes.contacts, lanes.status, lanes.steps, lanes.events)
+
+
+@lru_cache(maxsize=8)
+def kernel(max_steps: int) -> Kernel:
+    """The jitted engine (p, e, times, initial) -> Trajectory on lanes.
+
+    Under ``vmap`` the new axis is folded into the lanes, because a loop inside a loop over lanes would copy its buffers
+    at every step.
+    """
+
+    @custom_vmap
+    def simulate_exact(p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial) -> Trajectory:
+        return run(max_steps, p, e, times, initial)
+
+    @simulate_exact.def_vmap
+    def fold(  # pyright: ignore[reportUnusedFunction]
+        size: int, batched: list[object], *args: object
+    ) -> tuple[Trajectory, Trajectory]:
+        flat, structure = jax.tree.flatten(args)
+        flags = jax.tree.leaves(batched)
+        if not any(flags):
+            out = run(max_steps, *args)  # pyright: ignore[reportArgumentType]
+            return out, jax.tree.map(lambda _: False, out)
+        full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(flat, flags, strict=True)]
+        L = full[0].shape[1]
+        lanes = jax.tree.unflatten(structure, [x.reshape(size * L, *x.shape[2:]) for x in full])
+        out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), simulate_exact(*lanes))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return jax.jit(simulate_exact)
