@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from capsule_id.capsule.taylor import ORDER, Motion, State, horner, integral
+from capsule_id.capsule.taylor import ORDER, Motion, State, horner, mean
 
 WIDTH = 4 + 2 * (ORDER + 1)
 # Samples of a lane read off at once.
@@ -41,9 +41,8 @@ def row_of(state: State, motion: Motion) -> jax.Array:
 def values_of(row: jax.Array, t: jax.Array, G: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """(X1, Y1, X2, Y2) at t from rows (WIDTH, ...)."""
     w, v = list(row[4 : 5 + ORDER]), list(row[5 + ORDER :])
-    h = row[1]
-    s = (t - row[0]) / h
-    d, X2 = row[2] + h * integral(w, s), row[3] + h * integral(v, s)
+    s = (t - row[0]) / row[1]
+    d, X2 = row[2] + (t - row[0]) * mean(w, s), row[3] + (t - row[0]) * mean(v, s)
     Y2 = horner(v, s)
     return X2 + d + G, horner(w, s) + Y2, X2, Y2
 

@@ -7,7 +7,7 @@ mode's direction, or, while stuck, F_b - f and F_b + f. All are linear in the st
 import jax
 import jax.numpy as jnp
 
-from capsule_id.capsule.taylor import Mode, Motion, Rig, Series, State, cos_sin
+from capsule_id.capsule.taylor import Mode, Motion, Rig, Series, State
 
 # Kinds of events.
 NONE, GAP, VELOCITY, UPPER, LOWER = 0, 1, 2, 3, 4
@@ -45,7 +45,7 @@ def _value_and_slope(p: Series, s: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _leap(p0: jax.Array, p1: jax.Array, bend: jax.Array) -> jax.Array:
-    """First root tau >= 0 of the minorant p0 + p1 tau - bend tau^2; inf where it has none. p cannot be negative before."""
+    """First root tau >= 0 of the minorant p0 + p1 tau - bend tau^2, inf where it has none: p has no root before."""
     p0 = jnp.maximum(p0, 0.0)
     root2 = p1 * p1 + 4.0 * bend * p0
     root = jnp.sqrt(jnp.maximum(root2, 0.0))
@@ -109,8 +109,7 @@ def mode_at(rig: Rig, state: State, onset: jax.Array) -> Mode:
     k2 = jnp.where((state.d > 0.0) | closing, k2, 0.0)
     r = state.d + rig.G
     f = k1 * r + c * state.w + k2 * state.d
-    drive = rig.P_d * cos_sin(rig.Omega * state.t + rig.phase)[0]
-    w_rate = (drive - f) / rig.m1
+    w_rate = (rig.P_d * state.C - f) / rig.m1
     f_rate = (k1 + k2) * state.w + c * w_rate
     rounding = jnp.finfo(float).eps * (jnp.abs(k1 * r) + jnp.abs(c * state.w) + jnp.abs(k2 * state.d) + F_b)
     excess = jnp.abs(f) - F_b

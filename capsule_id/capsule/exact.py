@@ -19,7 +19,19 @@ from jax.lax import stop_gradient
 from capsule_id.capsule.dense import WIDTH, Samples, read_off, row_of, samples_at
 from capsule_id.capsule.events import GAP, LOWER, NONE, UPPER, VELOCITY, first_event, mode_at
 from capsule_id.capsule.model import CapsuleParameters, Excitation, Initial, Status, Trajectory
-from capsule_id.capsule.taylor import Mode, Motion, Rig, State, advance, friction, rig_of, series, size, trusted
+from capsule_id.capsule.taylor import (
+    Mode,
+    Motion,
+    Rig,
+    State,
+    advance,
+    cos_sin,
+    friction,
+    rig_of,
+    series,
+    size,
+    trusted,
+)
 from capsule_id.precision import require_float64
 
 require_float64()
@@ -52,8 +64,7 @@ def met(rig: Rig, mode: Mode, motion: Motion, at: State, kind: jax.Array) -> tup
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
     f = rig.k1 * rig.G + stiffness * at.d + rig.c * at.w
     a2 = jnp.where(mode.sigma != 0.0, (f - friction(rig, mode.sigma, at.v)[0]) / rig.m2, 0.0)
-    drive = rig.P_d * jnp.cos(rig.Omega * at.t + rig.phase)
-    w_rate = (drive - f) / rig.m1 - a2
+    w_rate = (rig.P_d * at.C - f) / rig.m1 - a2
     f_rate = stiffness * at.w + rig.c * w_rate
     level = jnp.where(kind == UPPER, -rig.F_b, rig.F_b)
     g = jnp.where(kind == GAP, at.d, jnp.where(kind == VELOCITY, at.v, f + level))
@@ -61,12 +72,18 @@ def met(rig: Rig, mode: Mode, motion: Motion, at: State, kind: jax.Array) -> tup
     typical = jnp.where(
         kind == GAP, size(motion.w), jnp.where(kind == VELOCITY, size(motion.v), size(motion.f)) / motion.h
     )
-    rate, a2, w_rate, w, v, typical = stop_gradient((rate, a2, w_rate, at.w, at.v, typical))
+    rate, a2, w_rate, before, typical, Omega = stop_gradient((rate, a2, w_rate, at, typical, rig.Omega))
     grazing = (kind != NONE) & ~(jnp.abs(rate) > GRAZING_RATE * typical)
     dt = (stop_gradient(g) - g) / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
-    d = jnp.where(kind == GAP, 0.0, at.d + w * dt)
-    Y2 = jnp.where(kind == VELOCITY, 0.0, at.v + a2 * dt)
-    return State(at.t + dt, d, at.w + w_rate * dt, at.X2 + v * dt, Y2), grazing
+    return State(
+        at.t + dt,
+        jnp.where(kind == GAP, 0.0, at.d + before.w * dt),
+        at.w + w_rate * dt,
+        at.X2 + before.v * dt,
+        jnp.where(kind == VELOCITY, 0.0, at.v + a2 * dt),
+        at.C - before.S * (Omega * dt),
+        at.S + before.C * (Omega * dt),
+    ), grazing
 
 
 def step(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes) -> tuple[Lanes, Motion]:
@@ -77,9 +94,9 @@ def step(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes) -> tuple[Lane
     held = stop_gradient(motion)
     s_end = trusted(held)
     s, kind = first_event(stop_gradient(rig), mode, held, s_end, active)
-    new, grazing = met(rig, mode, motion, advance(state, motion, s), kind)
+    new, grazing = met(rig, mode, motion, advance(rig, state, motion, s), kind)
     event = kind != NONE
-    finished = ~event & (s >= 1.0) & (held.h >= left)
+    finished = ~event & (s >= 1.0) & held.last
     new = new._replace(t=jnp.where(finished, t_end, new.t))
     after = mode_at(stop_gradient(rig), stop_gradient(new), (kind == UPPER) | (kind == LOWER))
     after = Mode(*(jnp.where(event, x, y) for x, y in zip(after, mode, strict=True)))
@@ -107,7 +124,8 @@ def start(rig: Rig, times: jax.Array, initial: Initial) -> Lanes:
     d = (X1 - X2) - rig.G
     rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2) + rig.G)
     d = jnp.where(jnp.abs(d) <= rounding, d - stop_gradient(d), d)
-    state = State(times[:, 0], d, Y1 - Y2, X2, Y2)
+    t = times[:, 0]
+    state = State(t, d, Y1 - Y2, X2, Y2, *cos_sin(rig.Omega * t + rig.phase))
     given = jnp.stack([*rig, *state, times[:, -1]])
     positive = (rig.m1 > 0.0) & (rig.m2 > 0.0) & (rig.v_s > 0.0)
     not_negative = jnp.all(jnp.stack([rig.k1, rig.k2, rig.c, rig.F_b, rig.G]) >= 0.0, axis=0)
@@ -115,7 +133,7 @@ def start(rig: Rig, times: jax.Array, initial: Initial) -> Lanes:
     zero = jnp.zeros(d.shape, jnp.int32)
     status = jnp.where(valid, jnp.int32(Status.OK), jnp.int32(Status.INVALID))
     mode = mode_at(stop_gradient(rig), stop_gradient(state), jnp.zeros(d.shape, bool))
-    return Lanes(state, mode, valid & (times[:, 0] < times[:, -1]), status, zero, zero, zero)
+    return Lanes(state, mode, valid & (t < times[:, -1]), status, zero, zero, zero)
 
 
 def run(max_steps: int, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial) -> Trajectory:

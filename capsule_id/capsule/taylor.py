@@ -6,6 +6,9 @@ series is a list of coefficients in the scaled time s = (t - t0)/h. Written in r
 digits when the capsule has travelled far:
 
     d = X1 - X2 - G (penetration of the support spring if positive),  w = d' = Y1 - Y2,  X2,  v = Y2
+
+XLA recomputes a cheap expression in every place that uses it, which for recursions grows without bound, but never a
+division by a value known only at run time. So every quantity that is used often ends in such a division, on purpose.
 """
 
 from typing import NamedTuple
@@ -17,9 +20,9 @@ from capsule_id.capsule.model import CapsuleParameters, Excitation
 
 ORDER = 12
 # A step ends where the last coefficients of the series, relative to the sum of all, would exceed this.
-SERIES_TOLERANCE = 1e-12
+SERIES_TOLERANCE = 1e-9
 # First guess of a step, in units of the fastest time scale of the mode; the coefficients then cut it.
-STEP_GUESS = 2.0
+STEP_GUESS = 3.0
 # A series whose first guess reaches this many Stribeck velocities would converge too slowly.
 STRIBECK_GUESS = 4.0
 
@@ -43,13 +46,15 @@ class Rig(NamedTuple):
 
 
 class State(NamedTuple):
-    """Time (s) and relative state (m, m/s), every leaf (L,)."""
+    """Time (s), relative state (m, m/s), cosine and sine of the drive's phase there; every leaf (L,)."""
 
     t: jax.Array
     d: jax.Array
     w: jax.Array
     X2: jax.Array
     v: jax.Array
+    C: jax.Array
+    S: jax.Array
 
 
 class Mode(NamedTuple):
@@ -60,14 +65,17 @@ class Mode(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """One step's series: d, w, v and the spring's force f in s, X2's follow from v; D are the drive's coefficients."""
+    """One step's series in s: w, v, d (as the state) and f, the spring's force; h (L,) s is the unit of time.
+
+    last : (L,) bool, s = 1 is the end of the run
+    """
 
     h: jax.Array
+    last: jax.Array
     w: Series
     v: Series
     d: Series
     f: Series
-    D: Series
 
 
 def rig_of(p: CapsuleParameters, e: Excitation) -> Rig:
@@ -110,7 +118,8 @@ def cos_sin(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     odd = (quadrant == 1.0) | (quadrant == 3.0)
     c = jnp.where(odd, sine, cosine) * jnp.where((quadrant == 1.0) | (quadrant == 2.0), -1.0, 1.0)
     s = jnp.where(odd, cosine, sine) * jnp.where(quadrant >= 2.0, -1.0, 1.0)
-    return c, s
+    one = c * c + s * s
+    return c / one, s / one
 
 
 @cos_sin.defjvp
@@ -121,15 +130,15 @@ def _cos_sin_jvp(
     return (c, s), (-s * tangents[0], c * tangents[0])
 
 
-def step_guess(rig: Rig, mode: Mode, y2_rate: jax.Array) -> jax.Array:
-    """(L,) s: a step of the order of the mode's fastest time scale, where the series is worth computing.
+def step_rate(rig: Rig, mode: Mode, y2_rate: jax.Array) -> jax.Array:
+    """(L,) 1/s: inverse of a step of the order of the mode's fastest time scale, where the series is worth computing.
 
     y2_rate : (L,) m/s^2, the capsule's acceleration at the start of the step
     """
     compliance = 1.0 / rig.m1 + jnp.where(mode.sigma != 0.0, 1.0 / rig.m2, 0.0)
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
     rate = jnp.sqrt(stiffness * compliance) + rig.c * compliance + jnp.abs(rig.Omega)
-    return 1.0 / (rate / STEP_GUESS + jnp.abs(y2_rate) / (STRIBECK_GUESS * rig.v_s))
+    return rate / STEP_GUESS + jnp.abs(y2_rate) / (STRIBECK_GUESS * rig.v_s)
 
 
 def friction(rig: Rig, sigma: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -138,40 +147,34 @@ def friction(rig: Rig, sigma: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.A
     return sigma * (0.5 * rig.F_b) * (1.0 + u), u
 
 
-def series(rig: Rig, state: State, mode: Mode, h_max: jax.Array) -> Motion:
-    """Series of degree ORDER about the state, in the mode; h_max (L,) bounds the scaled time's unit h."""
+def series(rig: Rig, state: State, mode: Mode, left: jax.Array) -> Motion:
+    """Series of degree ORDER about the state, in the mode; left (L,) s bounds the step."""
     sliding = mode.sigma != 0.0
-    k2 = jnp.where(mode.contact, rig.k2, 0.0)
-    stiffness = rig.k1 + k2
-    C, S = cos_sin(rig.Omega * state.t + rig.phase)
+    stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
     F0, u0 = friction(rig, mode.sigma, state.v)
     f0 = rig.k1 * rig.G + stiffness * state.d + rig.c * state.w
     a2 = jnp.where(sliding, (f0 - F0) / rig.m2, 0.0)
-    h = jax.lax.stop_gradient(jnp.minimum(step_guess(rig, mode, a2), h_max))
-    hm1, hm2 = h / rig.m1, jnp.where(sliding, h / rig.m2, 0.0)
-    half, decay = mode.sigma * (0.5 * rig.F_b), -mode.sigma / rig.v_s
-    turn = -((rig.Omega * h) ** 2)
-    D: Series = [rig.P_d * C, -rig.P_d * rig.Omega * h * S]
-    d: Series = [state.d]
-    w: Series = [state.w]
-    v: Series = [state.v]
-    f: Series = [f0]
+    rate, rate_left = jax.lax.stop_gradient((step_rate(rig, mode, a2), 1.0 / left))
+    h = 1.0 / jnp.maximum(rate, rate_left)
+    half, m2 = mode.sigma * (0.5 * rig.F_b), jnp.where(sliding, rig.m2 / h, jnp.inf)
+    m1, v_s, turn = rig.m1 / h, -mode.sigma * rig.v_s, -((rig.Omega * h) ** 2)
+    D: Series = [rig.P_d * state.C, -rig.P_d * rig.Omega * h * state.S]
+    d, w, v, f = [state.d], [state.w], [state.v], [f0]
     F, u = F0, [u0]
-    v_rates: Series = []
     for k in range(ORDER):
         if k > 0:
             d.append(h * w[k - 1] * (1.0 / k))
             f.append(stiffness * d[k] + rig.c * w[k])
-            u.append(sum((v_rates[j] * u[k - 1 - j] for j in range(1, k)), v_rates[0] * u[k - 1]) * (decay / k))
+            product = sum((j * v[j] * u[k - j] for j in range(2, k + 1)), v[1] * u[k - 1])
+            u.append(jnp.where(sliding, product / (k * v_s), 0.0))
             F = half * u[k]
         if k > 1:
             D.append(D[k - 2] * turn * (1.0 / (k * (k - 1))))
-        v_rates.append((f[k] - F) * hm2)
-        w.append(((D[k] - f[k]) * hm1 - v_rates[k]) * (1.0 / (k + 1)))
-        v.append(v_rates[k] * (1.0 / (k + 1)))
+        v.append((f[k] - F) / (m2 * (k + 1)))
+        w.append((D[k] - f[k]) / (m1 * (k + 1)) - v[k + 1])
     d.append(h * w[ORDER - 1] * (1.0 / ORDER))
     f.append(stiffness * d[ORDER] + rig.c * w[ORDER])
-    return Motion(h, w, v, d, f, D)
+    return Motion(h, rate_left >= rate, w, v, d, f)
 
 
 def size(p: Series) -> jax.Array:
@@ -195,13 +198,20 @@ def horner(p: Series, s: jax.Array) -> jax.Array:
     return value
 
 
-def integral(p: Series, s: jax.Array) -> jax.Array:
-    """Integral of the polynomial from 0 to s."""
-    return s * horner([x * (1.0 / (k + 1)) for k, x in enumerate(p)], s)
+def gain(p: Series, s: jax.Array) -> jax.Array:
+    """Increase of the polynomial from 0 to s > 0."""
+    return horner(p[1:], s) / (1.0 / s)
 
 
-def advance(state: State, motion: Motion, s: jax.Array) -> State:
+def mean(p: Series, s: jax.Array) -> jax.Array:
+    """Mean of the polynomial over 0..s."""
+    return horner([x * (1.0 / (k + 1)) for k, x in enumerate(p)], s)
+
+
+def advance(rig: Rig, state: State, motion: Motion, s: jax.Array) -> State:
     """The state at the scaled time s of the step."""
-    d = state.d + motion.h * integral(motion.w, s)
-    X2 = state.X2 + motion.h * integral(motion.v, s)
-    return State(state.t + motion.h * s, d, horner(motion.w, s), X2, horner(motion.v, s))
+    per = 1.0 / (motion.h * s)
+    t, d, X2 = state.t + motion.h * s, state.d + mean(motion.w, s) / per, state.X2 + mean(motion.v, s) / per
+    return State(
+        t, d, state.w + gain(motion.w, s), X2, state.v + gain(motion.v, s), *cos_sin(rig.Omega * t + rig.phase)
+    )
