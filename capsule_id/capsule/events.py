@@ -62,7 +62,7 @@ def first_event(
     Marches from the left, each leap to the root of a quadratic minorant of each event function on what is left of the
     step, so no root can be passed, double ones included.
     """
-    sliding, frictionless = mode.sigma != 0.0, rig.F_b == 0.0
+    sliding = mode.sigma != 0.0
     gap = _divided([jnp.where(mode.contact, x, -x) for x in motion.d])
     speed = _divided([mode.sigma * x for x in motion.v])
     other = [jnp.where(sliding, a, b) for a, b in zip(speed, motion.f, strict=True)]
@@ -74,7 +74,7 @@ def first_event(
         p0, p1 = _value_and_slope(other, s)
         to_gap = _leap(g0, g1, gap_rest - gap_bend2)
         level, sign = jnp.where(sliding, 0.0, rig.F_b), jnp.where(sliding, 1.0, -1.0)
-        to_upper = jnp.where(frictionless, jnp.inf, _leap(level + sign * p0, sign * p1, rest - sign * bend2))
+        to_upper = _leap(level + sign * p0, sign * p1, rest - sign * bend2)
         to_lower = jnp.where(sliding, jnp.inf, _leap(rig.F_b + p0, p1, rest - bend2))
         to_motion = jnp.minimum(to_upper, to_lower)
         motion_kind = jnp.where(sliding, VELOCITY, jnp.where(to_upper <= to_lower, UPPER, LOWER))
@@ -112,11 +112,14 @@ def mode_at(rig: Rig, state: State, onset: jax.Array) -> Mode:
     w_rate = (rig.P_d * state.C - f) / rig.m1
     f_rate = (k1 + k2) * state.w + c * w_rate
     rounding = jnp.finfo(float).eps * (jnp.abs(k1 * r) + jnp.abs(c * state.w) + jnp.abs(k2 * state.d) + F_b)
-    excess = jnp.abs(f) - F_b
-    at_threshold = onset | (jnp.abs(excess) <= THRESHOLD_ROUNDINGS * rounding)
+    tolerance, excess = THRESHOLD_ROUNDINGS * rounding, jnp.abs(f) - F_b
+    at_threshold = onset | (jnp.abs(excess) <= tolerance)
     slips = jnp.where(at_threshold, f * f_rate > 0.0, excess > 0.0)
-    sigma = jnp.where(state.v != 0.0, jnp.sign(state.v), jnp.where(slips, jnp.sign(f), 0.0))
-    sigma = jnp.where(F_b == 0.0, 1.0, sigma)
+    # Without friction nothing ever sticks, and a force of zero leaves the direction to its rate, then to the drive's.
+    later = jnp.where(f_rate != 0.0, jnp.sign(f_rate), jnp.where(state.C < 0.0, -1.0, 1.0))
+    direction = jnp.where((F_b == 0.0) & (jnp.abs(f) <= tolerance), later, jnp.sign(f))
+    sigma = jnp.where(slips | (F_b == 0.0), direction, 0.0)
+    sigma = jnp.where(state.v != 0.0, jnp.sign(state.v), sigma)
     d_bend = w_rate - jnp.where(sigma != 0.0, (f - sigma * F_b) / rig.m2, 0.0)
     touching = (state.d == 0.0) & (state.w == 0.0) & (d_bend > 0.0)
     return Mode((state.d > 0.0) | closing | touching, sigma)

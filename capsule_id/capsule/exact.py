@@ -38,7 +38,7 @@ require_float64()
 
 # Steps kept before samples are read off them; a buffer of this many rows stays in the second-level cache.
 ROWS = 64
-# An event whose function falls slower than this, relative to the size of its rate on the step, counts as grazing.
+# An event whose function falls slower than this, relative to the typical size of its rate, counts as grazing.
 GRAZING_RATE = 1e-6
 
 Kernel = Callable[[CapsuleParameters, Excitation, jax.Array, Initial], Trajectory]
@@ -56,10 +56,10 @@ class Lanes(NamedTuple):
     steps: jax.Array
 
 
-def met(rig: Rig, mode: Mode, motion: Motion, at: State, kind: jax.Array) -> tuple[State, jax.Array]:
+def met(rig: Rig, mode: Mode, motion: Motion, s: jax.Array, at: State, kind: jax.Array) -> tuple[State, jax.Array]:
     """(the state on the event's surface with the event time's tangent, whether the event is grazing).
 
-    at : the state at the located time, in the mode before the event
+    s, at : the located time and the state there, in the mode before the event
     """
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
     f = rig.k1 * rig.G + stiffness * at.d + rig.c * at.w
@@ -69,9 +69,9 @@ def met(rig: Rig, mode: Mode, motion: Motion, at: State, kind: jax.Array) -> tup
     level = jnp.where(kind == UPPER, -rig.F_b, rig.F_b)
     g = jnp.where(kind == GAP, at.d, jnp.where(kind == VELOCITY, at.v, f + level))
     rate = jnp.where(kind == GAP, at.w, jnp.where(kind == VELOCITY, a2, f_rate))
-    typical = jnp.where(
-        kind == GAP, size(motion.w), jnp.where(kind == VELOCITY, size(motion.v), size(motion.f)) / motion.h
-    )
+    f_rates = [k * x for k, x in enumerate(motion.f)][1:]
+    onset_or_stop = jnp.where(kind == VELOCITY, (jnp.abs(f) + rig.F_b) / rig.m2, size(f_rates, s) / motion.h)
+    typical = jnp.where(kind == GAP, size(motion.w, s), onset_or_stop)
     rate, a2, w_rate, before, typical, Omega = stop_gradient((rate, a2, w_rate, at, typical, rig.Omega))
     grazing = (kind != NONE) & ~(jnp.abs(rate) > GRAZING_RATE * typical)
     dt = (stop_gradient(g) - g) / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
@@ -94,7 +94,7 @@ def step(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes) -> tuple[Lane
     held = stop_gradient(motion)
     s_end = trusted(held)
     s, kind = first_event(stop_gradient(rig), mode, held, s_end, active)
-    new, grazing = met(rig, mode, motion, advance(rig, state, motion, s), kind)
+    new, grazing = met(rig, mode, motion, s, advance(rig, state, motion, s), kind)
     event = kind != NONE
     finished = ~event & (s >= 1.0) & held.last
     new = new._replace(t=jnp.where(finished, t_end, new.t))

@@ -23,8 +23,8 @@ ORDER = 12
 SERIES_TOLERANCE = 1e-9
 # First guess of a step, in units of the fastest time scale of the mode; the coefficients then cut it.
 STEP_GUESS = 3.0
-# A series whose first guess reaches this many Stribeck velocities would converge too slowly.
-STRIBECK_GUESS = 4.0
+# Coefficients that tell the size of a motion; the later ones may be large only because the guess was.
+LEADING = 4
 
 Series = list[jax.Array]
 
@@ -130,15 +130,11 @@ def _cos_sin_jvp(
     return (c, s), (-s * tangents[0], c * tangents[0])
 
 
-def step_rate(rig: Rig, mode: Mode, y2_rate: jax.Array) -> jax.Array:
-    """(L,) 1/s: inverse of a step of the order of the mode's fastest time scale, where the series is worth computing.
-
-    y2_rate : (L,) m/s^2, the capsule's acceleration at the start of the step
-    """
+def step_rate(rig: Rig, mode: Mode) -> jax.Array:
+    """(L,) 1/s: inverse of a step of the order of the mode's fastest time scale, beyond which no series is worth it."""
     compliance = 1.0 / rig.m1 + jnp.where(mode.sigma != 0.0, 1.0 / rig.m2, 0.0)
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
-    rate = jnp.sqrt(stiffness * compliance) + rig.c * compliance + jnp.abs(rig.Omega)
-    return rate / STEP_GUESS + jnp.abs(y2_rate) / (STRIBECK_GUESS * rig.v_s)
+    return (jnp.sqrt(stiffness * compliance) + rig.c * compliance + jnp.abs(rig.Omega)) / STEP_GUESS
 
 
 def friction(rig: Rig, sigma: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -153,8 +149,7 @@ def series(rig: Rig, state: State, mode: Mode, left: jax.Array) -> Motion:
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
     F0, u0 = friction(rig, mode.sigma, state.v)
     f0 = rig.k1 * rig.G + stiffness * state.d + rig.c * state.w
-    a2 = jnp.where(sliding, (f0 - F0) / rig.m2, 0.0)
-    rate, rate_left = jax.lax.stop_gradient((step_rate(rig, mode, a2), 1.0 / left))
+    rate, rate_left = jax.lax.stop_gradient((step_rate(rig, mode), 1.0 / left))
     h = 1.0 / jnp.maximum(rate, rate_left)
     half, m2 = mode.sigma * (0.5 * rig.F_b), jnp.where(sliding, rig.m2 / h, jnp.inf)
     m1, v_s, turn = rig.m1 / h, -mode.sigma * rig.v_s, -((rig.Omega * h) ** 2)
@@ -177,13 +172,13 @@ def series(rig: Rig, state: State, mode: Mode, left: jax.Array) -> Motion:
     return Motion(h, rate_left >= rate, w, v, d, f)
 
 
-def size(p: Series) -> jax.Array:
-    """Sum of the moduli of the coefficients: bounds the polynomial on 0 <= s <= 1."""
-    return sum((jnp.abs(x) for x in p[1:]), jnp.abs(p[0]))
+def size(p: Series, s: jax.Array | float = 1.0) -> jax.Array:
+    """Size of a motion from its leading coefficients, taken up to the scaled time s."""
+    return horner([jnp.abs(x) for x in p[:LEADING]], s)
 
 
 def trusted(motion: Motion) -> jax.Array:
-    """(L,) the s <= 1 up to which the series of w and v hold to SERIES_TOLERANCE of their sizes."""
+    """(L,) the s <= 1 up to which the series of w and v hold to SERIES_TOLERANCE of their leading terms' size."""
     tiny = jnp.finfo(float).tiny
     last = [jnp.maximum(jnp.abs(p[-1]), jnp.abs(p[-2])) / (size(p) + tiny) for p in (motion.w, motion.v)]
     excess = jnp.maximum(jnp.maximum(*last), SERIES_TOLERANCE) / SERIES_TOLERANCE
