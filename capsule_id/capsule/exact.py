@@ -136,28 +136,35 @@ def start(rig: Rig, times: jax.Array, initial: Initial) -> Lanes:
     return Lanes(state, mode, valid & (t < times[:, -1]), status, zero, zero, zero)
 
 
-def run(max_steps: int, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial) -> Trajectory:
-    """The motion of lanes: every leaf (L,), times (L, n)."""
-    rig = rig_of(p, e)
-    lanes = start(rig, times, initial)
-    samples = samples_at(times, initial, lanes.status == Status.OK)
-    L, n = times.shape
-    t_end = stop_gradient(times[:, -1])
+def march(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes, length: int) -> tuple[Lanes, jax.Array, jax.Array]:
+    """Up to ``length`` steps: (lanes, rows (length, WIDTH, L), starts (length, L)), see dense.py."""
+    L = t_end.shape[0]
 
-    def fill(carry: tuple[Lanes, jax.Array, jax.Array, jax.Array]) -> tuple[Lanes, jax.Array, jax.Array, jax.Array]:
+    def more(carry: tuple[Lanes, jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        return (carry[3] < length) & jnp.any(carry[0].active)
+
+    def one(carry: tuple[Lanes, jax.Array, jax.Array, jax.Array]) -> tuple[Lanes, jax.Array, jax.Array, jax.Array]:
         lanes, rows, starts, row = carry
         after, motion = step(rig, t_end, max_steps, lanes)
         begin = jnp.where(lanes.active, stop_gradient(lanes.state.t), jnp.inf)
         rows = jax.lax.dynamic_update_index_in_dim(rows, row_of(lanes.state, motion), row, 0)
         return after, rows, jax.lax.dynamic_update_index_in_dim(starts, begin, row, 0), row + 1
 
+    blank = (jnp.zeros((length, WIDTH, L)), jnp.full((length, L), jnp.inf), jnp.int32(0))
+    return jax.lax.while_loop(more, one, (lanes, *blank))[:3]
+
+
+def run(max_steps: int, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial) -> Trajectory:
+    """The motion of lanes: every leaf (L,), times (L, n)."""
+    rig = rig_of(p, e)
+    lanes = start(rig, times, initial)
+    samples = samples_at(times, initial, lanes.status == Status.OK)
+    n = times.shape[1]
+    t_end = stop_gradient(times[:, -1])
+
     def stretch(carry: tuple[Lanes, Samples]) -> tuple[Lanes, Samples]:
-        lanes, samples = carry
-        blank = (jnp.zeros((ROWS, WIDTH, L)), jnp.full((ROWS, L), jnp.inf), jnp.int32(0))
-        lanes, rows, starts, _ = jax.lax.while_loop(
-            lambda c: (c[3] < ROWS) & jnp.any(c[0].active), fill, (lanes, *blank)
-        )
-        return lanes, read_off(samples, rows, starts, lanes.state.t, rig.G)
+        lanes, rows, starts = march(rig, t_end, max_steps, carry[0], ROWS)
+        return lanes, read_off(carry[1], rows, starts, lanes.state.t, rig.G)
 
     lanes, samples = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
     X1, Y1, X2, Y2 = (samples.values[:, i, :n] for i in range(4))
