@@ -103,5 +103,7 @@ def _recorded(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """(rows (max_steps, WIDTH, L), starts (max_steps, L), status (L,)) of all steps of a run."""
     rig = rig_of(p, e)
-    lanes, rows, starts = march(rig, jnp.asarray(times[:, -1]), max_steps, start(rig, times, initial), max_steps)
+    begin, end = jnp.asarray(times[:, 0]), jnp.asarray(times[:, 1])
+    lanes = start(rig, begin, end, initial)
+    lanes, rows, starts = march(rig, end, jnp.full(end.shape, max_steps), lanes, max_steps)
     return rows, starts, lanes.status

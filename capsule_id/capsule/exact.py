@@ -8,14 +8,15 @@ dt = -dg/g', whose value is zero and whose tangent is the event's own (the salta
 """
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.lax import stop_gradient
 
+from capsule_id.capsule.batches import is_traced
 from capsule_id.capsule.dense import WIDTH, Samples, read_off, row_of, samples_at
 from capsule_id.capsule.events import GAP, LOWER, NONE, UPPER, VELOCITY, first_event, mode_at
 from capsule_id.capsule.model import CapsuleParameters, Excitation, Initial, Status, Trajectory
@@ -40,6 +41,9 @@ require_float64()
 ROWS = 64
 # An event whose function falls slower than this, relative to the typical size of its rate, counts as grazing.
 GRAZING_RATE = 1e-6
+
+# Numbers of samples are padded to this times a power of four.
+SHORTEST = 64
 
 Kernel = Callable[[CapsuleParameters, Excitation, jax.Array, Initial], Trajectory]
 
@@ -86,7 +90,7 @@ def met(rig: Rig, mode: Mode, motion: Motion, s: jax.Array, at: State, kind: jax
     ), grazing
 
 
-def step(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes) -> tuple[Lanes, Motion]:
+def step(rig: Rig, t_end: jax.Array, max_steps: jax.Array, lanes: Lanes) -> tuple[Lanes, Motion]:
     """One step of every active lane."""
     state, mode, active = lanes.state, lanes.mode, lanes.active
     left = t_end - stop_gradient(state.t)
@@ -118,25 +122,26 @@ def step(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes) -> tuple[Lane
     ), motion
 
 
-def start(rig: Rig, times: jax.Array, initial: Initial) -> Lanes:
-    """Lanes at times[:, 0]: an initial state that rounding alone keeps off the gap's closing point is put onto it."""
+def start(rig: Rig, t: jax.Array, t_end: jax.Array, initial: Initial) -> Lanes:
+    """Lanes at t (L,): an initial state that rounding alone keeps off the gap's closing point is put onto it."""
     X1, Y1, X2, Y2 = (jnp.asarray(x) for x in initial)
     d = (X1 - X2) - rig.G
     rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2) + rig.G)
     d = jnp.where(jnp.abs(d) <= rounding, d - stop_gradient(d), d)
-    t = times[:, 0]
     state = State(t, d, Y1 - Y2, X2, Y2, *cos_sin(rig.Omega * t + rig.phase))
-    given = jnp.stack([*rig, *state, times[:, -1]])
+    given = jnp.stack([*rig, *state, t_end])
     positive = (rig.m1 > 0.0) & (rig.m2 > 0.0) & (rig.v_s > 0.0)
     not_negative = jnp.all(jnp.stack([rig.k1, rig.k2, rig.c, rig.F_b, rig.G]) >= 0.0, axis=0)
     valid = jnp.all(jnp.isfinite(given), axis=0) & positive & not_negative
     zero = jnp.zeros(d.shape, jnp.int32)
     status = jnp.where(valid, jnp.int32(Status.OK), jnp.int32(Status.INVALID))
     mode = mode_at(stop_gradient(rig), stop_gradient(state), jnp.zeros(d.shape, bool))
-    return Lanes(state, mode, valid & (t < times[:, -1]), status, zero, zero, zero)
+    return Lanes(state, mode, valid & (t < t_end), status, zero, zero, zero)
 
 
-def march(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes, length: int) -> tuple[Lanes, jax.Array, jax.Array]:
+def march(
+    rig: Rig, t_end: jax.Array, max_steps: jax.Array, lanes: Lanes, length: int
+) -> tuple[Lanes, jax.Array, jax.Array]:
     """Up to ``length`` steps: (lanes, rows (length, WIDTH, L), starts (length, L)), see dense.py."""
     L = t_end.shape[0]
 
@@ -154,13 +159,14 @@ def march(rig: Rig, t_end: jax.Array, max_steps: int, lanes: Lanes, length: int)
     return jax.lax.while_loop(more, one, (lanes, *blank))[:3]
 
 
-def run(max_steps: int, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial) -> Trajectory:
-    """The motion of lanes: every leaf (L,), times (L, n)."""
-    rig = rig_of(p, e)
-    lanes = start(rig, times, initial)
+def run(
+    p: CapsuleParameters, e: Excitation, times: jax.Array, t_end: jax.Array, initial: Initial, max_steps: jax.Array
+) -> Trajectory:
+    """The motion of lanes: every leaf (L,), times (L, n); times beyond t_end (L,) are not reached and stay NaN."""
+    rig, t_end = rig_of(p, e), stop_gradient(t_end)
+    lanes = start(rig, times[:, 0], t_end, initial)
     samples = samples_at(times, initial, lanes.status == Status.OK)
     n = times.shape[1]
-    t_end = stop_gradient(times[:, -1])
 
     def stretch(carry: tuple[Lanes, Samples]) -> tuple[Lanes, Samples]:
         lanes, rows, starts = march(rig, t_end, max_steps, carry[0], ROWS)
@@ -171,31 +177,44 @@ def run(max_steps: int, p: CapsuleParameters, e: Excitation, times: jax.Array, i
     return Trajectory(times, X1, Y1, X2, Y2, lanes.contacts, lanes.status, lanes.steps, lanes.events)
 
 
-@lru_cache(maxsize=8)
-def kernel(max_steps: int) -> Kernel:
-    """The jitted engine (p, e, times, initial) -> Trajectory on lanes.
+@jax.jit
+@custom_vmap
+def _run(
+    p: CapsuleParameters, e: Excitation, times: jax.Array, t_end: jax.Array, initial: Initial, max_steps: jax.Array
+) -> Trajectory:
+    return run(p, e, times, t_end, initial, max_steps)
 
-    Under ``vmap`` the new axis is folded into the lanes, because a loop inside a loop over lanes would copy its buffers
-    at every step.
+
+@_run.__wrapped__.def_vmap
+def _fold(size: int, batched: list[object], *args: object) -> tuple[Trajectory, Trajectory]:
+    """Fold a new axis into the lanes: a loop inside a loop over lanes would copy its buffers at every step."""
+    flat, structure = jax.tree.flatten(args)
+    flags = jax.tree.leaves(batched)
+    if not any(flags):
+        out = run(*args)  # pyright: ignore[reportArgumentType]
+        return out, jax.tree.map(lambda _: False, out)
+    full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(flat, flags, strict=True)]
+    L = full[0].shape[1]
+    lanes = jax.tree.unflatten(structure, [x.reshape(size * L, *x.shape[2:]) for x in full])
+    out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), _run(*lanes))
+    return out, jax.tree.map(lambda _: True, out)
+
+
+def kernel(max_steps: int) -> Kernel:
+    """The engine (p, e, times, initial) -> Trajectory on lanes.
+
+    Concrete times are padded to one of few lengths, so that a new number of samples is seldom a new program.
     """
 
-    @custom_vmap
     def simulate_exact(p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial) -> Trajectory:
-        return run(max_steps, p, e, times, initial)
+        L, n = times.shape
+        bound, t_end = np.full(L, max_steps, np.int32), times[:, -1]
+        if is_traced((p, e, times, initial)):
+            return _run(p, e, times, t_end, initial, bound)
+        length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
+        padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
+        t = _run(p, e, padded, t_end, initial, bound)
+        cut = (x[:, :n] for x in (t.times, t.X1, t.Y1, t.X2, t.Y2))
+        return Trajectory(*cut, t.contacts, t.status, t.steps, t.events)
 
-    @simulate_exact.def_vmap
-    def fold(  # pyright: ignore[reportUnusedFunction]
-        size: int, batched: list[object], *args: object
-    ) -> tuple[Trajectory, Trajectory]:
-        flat, structure = jax.tree.flatten(args)
-        flags = jax.tree.leaves(batched)
-        if not any(flags):
-            out = run(max_steps, *args)  # pyright: ignore[reportArgumentType]
-            return out, jax.tree.map(lambda _: False, out)
-        full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(flat, flags, strict=True)]
-        L = full[0].shape[1]
-        lanes = jax.tree.unflatten(structure, [x.reshape(size * L, *x.shape[2:]) for x in full])
-        out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), simulate_exact(*lanes))
-        return out, jax.tree.map(lambda _: True, out)
-
-    return jax.jit(simulate_exact)
+    return simulate_exact
