@@ -44,12 +44,12 @@ def _stage_solver(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[C
     r_1, r_2 = (1.0 - q_1) * r_inverse, -q_2 * r_inverse
     m11, m12 = d - a_1 - a_r * r_1, -a_2 - a_r * r_2
     m21, m22 = -b_1 - b_r * r_1, d - b_2 - b_r * r_2
-    scale = 1.0 / (m11 * m22 - m12 * m21)
+    determinant = m11 * m22 - m12 * m21
 
     def solve(b: State) -> State:
         r_0 = (b[0] - b[2]) * r_inverse
         c1, c2 = b[1] + a_r * r_0, b[3] + b_r * r_0
-        u1, u2 = (m22 * c1 - m12 * c2) * scale, (m11 * c2 - m21 * c1) * scale
+        u1, u2 = (m22 * c1 - m12 * c2) / determinant, (m11 * c2 - m21 * c1) / determinant
         r = r_0 + r_1 * u1 + r_2 * u2
         return jnp.stack([(b[0] + u1) / d, u1, (b[2] + q_r * r + q_1 * u1 + q_2 * u2) / d, u2])
 
