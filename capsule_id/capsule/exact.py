@@ -40,7 +40,7 @@ require_float64()
 # Steps kept before samples are read off them; a buffer of this many rows stays in the second-level cache.
 ROWS = 64
 # An event whose function falls slower than this, relative to the typical size of its rate, counts as grazing.
-GRAZING_RATE = 1e-6
+GRAZING_RATE = 1e-5
 
 # Numbers of samples are padded to this times a power of four.
 SHORTEST = 64
