@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from capsule_id.precision import require_float64
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 require_float64()
 
-Array = jax.Array | float
+Array = jax.Array | np.ndarray | float
 
 
 # ------------------------------------------- smoothed Heaviside, its integral, sign and |x|; every width is positive
@@ -187,8 +188,8 @@ def friction_smooth(law: FrictionLaw, F_b: Array, Y2: Array, f: Array, widths: t
 
     At Y2 = 0: f inside the thresholds, the threshold outside; slope in Y2 there sqrt(F_b^2 + f^2) / velocity inside,
     0 outside. |Y2| >= sqrt(2) velocity (1 + rounding): exactly the law's resistance with the sign of Y2, so also at
-    Y2 -> +-infinity; at f -> +-infinity with Y2 = 0 the threshold with the sign of f. Limit velocity -> 0: the exact rule,
-    for every ``rounding``.
+    Y2 -> +-infinity; at f -> +-infinity with Y2 = 0 the threshold with the sign of f. Limit velocity -> 0: the exact
+    rule, for every ``rounding``.
 
     F_b : ``breakaway(law)``, computed once per run
     widths : (velocity, m/s; rounding: the half-width of the clip's corner as a fraction of F_b)
