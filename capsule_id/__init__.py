@@ -2,6 +2,10 @@
 
     rig folder -> Rig -> experiments -> log-posterior -> point fit -> emcee -> checks -> report
 
+    rig = capsule_id.read_rig("data/")          # folder -> Rig: SI, checked, hashed
+    result = capsule_id.fit(rig, seed=0)        # Rig -> Result: point fit, posterior, findings
+    result.write("results/twin")                # Result -> parameters.json, posterior.nc, report.html
+
 The public names are imported on first use, so that ``import capsule_id`` is free of JAX.
 """
 
@@ -9,6 +13,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from capsule_id.api import Fit as Fit
+    from capsule_id.api import fit as fit
     from capsule_id.capsule.model import CapsuleParameters as CapsuleParameters
     from capsule_id.capsule.model import Excitation as Excitation
     from capsule_id.capsule.model import Status as Status
@@ -18,25 +24,34 @@ if TYPE_CHECKING:
     from capsule_id.capsule.response import Response as Response
     from capsule_id.capsule.response import response as response
     from capsule_id.capsule.smooth import Smoothing as Smoothing
+    from capsule_id.errors import InputError as InputError
+    from capsule_id.rig.read import read_rig as read_rig
+    from capsule_id.synthetic import synthesize as synthesize
 
-_ROOMS = {
+_HOME = {
     "CapsuleParameters": "capsule_id.capsule.model",
     "Excitation": "capsule_id.capsule.model",
+    "Fit": "capsule_id.api",
+    "fit": "capsule_id.api",
+    "InputError": "capsule_id.errors",
+    "read_rig": "capsule_id.rig.read",
     "Response": "capsule_id.capsule.response",
-    "Smoothing": "capsule_id.capsule.smooth",
-    "Status": "capsule_id.capsule.model",
-    "Trajectory": "capsule_id.capsule.model",
     "response": "capsule_id.capsule.response",
     "simulate": "capsule_id.capsule.model",
+    "Smoothing": "capsule_id.capsule.smooth",
+    "Status": "capsule_id.capsule.model",
     "status_message": "capsule_id.capsule.model",
+    "synthesize": "capsule_id.synthetic",
+    "Trajectory": "capsule_id.capsule.model",
 }
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401
-    if name not in _ROOMS:
-        raise AttributeError(f"module 'capsule_id' has no attribute '{name}'")
-    return getattr(import_module(_ROOMS[name]), name)
+    """Import a public name from its room when it is first asked for."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_ROOMS])
+    return sorted([*globals(), *_HOME])

@@ -1,0 +1,47 @@
+"""``fit``: what ``fit-params`` does, as an object."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.result import Result
+from capsule_id.inference.sampling import DEFAULT_BUDGET
+from capsule_id.output import check_directory, open_partial, publish
+from capsule_id.rig.model import Rig
+
+
+@dataclass(frozen=True)
+class Fit(Result):
+    """A ``Result`` that can be written."""
+
+    def write(self, directory: str | Path) -> None:
+        """Write parameters.json, parameters.csv, posterior.nc, report.html and figures/ into ``directory``.
+
+        Raises
+        ------
+        InputError
+            If it exists and is not a result of this package.
+        """
+        path = Path(directory)
+        check_directory(path)
+        open_partial(path, {}, resume=False)
+        publish(self, path)
+
+
+def fit(rig: Rig, seed: int = 0, experiments: str = "all", budget: int | None = DEFAULT_BUDGET) -> Fit:
+    """Fit a rig: point estimate, posterior, checks.
+
+    Parameters
+    ----------
+    rig : from ``read_rig``
+    seed : the same seed gives the same numbers
+    experiments : "bench", "runs" or "all"
+    budget : emcee steps of an ensemble after burn-in; None for the point fit alone
+
+    Raises
+    ------
+    InputError
+        If the rig holds nothing to fit.
+    """
+    result = fit_rig(rig, seed, experiments, budget)
+    return Fit(**{field.name: getattr(result, field.name) for field in fields(result)})

@@ -1,0 +1,45 @@
+"""``capsule-id check DATA``: read a rig folder, say what stands in it and what to mind; fits nothing."""
+
+import argparse
+
+from capsule_id.errors import InputError
+from capsule_id.rig.filters import sampling_step
+from capsule_id.rig.lint import lint
+from capsule_id.rig.model import Table
+from capsule_id.rig.read import read_rig
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """DATA."""
+    parser.add_argument("data", metavar="DATA", help="rig folder, with its rig.toml")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a line per experiment and per finding to standard output; 0.
+
+    Raises
+    ------
+    InputError
+        If the folder is no valid rig.
+    """
+    rig = read_rig(args.data)
+    print(f"{rig.name}: {len(rig.tables)} experiments{', SYNTHETIC data' if rig.synthetic else ''}")
+    for table in rig.tables:
+        print(_summary(table))
+    findings = lint(rig)
+    for finding in findings:
+        print(f"lint: {finding}")
+    print(f"{len(findings)} findings" if findings else "no findings")
+    return 0
+
+
+def _summary(table: Table) -> str:
+    """Kind, label, rows, columns and sampling of one experiment."""
+    columns = ", ".join(f"{column.name} [{column.unit}]" for column in table.columns.values())
+    text = f"{table.kind} {table.label}: {len(table.rows)} rows of {columns}"
+    if "time" not in table.columns:
+        return text
+    try:
+        return f"{text}, {1.0 / sampling_step(table['time']):.6g} Hz"
+    except InputError:
+        return f"{text}, unevenly sampled"

@@ -1,0 +1,95 @@
+"""One file per rig test: its readings, the paper's estimator, its likelihood, what the report shows of it.
+
+The next experiment is one file with a subclass of ``Experiment``, one entry in ``KINDS`` here and its columns in
+``capsule_id.rig.schema``.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.dynamic_friction import DynamicFriction
+from capsule_id.experiments.free_vibration import FreeVibration
+from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
+from capsule_id.experiments.line import Line
+from capsule_id.experiments.motor_current import MotorCurrent
+from capsule_id.experiments.sliding_friction import SlidingFriction
+from capsule_id.experiments.static_friction import StaticFriction
+from capsule_id.experiments.support_spring import SupportSpring
+from capsule_id.rig.model import Rig
+from capsule_id.views import Comparison
+
+KINDS: Mapping[str, type[Experiment]] = {
+    "free_vibration": FreeVibration,
+    "static_friction": StaticFriction,
+    "dynamic_friction": DynamicFriction,
+    "sliding_friction": SlidingFriction,
+    "motor_current": MotorCurrent,
+    "support_spring": SupportSpring,
+}
+#: Experiments on the bench, as against forced runs.
+BENCH = tuple(KINDS)
+
+
+def make_experiments(rig: Rig, which: str = "all") -> tuple[Experiment, ...]:
+    """The rig's experiments, in the order of ``rig.toml``.
+
+    Parameters
+    ----------
+    which : "bench", "runs" or "all"
+
+    Raises
+    ------
+    InputError
+        If nothing is left to fit, or a kind has no likelihood yet.
+    """
+    tables = [t for t in rig.tables if which == "all" or (t.kind in BENCH) == (which == "bench")]
+    if not tables:
+        rule = "the rig folder must hold an experiment to fit"
+        raise InputError(rule, f"none with --experiments {which}", "add one to rig.toml", rig.folder / "rig.toml")
+    for table in tables:
+        if table.kind not in KINDS:
+            remedy = "fit the bench tests with --experiments bench"
+            raise InputError(f"{table.kind} has no likelihood yet", table.label, remedy, rig.folder / "rig.toml")
+    return tuple(KINDS[table.kind](table, rig) for table in tables)
+
+
+def paper_estimates(experiments: Sequence[Experiment]) -> dict[str, float]:
+    """What the paper's own protocol gives (section 2.2), by parameter name, SI; absent where it gives nothing.
+
+    k1 and c: the mean over the records of m1 Omega_o^2 and of the logarithmic decrement after Savitzky–Golay. mu and
+    v_s: eq. (1) fitted to the static and dynamic points. K and k2: ordinary straight lines, the mean over tables.
+    """
+    collected: dict[str, list[float]] = {}
+    for experiment in experiments:
+        if isinstance(experiment, FreeVibration):
+            decrement = experiment.paper_decrement()
+            if decrement is not None:
+                collected.setdefault("k1", []).append(decrement.k1)
+                collected.setdefault("c", []).append(decrement.c)
+        elif isinstance(experiment, Line):
+            collected.setdefault(experiment.slope.name, []).append(experiment.ordinary_line()[0])
+    estimates = {name: float(np.mean(values)) for name, values in collected.items()}
+    friction = [e.paper_points() for e in experiments if isinstance(e, FrictionExperiment)]
+    if friction:
+        speed, coefficient = (np.concatenate(parts) for parts in zip(*friction, strict=True))
+        estimates |= paper_friction_fit(speed, coefficient)
+    return estimates
+
+
+def compare(
+    experiments: Sequence[Experiment], values: Mapping[str, float], draws: Sequence[Mapping[str, float]]
+) -> tuple[Comparison, ...]:
+    """One panel per experiment, at ``values`` by name with a band from ``draws``; friction experiments share one."""
+    friction = [e for e in experiments if isinstance(e, FrictionExperiment)]
+    panels = []
+    if friction:
+        # Their local values differ in scatters only; together they know both mu and v_s where one of them does.
+        everything = [{k: v for e in friction for k, v in e.local(point).items()} for point in (values, *draws)]
+        panels.append(friction_comparison(friction, everything[0], everything[1:]))
+    for e in experiments:
+        if not isinstance(e, FrictionExperiment):
+            panels.append(e.comparison(e.local(values), [e.local(draw) for draw in draws]))
+    return tuple(panels)

@@ -1,0 +1,199 @@
+"""What every experiment offers to inference and to the report.
+
+An experiment says, for given parameters, by how much each reading misses (``misfit``): the raw misfit, its standard
+deviation and the design of the nuisances that enter linearly. Likelihood, residuals, pointwise densities and the
+posterior predictive p-value all follow from that here, once.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Mapping
+from copy import copy
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Self
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from capsule_id.experiments.linear import LOG_2PI, conditional_draw, conditional_mean, marginal_log_density
+from capsule_id.parameters import Parameter
+from capsule_id.precision import require_float64
+from capsule_id.rig.model import Column, Rig, Table
+from capsule_id.views import Comparison, Finding
+
+require_float64()
+
+#: Parameter values, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, and the constants ``g``, ``m1``, ``m2``): what one
+#: experiment sees. ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
+Theta = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a fit may start: ``centre`` (SI) and how far starts are dispersed, natural-log units where positive."""
+
+    centre: float
+    spread: float
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """By how much the readings miss a model.
+
+    Attributes
+    ----------
+    raw : (n,) measured minus predicted
+    sd : (n,) its standard deviation
+    design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
+    """
+
+    raw: Any
+    sd: Any
+    design: Any
+
+    def moments(self) -> tuple[Any, Any, Any]:
+        """y'y, A'y, A'A in units of the noise."""
+        y, a = self.raw / self.sd, self.design / self.sd[:, None]
+        return y @ y, a.T @ y, a.T @ a
+
+
+class Experiment(ABC):
+    """One rig test: its readings, the paper's estimator, its likelihood, what the report shows of it."""
+
+    #: The unit of ``misfit`` is known beforehand (no scatter is estimated): chi-square has a meaning of its own.
+    scale_known = False
+    #: Readings follow each other in time: residuals must be white.
+    time_series = False
+    #: Numeric attributes, and the others, that the likelihood reads: experiments of one class that agree in the shapes
+    #: of the former and in the values of the latter are evaluated together, in one batch (see ``signature``).
+    ARRAYS: tuple[str, ...] = ()
+    STATIC: tuple[str, ...] = ()
+
+    def __init__(self, table: Table, rig: Rig) -> None:
+        self.table = table
+        self.rig = rig
+
+    @property
+    def label(self) -> str:
+        return self.table.label
+
+    @property
+    def kind(self) -> str:
+        return self.table.kind
+
+    @property
+    def n(self) -> int:
+        """Number of readings that enter the likelihood."""
+        return self.observed.shape[0]
+
+    @property
+    def signature(self) -> Hashable:
+        """Equal for experiments that differ only in numbers."""
+        shapes = tuple(np.shape(getattr(self, name)) for name in self.ARRAYS)
+        return type(self), self.n, shapes, tuple(getattr(self, name) for name in self.STATIC)
+
+    def with_arrays(self, arrays: Mapping[str, Any]) -> Self:
+        """The same experiment with other (traced) numbers in place of ``ARRAYS``."""
+        clone = copy(self)
+        clone.__dict__.update(arrays)
+        return clone
+
+    def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values by symbol out of values by name."""
+        own = {row.symbol: values[row.name] for row in self.parameters}
+        return own | {name: values[name] for name in ("m1", "m2", "g") if name in values}
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Those sampled for this experiment (masses are the rig's)."""
+
+    @property
+    @abstractmethod
+    def observed(self) -> np.ndarray:
+        """(n,) the readings that the likelihood is a density of, SI."""
+
+    @abstractmethod
+    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+        """Misfit for parameters ``theta``; ``xp`` is ``jax.numpy`` or ``numpy``."""
+
+    @abstractmethod
+    def starts(self) -> dict[str, Start]:
+        """A start for every parameter of this experiment, from rough estimates out of its own readings."""
+
+    @abstractmethod
+    def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
+        """Measured beside predicted at the point fit ``theta``, with a band from posterior ``draws`` (may be [])."""
+
+    def lint(self, theta: Theta) -> list[Finding]:
+        """What the settings themselves say against the experiment, at the point fit."""
+        del theta
+        return []
+
+    def log_likelihood(self, theta: Theta, xp: ModuleType = jnp) -> Any:
+        """Natural, normalised log-density of the readings, linear nuisances integrated out; scalar."""
+        misfit = self.misfit(theta, xp)
+        if misfit.design.shape[1] == 0:
+            y = misfit.raw / misfit.sd
+            return -0.5 * (self.n * LOG_2PI + y @ y) - xp.sum(xp.log(misfit.sd))
+        return marginal_log_density(*misfit.moments(), self.n, xp) - xp.sum(xp.log(misfit.sd))
+
+    def residuals(self, theta: Theta, xp: ModuleType = jnp) -> Any:
+        """(n + p,) residuals in units of the noise at the conditional mean of the p linear nuisances, then those.
+
+        Half their sum of squares is the parameter-dependent part of -log_likelihood but for its log-determinant.
+        """
+        misfit = self.misfit(theta, xp)
+        if misfit.design.shape[1] == 0:
+            return misfit.raw / misfit.sd
+        _, ay, aa = misfit.moments()
+        b = conditional_mean(ay, aa, xp)
+        return xp.concatenate([(misfit.raw - misfit.design @ b) / misfit.sd, b])
+
+    def nuisance_mean(self, theta: Theta) -> np.ndarray:
+        """(p,) conditional mean of the linear nuisances, in units of their priors."""
+        _, ay, aa = self.misfit(theta, np).moments()
+        return conditional_mean(ay, aa, np) if len(ay) else np.zeros(0)
+
+    def pointwise(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
+        """(n,) log-density of each reading, conditional on one draw of the linear nuisances."""
+        misfit = self.misfit(theta, np)
+        raw = misfit.raw
+        if misfit.design.shape[1]:
+            _, ay, aa = misfit.moments()
+            raw = raw - misfit.design @ conditional_draw(ay, aa, rng)
+        return -0.5 * (raw / misfit.sd) ** 2 - np.log(misfit.sd) - 0.5 * LOG_2PI
+
+    def predictive_p(self, draws: list[Theta], rng: np.random.Generator) -> float | None:
+        """Posterior predictive p-value of the chi-square discrepancy; None without draws.
+
+        Given the parameters the discrepancy of a replicate is chi-square with n degrees of freedom exactly, so no
+        replicate needs to be drawn.
+        """
+        if not draws:
+            return None
+        tails = []
+        for theta in draws:
+            misfit = self.misfit(theta, np)
+            square = -2.0 * np.sum(self.pointwise(theta, rng) + np.log(misfit.sd) + 0.5 * LOG_2PI)
+            tails.append(stats.chi2.sf(square, self.n))
+        return float(np.mean(tails))
+
+
+def no_design(n: int, xp: ModuleType = jnp) -> Any:
+    """Design of an experiment without linear nuisances, (n, 0)."""
+    return xp.zeros((n, 0))
+
+
+def axis_label(column: Column, symbol: str = "") -> str:
+    """``name, unit`` for an axis."""
+    return f"{symbol or column.name} [{column.unit}]"
+
+
+def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Equal-tailed 95 % band over the first axis of ``values`` (m, n); (None, None) where m is 0."""
+    if len(values) == 0:
+        return None, None
+    lower, upper = np.quantile(values, [0.025, 0.975], axis=0)
+    return lower, upper

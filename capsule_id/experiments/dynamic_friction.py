@@ -1,0 +1,77 @@
+"""Pushes: an initial speed and the distance slid, rod locked to the capsule (paper, section 2.2)."""
+
+from types import ModuleType
+
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import Misfit, Start, Theta, no_design
+from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient, slide_distance
+from capsule_id.parameters import Parameter, parameter
+from capsule_id.rig.model import Rig, Table
+
+
+class DynamicFriction(FrictionExperiment):
+    """d = slide_distance(v): the paper reads mu_d = v^2/(2gd) as mu at speed v, but it is an average over the slide.
+
+    Variance of d: its reading error, that of v through dd/dv = v/(g mu_d(v)), and the surface's scatter of mu from
+    push to push, to first order (d is proportional to 1/mu).
+    """
+
+    role = "dynamic"
+    ARRAYS = ("speed", "distance", "speed_sd", "distance_sd")
+
+    def __init__(self, table: Table, rig: Rig) -> None:
+        super().__init__(table, rig)
+        self.speed, self.distance = table["speed"], table["distance"]
+        self.speed_sd = table.columns["speed"].reading_sd
+        self.distance_sd = table.columns["distance"].reading_sd
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return parameter("mu"), parameter("v_s"), parameter("push_scatter")
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.distance
+
+    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+        mu, v_s, g = theta["mu"], theta["v_s"], theta["g"]
+        distance = slide_distance(self.speed, mu, v_s, g, xp)
+        slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))
+        variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2 + (theta["push_scatter"] * distance) ** 2
+        return Misfit(self.distance - distance, xp.sqrt(variance), no_design(self.n, xp))
+
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pushes are read as mu = v^2/(2gd) at their initial speed."""
+        return self.speed, self.speed**2 / (2.0 * self.rig.g.value * self.distance)
+
+    def starts(self) -> dict[str, Start]:
+        _, coefficient = self.paper_points()
+        return {
+            "mu": Start(float(np.max(coefficient)), 0.3),
+            "v_s": Start(float(np.median(self.speed)), 0.5),
+            "push_scatter": Start(0.02, 0.3),
+        }
+
+
+def twin(
+    rng: np.random.Generator,
+    mu: float,
+    v_s: float,
+    g: float,
+    speeds: np.ndarray,
+    speed_sd: float,
+    distance_sd: float,
+    push_scatter: float,
+) -> dict[str, np.ndarray]:
+    """A synthetic table: pushes at ``speeds`` (n,) m/s, read with ``speed_sd`` m/s and ``distance_sd`` m.
+
+    The surface's mu scatters by ``push_scatter`` (relative) from push to push.
+    """
+    surface = mu * (1.0 + push_scatter * rng.standard_normal(len(speeds)))
+    distance = np.asarray(slide_distance(speeds, 1.0, v_s, g, np)) / surface
+    return {
+        "speed [m/s]": speeds + speed_sd * rng.standard_normal(len(speeds)),
+        "distance [mm]": 1e3 * (distance + distance_sd * rng.standard_normal(len(speeds))),
+    }

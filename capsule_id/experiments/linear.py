@@ -1,0 +1,43 @@
+"""Nuisances that enter a Gaussian likelihood linearly are integrated out in closed form.
+
+Model, in units of the noise: y = A b + e, e ~ N(0, I), b ~ N(0, I) (the prior's widths are absorbed in A). Then
+y ~ N(0, I + A A'), and only the moments y'y, A'y, A'A are needed (matrix inversion and determinant lemmas).
+"""
+
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+#: A linear nuisance has a normal prior of this many times the range of its record: wide, but proper.
+NUISANCE_WIDTH = 10.0
+LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp) -> Any:
+    """log N(y; 0, I + A A') from the moments.
+
+    Parameters
+    ----------
+    yy : () y'y
+    ay : (p,) A'y
+    aa : (p, p) A'A
+    n : length of y
+    """
+    chol = xp.linalg.cholesky(xp.eye(aa.shape[-1]) + aa)
+    half = xp.linalg.solve(chol, ay) if aa.shape[-1] > 1 else ay / chol[..., 0]
+    log_det = 2.0 * xp.sum(xp.log(xp.diagonal(chol)))
+    return -0.5 * (n * LOG_2PI + log_det + yy - xp.sum(half**2))
+
+
+def conditional_mean(ay: Any, aa: Any, xp: ModuleType = jnp) -> Any:
+    """Posterior mean of b given y, (p,): (I + A'A)^-1 A'y."""
+    return xp.linalg.solve(xp.eye(aa.shape[-1]) + aa, ay)
+
+
+def conditional_draw(ay: np.ndarray, aa: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One draw of b given y, (p,)."""
+    precision = np.eye(len(aa)) + aa
+    chol = np.linalg.cholesky(precision)
+    return np.linalg.solve(precision, ay) + np.linalg.solve(chol.T, rng.standard_normal(len(aa)))

@@ -1,0 +1,74 @@
+"""Steady sliding: friction force, or coefficient, at a held speed, on eq. (1)."""
+
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import Misfit, Start, Theta, no_design
+from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient
+from capsule_id.parameters import Parameter, parameter
+from capsule_id.rig.model import Rig, Table
+
+
+class SlidingFriction(FrictionExperiment):
+    """y = w mu_d(v), w = (m1 + m2) g for a force and 1 for a coefficient.
+
+    Variance: reading errors of y and of v (through the slope of eq. (1)) and the relative scatter of mu.
+    """
+
+    role = "sliding"
+    ARRAYS = ("speed", "values", "speed_sd", "values_sd")
+    STATIC = ("quantity",)
+
+    def __init__(self, table: Table, rig: Rig) -> None:
+        super().__init__(table, rig)
+        self.speed = table["speed"]
+        self.quantity = "force" if "force" in table.columns else "coefficient"
+        self.values = table[self.quantity]
+        self.speed_sd = table.columns["speed"].reading_sd
+        self.values_sd = table.columns[self.quantity].reading_sd
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return parameter("mu"), parameter("v_s"), parameter("sliding_scatter")
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.values
+
+    def _weight(self, theta: Theta) -> Any:
+        return (theta["m1"] + theta["m2"]) * theta["g"] if self.quantity == "force" else 1.0
+
+    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+        mu, v_s, weight = theta["mu"], theta["v_s"], self._weight(theta)
+        predicted = weight * friction_coefficient(self.speed, mu, v_s, xp)
+        slope = -0.5 * weight * mu * xp.exp(-self.speed / v_s) / v_s
+        variance = self.values_sd**2 + (slope * self.speed_sd) ** 2 + (theta["sliding_scatter"] * predicted) ** 2
+        return Misfit(self.values - predicted, xp.sqrt(variance), no_design(self.n, xp))
+
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Steady sliding is read as measured."""
+        if self.quantity == "coefficient":
+            return self.speed, self.values
+        m1, m2 = self.rig.m1, self.rig.m2
+        assert m1 is not None, "the schema asks for both masses beside a sliding force"
+        assert m2 is not None, "the schema asks for both masses beside a sliding force"
+        return self.speed, self.values / ((m1.value + m2.value) * self.rig.g.value)
+
+    def starts(self) -> dict[str, Start]:
+        speed, coefficient = self.paper_points()
+        return {
+            "mu": Start(float(np.max(coefficient)), 0.3),
+            "v_s": Start(float(np.median(speed)), 0.5),
+            "sliding_scatter": Start(0.02, 0.3),
+        }
+
+
+def twin(
+    rng: np.random.Generator, mu: float, v_s: float, speeds: np.ndarray, sliding_scatter: float
+) -> dict[str, np.ndarray]:
+    """A synthetic table of coefficients at ``speeds`` (n,) m/s with relative scatter ``sliding_scatter``."""
+    scatter = 1.0 + sliding_scatter * rng.standard_normal(len(speeds))
+    return {"speed [m/s]": speeds, "coefficient [1]": scatter * friction_coefficient(speeds, mu, v_s, np)}

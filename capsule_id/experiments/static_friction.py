@@ -1,0 +1,70 @@
+"""Tilt to slide: mu is the tangent of the angle at which the capsule breaks away (paper, section 2.2)."""
+
+from types import ModuleType
+
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import Misfit, Start, Theta, no_design
+from capsule_id.experiments.friction_curve import FrictionExperiment
+from capsule_id.parameters import Parameter, parameter
+from capsule_id.rig.model import Rig, Table
+
+
+class StaticFriction(FrictionExperiment):
+    """Trials of one surface: angle_i = arctan(mu) + N(0, tilt_sd^2 + reading error^2).
+
+    Where height and length are recorded instead of the angle, ``length_is`` says which side of the triangle the length
+    is: the tilted board (sin = height/length) or the base (tan = height/length).
+    """
+
+    role = "static"
+    ARRAYS = ("angle", "reading_sd")
+
+    def __init__(self, table: Table, rig: Rig) -> None:
+        super().__init__(table, rig)
+        self.angle, self.reading_sd = _angles(table)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return parameter("mu"), parameter("tilt_sd")
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.angle
+
+    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+        sd = xp.sqrt(theta["tilt_sd"] ** 2 + self.reading_sd**2)
+        return Misfit(self.angle - xp.arctan(theta["mu"]), sd, no_design(self.n, xp))
+
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Tilts are read as mu = tan(angle) at speed 0."""
+        return np.zeros(self.n), np.tan(self.angle)
+
+    def starts(self) -> dict[str, Start]:
+        scatter = np.std(self.angle, ddof=1) if self.n > 1 else 0.0
+        return {
+            "mu": Start(float(np.mean(np.tan(self.angle))), 0.3),
+            "tilt_sd": Start(max(scatter, np.deg2rad(0.1)), 0.3),
+        }
+
+
+def _angles(table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Angle and its reading error, (n,) rad each."""
+    if "angle" in table.columns:
+        angle = table.columns["angle"]
+        return angle.values, np.full(len(angle.values), angle.reading_sd)
+    height, length = table.columns["height"], table.columns["length"]
+    ratio = height.values / length.values
+    ratio_sd = ratio * np.hypot(height.reading_sd / height.values, length.reading_sd / length.values)
+    if table.settings["length_is"] == "board":
+        return np.arcsin(ratio), ratio_sd / np.sqrt(1.0 - ratio**2)
+    return np.arctan(ratio), ratio_sd / (1.0 + ratio**2)
+
+
+def twin(
+    rng: np.random.Generator, mu: float, trials: int = 4, tilt_sd: float = np.deg2rad(0.5)
+) -> dict[str, np.ndarray]:
+    """A synthetic table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
+    angle = np.arctan(mu) + tilt_sd * rng.standard_normal(trials)
+    return {"angle [deg]": np.rad2deg(angle)}

@@ -1,0 +1,191 @@
+"""The whole path from a rig to a result: experiments, log-posterior, point fit, sample, checks."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from capsule_id.experiments import compare, make_experiments, paper_estimates
+from capsule_id.experiments.base import Experiment
+from capsule_id.inference.checks import Setting, informed, run_checks
+from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.notes import make_notes
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.result import PointFit, Posterior, Result
+from capsule_id.inference.sampling import DEFAULT_BUDGET, Progress, sample
+from capsule_id.parameters import Parameter, parameter
+from capsule_id.rig.model import Rig
+from capsule_id.views import Comparison
+
+#: Posterior draws behind bands and predictive p-values, and behind the pointwise log-likelihood.
+BAND_DRAWS = 200
+PRIOR_DRAWS = 2000
+PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
+
+
+def fit_rig(
+    rig: Rig,
+    seed: int = 0,
+    which: str = "all",
+    budget: int | None = DEFAULT_BUDGET,
+    store: Path | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Fit ``rig``.
+
+    Parameters
+    ----------
+    seed : every random number follows from it
+    which : "bench", "runs" or "all" experiments
+    budget : emcee steps of an ensemble; None draws no sample
+    store : HDF5 file for the chains; chains found there are continued
+    progress : see ``capsule_id.inference.sampling.sample``
+
+    Raises
+    ------
+    InputError
+        If the rig holds nothing to fit.
+    """
+    experiments = make_experiments(rig, which)
+    target = LogPosterior(rig, experiments)
+    seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
+    if progress:
+        progress(0, 1, "point fit")
+    point = point_fit(target, seeds[0])
+    posterior = None
+    if budget is not None:
+        posterior = sample(target, point, seeds[1], budget, store, progress)
+    values = {**target.fixed, **point.values}
+    setting = Setting(rig, experiments, target, point, posterior, values)
+    findings, flagged = run_checks(setting)
+    rng = np.random.default_rng(seeds[2])
+    draws = _draws(target, posterior)
+    tables = _tables(rig, target, point, posterior, experiments)
+    return Result(
+        rig=rig,
+        summary=tables["physical"],
+        nuisances=tables["nuisance"],
+        point_fit=point,
+        posterior=posterior,
+        findings=tuple(findings),
+        comparisons=_comparisons(experiments, values, draws, flagged, rng),
+        notes=tuple(make_notes(setting, findings, flagged, seeds[0])),
+        provenance={
+            "seed": seed,
+            "experiments": which,
+            "versions": package_versions(PACKAGES),
+            "files": dict(rig.files),
+        },
+        groups=_groups(target, experiments, posterior, rng),
+    )
+
+
+def package_versions(packages: Sequence[str]) -> dict[str, str]:
+    """Versions of Python and of ``packages``, as installed."""
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def _draws(target: LogPosterior, posterior: Posterior | None) -> list[dict[str, float]]:
+    """``BAND_DRAWS`` draws, evenly spaced over the sample, by parameter name."""
+    if posterior is None:
+        return []
+    flat = posterior.draws.reshape(-1, len(posterior.names))
+    return [target.mapping(flat[i]) for i in np.linspace(0, len(flat) - 1, BAND_DRAWS).astype(int)]
+
+
+def _comparisons(
+    experiments: Sequence[Experiment],
+    values: Mapping[str, float],
+    draws: list[dict[str, float]],
+    flagged: Mapping[str, list[int]],
+    rng: np.random.Generator,
+) -> tuple[Comparison, ...]:
+    """Panels with flagged rows marked and predictive p-values filled in."""
+    by_label = {e.label: e for e in experiments}
+    panels = []
+    for panel in compare(experiments, values, draws):
+        points = []
+        for part in panel.points:
+            mask = np.zeros(len(part.x), dtype=bool)
+            mask[flagged.get(part.label, [])] = True
+            points.append(replace(part, flagged=mask))
+        own = by_label.get(panel.label)
+        p = None if own is None else own.predictive_p([own.local(d) for d in draws], rng)
+        panels.append(replace(panel, points=tuple(points), predictive_p=p))
+    return tuple(panels)
+
+
+def _tables(
+    rig: Rig, target: LogPosterior, point: PointFit, posterior: Posterior | None, experiments: Sequence[Experiment]
+) -> dict[str, pd.DataFrame]:
+    """The parameter table and the nuisance table; see ``Result``."""
+    paper = paper_estimates(experiments)
+    paper |= {name: mass.value for name, mass in (("m1", rig.m1), ("m2", rig.m2)) if mass is not None}
+    known = informed(target, posterior, point)
+    rows: list[tuple[Parameter, dict[str, object]]] = []
+    for i, row in enumerate(target.parameters):
+        entry: dict[str, object] = {
+            "unit": row.unit,
+            "meaning": row.meaning,
+            "paper": paper.get(row.name, np.nan),
+            "map": point.values[row.name],
+            "standard_error": point.standard_errors[row.name],
+            "informed": bool(known[i]),
+        }
+        if posterior is not None:
+            entry |= _sample_columns(posterior, i)
+        rows.append((row, entry))
+    for symbol in ("m1", "m2"):
+        if symbol in target.fixed:
+            value = target.fixed[symbol]
+            exact = {"paper": value, "map": value, "standard_error": 0.0, "mean": value, "sd": 0.0, "median": value}
+            row = parameter(symbol)
+            entry = {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact}
+            rows.append((row, entry | {"lower": value, "upper": value}))
+    tables = {}
+    for role in ("physical", "nuisance"):
+        chosen = {row.name: entry for row, entry in rows if row.physical == (role == "physical")}
+        columns = [
+            "unit", "meaning", "paper", "map", "standard_error", "mean", "sd", "median", "lower", "upper", "ess", "rhat",
+            "informed",
+        ]  # fmt: skip
+        frame = pd.DataFrame.from_dict(chosen, orient="index").reindex(columns=columns)
+        tables[role] = frame.rename_axis("name")
+    return tables
+
+
+def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
+    draws = posterior.draws[..., i].ravel()
+    lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
+    return {
+        "mean": np.mean(draws),
+        "sd": np.std(draws, ddof=1),
+        "median": median,
+        "lower": lower,
+        "upper": upper,
+        "ess": posterior.ess[i],
+        "rhat": posterior.rhat[i],
+    }
+
+
+def _groups(
+    target: LogPosterior, experiments: Sequence[Experiment], posterior: Posterior | None, rng: np.random.Generator
+) -> dict[str, object]:
+    """What goes into posterior.nc beside the draws. The pointwise densities are those of every walker's last draw."""
+    fixed = {name: value for name, value in target.fixed.items() if name != "g"}
+    groups: dict[str, object] = {"fixed": fixed, "observed": {e.label: e.observed for e in experiments}}
+    groups["prior"] = target.sample_prior(rng, PRIOR_DRAWS)
+    if posterior is not None:
+        ensembles, draws, walkers, _ = posterior.draws.shape
+        last = posterior.draws[:, -1].reshape(ensembles * walkers, -1)
+        values = [target.mapping(theta) for theta in last]
+        groups["log_likelihood"] = {
+            e.label: np.stack([e.pointwise(e.local(v), rng) for v in values])[:, None] for e in experiments
+        }
+        groups["log_likelihood_chain"] = np.arange(ensembles * walkers)
+        groups["log_likelihood_draw"] = np.array([draws - 1])
+    return groups

@@ -1,0 +1,262 @@
+"""Nonlinear least squares from several starts, with the covariance that the solver does not give.
+
+Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the minimum the covariance of the parameters is
+σ² (JᵀJ)⁻¹ with σ² = Σ r² / (n − d) unless it is known (Seber & Wild, *Nonlinear Regression*, 1989, ch. 2).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+
+from capsule_id.errors import InputError
+from capsule_id.precision import require_float64
+
+require_float64()
+
+Residual = Callable[[jax.Array], jax.Array]
+
+#: XLA options for what is compiled to run once: it runs for milliseconds, compiling it well takes seconds.
+QUICK_COMPILE = {"xla_backend_optimization_level": 0}
+
+SMALLEST_EFFECT = 0.01
+"""Dimensionless. Where changing a parameter by 100 % of its start moves the residuals by less than this share of what
+the strongest parameter does, the parameter's scale is the step that moves them by this share: zero has no size."""
+
+LARGEST_OFFSET = 1e-3
+"""Dimensionless, in radii of the joint confidence region: how far from a stationary point an end counts as converged
+(Bates & Watts, *Technometrics* 23, 1981, 179, the relative offset)."""
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of the parameters at a minimum, and whether the data determine them at all.
+
+    Attributes
+    ----------
+    matrix : (d, d), units of the parameters; every entry is inf where the Jacobian is rank deficient
+    rank : numerical rank of the Jacobian, its columns scaled to unit length; 0 where it is not finite
+    residual_sd : σ that the matrix was multiplied with, units of the residuals
+    """
+
+    matrix: np.ndarray
+    rank: int
+    residual_sd: float
+
+    @property
+    def rank_deficient(self) -> bool:
+        """Some combination of the parameters leaves the residuals unchanged: no standard error exists."""
+        return self.rank < self.matrix.shape[0]
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """(d,) square roots of the diagonal, units of the parameters; inf where rank deficient."""
+        return np.sqrt(np.diag(self.matrix))
+
+
+@dataclass(frozen=True)
+class LeastSquaresFit:
+    """Where each start ended, and whether it converged there.
+
+    Attributes
+    ----------
+    x : (s, d) end points, units of the parameters
+    cost : (s,) ½ Σ r², units of the residuals squared
+    stalled : (s,) bool, no convergence: out of steps, numbers that are not finite, or steps that became tiny short of
+        a stationary point
+    steps : (s,) solver steps, rejected ones included
+    message : (s,) the reason, "" where it converged
+    residuals : (s, n) at the end points
+    jacobian : (s, n, d) of the residuals at the end points
+    """
+
+    x: np.ndarray
+    cost: np.ndarray
+    stalled: np.ndarray
+    steps: np.ndarray
+    message: tuple[str, ...]
+    residuals: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def best(self) -> int:
+        """The start with the smallest finite cost among those that converged, or among all where none did."""
+        candidates = self.stalled if self.stalled.all() else ~self.stalled
+        return int(np.argmin(np.where(candidates & np.isfinite(self.cost), self.cost, np.inf)))
+
+    def covariance(self, residual_sd: float | None = None, start: int | None = None) -> Covariance:
+        """Covariance at the end point of ``start`` (default: the best one); see the function ``covariance``."""
+        index = self.best if start is None else start
+        return covariance(self.jacobian[index], self.residuals[index], residual_sd)
+
+
+def least_squares(
+    residual: Residual,
+    starts: np.ndarray,
+    *,
+    tolerance: float = 1e-9,
+    max_steps: int = 1024,
+    normal_equations: bool = False,
+) -> LeastSquaresFit:
+    """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
+
+    The damping of Levenberg-Marquardt, and its tolerance, mean something only when the parameters are of comparable
+    size, so each start is solved in v_j = x_j / scale_j with scale_j = |start_j| (``SMALLEST_EFFECT`` says what happens
+    at zero), and the residuals are divided by the largest column norm of the Jacobian in v at the start. The result
+    therefore depends on neither the units of the parameters nor those of the residuals.
+
+    Parameters
+    ----------
+    residual : (d,) -> (n,), a JAX function; it may close over arrays. A ``jax.tree_util.Partial`` or ``equinox.Module``
+        carries its arrays as arguments instead: other numbers of the same shapes then need no new compilation
+    starts : (s, d), units of the parameters
+    tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
+        tolerance (1 + its size)
+    max_steps : solver steps, rejected ones included, after which a start counts as stalled
+    normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
+        times as fast where there are thousands of residuals
+
+    Raises
+    ------
+    ValueError
+        ``starts`` is not (s, d) with s ≥ 1, or not finite.
+    """
+    starts = np.asarray(starts, dtype=float)
+    if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
+        raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
+    _, jacobian = _linearise(residual, jnp.asarray(starts))
+    scale, unit = jax.vmap(_scales)(jacobian, jnp.asarray(starts))
+    solve = partial(_solve, residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations)
+    # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
+    ends, steps, results = zip(*map(solve, jnp.asarray(starts), scale, unit), strict=True)
+    x, steps = np.stack(ends), np.array(steps, dtype=int)
+    residuals, jacobian = (np.asarray(array) for array in _linearise(residual, jnp.asarray(x)))
+    message = []
+    for i in range(len(starts)):
+        reason = optx.RESULTS[results[i]]
+        if not _finite(jacobian[i], residuals[i]):
+            reason = "The residuals or their Jacobian are not finite where this start ended: try another start."
+        # A solver that only watches its steps takes heavy damping for convergence.
+        elif not reason and not _stationary(jacobian[i], residuals[i], tolerance * float(unit[i])):
+            reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
+        message.append(reason)
+    return LeastSquaresFit(
+        x=x,
+        cost=0.5 * np.sum(residuals**2, axis=1),
+        stalled=np.array([reason != "" for reason in message]),
+        steps=steps,
+        message=tuple(message),
+        residuals=residuals,
+        jacobian=jacobian,
+    )
+
+
+def covariance(jacobian: np.ndarray, residuals: np.ndarray, residual_sd: float | None = None) -> Covariance:
+    """σ² (JᵀJ)⁻¹ from the singular values of J, never by a pseudo-inverse: a direction without data has no variance.
+
+    The columns are scaled to unit length first, so that the rank does not depend on the units of the parameters.
+
+    Parameters
+    ----------
+    jacobian : (n, d) of the residuals at the minimum
+    residuals : (n,) at the minimum
+    residual_sd : σ where it is known, 1 for residuals in units of their own sd; None estimates it from the residuals
+
+    Raises
+    ------
+    InputError
+        σ is to be estimated and there are not more residuals than parameters.
+    """
+    count, parameters = jacobian.shape
+    if residual_sd is None:
+        if count <= parameters:
+            raise InputError(
+                "the residual sd can be estimated only from more residuals than parameters",
+                f"{count} residuals for {parameters} parameters",
+                "give the sd of the measurements or more measurements",
+            )
+        residual_sd = float(np.sqrt(residuals @ residuals / (count - parameters)))
+    no_answer = np.full((parameters, parameters), np.inf)
+    if not _finite(jacobian, residuals):
+        return Covariance(no_answer, 0, residual_sd)
+    _, singular, right, column_norm = _range(jacobian)
+    if len(singular) < parameters:
+        return Covariance(no_answer, len(singular), residual_sd)
+    root = residual_sd * right.T / singular / column_norm[:, None]
+    return Covariance(root @ root.T, parameters, residual_sd)
+
+
+def _finite(jacobian: np.ndarray, residuals: np.ndarray) -> bool:
+    return bool(np.isfinite(jacobian).all() and np.isfinite(residuals).all())
+
+
+def _range(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Singular vectors and values of J with unit columns, as far as they are above rounding, and the column norms.
+
+    (n, rank), (rank,), (rank, d), (d,).
+    """
+    column_norm = np.linalg.norm(jacobian, axis=0)
+    left, singular, right = np.linalg.svd(jacobian / np.where(column_norm > 0, column_norm, 1.0), full_matrices=False)
+    rank = int(np.sum(singular > singular[0] * max(jacobian.shape) * np.finfo(float).eps))
+    return left[:, :rank], singular[:rank], right[:rank], column_norm
+
+
+def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> bool:
+    """The part of the residuals (n,) in the range of J (n, d) is small against the rest, or below ``rounding``."""
+    left = _range(jacobian)[0]
+    tangential = float(np.linalg.norm(left.T @ residuals))
+    normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))
+    freedom = max(len(residuals) - left.shape[1], 1)
+    # Bates & Watts: both parts per degree of freedom.
+    radius = normal * np.sqrt(max(left.shape[1], 1) / freedom)
+    return tangential <= max(LARGEST_OFFSET * radius, rounding)
+
+
+@eqx.filter_jit(compiler_options=QUICK_COMPILE)
+def _linearise(residual: Residual, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Residuals (s, n) and Jacobians (s, n, d) at points (s, d)."""
+    return eqx.filter_vmap(lambda x: (residual(x), jax.jacfwd(residual)(x)))(points)
+
+
+@eqx.filter_jit(compiler_options=QUICK_COMPILE)
+def _solve(
+    residual: Residual,
+    start: jax.Array,
+    scale: jax.Array,
+    unit: jax.Array,
+    *,
+    tolerance: float,
+    max_steps: int,
+    normal_equations: bool,
+) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
+    """From one start (d,): x (d,), steps, result code."""
+    solution = optx.least_squares(
+        lambda v, _: residual(v * scale) / unit,
+        optx.LevenbergMarquardt(
+            rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR()
+        ),
+        start / scale,
+        max_steps=max_steps,
+        throw=False,
+    )
+    return solution.value * scale, solution.stats["num_steps"], solution.result
+
+
+def _scales(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Scale of each parameter (d,) and unit of the residuals (): the largest column norm in the scaled parameters."""
+    column_norm = jnp.linalg.norm(jacobian, axis=0)
+    size = jnp.abs(start)
+    strongest = jnp.max(column_norm * size)
+    # All starts at zero: there is no size to compare with, so every parameter counts as equally strong.
+    step = jnp.where(strongest > 0, SMALLEST_EFFECT * strongest, 1.0) / column_norm
+    scale = jnp.maximum(size, jnp.where(column_norm > 0, step, 0.0))
+    # Neither a start nor an effect: any scale does, the parameter will not move.
+    scale = jnp.where(scale > 0, scale, 1.0)
+    unit = jnp.max(column_norm * scale)
+    return scale, jnp.where(unit > 0, unit, 1.0)

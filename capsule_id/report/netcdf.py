@@ -1,0 +1,126 @@
+"""``posterior.nc``: the sample in the groups and dimensions that ArviZ knows."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import xarray as xr
+
+from capsule_id.inference.result import Posterior, Result
+
+# The extra dimension of bracketed names; every other family gets "<base>_of".
+_DIMENSIONS = {"k2": "spring"}
+
+
+def write_posterior(result: Result, path: Path) -> None:
+    """Write the sample of ``result`` as netCDF (h5netcdf), to be opened by ``arviz.from_netcdf``.
+
+    Groups: ``posterior`` and ``sample_stats`` (dimensions ``chain``: every walker of every ensemble, with the
+    coordinate ``ensemble``; and ``draw``), ``observed_data``, ``log_likelihood`` and ``prior`` where the result has
+    them. A family of names such as ``k2[soft]``, ``k2[stiff]`` is one variable with one dimension more.
+
+    Raises
+    ------
+    ValueError
+        If nothing was sampled, or a name is used both alone and as a family.
+    """
+    if result.posterior is None:
+        raise ValueError("nothing was sampled (point fit only): there is no posterior to write")
+    units = {
+        str(name): str(unit) for frame in (result.summary, result.nuisances) for name, unit in frame["unit"].items()
+    }
+    groups = {
+        "posterior": _posterior(result.posterior, cast("Mapping[str, float]", result.groups.get("fixed", {})), units),
+        "sample_stats": _sample_stats(result.posterior),
+        "observed_data": _observed(result.groups),
+        "log_likelihood": _log_likelihood(result.groups),
+        "prior": _prior(result.groups, units),
+    }
+    tree = xr.DataTree.from_dict({name: group for name, group in groups.items() if group.data_vars})
+    tree.attrs = {"rig": result.rig.name, "synthetic": int(result.rig.synthetic)}
+    tree.to_netcdf(path, engine="h5netcdf")
+
+
+def _posterior(posterior: Posterior, fixed: Mapping[str, float], units: Mapping[str, str]) -> xr.Dataset:
+    ensembles, draws, walkers, d = posterior.draws.shape
+    chains = ensembles * walkers
+    columns = posterior.draws.transpose(3, 0, 2, 1).reshape(d, chains, draws).astype(np.float64)
+    arrays = dict(zip(posterior.names, columns, strict=True))
+    # Exact masses stand among the draws as constants, so that whoever computes with draws has them all in one place.
+    arrays |= {name: np.full((chains, draws), value, dtype=np.float64) for name, value in fixed.items()}
+    dataset = _families(arrays, units)
+    for name, variable in dataset.data_vars.items():
+        if _members(str(name), arrays) <= set(fixed):
+            variable.attrs["fixed"] = 1
+    return dataset.assign_coords(chain=np.arange(chains), draw=np.arange(draws), ensemble=_ensemble_of(posterior))
+
+
+def _sample_stats(posterior: Posterior) -> xr.Dataset:
+    ensembles, draws, walkers, _ = posterior.draws.shape
+    chains = ensembles * walkers
+    lp = posterior.lp.transpose(0, 2, 1).reshape(chains, draws).astype(np.float64)
+    acceptance = posterior.acceptance.reshape(chains).astype(np.float64)
+    dataset = xr.Dataset(
+        {
+            "lp": (("chain", "draw"), lp, {"units": "1", "meaning": "log-posterior density, unconstrained space"}),
+            "acceptance": ("chain", acceptance, {"units": "1", "meaning": "share of accepted proposals of the walker"}),
+        }
+    )
+    return dataset.assign_coords(chain=np.arange(chains), draw=np.arange(draws), ensemble=_ensemble_of(posterior))
+
+
+def _observed(groups: Mapping[str, object]) -> xr.Dataset:
+    observed = cast("Mapping[str, np.ndarray]", groups.get("observed", {}))
+    return xr.Dataset(
+        {label: (f"{label}_row", np.asarray(y, np.float64), {"units": "SI"}) for label, y in observed.items()}
+    )
+
+
+def _log_likelihood(groups: Mapping[str, object]) -> xr.Dataset:
+    pointwise = cast("Mapping[str, np.ndarray]", groups.get("log_likelihood", {}))
+    if not pointwise:
+        return xr.Dataset()
+    dataset = xr.Dataset(
+        {
+            label: (("chain", "draw", f"{label}_row"), np.asarray(values, np.float64), {"units": "1"})
+            for label, values in pointwise.items()
+        }
+    )
+    chain = np.asarray(groups["log_likelihood_chain"])
+    return dataset.assign_coords(chain=chain, draw=np.asarray(groups["log_likelihood_draw"]))
+
+
+def _prior(groups: Mapping[str, object], units: Mapping[str, str]) -> xr.Dataset:
+    prior = cast("Mapping[str, np.ndarray]", groups.get("prior", {}))
+    return _families({name: np.asarray(draws, np.float64)[np.newaxis] for name, draws in prior.items()}, units)
+
+
+def _ensemble_of(posterior: Posterior) -> tuple[str, np.ndarray]:
+    ensembles, _, walkers, _ = posterior.draws.shape
+    return "chain", np.repeat(np.arange(ensembles), walkers)
+
+
+def _families(arrays: Mapping[str, np.ndarray], units: Mapping[str, str]) -> xr.Dataset:
+    """Variables (chain, draw) by name; names with brackets are stacked along the dimension of their family."""
+    variables: dict[str, xr.Variable] = {}
+    coordinates: dict[str, list[str]] = {}
+    for base in dict.fromkeys(name.partition("[")[0] for name in arrays):
+        members = [name for name in arrays if name in _members(base, arrays)]
+        if members == [base]:
+            variables[base] = xr.Variable(("chain", "draw"), arrays[base], {"units": units.get(base, "")})
+            continue
+        if base in members:
+            raise ValueError(f"{base} is used both alone and as a family: {', '.join(members)}; rename one of them")
+        dimension = _DIMENSIONS.get(base, f"{base}_of")
+        stacked = np.stack([arrays[name] for name in members], axis=-1)
+        each = [units.get(name, "") for name in members]
+        # One unit where all members share it, otherwise one per label in the order of the dimension.
+        unit = each[0] if len(set(each)) == 1 else each
+        variables[base] = xr.Variable(("chain", "draw", dimension), stacked, {"units": unit})
+        coordinates[dimension] = [name[len(base) + 1 : -1] for name in members]
+    return xr.Dataset(variables, coords=coordinates)
+
+
+def _members(base: str, names: Mapping[str, np.ndarray]) -> set[str]:
+    return {name for name in names if name == base or (name.startswith(f"{base}[") and name.endswith("]"))}

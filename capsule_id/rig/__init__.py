@@ -1,0 +1,1 @@
+"""What was measured: a folder of tables becomes a ``Rig`` in SI units."""

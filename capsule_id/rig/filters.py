@@ -1,0 +1,184 @@
+"""Savitzky–Golay smoothing and derivatives, as the paper prepares its records.
+
+Filtered records serve the paper's estimators, pictures and starting values. Likelihoods use raw records: a filter that
+passes the signal removes most of the white noise and makes what is left of neighbouring samples alike, so that a
+likelihood of independent errors finds sigma too small and its intervals too short.
+
+Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. Schafer, IEEE Signal Process. Mag. 28(4),
+111 (2011).
+"""
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from capsule_id.errors import InputError
+
+JITTER = 0.01  # of a sampling step; samples this near to an even grid count as evenly spaced
+PASSED = 0.99  # gain that `choose_window` keeps at the dominant frequency
+_ZERO_PADDING = 8  # the spectrum's grid is this much finer than 1 / duration
+
+
+def savitzky_golay(time: np.ndarray, values: np.ndarray, window: float, order: int, derivative: int = 0) -> np.ndarray:
+    """Smooth a record, or differentiate it, by least-squares polynomials over a moving window.
+
+    The first and last half windows are the values (or derivatives) of the polynomial fitted to the first and last whole
+    window, so that polynomials up to ``order`` pass unchanged up to the very edges.
+
+    Parameters
+    ----------
+    time : (n,) s, evenly spaced
+    values : (n,)
+    window : s, used as the odd number of samples that comes nearest (see ``window_samples``)
+    order : of the polynomial
+    derivative : 0 to smooth, 1 for the rate in values per second, ...
+
+    Returns
+    -------
+    (n,) array
+
+    Raises
+    ------
+    InputError
+        If the samples are unevenly spaced, or the window holds too few or too many samples.
+    """
+    if not 0 <= derivative <= order:
+        remedy = "raise the order"
+        raise InputError(
+            "derivative must lie between 0 and the order of the filter", f"{derivative} of {order}", remedy
+        )
+    step = sampling_step(time)
+    samples = window_samples(window, step)
+    _check_window(samples, order, len(time))
+    half = samples // 2
+    q, triangle, rows = _least_squares(samples, order, derivative)
+    weights = np.linalg.solve(triangle.T, rows[half]) @ q.T
+    first, last = (np.linalg.solve(triangle, q.T @ part) for part in (values[:samples], values[-samples:]))
+    parts = (rows[:half] @ first, np.correlate(values, weights, mode="valid"), rows[half + 1 :] @ last)
+    return np.concatenate(parts) / (max(half, 1) * step) ** derivative
+
+
+def sampling_step(time: np.ndarray) -> float:
+    """The sampling step of an evenly spaced record, s.
+
+    Parameters
+    ----------
+    time : (n,) s, increasing
+
+    Raises
+    ------
+    InputError
+        If a sample lies further than ``JITTER`` of a step from the even grid between the first and the last.
+    """
+    if len(time) < 2:
+        raise InputError("a filter needs at least 2 samples", f"{len(time)}", "give a longer record")
+    step = float(time[-1] - time[0]) / (len(time) - 1)
+    offset = float(np.max(np.abs(time - time[0] - step * np.arange(len(time)))))
+    if not offset <= JITTER * step:
+        steps = np.diff(time)
+        value = f"steps from {steps.min():g} to {steps.max():g} s"
+        raise InputError("a filter needs evenly spaced samples", value, "resample the record evenly, or export it raw")
+    return step
+
+
+def window_samples(window: float, step: float) -> int:
+    """The odd number of samples whose count times ``step`` comes nearest to ``window``, both in s."""
+    return 2 * max(0, round((window / step - 1.0) / 2.0)) + 1
+
+
+def gain(frequency: np.ndarray | float, samples: int, order: int) -> np.ndarray:
+    """Gain of the smoothing filter away from the edges, from its coefficients: sum of c_k cos(2 pi f k).
+
+    Parameters
+    ----------
+    frequency : any shape, cycles per sample (Hz times the sampling step)
+    samples : length of the window, odd
+    order : of the polynomial, less than ``samples``
+
+    Returns
+    -------
+    array of the shape of ``frequency``; real, since the filter is symmetric: it never shifts a phase by less than pi
+    """
+    q, _, _ = _least_squares(samples, order, 0)
+    coefficients = q @ q[samples // 2]
+    lags = np.arange(samples) - samples // 2
+    return np.cos(2.0 * np.pi * np.multiply.outer(np.asarray(frequency, float), lags)) @ coefficients
+
+
+def choose_window(time: np.ndarray, values: np.ndarray, order: int) -> float:
+    """The longest window that leaves the dominant frequency alone, s.
+
+    Rule (this package's own): the longest odd window whose gain at the record's dominant frequency is still at least
+    ``PASSED``. Longer windows remove more noise and more of the motion.
+
+    Parameters
+    ----------
+    time : (n,) s, evenly spaced
+    values : (n,)
+    order : of the polynomial
+
+    Raises
+    ------
+    InputError
+        As ``savitzky_golay``.
+    """
+    step = sampling_step(time)
+    frequency = dominant_frequency(time, values) * step
+    samples = order + 1 + order % 2
+    _check_window(samples, order, len(time))
+    # the gain falls monotonically from 1 to the stop band, whose ripple stays far below 1: halve the interval
+    too_long = len(time) + 1 + len(time) % 2
+    while too_long - samples > 2:
+        middle = samples + 2 * ((too_long - samples) // 4)
+        if gain(frequency, middle, order) >= PASSED:
+            samples = middle
+        else:
+            too_long = middle
+    return samples * step
+
+
+def dominant_frequency(time: np.ndarray, values: np.ndarray) -> float:
+    """Frequency of the highest peak of the spectrum, Hz, the record's straight trend removed first.
+
+    Parameters
+    ----------
+    time : (n,) s, evenly spaced
+    values : (n,)
+
+    Raises
+    ------
+    InputError
+        As ``sampling_step``.
+    """
+    step = sampling_step(time)
+    index = np.arange(len(time)) / len(time)
+    residual = values - np.polyval(np.polyfit(index, values, 1), index)
+    length = _ZERO_PADDING * len(time)
+    spectrum = np.abs(np.fft.rfft(residual, length))
+    # below 1 / duration a peak is only the rest of the trend
+    return float(np.fft.rfftfreq(length, step)[_ZERO_PADDING + int(np.argmax(spectrum[_ZERO_PADDING:]))])
+
+
+def _least_squares(samples: int, order: int, derivative: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least squares in Legendre polynomials of k/half, k = -half .. half: (q, triangle) of the design and the (samples,
+    order + 1) values of their derivatives.
+
+    In powers of k, as ``scipy.signal.savgol_coeffs`` (1.17) solves for them, no digit of float64 is right any more at
+    1001 samples and order 5, and nothing warns; a test shows that.
+    """
+    half = samples // 2
+    place = (np.arange(samples) - half) / max(half, 1)
+    polynomials = np.eye(order + 1)
+    q, triangle = np.linalg.qr(legendre.legval(place, polynomials).T)
+    return q, triangle, legendre.legval(place, legendre.legder(polynomials, derivative)).T
+
+
+def _check_window(samples: int, order: int, available: int) -> None:
+    """A polynomial of ``order`` needs more samples than that, and the window must fit the record."""
+    if samples <= order:
+        value = f"{samples} samples for order {order}"
+        raise InputError(
+            "the window must hold more samples than the order", value, "widen the window or lower the order"
+        )
+    if samples > available:
+        value = f"{samples} samples of {available}"
+        raise InputError("the window must fit into the record", value, "shorten the window")

@@ -1,0 +1,103 @@
+"""The frozen nouns of a rig folder. Everything is SI and float64; arrays are read-only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A stated value with its standard deviation, SI; ``sd`` is 0 where the folder states none (then exact)."""
+
+    value: float
+    sd: float = 0.0
+
+
+@dataclass(frozen=True)
+class PriorOverride:
+    """One line of ``[prior]``, SI: log-normal by ``median`` and ``factor`` (95 % within median/factor..median*factor),
+    or, for scatters, half-normal by ``scale``."""
+
+    median: float | None = None
+    factor: float | None = None
+    scale: float | None = None
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table.
+
+    Attributes
+    ----------
+    name : the column's name in the file, e.g. ``x_rel``
+    unit : the unit written in the file, e.g. ``mm`` (only for display)
+    to_display : multiply SI by this to get the file's unit
+    values : (n,) SI, read-only
+    sd : stated reading error, SI (None: not stated)
+    resolution : stated reading step, SI (None: not stated)
+    """
+
+    name: str
+    unit: str
+    to_display: float
+    values: np.ndarray
+    sd: float | None = None
+    resolution: float | None = None
+
+    @property
+    def reading_sd(self) -> float:
+        """Stated error and the rounding error of the reading step, step/sqrt(12), added in quadrature; SI."""
+        return float(np.hypot(self.sd or 0.0, (self.resolution or 0.0) / np.sqrt(12.0)))
+
+
+@dataclass(frozen=True)
+class Table:
+    """One ``[[experiment]]`` of the folder: its columns and its settings.
+
+    Attributes
+    ----------
+    kind : "free_vibration", "static_friction", ... as in ``rig.toml``
+    label : unique within the rig, the file's name without suffix
+    file : path relative to the folder
+    columns : by name
+    settings : validated keys of the entry other than kind, file and reading errors; numbers are SI floats,
+        quantities with an sd are ``Quantity``
+    rows : (n,) 1-based line number in the file of every row, read-only: how a finding names a row
+    """
+
+    kind: str
+    label: str
+    file: str
+    columns: Mapping[str, Column]
+    settings: Mapping[str, object]
+    rows: np.ndarray
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Values of column ``name``, (n,) SI."""
+        return self.columns[name].values
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A whole rig folder, read and checked.
+
+    Attributes
+    ----------
+    m1, m2 : masses, kg (None: not stated)
+    g : m/s^2
+    priors : overrides by parameter name (``k1``, ``k2[L60]``, ``tilt_sd``, ...)
+    tables : in the order of ``rig.toml``
+    files : sha256 of every file read, by relative path
+    """
+
+    name: str
+    synthetic: bool
+    m1: Quantity | None
+    m2: Quantity | None
+    g: Quantity
+    priors: Mapping[str, PriorOverride]
+    tables: tuple[Table, ...]
+    files: Mapping[str, str]
+    folder: Path

@@ -1,0 +1,155 @@
+"""The values of ``rig.toml``, one by one: type, unit, domain, then SI. A fault is named at its own line and column."""
+
+import re
+from collections.abc import Collection
+from difflib import get_close_matches
+from math import isfinite
+from typing import Any
+
+from capsule_id.rig.model import PriorOverride, Quantity
+from capsule_id.rig.schema import (
+    ABOVE_ONE,
+    NAME_PATTERN,
+    NOT_NEGATIVE,
+    POSITIVE,
+    ChoiceRule,
+    Domain,
+    NameRule,
+    QuantityRule,
+    SettingRule,
+)
+from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.rig.units import UnitError, factor_to_si, scale
+
+_LONGEST_SHOWN = 60  # characters of a faulty value that an error line repeats
+
+
+def shown(value: object) -> str:
+    """A faulty value as an error line repeats it: printable and short."""
+    try:
+        text = str(value).lower() if isinstance(value, bool) else repr(value)
+    except ValueError:  # Python refuses to write integers of thousands of digits
+        text = "a very large number"
+    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…"
+
+
+def closest(word: str, known: Collection[str]) -> str | None:
+    """The one of ``known`` that ``word`` may be a slip of."""
+    return next(iter(get_close_matches(word[:_LONGEST_SHOWN], known, n=1)), None)
+
+
+def refuse_unknown_keys(document: TomlDocument, path: KeyPath, entry: dict[str, Any], known: Collection[str]) -> None:
+    """Raise at the first key of ``entry`` that is not ``known``."""
+    for key in entry:
+        if key not in known:
+            close = closest(key, known)
+            remedy = f"write {close}" if close else "remove it"
+            remedy += f"; known: {' '.join(known)}"
+            raise document.error((*path, key), "unknown key", shown(key), remedy, of_key=True)
+
+
+def read_string(document: TomlDocument, path: KeyPath, value: object) -> str:
+    """A non-empty string."""
+    if not isinstance(value, str) or not value:
+        raise document.error(path, f"{path[-1]} must be a string", shown(value), 'write it in quotes: "..."')
+    return value
+
+
+def read_bool(document: TomlDocument, path: KeyPath, value: object) -> bool:
+    """true or false."""
+    if not isinstance(value, bool):
+        raise document.error(
+            path, f"{path[-1]} must be true or false", shown(value), "write true or false without quotes"
+        )
+    return value
+
+
+def read_name(document: TomlDocument, path: KeyPath, value: object) -> str:
+    """A name; ``.`` and ``..`` are none, because results are written to a folder of that name."""
+    name = read_string(document, path, value)
+    if not re.fullmatch(NAME_PATTERN, name) or not name.strip("."):
+        rule = f"{path[-1]} must be a name of letters, digits, dot, underscore and hyphen"
+        raise document.error(path, rule, shown(name), 'write e.g. "rig-1"')
+    return name
+
+
+def read_table(document: TomlDocument, path: KeyPath, value: object, example: str) -> dict[str, Any]:
+    """A TOML table."""
+    if not isinstance(value, dict):
+        raise document.error(path, f"{path[-1]} must be a table", shown(value), f"write {example}")
+    return value
+
+
+def read_quantity(document: TomlDocument, path: KeyPath, value: object, rule: QuantityRule) -> Quantity:
+    """``{ value = ..., sd = ..., unit = "..." }`` in SI."""
+    example = f'{{ value = ..., {"sd = ..., " if rule.has_sd else ""}unit = "{rule.si}" }}'
+    entry = read_table(document, path, value, example)
+    refuse_unknown_keys(document, path, entry, ("value", "sd", "unit") if rule.has_sd else ("value", "unit"))
+    factor = _read_unit(document, path, entry, rule.si)
+    number = _read_scaled(document, path, entry, "value", factor, rule.domain)
+    sd = _read_scaled(document, path, entry, "sd", factor, NOT_NEGATIVE) if "sd" in entry else 0.0
+    return Quantity(number, sd)
+
+
+def read_setting(document: TomlDocument, path: KeyPath, value: object, rule: SettingRule) -> str | float | Quantity:
+    """A setting as its rule has it: a word, a name, an SI float, or a ``Quantity`` where it may have an sd."""
+    if isinstance(rule, NameRule):
+        return read_name(document, path, value)
+    if isinstance(rule, ChoiceRule):
+        word = read_string(document, path, value)
+        if word not in rule.choices:
+            choices = " or ".join(f'"{choice}"' for choice in rule.choices)
+            raise document.error(path, f"{path[-1]} must be {choices}", shown(word), f"write {choices}")
+        return word
+    quantity = read_quantity(document, path, value, rule)
+    return quantity if rule.has_sd else quantity.value
+
+
+def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, is_scatter: bool) -> PriorOverride:
+    """``{ median, factor, unit }``, or ``{ scale, unit }`` for a scatter; the unit may be left out where it is 1."""
+    keys = ("scale", "unit") if is_scatter else ("median", "factor", "unit")
+    example = "{ " + ", ".join(f"{key} = ..." for key in keys[:-1]) + f', unit = "{si}" }}'
+    entry = read_table(document, path, value, example)
+    refuse_unknown_keys(document, path, entry, keys)
+    factor = 1.0 if si == "1" and "unit" not in entry else _read_unit(document, path, entry, si)
+    if is_scatter:
+        return PriorOverride(scale=_read_scaled(document, path, entry, "scale", factor, POSITIVE))
+    return PriorOverride(
+        median=_read_scaled(document, path, entry, "median", factor, POSITIVE),
+        factor=_read_scaled(document, path, entry, "factor", 1.0, ABOVE_ONE),
+    )
+
+
+def _read_unit(document: TomlDocument, path: KeyPath, entry: dict[str, Any], si: str) -> float:
+    """The factor of the entry's unit to SI."""
+    if "unit" not in entry:
+        raise document.error(
+            path, f"{path[-1]} must have a unit", shown(entry), f'add unit = "{si}" or another unit of it'
+        )
+    unit = read_string(document, (*path, "unit"), entry["unit"])
+    try:
+        return factor_to_si(unit, si)
+    except UnitError as error:
+        raise document.error((*path, "unit"), error.rule, shown(unit), error.remedy) from None
+
+
+def _read_scaled(
+    document: TomlDocument, path: KeyPath, entry: dict[str, Any], key: str, factor: float, domain: Domain
+) -> float:
+    """The number at ``entry[key]`` times ``factor``, finite and inside ``domain``."""
+    place = (*path, key)
+    name = path[-1] if key == "value" else f"{key} of {path[-1]}"
+    if key not in entry:
+        raise document.error(path, f"{path[-1]} must have a {key}", shown(entry), f"add {key} = ...")
+    number = entry[key]
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        raise document.error(place, f"{name} must be a number", shown(number), "write a number without quotes")
+    try:
+        scaled = scale(float(number), factor)
+    except OverflowError:
+        scaled = float("inf")
+    if not isfinite(scaled):
+        raise document.error(place, f"{name} must be a finite number", shown(number), "correct it")
+    if not domain.holds(scaled):
+        raise document.error(place, f"{name} must {domain.text}", shown(number), "correct it")
+    return scaled

@@ -1,0 +1,32 @@
+"""Bytes of a text file, decoded; the place of the first byte that cannot be."""
+
+import re
+from pathlib import Path
+
+from capsule_id.errors import InputError
+
+
+def decode(content: bytes, path: Path) -> str:
+    """UTF-8 text with ``\\n`` line ends, without the byte-order mark.
+
+    Raises
+    ------
+    InputError
+        If the content is not UTF-8 or holds a NUL byte, at its line and character.
+    """
+    nul = content.find(b"\0")
+    if nul >= 0:
+        remedy = "export it as text"
+        raise InputError("the file must be text", "a binary file (NUL byte)", remedy, path, *_place(content, nul))
+    try:
+        return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        place = _place(error.object, error.start)  # error.object: the bytes after the byte-order mark
+        value = f"byte 0x{error.object[error.start]:02x}"
+        raise InputError("the file must be UTF-8 text", value, "save it as UTF-8", path, *place) from None
+
+
+def _place(content: bytes, offset: int) -> tuple[int, int]:
+    """1-based line and character of a byte; what precedes it on its line may be broken too."""
+    lines = re.split(rb"\r\n?|\n", content[:offset])
+    return len(lines), len(lines[-1].decode("utf-8", "replace")) + 1

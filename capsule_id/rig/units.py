@@ -1,0 +1,139 @@
+"""Units at the door: a written unit becomes one factor to SI, its dimension checked. Nothing behind the door has units.
+
+pint does the algebra on a registry of this file's own: its default one takes 0.1 s to build, reads ``Ns`` as a plural
+of ``N``, and takes the radian for a pure number. Here the angle is a dimension, so that rad/s and Hz cannot be mixed.
+"""
+
+import re
+from difflib import get_close_matches
+from functools import cache
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import pint
+
+Values = TypeVar("Values", float, np.ndarray)
+
+# One line per unit that a rig folder may name: symbol -> definition.
+_DEFINITIONS = {
+    "m": "[length]",
+    "s": "[time]",
+    "kg": "[mass]",
+    "A": "[current]",
+    "rad": "[angle]",
+    "um": "1e-6 * m",
+    "mm": "1e-3 * m",
+    "cm": "1e-2 * m",
+    "km": "1e3 * m",
+    "in": "0.0254 * m",
+    "us": "1e-6 * s",
+    "ms": "1e-3 * s",
+    "min": "60 * s",
+    "mg": "1e-6 * kg",
+    "g": "1e-3 * kg",
+    "lb": "0.45359237 * kg",
+    "uA": "1e-6 * A",
+    "mA": "1e-3 * A",
+    "mrad": "1e-3 * rad",
+    "deg": "0.017453292519943295 * rad",
+    "rev": "6.283185307179586 * rad",
+    "rpm": "0.10471975511965977 * rad / s",
+    "Hz": "1 / s",
+    "kHz": "1e3 / s",
+    "N": "kg * m / s ** 2",
+    "uN": "1e-6 * N",
+    "mN": "1e-3 * N",
+    "kN": "1e3 * N",
+    "gf": "9.80665e-3 * N",
+    "kgf": "9.80665 * N",
+    "lbf": "4.4482216152605 * N",
+    "Ns": "N * s",
+}
+# Other ways to write the same symbol.
+_SPELLINGS = {"µ": "u", "μ": "u", "°": "deg", "·": "*", "⋅": "*"}
+_SUPERSCRIPTS = str.maketrans("⁻¹²³⁴", "-1234")
+_FACTOR = r"(?:[A-Za-z]+(?:\^-?[1-4])?|1)"
+_GRAMMAR = re.compile(rf"{_FACTOR}(?:(?: ?[*/] ?| ){_FACTOR})*")
+_LONGEST = 40  # characters; nothing sensible is longer
+_EXAMPLES = {
+    "m": "mm",
+    "s": "ms",
+    "kg": "g",
+    "A": "mA",
+    "rad": "deg",
+    "N": "N",
+    "1": "1",
+    "m/s": "mm/s",
+    "m/s^2": "m/s^2",
+    "rad/s": "rad/s",
+    "Hz": "Hz",
+    "N/m": "kN/m",
+    "N*s/m": "N*s/m",
+    "N/A": "N/A",
+}
+
+
+class UnitError(ValueError):
+    """A unit that is unknown or of the wrong dimension; ``rule`` and ``remedy`` go into the user's error line."""
+
+    def __init__(self, rule: str, remedy: str) -> None:
+        super().__init__(f"{rule}, {remedy}")
+        self.rule, self.remedy = rule, remedy
+
+
+@cache
+def _registry() -> "pint.UnitRegistry":
+    """The one registry, made when the first unit is read (importing pint costs more than reading a folder)."""
+    import pint
+
+    registry = pint.UnitRegistry(None)  # pyright: ignore[reportArgumentType]  (None: an empty registry, by pint's manual)
+    for symbol, definition in _DEFINITIONS.items():
+        registry.define(f"{symbol} = {definition}")
+    return registry
+
+
+@cache
+def factor_to_si(unit: str, si: str) -> float:
+    """The number that turns a value in ``unit`` into one in the SI unit ``si``.
+
+    Parameters
+    ----------
+    unit : as written by the user, e.g. ``kN/m``, ``N s/m``, ``m/s^2``, ``1``
+    si : the SI unit wanted, e.g. ``N/m``; ``1`` for a pure number
+
+    Raises
+    ------
+    UnitError
+        If the unit is unknown or has another dimension.
+    """
+    remedy = f"write a unit such as {_EXAMPLES.get(si, si)}"
+    written = unit.strip()
+    for spelling, symbol in _SPELLINGS.items():
+        written = written.replace(spelling, symbol)
+    written = re.sub("[⁻¹²³⁴]+", lambda found: "^" + found[0].translate(_SUPERSCRIPTS), written)
+    if len(written) > _LONGEST or not _GRAMMAR.fullmatch(written):
+        raise UnitError("a unit is a product of symbols, e.g. kN/m, N*s/m or m/s^2 (1: no unit)", remedy)
+    for symbol in re.findall(r"[A-Za-z]+", written):
+        if symbol not in _DEFINITIONS:
+            close = get_close_matches(symbol, _DEFINITIONS, n=1)
+            raise UnitError(f"unknown unit symbol {symbol}", f"{remedy}; did you mean {close[0]}?" if close else remedy)
+    quantity = _quantity(written)
+    if quantity.dimensionality != _quantity(si).dimensionality:
+        raise UnitError(
+            f"unit must have the dimension of {si}" if si != "1" else "unit must be 1 (a pure number)", remedy
+        )
+    return float(quantity.to_base_units().magnitude)
+
+
+def scale(values: Values, factor: float) -> Values:
+    """``values * factor``; by division where 1/factor is whole, so that 9 ms and 0.009 s are the same float."""
+    whole = round(1.0 / factor)
+    return values / whole if whole > 1 and whole * factor == 1.0 else values * factor
+
+
+def _quantity(unit: str) -> "pint.Quantity":
+    """1 ``unit`` as a pint quantity; a space multiplies, and ``/`` divides by the next symbol only."""
+    product = re.sub(" ?([*/]) ?", r"\1", unit).replace(" ", "*")
+    return _registry().Quantity(1.0, "") * _registry().parse_expression(product.replace("^", "**"))

@@ -1,0 +1,255 @@
+"""A plausible result, made of random numbers: the report has to render it, not to believe it."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from capsule_id.inference.result import PointFit, Posterior, Result
+from capsule_id.report.gallery import Picture, pictures
+from capsule_id.rig.model import Quantity, Rig
+from capsule_id.views import Comparison, Curve, Finding, NoteTable, Points
+
+PHYSICAL = {
+    # name: (unit, meaning, value, sd, paper)
+    "m1": ("kg", "mass of the rod", 0.11, 2e-4, np.nan),
+    "m2": ("kg", "mass of the capsule", 0.53, 5e-4, np.nan),
+    "k1": ("N/m", "stiffness between rod and capsule", 1421.3, 3.1, 1386.0),
+    "c": ("N s/m", "damping between rod and capsule", 3.89, 0.021, 3.52),
+    "mu": ("1", "static friction coefficient", 0.66, 0.0061, 0.662),
+    "v_s": ("m/s", "Stribeck velocity", 0.302, 0.034, 0.465),
+    "K": ("N/A", "force per current", 2.003, 0.0147, 2.011),
+    "k2[soft]": ("N/m", "stiffness of the support spring", 2420.0, 1.9, 2421.2),
+    "k2[medium]": ("N/m", "stiffness of the support spring", 18960.0, 14.0, 18950.0),
+    "k2[stiff]": ("N/m", "stiffness of the support spring", 56410.0, 46.0, 56430.0),
+}
+NUISANCES = {
+    "tilt_sd": ("rad", "trial scatter of the tilt angle", 0.0088, 0.003, np.nan),
+    "push_scatter": ("1", "trial scatter of mu between pushes", 0.017, 0.006, np.nan),
+    "noise_sd[free_vibration_1]": ("m", "noise of the record", 2.02e-5, 4.6e-7, np.nan),
+    "noise_sd[free_vibration_2]": ("m", "noise of the record", 2.97e-5, 6.6e-7, np.nan),
+    "noise_sd[free_vibration_3]": ("m", "noise of the record", 1.01e-5, 2.3e-7, np.nan),
+    "noise_sd[motor_current]": ("N", "scatter of the line", 0.035, 0.011, np.nan),
+    "noise_sd[support_spring_soft]": ("N", "scatter of the line", 0.005, 0.0013, np.nan),
+    "noise_sd[support_spring_medium]": ("N", "scatter of the line", 0.038, 0.0093, np.nan),
+    "noise_sd[support_spring_stiff]": ("N", "scatter of the line", 0.113, 0.029, np.nan),
+}
+SAMPLED = {**PHYSICAL, **NUISANCES}
+
+
+def _frame(rows: dict[str, tuple[str, str, float, float, float]], rng: np.random.Generator) -> pd.DataFrame:
+    table = {}
+    for name, (unit, meaning, value, sd, paper) in rows.items():
+        mean = value + 0.1 * sd * rng.normal()
+        table[name] = {
+            "unit": unit, "meaning": meaning, "paper": paper, "map": value, "standard_error": 0.97 * sd, "mean": mean,
+            "sd": sd, "median": mean, "lower": mean - 1.96 * sd, "upper": mean + 1.96 * sd,
+            "ess": 4100.0 + 100 * rng.normal(), "rhat": 1.002, "informed": name not in ("m1", "m2"),
+        }  # fmt: skip
+    frame = pd.DataFrame.from_dict(table, orient="index")
+    frame.index.name = "name"
+    return frame
+
+
+def _friction(rng: np.random.Generator) -> Comparison:
+    v = np.linspace(0.0, 1.1, 120)
+    ours = 0.33 * (1 + np.exp(-v / 0.302))
+    paper = 0.33 * (1 + np.exp(-v / 0.465))
+    speeds = np.array([0.15, 0.3, 0.5, 0.75, 1.0])
+    return Comparison(
+        "friction", "friction", "Friction coefficient against velocity", "velocity [m/s]", "friction coefficient [1]",
+        points=(
+            Points("static tests (tilt)", np.zeros(4), 0.66 + 0.01 * rng.normal(size=4), role="static"),
+            Points("pushes, read as mu at v", speeds, np.interp(speeds, v, paper), np.full(5, 0.01), role="dynamic"),
+        ),
+        curves=(
+            Curve("paper's fit of eq. (1)", v, paper, role="paper"),
+            Curve("this fit", v, ours, ours - 0.01 - 0.01 * v, ours + 0.01 + 0.01 * v, role="ours"),
+        ),
+        predictive_p=0.41,
+    )  # fmt: skip
+
+
+def _line(kind: str, label: str, slope: float, rng: np.random.Generator) -> Comparison:
+    current = kind == "motor_current"
+    n, top = (8, 2.0) if current else (11, 1.0)
+    x = np.linspace(0.1 if current else 0.0, top, n)
+    noise = 0.002 * slope * top * rng.normal(size=n)
+    flagged = np.zeros(n, dtype=bool)
+    flagged[4] = label == "support_spring_stiff"
+    return Comparison(
+        kind, label, "Current against force" if current else f"Support spring {label.removeprefix('support_spring_')}",
+        "motor current [A]" if current else "deflection [mm]", "force [N]",
+        points=(Points("measured", x, slope * x + noise, flagged=flagged),),
+        curves=(Curve("this fit", x, slope * x, 0.998 * slope * x, 1.002 * slope * x),),
+        residual_x=x, residuals=noise / np.std(noise), predictive_p=0.62,
+    )  # fmt: skip
+
+
+def _decay(number: int, rng: np.random.Generator, n: int = 1000) -> Comparison:
+    t = np.arange(n) / 2000.0
+    clean = (1.0 + number) * np.exp(-17.7 * t) * np.cos(112.2 * t)
+    residuals = rng.normal(size=n)
+    lags = np.arange(1, 61)
+    white = residuals - residuals.mean()
+    autocorrelation = np.array([np.dot(white[:-lag], white[lag:]) for lag in lags]) / np.dot(white, white)
+    return Comparison(
+        "free_vibration", f"free_vibration_{number}", f"Free vibration free_vibration_{number}", "time [s]",
+        "relative displacement [mm]",
+        points=(Points("measured", t, clean + 0.01 * (1 + number) * residuals),),
+        curves=(Curve("this fit", t, clean, clean - 0.02, clean + 0.02),),
+        residual_x=t, residuals=residuals, autocorrelation=autocorrelation, autocorrelation_bound=1.96 / np.sqrt(n),
+        predictive_p=0.55,
+    )  # fmt: skip
+
+
+def _point_fit(rng: np.random.Generator) -> PointFit:
+    names = tuple(SAMPLED)
+    d = len(names)
+    sd = np.array([row[3] / row[2] for row in SAMPLED.values()])
+    u = np.log([row[2] for row in SAMPLED.values()])
+    starts = u + rng.normal(size=(6, d))
+    return PointFit(
+        names, u, {n: r[2] for n, r in SAMPLED.items()}, np.diag(sd**2), {n: 0.97 * r[3] for n, r in SAMPLED.items()},
+        starts, u + 1e-4 * sd * rng.normal(size=(6, d)), 1234.5 - 1e-7 * rng.random(6), True, np.zeros(6, dtype=bool),
+    )  # fmt: skip
+
+
+def _posterior(rng: np.random.Generator, ensembles: int, draws: int, walkers: int) -> Posterior:
+    names = tuple(SAMPLED)
+    centre = np.array([row[2] for row in SAMPLED.values()])
+    sd = np.array([row[3] for row in SAMPLED.values()])
+    mixing = np.eye(len(names)) + 0.4 * np.eye(len(names), k=1)
+    z = rng.normal(size=(ensembles, draws, walkers, len(names))) @ mixing
+    d = len(names)
+    return Posterior(
+        names, centre + sd * z, 1234.5 - 0.5 * (z**2).sum(-1), np.full((ensembles, walkers), 0.28),
+        np.full(d, 3.0), np.full(d, 1.002), np.full(d, 4100.0), True, {"DE + snooker": 61.0, "stretch": 142.0},
+        steps=10000, thin=20,
+    )  # fmt: skip
+
+
+def _groups(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> dict[str, object]:
+    chains, draws = np.arange(0, 8, 2), np.arange(0, 20, 4)
+    observed = {item.label: item.points[0].y for item in comparisons}
+    return {
+        "fixed": {"m3": 0.64},
+        "observed": observed,
+        "log_likelihood": {label: rng.normal(size=(len(chains), len(draws), y.size)) for label, y in observed.items()},
+        "log_likelihood_chain": chains,
+        "log_likelihood_draw": draws,
+        "prior": {name: np.exp(rng.normal(size=500)) for name in SAMPLED},
+    }
+
+
+def _findings() -> tuple[Finding, ...]:
+    white = "expected a white record, seen Ljung-Box p = 0.3"
+    outlier = (
+        "expected |residual| < 3 sd, seen 4.1 sd in row 5 of the table; look at that row: "
+        "k2 is 56410 N/m with and 56350 N/m without it"
+    )
+    return (
+        Finding("starts agree", "ok", "all 6 starts ended at the same maximum, log-posterior within 1e-7"),
+        Finding("chains converged", "ok", "every parameter has N > 50 tau and R-hat ≤ 1.01 (largest 1.002)"),
+        *(Finding("residuals white", "ok", white, f"free_vibration_{i}") for i in (1, 2, 3)),
+        Finding("outliers", "warn", outlier, "support_spring_stiff"),
+        Finding("linearity", "ok", "quadratic term 0.3 ± 0.5 N/A², line adequate", "motor_current"),
+        Finding("parameters informed", "warn", "m1 and m2 are known from the weighing only"),
+    )
+
+
+def _notes() -> tuple[NoteTable, ...]:
+    rows = {"k2 [N/m]": [56410.123, 56350.2], "sd [N/m]": [46.0, 31.0]}
+    priors = {
+        "parameter": ["k1", "mu"],
+        "prior": ["log-normal"] * 2,
+        "median": [1000.0, 0.4],
+        "factor": [100.0, np.nan],
+    }
+    return (
+        NoteTable(
+            "With and without the flagged row",
+            "Nothing is dropped by itself.",
+            pd.DataFrame(rows, index=["all rows", "without row 5"]),
+        ),
+        NoteTable("Priors", "Log-normal: 95 % within median/factor to median × factor.", pd.DataFrame(priors)),
+    )
+
+
+def make_result(seed: int = 0, ensembles: int = 4, draws: int = 60, walkers: int = 8) -> Result:
+    """The whole fake; the same seed gives the same result."""
+    rng = np.random.default_rng(seed)
+    files = {f"free_vibration_{i}.csv": f"{i:x}" * 64 for i in (1, 2, 3)}
+    rig = Rig("twin", True, Quantity(0.11, 2e-4), Quantity(0.53, 5e-4), Quantity(9.81), {}, (), files, Path("data"))
+    springs = (("soft", 2.42), ("medium", 18.96), ("stiff", 56.41))
+    comparisons = (
+        _friction(rng),
+        _line("motor_current", "motor_current", 2.0, rng),
+        *(_line("support_spring", f"support_spring_{name}", slope, rng) for name, slope in springs),
+        *(_decay(i, rng) for i in (1, 2, 3)),
+    )
+    provenance = {
+        "seed": seed,
+        "experiments": "bench",
+        "versions": {"capsule_id": "0.1.0", "jax": "0.10.2", "emcee": "3.1.6"},
+        "files": files,
+        "command": "fit-params data --seed 0",
+        "budget": np.float64(np.nan),
+        "counts": np.arange(3),
+    }
+    return Result(
+        rig=rig,
+        summary=_frame(PHYSICAL, rng),
+        nuisances=_frame(NUISANCES, rng),
+        point_fit=_point_fit(rng),
+        posterior=_posterior(rng, ensembles, draws, walkers),
+        findings=_findings(),
+        comparisons=comparisons,
+        notes=_notes(),
+        provenance=provenance,
+        groups=_groups(rng, comparisons),
+    )
+
+
+@pytest.fixture(scope="session")
+def result() -> Result:
+    """Synthetic rig, sampled, clean with two warnings."""
+    return make_result()
+
+
+@pytest.fixture(scope="session")
+def drawn(result: Result) -> tuple[Picture, ...]:
+    """Its pictures."""
+    return pictures(result)
+
+
+@pytest.fixture(scope="session")
+def unclean(result: Result) -> Result:
+    """The same from a real rig, with two failures."""
+    bad = (
+        Finding("chains converged", "fail", "expected N > 50 tau, seen 12 tau for v_s; run longer"),
+        Finding("residuals white", "fail", "expected a white record, seen Ljung-Box p = 1e-30", "free_vibration_2"),
+    )
+    return dataclasses.replace(
+        result, findings=result.findings + bad, rig=dataclasses.replace(result.rig, synthetic=False)
+    )
+
+
+@pytest.fixture(scope="session")
+def unsampled(result: Result) -> Result:
+    """What ``--no-sample`` gives: sampled columns are NaN."""
+    columns = ["mean", "sd", "median", "lower", "upper", "ess", "rhat", "informed"]
+    summary, nuisances = result.summary.copy(), result.nuisances.copy()
+    for frame in (summary, nuisances):
+        frame["informed"] = frame["informed"].astype(object)
+        frame[columns] = np.nan
+    return dataclasses.replace(result, summary=summary, nuisances=nuisances, posterior=None, groups={})
+
+
+@pytest.fixture
+def maker() -> Callable[..., Result]:
+    """``make_result`` for the tests that need a size or a seed of their own."""
+    return make_result

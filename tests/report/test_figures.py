@@ -1,0 +1,202 @@
+"""Every figure has labels with units, shows what it was given, and survives hostile text."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from capsule_id.inference.result import Result
+from capsule_id.report import figures
+from capsule_id.report.corner import _ticks, corner
+from capsule_id.report.gallery import Picture, pictures
+from capsule_id.report.style import figure_of, png
+from capsule_id.report.traces import traces
+from capsule_id.views import Comparison
+
+UNIT = re.compile(r"\[[^\]]+\]$")
+
+
+def _named(result: Result, label: str) -> Comparison:
+    return next(item for item in result.comparisons if item.label == label)
+
+
+def _assert_units(figure: Figure) -> None:
+    for ax in figure.axes:
+        if not ax.axison:
+            continue
+        # A shared x-axis carries its label on the lowest panel only.
+        sharing = ax.get_shared_x_axes().get_siblings(ax)
+        assert any(UNIT.search(other.get_xlabel()) for other in sharing)
+        named_rows = any(label.get_text().isidentifier() for label in ax.get_yticklabels())
+        assert named_rows or UNIT.search(ax.get_ylabel())
+
+
+def test_every_panel_has_labels_with_units(result: Result) -> None:
+    for item in result.comparisons:
+        _assert_units(figures.comparison_figure(item))
+    _assert_units(figure_of(figures.point_fit_starts(result.point_fit)))
+    _assert_units(traces(result))
+
+
+def test_corner_names_every_physical_parameter_with_its_unit(result: Result) -> None:
+    (ax,) = corner(result).axes
+    labels = [text.get_text() for text in ax.texts if "[" in text.get_text()]
+    # Each on the horizontal axis, and all but the first, which has a histogram in its row, on the vertical one.
+    assert len(labels) == 2 * len(result.summary) - 1
+    assert {"m₁\n[kg]", "k₂ stiff\n[N/m]", "vₛ\n[m/s]", "μ\n[1]"} <= set(labels)
+    assert not any("noise" in label for label in labels)
+
+
+def _inside(polygons: list[np.ndarray], points: np.ndarray) -> np.ndarray:
+    """Even-odd rule over closed polygons: an independent count of the draws within a contour."""
+    inside = np.zeros(len(points), dtype=bool)
+    x, y = points.T
+    for polygon in polygons:
+        for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+            crosses = (y0 > y) != (y1 > y)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                inside ^= crosses & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return inside
+
+
+def test_contours_hold_the_shares_they_claim(maker: Callable[..., Result]) -> None:
+    result = maker(draws=250, walkers=32)
+    assert result.posterior is not None
+    (ax,) = corner(result).axes
+    n = len(result.summary)
+    draws = result.posterior.draws.reshape(-1, len(result.posterior.names))[:, :2]
+    low, high = np.percentile(draws, (0.1, 99.9), axis=0)
+    width = high - low
+    place = (draws - (low - 0.02 * width)) / (1.04 * width) * 0.94 + (0, n - 2)  # panel of row 1, column 0
+    (contours,) = [item for item in ax.collections if type(item).__name__ == "QuadContourSet"]
+    for path, share in zip(contours.get_paths(), (0.95 - 0.68, 0.68), strict=True):
+        here = [p for p in path.to_polygons() if p[:, 0].max() < 1 and n - 2 < p[:, 1].min() and p[:, 1].max() < n - 1]
+        # Smoothing over five bins widens a contour a little; 3 % is the tolerance of the eye, not of the table.
+        assert _inside(here, place).mean() == pytest.approx(share, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1.0), (1418.2, 1424.9), (-3e-4, 7e-4), (56399.0, 56401.0), (1e-9, 1e9)]
+)
+def test_corner_ticks_are_distinct_inside_and_say_where_they_are(low: float, high: float) -> None:
+    ticks = _ticks(low, high)
+    values = np.array([value for value, _ in ticks])
+    assert 2 <= len(ticks) <= 5
+    assert np.all((low < values) & (values < high))
+    np.testing.assert_allclose([float(text) for _, text in ticks], values, rtol=0, atol=1e-9 * (high - low))
+
+
+def test_a_frozen_chain_is_drawn(result: Result) -> None:
+    posterior = result.posterior
+    assert posterior is not None
+    frozen = dataclasses.replace(posterior, draws=np.broadcast_to(posterior.draws[:1, :1, :1], posterior.draws.shape))
+    assert png(corner(dataclasses.replace(result, posterior=frozen)))
+    assert png(traces(dataclasses.replace(result, posterior=frozen)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_few_parameters(result: Result, count: int) -> None:
+    few = dataclasses.replace(result, summary=result.summary.iloc[:count])
+    assert len(traces(few).axes) == 2 * ((count + 1) // 2)
+    assert png(corner(few))
+
+
+def test_no_sample_is_refused(unsampled: Result) -> None:
+    with pytest.raises(ValueError, match="nothing was sampled"):
+        corner(unsampled)
+    with pytest.raises(ValueError, match="nothing was sampled"):
+        traces(unsampled)
+
+
+def test_panels_draw_into_given_axes(result: Result) -> None:
+    item = _named(result, "free_vibration_1")
+    for draw in (figures.comparison, figures.residuals, figures.autocorrelation):
+        ax = Figure().subplots()
+        assert draw(item, ax) is ax
+        assert isinstance(draw(item), Axes)
+    ax = Figure().subplots()
+    assert figures.point_fit_starts(result.point_fit, ax) is ax
+
+
+def test_panel_shows_points_curves_band_and_flag(result: Result) -> None:
+    item = _named(result, "support_spring_stiff")
+    ax = figures.comparison(item)
+    labels = ax.get_legend_handles_labels()[1]
+    assert set(labels) == {"this fit", "95 % band", "measured", "flagged by a check, kept"}
+    flagged = ax.lines[[line.get_label() for line in ax.lines].index("flagged by a check, kept")]
+    assert flagged.get_xdata() == item.points[0].x[4:5]
+    plain = figures.comparison(_named(result, "support_spring_soft"))
+    assert "flagged by a check, kept" not in plain.get_legend_handles_labels()[1]
+
+
+def test_residual_panel_shows_all_and_the_band(result: Result) -> None:
+    item = _named(result, "motor_current")
+    ax = figures.residuals(item)
+    np.testing.assert_array_equal(ax.lines[-1].get_ydata(), item.residuals)
+    wild = dataclasses.replace(item, residuals=np.array([*item.residuals[:-1], 40.0]))
+    assert figures.residuals(wild).get_ylim()[1] > 40.0
+
+
+def test_missing_parts_are_refused_not_drawn_empty(result: Result) -> None:
+    friction = _named(result, "friction")
+    with pytest.raises(ValueError, match="no residuals"):
+        figures.residuals(friction)
+    with pytest.raises(ValueError, match="no autocorrelation"):
+        figures.autocorrelation(friction)
+    assert len(figures.comparison_figure(friction).axes) == 1
+    assert len(figures.comparison_figure(_named(result, "motor_current")).axes) == 2
+    assert len(figures.comparison_figure(_named(result, "free_vibration_1")).axes) == 3
+
+
+def test_stalled_starts_end_in_a_cross(result: Result) -> None:
+    stalled = np.array([False, True, False, False, True, False])
+    ends = result.point_fit.ends.copy()
+    ends[1] += 1.0
+    ax = figures.point_fit_starts(dataclasses.replace(result.point_fit, stalled=stalled, ends=ends))
+    assert sum(line.get_marker() == "x" for line in ax.lines) == 2
+    assert "end, stalled" in ax.get_legend_handles_labels()[1]
+    broken = dataclasses.replace(result.point_fit, covariance=np.full_like(result.point_fit.covariance, np.nan))
+    assert png(figure_of(figures.point_fit_starts(broken)))
+
+
+def test_hostile_text_is_drawn_as_it_stands(result: Result) -> None:
+    bad = r"$\frac{$ <script> 50 % {x} \n"
+    item = _named(result, "support_spring_soft")
+    points = tuple(dataclasses.replace(points, label=bad) for points in item.points)
+    hostile = dataclasses.replace(item, title=bad, x_label=bad, y_label=bad, points=points, label="../../$etc")
+    assert png(figures.comparison_figure(hostile))
+    twice = dataclasses.replace(result, comparisons=(hostile, hostile), posterior=None)
+    names = [picture.name for picture in pictures(twice)]
+    assert len(set(names)) == len(names)
+    assert all(re.fullmatch(r"[A-Za-z0-9_-]+", name) for name in names)
+
+
+def test_a_script_without_glyphs_is_no_failure(result: Result) -> None:
+    item = dataclasses.replace(_named(result, "friction"), title="ばね 弹簧")
+    assert png(figures.comparison_figure(item))
+
+
+def test_synthetic_mark_changes_every_picture(result: Result, drawn: tuple[Picture, ...]) -> None:
+    real = dataclasses.replace(result, rig=dataclasses.replace(result.rig, synthetic=False))
+    for marked, plain in zip(drawn, pictures(real), strict=True):
+        assert marked.name == plain.name
+        assert marked.png != plain.png
+
+
+def test_no_pyplot_and_no_matplotlib_for_text() -> None:
+    code = """
+import sys
+import capsule_id.report.text
+assert "matplotlib" not in sys.modules and "xarray" not in sys.modules
+import capsule_id.report.write
+assert "matplotlib.figure" in sys.modules
+assert "matplotlib.pyplot" not in sys.modules and "jax" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

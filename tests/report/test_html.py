@@ -1,0 +1,180 @@
+"""The page stands alone, says loudly what must be said, and shows every number of the result."""
+
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from capsule_id.inference.result import Result
+from capsule_id.report.gallery import Picture, pictures
+from capsule_id.report.html import render
+from capsule_id.views import Finding, NoteTable
+
+EMPTY = {"meta", "img", "br"}
+
+
+class Page(HTMLParser):
+    """Collects what the page is made of, and checks that every element is closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str]] = []
+        self.words: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(key, value or "") for key, value in attrs]
+        if tag not in EMPTY:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def page(result: Result, drawn: tuple[Picture, ...]) -> str:
+    return render(result, drawn)
+
+
+def test_self_contained(page: str, drawn: tuple[Picture, ...]) -> None:
+    parsed = Page(page)
+    assert not re.search(r"https?:|url\(|@import|//[a-z]", re.sub(r"base64,[A-Za-z0-9+/=]+", "", page))
+    assert not {"script", "link", "iframe", "object", "embed", "form"} & set(parsed.tags)
+    sources = [value for key, value in parsed.attributes if key in ("src", "href")]
+    assert len(sources) == len(drawn)
+    assert all(source.startswith("data:image/png;base64,iVBORw0KGgo") for source in sources)
+    assert not [key for key, _ in parsed.attributes if key.startswith("on")]
+
+
+def test_every_number_of_the_table_is_there(result: Result, page: str) -> None:
+    text = Page(page).text
+    row = result.summary.loc["k1"]
+    for number in ("1386.0", "1421.3 ± 3.0", f"{row['mean']:.1f} ± 3.1", f"{row['lower']:.1f} to {row['upper']:.1f}"):
+        assert number in text
+    assert "0.302 ± 0.033" in text
+    # The nuisance in micrometres, its unit beside it.
+    assert re.search(r"µm 20\.20 ± 0\.45", text)
+    assert page.count('<td class="warn">no</td>') == 2
+
+
+def test_symbols_are_set_as_in_the_paper(page: str) -> None:
+    for symbol in (
+        "<var>k</var><sub>1</sub>",
+        "<var>v</var><sub>s</sub>",
+        "<var>μ</var>",
+        '<span class="label">soft</span>',
+    ):
+        assert symbol in page
+
+
+def test_verdict_strip_has_text_beside_colour(unclean: Result) -> None:
+    page = render(unclean, ())
+    cells = re.findall(r'<li class="(\w+)"><b>([^<]+)</b>([^<]+)</li>', page)
+    assert [(level, check) for level, check, _ in cells] == [
+        ("ok", "starts agree"), ("fail", "chains converged"), ("fail", "residuals white"), ("warn", "outliers"),
+        ("ok", "linearity"), ("warn", "parameters informed"),
+    ]  # fmt: skip
+    words = {"ok": "ok", "warn": "warning", "fail": "failed"}
+    assert all(words[level] in text for level, _, text in cells)
+
+
+def test_every_finding_is_there_in_full_worst_first(unclean: Result) -> None:
+    text = Page(render(unclean, ())).text
+    places = [text.index(finding.text) for finding in unclean.findings]
+    assert max(places[-2:]) < min(places[:-2])
+
+
+def test_unclean_says_so_at_the_table(unclean: Result, page: str) -> None:
+    said = "intervals in this table are not to be trusted"
+    text = render(unclean, ())
+    assert said in Page(text).text
+    assert 'class="untrusted"' in text
+    assert text.index("<h2>Parameters") < text.index("not to be trusted") < text.index("<table")
+    assert said not in Page(page).text
+    assert 'class="untrusted"' not in page
+
+
+def test_synthetic_is_said_loudly_and_only_when_true(page: str, unclean: Result) -> None:
+    assert page.index("SYNTHETIC RIG") < page.index("<h1>")
+    assert page.count("synthetic data</span>") >= 3  # beside every table
+    assert "ynthetic" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", render(unclean, ()))
+
+
+def test_point_fit_only(unsampled: Result) -> None:
+    text = Page(render(dataclasses.replace(unsampled, findings=()), pictures(unsampled))).text
+    assert "nothing was sampled" in text
+    assert "1421.3 ± 3.0" in text
+    for absent in ("R-hat", "95 % interval", "Corner plot", "The sample"):
+        assert absent not in text
+    assert not re.search(r"\bnan\b", text, re.IGNORECASE)
+
+
+@pytest.mark.parametrize(
+    "bad", ['<script>alert("x")</script>', "<img src=x onerror=y>", "&lt;b&gt;", '"><b>', "{{ 7 * 7 }}"]
+)
+def test_hostile_text_is_escaped(result: Result, bad: str) -> None:
+    summary = result.summary.rename(index={"k2[soft]": f"k2[{bad}]"})
+    summary["meaning"] = bad
+    frame = pd.DataFrame({bad: [bad]}, index=[bad])
+    hostile = dataclasses.replace(
+        result, summary=summary, notes=(NoteTable(bad, bad, frame),), findings=(Finding(bad, "fail", bad, bad),),
+        rig=dataclasses.replace(result.rig, name=bad), provenance={"seed": bad, bad: bad, "files": {bad: bad}},
+    )  # fmt: skip
+    picture = Picture("x", "measured", bad, bad, 10, 10, b"")
+    page = render(hostile, (picture,))
+    parsed = Page(page)
+    allowed = set(Page(render(result, (Picture("x", "measured", "t", "c", 10, 10, b""),))).tags)
+    assert set(parsed.tags) <= allowed
+    assert parsed.text.count(" ".join(bad.split())) >= 10
+    assert not [key for key, _ in parsed.attributes if key.startswith("on")]
+
+
+def test_notes_show_cells_and_dashes(page: str) -> None:
+    text = Page(page).text
+    assert "all rows 56410 46" in text
+    assert "mu log-normal 0.4 –" in text
+    assert "<NA>" not in text
+
+
+def test_note_frames_of_every_kind(result: Result) -> None:
+    frame = pd.DataFrame({"text": ["a", None], "number": [-1.23456789e-7, np.nan], "count": [1234567, 2]})
+    page = render(
+        dataclasses.replace(result, notes=(NoteTable("t", "c", frame), NoteTable("e", "c", frame.iloc[:0]))), ()
+    )
+    text = Page(page).text
+    assert "a −1.2346e−07 1234567" in text
+    assert "– – 2" in text
+
+
+def test_provenance_is_complete_and_undated(result: Result, page: str) -> None:
+    text = Page(page).text
+    for digest in result.rig.files.values():
+        assert digest in text
+    assert "0.10.2" in text
+    assert "fit-params data --seed 0" in text
+    assert not re.search(r"\b20\d\d-\d\d", text)
+
+
+def test_minimal_result(result: Result) -> None:
+    bare = dataclasses.replace(
+        result, posterior=None, findings=(), comparisons=(), notes=(), groups={}, nuisances=result.nuisances.iloc[:0],
+        summary=result.summary.iloc[:1],
+    )  # fmt: skip
+    text = Page(render(bare, pictures(bare))).text
+    assert "Scatters and noise" not in text
+    assert "Notes" not in text

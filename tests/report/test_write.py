@@ -1,0 +1,239 @@
+"""The files of a result: strict JSON in the agreed shape, a table, pictures, a netCDF file that ArviZ opens."""
+
+import dataclasses
+import json
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from capsule_id.inference.result import Result
+from capsule_id.report.netcdf import write_posterior
+from capsule_id.report.write import parameters_json, write_result
+from capsule_id.views import Finding
+
+
+@pytest.fixture(scope="module")
+def arviz() -> ModuleType:
+    with warnings.catch_warnings():
+        # The import announces ArviZ's own reorganisation; nothing here depends on it.
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+
+        return arviz
+
+
+@pytest.fixture(scope="module")
+def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("results")
+    write_result(result, path)
+    return path
+
+
+def _strict(text: str) -> dict:
+    def refuse(word: str) -> float:
+        raise AssertionError(f"{word} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_files(folder: Path, result: Result) -> None:
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    figures = {name for name in names if name.startswith("figures/")}
+    assert names - figures == {"parameters.json", "parameters.csv", "posterior.nc", "report.html"}
+    labels = {"friction", "motor_current", "corner", "traces", "point_fit_starts"}
+    labels |= {f"support_spring_{s}" for s in ("soft", "medium", "stiff")} | {f"free_vibration_{i}" for i in (1, 2, 3)}
+    assert figures == {f"figures/{label}.png" for label in labels}
+
+
+def test_figures_are_those_of_the_page_at_150_dpi(folder: Path) -> None:
+    from base64 import b64encode
+
+    from PIL import Image
+
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    for path in (folder / "figures").iterdir():
+        assert b64encode(path.read_bytes()).decode() in page
+        with Image.open(path) as image:
+            assert image.info["dpi"] == pytest.approx((150, 150), abs=0.1)
+            assert image.convert("RGB").getpixel((1, image.height - 2)) == (255, 255, 255)
+
+
+def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> None:
+    content = _strict((folder / "parameters.json").read_text(encoding="utf-8"))
+    assert list(content) == ["rig", "synthetic", "parameters", "verdict", "provenance"]
+    assert content["rig"] == "twin"
+    assert content["synthetic"] is True
+    assert list(content["parameters"]) == list(result.summary.index)
+    keys = ["unit", "paper", "map", "mean", "sd", "median", "ci95", "ess", "rhat", "informed"]
+    for name, entry in content["parameters"].items():
+        row = result.summary.loc[name]
+        assert list(entry) == keys
+        for key in ("map", "mean", "sd", "median", "ess", "rhat"):
+            assert entry[key] == row[key]  # not one digit is lost
+        assert entry["ci95"] == [row["lower"], row["upper"]]
+        assert entry["unit"] == row["unit"]
+        assert entry["informed"] is bool(row["informed"])
+        assert entry["paper"] == (None if np.isnan(row["paper"]) else row["paper"])
+    assert content["verdict"]["clean"] is True
+    assert all(list(finding) == ["check", "level", "text"] for finding in content["verdict"]["findings"])
+    assert content["provenance"]["files"] == dict(result.rig.files)
+    assert content["provenance"]["seed"] == 0
+    assert content["provenance"]["budget"] is None
+    assert content["provenance"]["counts"] == [0, 1, 2]
+
+
+def test_findings_in_json_name_their_experiment(result: Result) -> None:
+    findings = (
+        Finding("a", "fail", "seen 4", "run_1"),
+        Finding("b", "ok", "run_1 is white", "run_1"),
+        Finding("c", "ok", "fine"),
+    )
+    content = parameters_json(dataclasses.replace(result, findings=findings))
+    verdict = content["verdict"]
+    assert isinstance(verdict, dict)
+    assert verdict["clean"] is False
+    assert [finding["text"] for finding in verdict["findings"]] == ["run_1: seen 4", "run_1 is white", "fine"]
+
+
+def test_point_fit_only_is_null_and_has_no_posterior(unsampled: Result, tmp_path: Path) -> None:
+    write_result(unsampled, tmp_path)
+    assert not (tmp_path / "posterior.nc").exists()
+    entry = _strict((tmp_path / "parameters.json").read_text(encoding="utf-8"))["parameters"]["k1"]
+    assert entry["map"] == 1421.3
+    assert entry["paper"] == 1386.0
+    assert [entry[key] for key in ("mean", "sd", "median", "ci95", "ess", "rhat", "informed")] == [None] * 7
+
+
+def test_infinite_numbers_become_null(result: Result) -> None:
+    summary = result.summary.copy()
+    summary.loc["k1", "rhat"] = np.inf
+    summary.loc["k1", "lower"] = -np.inf
+    content = parameters_json(dataclasses.replace(result, summary=summary))
+    entry = _strict(json.dumps(content, allow_nan=False))["parameters"]["k1"]
+    assert entry["rhat"] is None
+    assert entry["ci95"] is None
+
+
+def test_csv_reads_back(folder: Path, result: Result) -> None:
+    table = pd.read_csv(folder / "parameters.csv", index_col="name")
+    assert list(table.index) == [*result.summary.index, *result.nuisances.index]
+    assert list(table["role"]) == ["physical"] * len(result.summary) + ["nuisance"] * len(result.nuisances)
+    assert table["synthetic"].all()
+    both = pd.concat([result.summary, result.nuisances])
+    for column in ("paper", "map", "standard_error", "mean", "sd", "lower", "upper", "ess", "rhat"):
+        np.testing.assert_array_equal(table[column].to_numpy(float), both[column].to_numpy(float))
+
+
+def test_directory_must_exist(result: Result, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        write_result(result, tmp_path / "absent")
+    assert not (tmp_path / "absent").exists()
+
+
+def test_same_result_same_bytes(folder: Path, maker: Callable[..., Result], tmp_path: Path) -> None:
+    write_result(maker(), tmp_path)
+    for path in (p for p in folder.rglob("*") if p.is_file()):
+        assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
+    other = tmp_path / "other"
+    other.mkdir()
+    write_result(maker(seed=1), other)
+    assert (other / "posterior.nc").read_bytes() != (folder / "posterior.nc").read_bytes()
+    assert (other / "report.html").read_bytes() != (folder / "report.html").read_bytes()
+
+
+def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType) -> None:
+    data = arviz.from_netcdf(str(folder / "posterior.nc"))
+    assert set(data.groups()) == {"posterior", "sample_stats", "observed_data", "log_likelihood", "prior"}
+    posterior = result.posterior
+    assert posterior is not None
+    ensembles, draws, walkers, _ = posterior.draws.shape
+    assert dict(data.posterior.sizes) == {
+        "chain": ensembles * walkers, "draw": draws, "spring": 3, "noise_sd_of": 7,
+    }  # fmt: skip
+    np.testing.assert_array_equal(data.posterior["ensemble"], np.arange(ensembles * walkers) // walkers)
+    assert all(variable.dtype == np.float64 for variable in data.posterior.data_vars.values())
+    summary = arviz.summary(data, var_names=["k1", "k2"], kind="stats")
+    assert summary.loc["k2[stiff]", "mean"] == pytest.approx(posterior.draws[..., 9].mean(), rel=1e-3)
+    assert list(data.log_likelihood.chain.values) == [0, 2, 4, 6]
+    assert list(data.log_likelihood.draw.values) == [0, 4, 8, 12, 16]
+
+
+def test_every_draw_is_in_its_place(folder: Path, result: Result) -> None:
+    posterior = result.posterior
+    assert posterior is not None
+    walkers = posterior.draws.shape[2]
+    with xr.open_dataset(folder / "posterior.nc", group="posterior", engine="h5netcdf") as data:
+        for e, draw, walker in ((0, 0, 0), (2, 5, 3), (3, 59, 7)):
+            chain = data.isel(chain=e * walkers + walker, draw=draw)
+            here = dict(zip(posterior.names, posterior.draws[e, draw, walker], strict=True))
+            assert float(chain["k1"]) == here["k1"]
+            assert float(chain["k2"].sel(spring="medium")) == here["k2[medium]"]
+            assert float(chain["noise_sd"].sel(noise_sd_of="motor_current")) == here["noise_sd[motor_current]"]
+            assert float(chain["m3"]) == 0.64
+        assert data["m3"].attrs["fixed"] == 1
+        assert "fixed" not in data["m1"].attrs
+        assert data["k2"].dims == ("chain", "draw", "spring")
+        assert list(data["spring"].values) == ["soft", "medium", "stiff"]
+        assert data["k2"].attrs["units"] == "N/m"
+        assert list(data["noise_sd"].attrs["units"]) == ["m", "m", "m", "N", "N", "N", "N"]
+    with xr.open_dataset(folder / "posterior.nc", group="sample_stats", engine="h5netcdf") as stats:
+        assert float(stats["lp"].isel(chain=2 * walkers + 3, draw=5)) == posterior.lp[2, 5, 3]
+        assert float(stats["acceptance"].isel(chain=walkers)) == posterior.acceptance[1, 0]
+        assert stats["acceptance"].dims == ("chain",)
+
+
+def test_the_other_groups_hold_what_was_given(folder: Path, result: Result) -> None:
+    for group in ("observed_data", "log_likelihood", "prior"):
+        with xr.open_dataset(folder / "posterior.nc", group=group, engine="h5netcdf") as data:
+            assert all("units" in variable.attrs for variable in data.data_vars.values())
+            if group == "prior":
+                np.testing.assert_array_equal(data["k2"].sel(spring="stiff")[0], result.groups["prior"]["k2[stiff]"])  # type: ignore[index]
+                continue
+            given = result.groups["observed" if group == "observed_data" else group]
+            assert isinstance(given, dict)
+            for label, values in given.items():
+                np.testing.assert_array_equal(data[label], values)
+                assert data[label].dims[-1] == f"{label}_row"
+
+
+def test_without_groups_only_the_sample_is_written(result: Result, tmp_path: Path, arviz: ModuleType) -> None:
+    write_posterior(dataclasses.replace(result, groups={}), tmp_path / "x.nc")
+    assert set(arviz.from_netcdf(str(tmp_path / "x.nc")).groups()) == {"posterior", "sample_stats"}
+
+
+def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None:
+    fixed = {"k2[rigid]": 1e6}
+    write_posterior(dataclasses.replace(result, groups={"fixed": fixed}), tmp_path / "x.nc")
+    with xr.open_dataset(tmp_path / "x.nc", group="posterior", engine="h5netcdf") as data:
+        assert list(data["spring"].values) == ["soft", "medium", "stiff", "rigid"]
+        assert np.all(data["k2"].sel(spring="rigid") == 1e6)
+        assert "fixed" not in data["k2"].attrs
+
+
+def test_netcdf_refusals(result: Result, unsampled: Result, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="nothing was sampled"):
+        write_posterior(unsampled, tmp_path / "x.nc")
+    clash = dataclasses.replace(result, groups={"fixed": {"k2": 1.0}})
+    with pytest.raises(ValueError, match=re.escape("k2 is used both alone and as a family")):
+        write_posterior(clash, tmp_path / "x.nc")
+
+
+@pytest.mark.benchmark
+def test_writing_is_quick(maker: Callable[..., Result], tmp_path: Path) -> None:
+    from time import process_time
+
+    result = maker(draws=250, walkers=64)
+    write_posterior(result, tmp_path / "warm.nc")
+    start = process_time()
+    write_posterior(result, tmp_path / "x.nc")
+    assert process_time() - start < 0.5
+    start = process_time()
+    write_result(result, tmp_path)
+    assert process_time() - start < 2.5

@@ -1,0 +1,139 @@
+"""capsule-id init and check."""
+
+import argparse
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from capsule_id.commands import check, init
+from capsule_id.errors import InputError
+from capsule_id.rig.read import read_rig
+from capsule_id.rig.schema import HALF_NORMAL_PRIORS, KINDS, LOG_NORMAL_PRIORS, ChoiceRule
+from tests.rig.folder import RIG_TOML, TABLES, write_folder
+
+
+def call(command: object, *words: str) -> int:
+    """Run a command as the command line does."""
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)  # type: ignore[attr-defined]
+    return command.run(parser.parse_args(words))  # type: ignore[attr-defined]
+
+
+def uncommented(text: str) -> str:
+    """The template with every `# ` removed that does not explain."""
+    return re.sub(r"(?m)^# ", "", text)
+
+
+FILES = {
+    "free_vibration_1.csv": "time [s],x_rel [mm]\n" + "".join(f"{i / 100},{2 * (-0.8) ** i}\n" for i in range(51)),
+    "support_spring_L60.csv": TABLES["support_spring_L60.csv"],
+    "run_01.csv": TABLES["run_01.csv"],
+    **{f"{kind}.csv": TABLES[f"{kind}.csv"] for kind in ("static_friction", "dynamic_friction", "motor_current")},
+    "sliding_friction.csv": TABLES["sliding_friction.csv"],
+}
+
+
+def test_the_whole_template_reads_once_its_comments_are_removed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert call(init, str(tmp_path / "new" / "my-rig")) == 0
+    assert "rig.toml" in capsys.readouterr().out
+    file = tmp_path / "new" / "my-rig" / "rig.toml"
+    assert [path.name for path in file.parent.iterdir()] == ["rig.toml"]
+    text = file.read_text(encoding="utf-8")
+    file.write_text(uncommented(text), encoding="utf-8")
+    for name, content in FILES.items():
+        (file.parent / name).write_text(content)
+    rig = read_rig(file.parent)
+    assert rig.name == "my-rig"
+    assert {table.kind for table in rig.tables} == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_experiment_of_the_template_alone(tmp_path: Path, kind: str) -> None:
+    head, *blocks = init.TEMPLATE.replace("@NAME@", "a").split("# [[experiment]]")
+    block = next(block for block in blocks if f'kind = "{kind}"' in block)
+    head = re.sub(r"(?m)^# (?=m[12] )", "", head)
+    name = re.findall(r'file = "(.*)"', block)[0]
+    text = head + "[[experiment]]" + uncommented(block)
+    assert [table.kind for table in read_rig(write_folder(tmp_path / "a", text, {name: FILES[name]})).tables] == [kind]
+
+
+def test_the_template_mentions_everything_that_a_rig_may_say() -> None:
+    for rule in KINDS.values():
+        assert all(column in init.TEMPLATE for column in rule.columns)
+        # forward has one choice until forced runs are fitted, so there is nothing to choose yet
+        assert all(key in init.TEMPLATE for key in rule.settings if key != "forward")
+        for setting in rule.settings.values():
+            if isinstance(setting, ChoiceRule) and len(setting.choices) > 1:
+                assert all(f'"{choice}"' in init.TEMPLATE for choice in setting.choices)
+    assert all(re.search(rf"\b{key}\b", init.TEMPLATE) for key in (*LOG_NORMAL_PRIORS, *HALF_NORMAL_PRIORS))
+
+
+def test_an_untouched_template_asks_for_an_experiment(tmp_path: Path) -> None:
+    call(init, str(tmp_path / "a"))
+    with pytest.raises(InputError, match="at least one"):
+        read_rig(tmp_path / "a")
+
+
+def test_init_takes_an_empty_folder_and_no_other(tmp_path: Path) -> None:
+    (tmp_path / "empty folder").mkdir()
+    assert call(init, str(tmp_path / "empty folder")) == 0
+    assert 'name = "rig"' in (tmp_path / "empty folder" / "rig.toml").read_text()
+    for name in ("empty folder", "empty folder/rig.toml", "empty folder/rig.toml/below"):
+        before = (tmp_path / "empty folder" / "rig.toml").read_bytes()
+        with pytest.raises(InputError, match="DIR must be"):
+            call(init, str(tmp_path / name))
+        assert (tmp_path / "empty folder" / "rig.toml").read_bytes() == before
+
+
+def test_check_prints_a_line_per_experiment(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert call(check, str(write_folder(tmp_path / "rig"))) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "twin: 8 experiments, SYNTHETIC data"
+    assert lines[1] == "free_vibration free_vibration_1: 10 rows of time [ms], x_rel [mm], 1000 Hz"
+    assert lines[3] == "static_friction lifted: 2 rows of height [mm], length [mm]"
+    assert lines[8] == "forced_run run_01: 9 rows of time [s], x_rel [mm], acceleration_rod [m/s^2], 100 Hz"
+
+
+def findings(folder: Path, capsys: pytest.CaptureFixture) -> list[str]:
+    call(check, str(folder))
+    return [line.removeprefix("lint: ") for line in capsys.readouterr().out.splitlines() if line.startswith("lint: ")]
+
+
+def test_lint(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    head = '[rig]\nname = "a"\nm1 = { value = 0.11, unit = "kg" }\n'
+    entry = '[[experiment]]\nkind = "free_vibration"\nfile = "{}"\n'
+    # 16 Hz for 0.5 s (8 periods) at 1 kHz (62 per period); at 128 Hz (8 per period); and its first 0.1 s (1.6 periods)
+    good, coarse, short = (sine(1000, 500), sine(128, 64), sine(1000, 100))
+    uneven = good.replace("\n0.003,", "\n0.0034,")
+    for name, table, finding in (
+        ("good.csv", good, ""),
+        ("coarse.csv", coarse, r"coarse: 8\.\d samples per period, 20 or more are wanted; sample faster"),
+        ("short.csv", short, r"short: 1\.\d periods, 2 or more are wanted; record for longer"),
+        ("uneven.csv", uneven, r"uneven: a filter needs evenly spaced samples \(steps from 0.0006 to 0.0014 s\): .*"),
+    ):
+        found = findings(write_folder(tmp_path / "rig", head + entry.format(name), {name: table}), capsys)
+        assert found.pop(0).startswith("m1: no sd stated")
+        assert re.fullmatch(finding, "".join(found))
+    rows = '[rig]\nname = "a"\n[[experiment]]\nkind = "motor_current"\nfile = "motor_current.csv"\n'
+    found = findings(write_folder(tmp_path / "rig", rows), capsys)
+    assert found == [
+        "motor_current: 3 rows, which hardly tell the scatter; measure 5 or more",
+        "motor_current: no reading error stated for force and current; add force_sd",
+    ]
+    twice = rows + '[[experiment]]\nkind = "motor_current"\nfile = "copy.csv"\n'
+    found = findings(write_folder(tmp_path / "rig", twice, {"copy.csv": TABLES["motor_current.csv"]}), capsys)
+    assert found[-1] == "motor_current and copy: the same data; use each reading in one experiment only"
+
+
+def sine(rate: int, samples: int) -> str:
+    """A 16 Hz swing sampled at ``rate`` Hz."""
+    rows = (f"{i / rate!r},{math.sin(2 * math.pi * 16 * i / rate)!r}\n" for i in range(samples))
+    return "time [s],x_rel [mm]\n" + "".join(rows)
+
+
+def test_check_refuses_with_the_place(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "rig", RIG_TOML.replace('"held"', '"hold"'))
+    with pytest.raises(InputError, match=r"rig\.toml:20:11: capsule must be"):
+        call(check, str(folder))

@@ -1,0 +1,158 @@
+"""What a valid rig folder becomes."""
+
+import hashlib
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.errors import InputError
+from capsule_id.rig.model import PriorOverride, Quantity
+from capsule_id.rig.read import read_rig
+from capsule_id.rig.schema import KINDS
+from capsule_id.rig.windows import decay_window
+from tests.rig.folder import RIG_TOML, TABLES, write_folder
+
+DEGREE = math.pi / 180.0
+
+
+def test_everything_is_si(tmp_path: Path) -> None:
+    rig = read_rig(write_folder(tmp_path / "rig"))
+    assert (rig.name, rig.synthetic, rig.folder) == ("twin", True, tmp_path / "rig")
+    assert (rig.m1, rig.m2, rig.g) == (Quantity(0.110, 0.0005), Quantity(0.530, 0.001), Quantity(9.81, 0.0))
+    assert dict(rig.priors) == {
+        "k1": PriorOverride(median=1500.0, factor=3.0),
+        "k2[L60]": PriorOverride(median=20000.0, factor=10.0),
+        "tilt_sd": PriorOverride(scale=DEGREE),
+        "push_scatter": PriorOverride(scale=0.05),
+    }
+    assert [table.kind for table in rig.tables] == [
+        "free_vibration",
+        "static_friction",
+        "static_friction",
+        "dynamic_friction",
+        "sliding_friction",
+        "motor_current",
+        "support_spring",
+        "forced_run",
+    ]
+    assert {table.kind for table in rig.tables} == set(KINDS)
+    decay, tilts, boards, pushes, _, motor, spring, run = rig.tables
+    np.testing.assert_array_equal(decay["time"], np.arange(10) / 1000)
+    np.testing.assert_array_equal(decay["x_rel"][:3], [0.002, 0.0015, 0.0005])
+    assert decay.columns["x_rel"].reading_sd == pytest.approx(math.hypot(2e-5, 1e-6 / math.sqrt(12.0)), rel=1e-15)
+    assert dict(decay.settings) == {
+        "start": 0.0,
+        "stop": 0.009,
+        "capsule": "held",
+        "damping": "dry",
+        "smoothing_window": 0.005,
+        "forward": "closed",
+    }
+    np.testing.assert_allclose(tilts["angle"], np.array([33.1, 33.6, 33.2]) * DEGREE, rtol=1e-15)
+    assert tilts.columns["angle"].to_display * tilts["angle"][0] == pytest.approx(33.1, rel=1e-15)
+    assert (boards.label, boards.file, boards.settings["length_is"]) == ("lifted", "boards/lifted.csv", "board")
+    np.testing.assert_array_equal(boards["height"], [0.3315, 0.329])
+    np.testing.assert_array_equal(pushes["distance"], [0.0019, 0.025])
+    assert (pushes.columns["speed"].sd, pushes.columns["distance"].sd) == (0.005, None)
+    assert motor.settings["sd_ratio"] == 3.0
+    assert dict(spring.settings) == {"spring": "L60", "length": Quantity(0.06, 0.0005)}
+    assert dict(run.settings) == {
+        "spring": "L60",
+        "gap": Quantity(0.001, 0.02 / 1000),
+        "Omega": 34.56,
+        "P_d": Quantity(4.0, 0.1),
+    }
+    np.testing.assert_array_equal(run.rows, np.arange(2, 11))
+
+
+def test_files_are_hashed(tmp_path: Path) -> None:
+    rig = read_rig(write_folder(tmp_path / "rig"))
+    contents = {"rig.toml": RIG_TOML, **TABLES}
+    assert dict(rig.files) == {name: hashlib.sha256(text.encode()).hexdigest() for name, text in contents.items()}
+
+
+def test_nothing_can_be_changed(tmp_path: Path) -> None:
+    rig = read_rig(write_folder(tmp_path / "rig"))
+    table = rig.tables[0]
+    for array in (*(column.values for column in table.columns.values()), table.rows):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+    for mapping in (rig.files, rig.priors, table.columns, table.settings):
+        with pytest.raises(TypeError):
+            mapping["new"] = 1  # type: ignore[index]
+
+
+def minimal(tmp_path: Path, head: str, entry: str, table: str) -> Path:
+    return write_folder(
+        tmp_path / "rig", f'[rig]\nname = "a"\n{head}\n[[experiment]]\nfile = "t.csv"\n{entry}', {"t.csv": table}
+    )
+
+
+def record(step: float, samples: int) -> str:
+    return "time [s],x_rel [mm]\n" + "".join(f"{i * step!r},{(-1) ** i}\n" for i in range(samples))
+
+
+def test_a_window_may_reach_one_sample_beyond_the_record(tmp_path: Path) -> None:
+    m1 = 'm1 = { value = 0.11, unit = "kg" }'
+    entry = 'kind = "free_vibration"\nstop = { value = STOP, unit = "s" }'
+    table = minimal(tmp_path, m1, entry.replace("STOP", "0.5"), record(0.0005, 1000))
+    assert len(decay_window(read_rig(table).tables[0])[0]) == 1000  # 0.5 s at 2 kHz end at 0.4995 s
+    beyond = minimal(tmp_path, m1, entry.replace("STOP", "0.5006"), record(0.0005, 1000))
+    with pytest.raises(InputError, match="stop must lie inside the record"):
+        read_rig(beyond)
+
+
+def test_decay_window_includes_both_ends(tmp_path: Path) -> None:
+    entry = 'kind = "free_vibration"\nstart = { value = 3, unit = "ms" }\nstop = { value = 12, unit = "ms" }'
+    folder = minimal(tmp_path, 'm1 = { value = 0.11, unit = "kg" }', entry, record(0.001, 20))
+    time, x_rel = decay_window(read_rig(folder).tables[0])
+    np.testing.assert_array_equal(time, np.arange(3, 13) * 0.001)
+    np.testing.assert_array_equal(x_rel, [(-1) ** i / 1000 for i in range(3, 13)])
+
+
+@pytest.mark.parametrize(
+    ("entry", "table", "needed"),
+    [
+        ('kind = "free_vibration"', record(0.1, 8), "m1"),
+        ('kind = "free_vibration"\ncapsule = "free"', record(0.1, 8), "m1 m2"),
+        ('kind = "sliding_friction"', "speed [m/s],force [N]\n1,2\n", "m1 m2"),
+        ('kind = "sliding_friction"', "speed [m/s],coefficient [1]\n1,2\n", ""),
+        ('kind = "static_friction"', "angle [deg]\n30\n", ""),
+        (
+            'kind = "forced_run"\nspring = "a"\ngap = { value = 0, unit = "m" }\nf = { value = 5, unit = "Hz" }',
+            "time [s],current [A]\n" + "".join(f"{i},{i}\n" for i in range(8)),
+            "m1 m2",
+        ),
+    ],
+)
+def test_masses_that_an_experiment_needs(tmp_path: Path, entry: str, table: str, needed: str) -> None:
+    masses = {name: f'{name} = {{ value = 1, unit = "kg" }}\n' for name in ("m1", "m2")}
+    assert read_rig(minimal(tmp_path, "".join(masses[name] for name in needed.split()), entry, table)).tables
+    for missing in needed.split():
+        stated = "".join(text for name, text in masses.items() if name != missing)
+        with pytest.raises(InputError, match=f"needs {missing}, no {missing} in"):
+            read_rig(minimal(tmp_path, stated, entry, table))
+
+
+def test_the_base_of_a_triangle_may_be_shorter_than_its_height(tmp_path: Path) -> None:
+    table = "height [mm],length [mm]\n600,400\n"
+    rig = read_rig(minimal(tmp_path, "", 'kind = "static_friction"\nlength_is = "base"', table))
+    assert rig.tables[0]["height"][0] > rig.tables[0]["length"][0]
+    with pytest.raises(InputError, match="height must be less than the length of the board"):
+        read_rig(minimal(tmp_path, "", 'kind = "static_friction"\nlength_is = "board"', table))
+
+
+def test_a_link_inside_the_folder_and_an_upper_case_suffix_are_fine(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "rig", RIG_TOML.replace('"static_friction.csv"', '"boards/../link.CSV"'))
+    (folder / "link.CSV").symlink_to("static_friction.csv")
+    assert read_rig(folder).tables[1].label == "link"
+
+
+def test_the_same_file_may_be_used_under_two_labels(tmp_path: Path) -> None:
+    twice = '\n[[experiment]]\nkind = "static_friction"\nfile = "static_friction.csv"\n'
+    with pytest.raises(InputError, match="labels must be unique"):
+        read_rig(write_folder(tmp_path / "rig", RIG_TOML + twice))
+    rig = read_rig(write_folder(tmp_path / "rig", RIG_TOML + twice + 'label = "again"\n'))
+    assert [table.label for table in rig.tables if table.file == "static_friction.csv"] == ["static_friction", "again"]

@@ -1,0 +1,108 @@
+"""Units against hand-written factors; the traps that a units library sets by default."""
+
+import math
+
+import pytest
+
+from capsule_id.rig.units import _DEFINITIONS, UnitError, factor_to_si, scale
+
+# symbol -> (SI unit, factor), written from the SI brochure and NIST SP 811, not from the code
+BY_HAND = {
+    "m": ("m", 1.0),
+    "mm": ("m", 0.001),
+    "um": ("m", 0.000001),
+    "cm": ("m", 0.01),
+    "km": ("m", 1000.0),
+    "in": ("m", 0.0254),
+    "s": ("s", 1.0),
+    "ms": ("s", 0.001),
+    "us": ("s", 0.000001),
+    "min": ("s", 60.0),
+    "kg": ("kg", 1.0),
+    "g": ("kg", 0.001),
+    "mg": ("kg", 0.000001),
+    "lb": ("kg", 0.45359237),
+    "A": ("A", 1.0),
+    "mA": ("A", 0.001),
+    "uA": ("A", 0.000001),
+    "rad": ("rad", 1.0),
+    "mrad": ("rad", 0.001),
+    "deg": ("rad", math.pi / 180.0),
+    "rev": ("rad", 2.0 * math.pi),
+    "rpm": ("rad/s", math.pi / 30.0),
+    "Hz": ("Hz", 1.0),
+    "kHz": ("Hz", 1000.0),
+    "N": ("N", 1.0),
+    "mN": ("N", 0.001),
+    "uN": ("N", 0.000001),
+    "kN": ("N", 1000.0),
+    "gf": ("N", 0.00980665),
+    "kgf": ("N", 9.80665),
+    "lbf": ("N", 4.4482216152605),
+    "Ns": ("N*s", 1.0),
+}
+
+
+def test_every_symbol_has_its_factor_by_hand() -> None:
+    assert set(BY_HAND) == set(_DEFINITIONS)
+    for symbol, (si, factor) in BY_HAND.items():
+        assert factor_to_si(symbol, si) == pytest.approx(factor, rel=4e-16, abs=0.0), symbol
+
+
+@pytest.mark.parametrize(
+    ("unit", "si", "factor"),
+    [
+        ("kN/m", "N/m", 1e3),
+        ("N/mm", "N/m", 1e3),
+        ("N s/m", "N*s/m", 1.0),
+        ("N·s/m", "N*s/m", 1.0),
+        ("Ns/m", "N*s/m", 1.0),
+        ("kg/s", "N*s/m", 1.0),
+        ("m/s^2", "m/s^2", 1.0),
+        ("mm/s²", "m/s^2", 1e-3),
+        ("m s⁻²", "m/s^2", 1.0),
+        ("m / s / s", "m/s^2", 1.0),
+        ("°", "rad", math.pi / 180.0),
+        ("µm", "m", 1e-6),
+        ("N/mA", "N/A", 1e3),
+        ("1/s", "Hz", 1.0),
+        ("deg/s", "rad/s", math.pi / 180.0),
+        ("1", "1", 1.0),
+        ("mm/m", "1", 1e-3),
+    ],
+)
+def test_products_and_spellings(unit: str, si: str, factor: float) -> None:
+    assert factor_to_si(unit, si) == pytest.approx(factor, rel=1e-15, abs=0.0)
+
+
+@pytest.mark.parametrize(
+    ("unit", "si", "rule"),
+    [
+        ("Hz", "rad/s", "dimension of rad/s"),  # pint's own registry lets both of these pass
+        ("rad", "1", "a pure number"),
+        ("rad/s", "Hz", "dimension of Hz"),
+        ("deg", "m", "dimension of m"),
+        ("kg", "N", "dimension of N"),
+        ("mms", "m", "unknown unit symbol mms"),  # a plural of mm to pint
+        ("newtons", "N", "unknown unit symbol newtons"),
+        ("MM", "m", "unknown unit symbol MM"),
+        ("", "m", "a unit is a product"),
+        ("3", "1", "a unit is a product"),
+        ("2 m", "m", "a unit is a product"),
+        ("m/", "m", "a unit is a product"),
+        ("m^99999", "m", "a unit is a product"),
+        ("__import__('os')", "m", "a unit is a product"),
+        ("m*" * 30 + "m", "m", "a unit is a product"),
+    ],
+)
+def test_refused(unit: str, si: str, rule: str) -> None:
+    with pytest.raises(UnitError) as caught:
+        factor_to_si(unit, si)
+    assert rule in caught.value.rule
+    assert caught.value.remedy.startswith("write a unit such as")
+
+
+def test_the_same_length_in_two_units_is_the_same_float() -> None:
+    millimetre = factor_to_si("mm", "m")
+    assert all(scale(float(n), millimetre) == n / 1000 for n in range(2000))
+    assert any(n * millimetre != n / 1000 for n in range(2000))  # what plain multiplication would do
