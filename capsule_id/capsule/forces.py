@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from capsule_id.precision import require_float64
 
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 require_float64()
 
-Array = jax.Array | np.ndarray | float
+Array = jax.Array | float
 
 
 # ------------------------------------------- smoothed Heaviside, its integral, sign and |x|; every width is positive
@@ -36,7 +35,7 @@ Array = jax.Array | np.ndarray | float
 
 def _scaled(x: Array, width: Array) -> jax.Array:
     """x / width clipped to [-1, 1]."""
-    return jnp.minimum(jnp.maximum(x / width, -1.0), 1.0)
+    return jnp.minimum(jnp.maximum(jnp.asarray(x) / width, -1.0), 1.0)
 
 
 def smooth_sign(x: Array, width: Array) -> jax.Array:
@@ -63,7 +62,7 @@ def smooth_ramp(x: Array, width: Array) -> jax.Array:
     """R_w(x), the integral of H_w from -infinity: max(x, 0) rounded off over +-width, C3.
 
     At 0: 5 width / 32, slope 1/2, curvature 15 / (16 width). At -infinity 0 with slope 0; at +infinity x with slope 1
-    (exactly, from +-width on). With H_w it makes a support force that has a potential: contact conserves energy.
+    (from +-width on, to rounding). With H_w it makes a support force that has a potential: contact conserves energy.
     """
     s = _scaled(x, width)
     q = s * s
@@ -135,7 +134,8 @@ class CoulombStribeck:
     @classmethod
     def of(cls, p: "CapsuleParameters") -> "CoulombStribeck":
         """The law with the capsule's mu, v_s and weight."""
-        return cls(mu=p.mu, N=(p.m1 + p.m2) * p.g, v_s=p.v_s)
+        mu, N, v_s = (jnp.asarray(leaf) for leaf in (p.mu, (p.m1 + p.m2) * p.g, p.v_s))
+        return cls(mu, N, v_s)
 
     def forward(self, speed: jax.Array) -> jax.Array:
         """F_s at ``speed``."""

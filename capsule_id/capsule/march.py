@@ -66,7 +66,8 @@ def _grown(speed: jax.Array, stretch: jax.Array, y: State) -> tuple[jax.Array, j
 def start(problem: Problem, times: jax.Array, y: State) -> Lanes:
     """Lanes at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
     t = times[:, 0]
-    speed, stretch = _grown(*(jnp.broadcast_to(floor, t.shape) for floor in problem.floors), y)
+    floors = [jnp.broadcast_to(floor, t.shape) for floor in problem.floors]
+    speed, stretch = _grown(floors[0], floors[1], y)
     finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(y), axis=0)
     status = jnp.where(finite & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
     zero = jnp.zeros(t.shape, jnp.int32)
@@ -165,7 +166,7 @@ def inside(rows: jax.Array, lanes: Lanes, times: jax.Array) -> jax.Array:
     return (times > rows[0, 0][:, None]) & (times <= lanes.t[:, None])
 
 
-def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:  # noqa: ANN401
+def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:
     """March all lanes from times[:, 0] to times[:, -1]; samples after a lane's failure are NaN. No derivatives."""
     problem, end = build(theta), times[:, -1]
     lanes = start(problem, times, y)

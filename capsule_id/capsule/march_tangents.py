@@ -25,12 +25,12 @@ Tangent = tuple[Any, State]  # of (theta, initial state)
 
 
 @jax.custom_jvp
-def _first_order_only(tree: Any) -> Any:  # noqa: ANN401
+def _first_order_only(tree: Any) -> Any:
     return tree
 
 
 @_first_order_only.defjvp
-def _refuse(_primals: tuple[Any], _tangents: tuple[Any]) -> Any:  # noqa: ANN401
+def _refuse(_primals: tuple[Any], _tangents: tuple[Any]) -> Any:
     raise NotImplementedError("the smoothed model has first derivatives only: take differences of jax.grad instead")
 
 
@@ -107,7 +107,7 @@ def differentiable_run(build: Build, max_steps: int) -> Callable[[Any, jax.Array
     """
 
     @jax.custom_jvp
-    def function(theta: Any, times: jax.Array, y: State) -> Record:  # noqa: ANN401
+    def function(theta: Any, times: jax.Array, y: State) -> Record:
         return run(build, theta, times, y, max_steps)
 
     @function.defjvp

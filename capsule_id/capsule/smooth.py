@@ -90,12 +90,12 @@ def eq2_field(theta: Theta, friction: Friction) -> Field:
 
 
 def _drive(e: Excitation, t: jax.Array) -> jax.Array:
-    return e.P_d * jnp.cos(e.Omega * t + e.phase)
+    return jnp.asarray(e.P_d) * jnp.cos(e.Omega * t + e.phase)
 
 
 def _rod_on_capsule(p: CapsuleParameters, widths: Smoothing, r: jax.Array, v: jax.Array) -> jax.Array:
-    contact = forces.support_smooth(p.k2, p.G, r, widths.penetration)
-    return jnp.asarray(forces.spring(p.k1, r) + forces.damper(p.c, v) + contact)
+    k1, c, k2, G = (jnp.asarray(leaf) for leaf in (p.k1, p.c, p.k2, p.G))
+    return forces.spring(k1, r) + forces.damper(c, v) + forces.support_smooth(k2, G, r, widths.penetration)
 
 
 def _valid(theta: Theta) -> jax.Array:
