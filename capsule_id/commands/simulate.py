@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         _check_suffix(args.figure, (".png",))
     values = _values(args)
     end, samples = _length(args, values["Omega"])
-    initial = tuple(_number(name, text) for name, text in zip(STATE, args.initial or ["0"] * 4, strict=True))
+    X1, Y1, X2, Y2 = (_number(name, text) for name, text in zip(STATE, args.initial or ["0"] * 4, strict=True))
     widths = {name: _number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "leave it out, or --model smooth")
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     section = _section(values["Omega"], end)
     times = np.union1d(grid, section)
     smoothing = Smoothing(**widths) if args.model == "smooth" else None
-    t = simulate(p, e, times, initial, model=args.model, semantics=args.semantics, smoothing=smoothing)
+    t = simulate(p, e, times, (X1, Y1, X2, Y2), model=args.model, semantics=args.semantics, smoothing=smoothing)
     status = Status(int(t.status))
     if not status.usable:
         raise InputError("the run must be complete", status.name, status_message(t.status))
