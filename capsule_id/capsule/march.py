@@ -113,12 +113,42 @@ def running(end: jax.Array, lanes: Lanes) -> jax.Array:
     return jnp.any((lanes.t < end) & (lanes.status == Status.OK))
 
 
-def segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, length: int) -> tuple[jax.Array, Lanes]:
+def segment(
+    build: Build,
+    theta: Any,
+    end: jax.Array,
+    lanes: Lanes,
+    max_steps: int,
+    length: int,
+) -> tuple[jax.Array, Lanes]:
     """Try up to ``length`` steps; the rows (t, X1, Y1, X2, Y2) on the way, and where the lanes then stand.
 
-    Rows: (length + 1, 5, L), infinite past the last step tried.
+    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of theta is (L,). Under ``jax.vmap`` the
+    new axis joins the lanes: batching the loop itself would copy all rows in every step.
     """
 
+    @jax.custom_batching.custom_vmap
+    def march(theta: Any, end: jax.Array, lanes: Lanes) -> tuple[jax.Array, Lanes]:
+        return _segment(build(theta), end, lanes, max_steps, length)
+
+    @march.def_vmap
+    def _(size: int, batched: Any, *inputs: Any) -> tuple[Any, Any]:
+        def join(leaf: jax.Array, has_axis: bool) -> jax.Array:
+            leaf = leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
+            leaf = jnp.moveaxis(leaf, 0, -2)
+            return leaf.reshape(*leaf.shape[:-2], -1)
+
+        def split(leaf: jax.Array) -> jax.Array:
+            return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], size, -1), -2, 0)
+
+        theta, end, lanes = jax.tree.map(join, inputs, tuple(batched))
+        result = jax.tree.map(split, segment(build, theta, end, lanes, max_steps, length))
+        return result, jax.tree.map(lambda _: True, result)
+
+    return march(theta, end, lanes)
+
+
+def _segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, length: int) -> tuple[jax.Array, Lanes]:
     def put(rows: jax.Array, i: jax.Array, lanes: Lanes) -> jax.Array:
         row = jnp.concatenate([lanes.t[None], lanes.y])
         return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
@@ -168,11 +198,11 @@ def inside(rows: jax.Array, lanes: Lanes, times: jax.Array) -> jax.Array:
 
 def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:
     """March all lanes from times[:, 0] to times[:, -1]; samples after a lane's failure are NaN. No derivatives."""
-    problem, end = build(theta), times[:, -1]
-    lanes = start(problem, times, y)
+    end = times[:, -1]
+    lanes = start(build(theta), times, y)
 
     def body(carry: tuple[Lanes, jax.Array]) -> tuple[Lanes, jax.Array]:
-        rows, lanes = segment(problem, end, carry[0], max_steps, SEGMENT)
+        rows, lanes = segment(build, theta, end, carry[0], max_steps, SEGMENT)
         return lanes, jnp.where(inside(rows, lanes, times), interpolate(rows[:, 0], rows[:, 1:], times), carry[1])
 
     nothing = jnp.full((4, *times.shape), jnp.nan)
@@ -181,16 +211,23 @@ def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) ->
     return Record(samples, lanes.closings, lanes.steps, lanes.status)
 
 
-def checkpoints(problem: Problem, times: jax.Array, y: State, max_steps: int, length: int) -> tuple[jax.Array, Lanes]:
+def checkpoints(
+    build: Build,
+    theta: Any,
+    times: jax.Array,
+    y: State,
+    max_steps: int,
+    length: int,
+) -> tuple[jax.Array, Lanes]:
     """The number of segments of a run, and the lanes at the start of each, (segments, L) each. No derivatives."""
     end = times[:, -1]
-    lanes = start(problem, times, y)
+    lanes = start(build(theta), times, y)
     store = jax.tree.map(lambda leaf: jnp.zeros((-(-max_steps // length), *leaf.shape), leaf.dtype), lanes)
 
     def body(carry: tuple[jax.Array, Lanes, Lanes]) -> tuple[jax.Array, Lanes, Lanes]:
         k, lanes, store = carry
         store = jax.tree.map(lambda rows, leaf: rows.at[k].set(leaf), store, lanes)
-        return k + 1, segment(problem, end, lanes, max_steps, length)[1], store
+        return k + 1, segment(build, theta, end, lanes, max_steps, length)[1], store
 
     count, _, store = jax.lax.while_loop(lambda c: running(end, c[1]), body, (jnp.int32(0), lanes, store))
     return count, store

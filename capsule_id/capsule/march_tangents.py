@@ -41,11 +41,11 @@ def _tangent_maps(
 ) -> tuple[Callable[[Tangent], jax.Array], Callable[[jax.Array], Tangent]]:
     """The linear map from tangents of (theta, initial state) to those of the samples (4, L, n), and its transpose."""
     theta, times, y = inputs
-    problem, end = build(theta), times[:, -1]
+    end = times[:, -1]
 
     def piece(begin: Lanes) -> tuple[Callable[[Any, State], tuple[State, jax.Array]], Lanes, jax.Array]:
         """The segment from ``begin`` as a function of (theta, state there), its end, and which samples it holds."""
-        rows, lanes = segment(problem, end, begin, max_steps, SEGMENT)
+        rows, lanes = segment(build, theta, end, begin, max_steps, SEGMENT)
         return lambda a, b: replay(build(a), b, rows[:, 0], times), lanes, inside(rows, lanes, times)
 
     def forward(tangent: Tangent) -> jax.Array:
@@ -56,11 +56,11 @@ def _tangent_maps(
             return after, d_y, jnp.where(held, d_samples, out)
 
         first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(tangent[1])
-        carry = (start(problem, times, y), tangent[1], first)
+        carry = (start(build(theta), times, y), tangent[1], first)
         return jax.lax.while_loop(lambda c: running(end, c[0]), body, carry)[2]
 
     def backward(cotangent: jax.Array) -> Tangent:
-        count, store = checkpoints(problem, times, y, max_steps, SEGMENT)
+        count, store = checkpoints(build, theta, times, y, max_steps, SEGMENT)
 
         def body(carry: tuple[jax.Array, Any, State]) -> tuple[jax.Array, Any, State]:
             k, c_theta, c_y = carry

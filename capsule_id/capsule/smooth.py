@@ -134,11 +134,13 @@ def _compiled(semantics: Semantics, max_steps: int, friction: Friction) -> Calla
     def lanes(
         smoothing: Smoothing, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial
     ) -> Trajectory:
-        floats = jax.tree.map(partial(jnp.asarray, dtype=float), ((p, e, smoothing), times, jnp.stack(initial)))
-        record = march(*floats)
+        shape = times.shape[:1]
+        theta = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), shape), (p, e, smoothing))
+        times = jnp.asarray(times, float)
+        record = march(theta, times, jnp.stack(initial))
         X1, Y1, X2, Y2 = record.samples
         none = jnp.zeros_like(record.steps)
-        return Trajectory(floats[1], X1, Y1, X2, Y2, record.closings, record.status, record.steps, none)
+        return Trajectory(times, X1, Y1, X2, Y2, record.closings, record.status, record.steps, none)
 
     return lanes
 
