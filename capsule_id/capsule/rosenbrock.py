@@ -31,13 +31,9 @@ def derivative(field: Field, t: jax.Array, y: State) -> State:
 def _stage_solver(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[Callable[[State], State], State]:
     """Solver of (1 / (gamma h) - J) u = b with the exact Jacobian J at (t, y), and the partial derivative in time."""
     at = (t, y[0] - y[2], y[1], y[3])
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-
-    def column(k: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return jax.jvp(field, at, tuple(one if i == k else zero for i in range(4)))[1]
-
-    a_t, q_t, b_t = column(0)
-    (a_r, q_r, b_r), (a_1, q_1, b_1), (a_2, q_2, b_2) = column(1), column(2), column(3)
+    directions = tuple(jnp.broadcast_to(row[:, None], (4, *t.shape)) for row in jnp.eye(4))
+    a, q, b = jax.vmap(lambda *d: jax.jvp(field, at, d)[1])(*directions)
+    (a_t, a_r, a_1, a_2), (q_t, q_r, q_1, q_2), (b_t, b_r, b_1, b_2) = a, q, b
     d = 1.0 / (_GAMMA * h)
     # u_r = u_X1 - u_X2 from its own row, then two equations for (u_Y1, u_Y2).
     r_inverse = 1.0 / (d + q_r)
@@ -53,7 +49,7 @@ def _stage_solver(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[C
         r = r_0 + r_1 * u1 + r_2 * u2
         return jnp.stack([(b[0] + u1) / d, u1, (b[2] + q_r * r + q_1 * u1 + q_2 * u2) / d, u2])
 
-    return solve, jnp.stack([zero, a_t, q_t, b_t])
+    return solve, jnp.stack([jnp.zeros_like(t), a_t, q_t, b_t])
 
 
 def step(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[State, State]:
