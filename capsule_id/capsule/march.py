@@ -166,11 +166,12 @@ def _segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, len
     return rows, lanes
 
 
-def _interpolate(t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
-    """States (4, n) of one lane at ``times`` (n,), from rows t (N,) and y (N, 4), where t[0] < times <= last finite t.
+def _interpolate(t: jax.Array, y: jax.Array, V2: jax.Array, times: jax.Array) -> jax.Array:
+    """States (4, n) of one lane at ``times`` (n,), from rows t (N,), y (N, 4) and X2' (N,), inside the finite rows.
 
-    Positions: the cubic through both ends with their velocities; velocities: its derivative. That needs no
-    acceleration, which in the stiff phases of rest would be far larger than what the step has used.
+    Positions: the cubic through both ends with their rates; velocities: its derivative. That needs no acceleration,
+    which in the stiff phases of rest would be far larger than what the step has used. Where X2' is not Y2 (the gate
+    of eq. (2)), their difference is interpolated linearly.
     """
     right = jnp.clip(jnp.searchsorted(t, times, side="left"), 1, t.shape[0] - 1)
     left = right - 1
@@ -180,15 +181,20 @@ def _interpolate(t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
     w, v0, v1 = s * s * (3.0 - 2.0 * s), s * (1.0 - s) ** 2, s * s * (s - 1.0)
     d, e0, e1 = 6.0 * s * (1.0 - s) / h, (1.0 - s) * (1.0 - 3.0 * s), s * (3.0 * s - 2.0)
 
-    def pair(X: jax.Array, Y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        X0, Y0, Y1, rise = X[left], Y[left], Y[right], X[right] - X[left]
-        return X0 + w * rise + h * (v0 * Y0 + v1 * Y1), d * rise + e0 * Y0 + e1 * Y1
+    def pair(X: jax.Array, V: jax.Array) -> tuple[jax.Array, jax.Array]:
+        X0, V0, V1, rise = X[left], V[left], V[right], X[right] - X[left]
+        return X0 + w * rise + h * (v0 * V0 + v1 * V1), d * rise + e0 * V0 + e1 * V1
 
-    return jnp.stack([*pair(y[:, 0], y[:, 1]), *pair(y[:, 2], y[:, 3])])
+    idle = y[:, 3] - V2
+    X2, moving = pair(y[:, 2], V2)
+    return jnp.stack([*pair(y[:, 0], y[:, 1]), X2, moving + (1.0 - s) * idle[left] + s * idle[right]])
 
 
-# Lanes stand last in rows, first in times: rows are written by lane, times are searched by lane.
-interpolate = jax.vmap(_interpolate, in_axes=(1, 2, 0), out_axes=1)
+def interpolate(field: Field, t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
+    """States (4, L, n) at ``times`` (L, n), from rows t (N, L) and y (N, 4, L) of a march through ``field``."""
+    V2 = field(t, y[:, 0] - y[:, 2], y[:, 1], y[:, 3])[1]
+    # Lanes stand last in rows, first in times: rows are written by lane, times are searched by lane.
+    return jax.vmap(_interpolate, in_axes=(1, 2, 1, 0), out_axes=1)(t, y, V2, times)
 
 
 def inside(rows: jax.Array, lanes: Lanes, times: jax.Array) -> jax.Array:
@@ -199,11 +205,14 @@ def inside(rows: jax.Array, lanes: Lanes, times: jax.Array) -> jax.Array:
 def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:
     """March all lanes from times[:, 0] to times[:, -1]; samples after a lane's failure are NaN. No derivatives."""
     end = times[:, -1]
-    lanes = start(build(theta), times, y)
+    problem = build(theta)
+    lanes = start(problem, times, y)
 
     def body(carry: tuple[Lanes, jax.Array]) -> tuple[Lanes, jax.Array]:
         rows, lanes = segment(build, theta, end, carry[0], max_steps, SEGMENT)
-        return lanes, jnp.where(inside(rows, lanes, times), interpolate(rows[:, 0], rows[:, 1:], times), carry[1])
+        return lanes, jnp.where(
+            inside(rows, lanes, times), interpolate(problem.field, rows[:, 0], rows[:, 1:], times), carry[1]
+        )
 
     nothing = jnp.full((4, *times.shape), jnp.nan)
     samples = nothing.at[:, :, 0].set(jnp.where(lanes.status == Status.OK, y, jnp.nan))
@@ -248,4 +257,4 @@ def replay(problem: Problem, y: State, t: jax.Array, times: jax.Array) -> tuple[
 
     spans = (jnp.where(jnp.isfinite(t[:-1]), t[:-1], 0.0), jnp.diff(t, axis=0))
     y_end, ends = jax.lax.scan(one, y, spans)
-    return y_end, interpolate(t, jnp.concatenate([y[None], ends]), times)
+    return y_end, interpolate(problem.field, t, jnp.concatenate([y[None], ends]), times)
