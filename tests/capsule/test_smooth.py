@@ -79,8 +79,8 @@ def test_switch_in_velocity_alone_turns_the_capsule_round(cases: Cases, monkeypa
     smooth._compiled.cache_clear()
     truth = cases.states[[c["name"] for c in cases.raw].index("fig6_k2_20"), -1, 2]
     assert truth > 5e-4
-    # The creep of F_s tanh(Y2 / velocity) carries the capsule backward, further than it should go forward.
-    assert float(tanh.X2[-1]) < -2.0 * truth
+    # The creep of F_s tanh(Y2 / velocity) carries the capsule backward, further than it goes forward in truth.
+    assert float(tanh.X2[-1]) < -truth
     assert abs(float(ours.X2[-1]) - truth) < 0.2 * abs(float(tanh.X2[-1]) - truth)
 
 
