@@ -71,7 +71,9 @@ def _tangent_maps(
 
         none = jax.tree.map(jnp.zeros_like, (theta, y))
         _, c_theta, c_y = jax.lax.while_loop(lambda c: c[0] > 0, body, (count, *none))
-        return c_theta, c_y + cotangent[:, :, 0]
+        # A lane that has failed has NaN cotangents at samples that no segment holds.
+        poison = jnp.where(jnp.any(jnp.isnan(cotangent), axis=(0, 2)), jnp.nan, 0.0)
+        return jax.tree.map(lambda leaf: leaf + poison, (c_theta, c_y + cotangent[:, :, 0]))
 
     return forward, backward
 
