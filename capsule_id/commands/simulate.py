@@ -33,6 +33,7 @@ EXCITATION: dict[str, tuple[float | None, str, str]] = {
     "phase": (0.0, "rad", "phase of the drive"),
 }
 WIDTHS = {"velocity": "m/s", "penetration": "m", "rounding": "fraction of the break-away force", "tolerance": "1"}
+PICTURE_SAMPLES = 20_000
 STATE = {"X1": "m", "Y1": "m/s", "X2": "m", "Y2": "m/s"}
 
 # Compiles the engines' loops as one function each, several times faster for a single run (internal to XLA's CPU part).
@@ -93,7 +94,9 @@ def run(args: argparse.Namespace) -> int:
     e = Excitation(**{name: values[name] for name in EXCITATION})
     grid = np.linspace(0.0, end, samples)
     section = _section(values["Omega"], end)
-    times = np.union1d(grid, section)
+    # Impacts are short: a picture needs more samples than a table may want.
+    drawn = np.linspace(0.0, end, PICTURE_SAMPLES) if args.figure is not None else section
+    times = np.union1d(np.union1d(grid, section), drawn)
     smoothing = Smoothing(**widths) if args.model == "smooth" else None
     t = simulate(p, e, times, (X1, Y1, X2, Y2), model=args.model, semantics=args.semantics, smoothing=smoothing)
     status = Status(int(t.status))
@@ -106,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         write_motion(args.out, columns, values | {"model": args.model, "semantics": args.semantics})
         if args.figure is not None:
-            _draw(args.figure, t, (held, np.isin(times, section)), values["G"])
+            _draw(args.figure, t, np.isin(times, section), values["G"])
     except OSError as error:
         raise InputError("the output must be writable", str(error), "choose another name") from None
     print(f"wrote {args.out}: {samples} samples of {end:g} s, {int(t.contacts)} contacts, {int(t.events)} events")
@@ -183,17 +186,15 @@ def _section(Omega: float, end: float) -> "np.ndarray":
     return T * np.arange(np.floor(end / T) + 1.0)
 
 
-def _draw(path: Path, t: "Trajectory", parts: tuple["np.ndarray", "np.ndarray"], G: float) -> None:
-    """Time histories and phase plane; parts: which samples are the table's, and which are the section's."""
+def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
+    """Time histories and phase plane; section: which samples stand at the drive's phase."""
     import numpy as np
 
     from capsule_id.report.figures_capsule import MotionView, motion
     from capsule_id.report.style import png
 
-    held, section = parts
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
-    times, X2 = np.asarray(t.times)[held], np.asarray(t.X2)[held]
-    view = MotionView(times, x_rel[held], X2, rate[held], x_rel[section], rate[section], G)
+    view = MotionView(np.asarray(t.times), x_rel, np.asarray(t.X2), rate, x_rel[section], rate[section], G)
     path.write_bytes(png(motion(view)))
 
 
