@@ -1,6 +1,6 @@
 """Dense output: the steps' polynomials are kept in rows, and samples are read off them window by window.
 
-rows (K, WIDTH, L): per step t0, h, d, X2 at its start and the series of w and v; starts (K, L): t0 again, inf where a
+rows (K, WIDTH, L): per step t0, h, r, X2 at its start and the series of w and v; starts (K, L): t0 again, inf where a
 lane took no step. Each lane has its own pointer to its next sample, since lanes advance at their own pace.
 """
 
@@ -35,19 +35,19 @@ def samples_at(times: jax.Array, initial: tuple[jax.Array, ...], valid: jax.Arra
 
 def row_of(state: State, motion: Motion) -> jax.Array:
     """(WIDTH, L): the step's polynomial."""
-    return jnp.stack([state.t, motion.h, state.d, state.X2, *motion.w, *motion.v])
+    return jnp.stack([state.t, motion.h, state.r, state.X2, *motion.w, *motion.v])
 
 
-def values_of(row: jax.Array, t: jax.Array, G: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+def values_of(row: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """(X1, Y1, X2, Y2) at t from rows (WIDTH, ...)."""
     w, v = list(row[4 : 5 + ORDER]), list(row[5 + ORDER :])
     s = (t - row[0]) / row[1]
-    d, X2 = row[2] + (t - row[0]) * mean(w, s), row[3] + (t - row[0]) * mean(v, s)
+    r, X2 = row[2] + (t - row[0]) * mean(w, s), row[3] + (t - row[0]) * mean(v, s)
     Y2 = horner(v, s)
-    return X2 + d + G, horner(w, s) + Y2, X2, Y2
+    return X2 + r, horner(w, s) + Y2, X2, Y2
 
 
-def read_off(samples: Samples, rows: jax.Array, starts: jax.Array, reached: jax.Array, G: jax.Array) -> Samples:
+def read_off(samples: Samples, rows: jax.Array, starts: jax.Array, reached: jax.Array) -> Samples:
     """Take every sample up to ``reached`` (L,) off the rows."""
     starts, reached = jax.lax.stop_gradient((starts, reached))
     lane = jnp.arange(reached.shape[0])[:, None]
@@ -66,7 +66,7 @@ def read_off(samples: Samples, rows: jax.Array, starts: jax.Array, reached: jax.
         covered = t <= reached[:, None]
         index = jnp.sum(starts[:, :, None] <= jax.lax.stop_gradient(t)[None], axis=0) - 1
         row = rows[jnp.maximum(index, 0), :, lane]
-        taken = jnp.stack(values_of(jnp.moveaxis(row, -1, 0), jnp.where(covered, t, 0.0), G[:, None]), axis=1)
+        taken = jnp.stack(values_of(jnp.moveaxis(row, -1, 0), jnp.where(covered, t, 0.0)), axis=1)
         taken = jnp.where(covered[:, None, :], taken, jnp.nan)
         return write(values, taken, at), at + jnp.sum(covered, axis=1, dtype=jnp.int32)
 

@@ -19,16 +19,27 @@ LEAP_TOLERANCE = 1e-9
 SURE_LEAP, SURE_AGREEMENT = 1e-3, 1e-4
 # Leaps on one step. Where they do not suffice (a root closely missed) the step ends early, with nothing lost.
 MAX_LEAPS = 100
-# An event is met at a fraction of the step no smaller than this, so that time always goes on.
-SMALLEST_FRACTION = 1e-13
+# An event is met at a fraction of the step no smaller than this, so that time always goes on; ``met`` steps back.
+SMALLEST_FRACTION = 1e-9
+# Coefficients of an event function below this part of its size are rounding, where only their sign would matter.
+ROUNDING_NOISE = 1e-14
 # |f| within this many roundings of F_b counts as at the threshold; the rate of |f| then decides.
 THRESHOLD_ROUNDINGS = 16.0
 
 
 def _divided(p: Series) -> Series:
-    """p/s where p(0) = 0 exactly, as right after an event of that kind: removes the root that was just met."""
-    zero = p[0] == 0.0
-    return [jnp.where(zero, high, low) for low, high in zip(p, [*p[1:], jnp.zeros_like(p[0])], strict=True)]
+    """p over that power of s which removes the root at s = 0, where p(0) = 0 exactly, as right after an event.
+
+    There the next coefficients, if they are mere rounding, are taken as 0 too: at an onset of slip the first rate is.
+    """
+    noise, zero = ROUNDING_NOISE * size(p), jnp.zeros_like(p[0])
+    once = p[0] == 0.0
+    twice = once & (jnp.abs(p[1]) <= noise)
+    thrice = twice & (jnp.abs(p[2]) <= noise)
+    q = [*p, zero, zero, zero]
+    return [
+        jnp.where(thrice, q[k + 3], jnp.where(twice, q[k + 2], jnp.where(once, q[k + 1], q[k]))) for k in range(len(p))
+    ]
 
 
 class _Watched(NamedTuple):
@@ -119,7 +130,7 @@ def motion_at(rig: Rig, state: State, contact: jax.Array, onset: jax.Array) -> j
     onset : (L,) bool, the state is at the threshold |f| = F_b of a capsule at rest whatever rounding says
     """
     F_b, k2 = rig.F_b, jnp.where(contact, rig.k2, 0.0)
-    spring, damper, support = rig.k1 * (state.d + rig.G), rig.c * state.w, k2 * state.d
+    spring, damper, support = rig.k1 * state.r, rig.c * state.w, k2 * state.d
     f = spring + damper + support
     f_rate = (rig.k1 + k2) * state.w + rig.c * (rig.P_d * state.C - f) / rig.m1
     tolerance = (
@@ -138,7 +149,7 @@ def mode_at(rig: Rig, state: State) -> Mode:
     """The mode that any state begins in: signs of d, v and, where they are 0, of their first rate that is not."""
     meeting = (state.d > 0.0) | ((state.d == 0.0) & (state.w > 0.0))
     sigma = motion_at(rig, state, meeting, jnp.zeros(state.d.shape, bool))
-    f = rig.k1 * (state.d + rig.G) + rig.c * state.w
+    f = rig.k1 * state.r + rig.c * state.w
     w_rate = (rig.P_d * state.C - f) / rig.m1 - jnp.where(sigma != 0.0, (f - sigma * rig.F_b) / rig.m2, 0.0)
     touching = (state.d == 0.0) & (state.w == 0.0) & (w_rate > 0.0)
     return Mode(meeting | touching, sigma)

@@ -31,6 +31,7 @@ from capsule_id.capsule.taylor import (
     rig_of,
     series,
     size,
+    spring_force,
     trusted,
 )
 from capsule_id.precision import require_float64
@@ -66,7 +67,7 @@ def met(rig: Rig, mode: Mode, motion: Motion, s: jax.Array, at: State, kind: jax
     s, at : the located time and the state there, in the mode before the event
     """
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
-    f = rig.k1 * rig.G + stiffness * at.d + rig.c * at.w
+    f = spring_force(rig, at, mode.contact)
     a2 = jnp.where(mode.sigma != 0.0, (f - friction(rig, mode.sigma, at.v)[0]) / rig.m2, 0.0)
     w_rate = (rig.P_d * at.C - f) / rig.m1 - a2
     f_rate = stiffness * at.w + rig.c * w_rate
@@ -81,6 +82,7 @@ def met(rig: Rig, mode: Mode, motion: Motion, s: jax.Array, at: State, kind: jax
     dt = -g / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
     return State(
         at.t + dt,
+        at.r + before.w * dt,
         jnp.where(kind == GAP, 0.0, at.d + before.w * dt),
         at.w + w_rate * dt,
         at.X2 + before.v * dt,
@@ -129,7 +131,7 @@ def start(rig: Rig, t: jax.Array, t_end: jax.Array, initial: Initial) -> Lanes:
     d = (X1 - X2) - rig.G
     rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2) + rig.G)
     d = jnp.where(jnp.abs(d) <= rounding, d - stop_gradient(d), d)
-    state = State(t, d, Y1 - Y2, X2, Y2, *cos_sin(rig.Omega * t + rig.phase))
+    state = State(t, X1 - X2, d, Y1 - Y2, X2, Y2, *cos_sin(rig.Omega * t + rig.phase))
     given = jnp.stack([*rig, *state, t_end])
     positive = (rig.m1 > 0.0) & (rig.m2 > 0.0) & (rig.v_s > 0.0)
     not_negative = jnp.all(jnp.stack([rig.k1, rig.k2, rig.c, rig.F_b, rig.G]) >= 0.0, axis=0)
@@ -171,7 +173,7 @@ def run(
 
     def stretch(carry: tuple[Lanes, Samples]) -> tuple[Lanes, Samples]:
         lanes, rows, starts = march(rig, t_end, max_steps, carry[0], ROWS)
-        return lanes, read_off(carry[1], rows, starts, lanes.state.t, rig.G)
+        return lanes, read_off(carry[1], rows, starts, lanes.state.t)
 
     lanes, samples = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
     X1, Y1, X2, Y2 = (samples.values[:, i, :n] for i in range(4))
