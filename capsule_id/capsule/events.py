@@ -32,10 +32,10 @@ def _divided(p: Series) -> Series:
 
     There the next coefficients, if they are mere rounding, are taken as 0 too: at an onset of slip the first rate is.
     """
-    noise, zero = ROUNDING_NOISE * size(p), jnp.zeros_like(p[0])
+    scale, zero = size(p) + jnp.finfo(float).tiny, jnp.zeros_like(p[0])
     once = p[0] == 0.0
-    twice = once & (jnp.abs(p[1]) <= noise)
-    thrice = twice & (jnp.abs(p[2]) <= noise)
+    twice = once & (jnp.abs(p[1]) / scale <= ROUNDING_NOISE)
+    thrice = twice & (jnp.abs(p[2]) / scale <= ROUNDING_NOISE)
     q = [*p, zero, zero, zero]
     return [
         jnp.where(thrice, q[k + 3], jnp.where(twice, q[k + 2], jnp.where(once, q[k + 1], q[k]))) for k in range(len(p))
