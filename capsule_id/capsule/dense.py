@@ -47,11 +47,24 @@ def values_of(row: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     return X2 + r, horner(w, s) + Y2, X2, Y2
 
 
+def _row_at(starts: jax.Array, t: jax.Array) -> jax.Array:
+    """(L, WINDOW) int32: the last row that starts at or before t (L, WINDOW), by bisection in starts (K, L)."""
+    lane = jnp.arange(t.shape[0])[:, None]
+    length = starts.shape[0]
+
+    def halve(i: jax.Array, index: jax.Array) -> jax.Array:
+        probe = index + (1 << (length - 1).bit_length()) // (2 << i)
+        return jnp.where((probe < length) & (starts[jnp.minimum(probe, length - 1), lane] <= t), probe, index)
+
+    return jax.lax.fori_loop(0, (length - 1).bit_length(), halve, jnp.zeros(t.shape, jnp.int32))
+
+
 def read_off(samples: Samples, rows: jax.Array, starts: jax.Array, reached: jax.Array) -> Samples:
     """Take every sample up to ``reached`` (L,) off the rows."""
     starts, reached = jax.lax.stop_gradient((starts, reached))
-    lane = jnp.arange(reached.shape[0])[:, None]
-    length = samples.times.shape[1]
+    L, length = samples.times.shape
+    # A row's coefficients side by side: read one lane at a time they would each cost a line of the cache.
+    table = jnp.reshape(jnp.swapaxes(rows, 1, 2), (-1, WIDTH))
     slice_times = jax.vmap(lambda row, at: jax.lax.dynamic_slice(row, (at,), (WINDOW,)))
     write = jax.vmap(lambda out, x, at: jax.lax.dynamic_update_slice(out, x, (jnp.int32(0), at)))
 
@@ -64,8 +77,7 @@ def read_off(samples: Samples, rows: jax.Array, starts: jax.Array, reached: jax.
         values, at = carry
         t = slice_times(samples.times, at)
         covered = t <= reached[:, None]
-        index = jnp.sum(starts[:, :, None] <= jax.lax.stop_gradient(t)[None], axis=0) - 1
-        row = rows[jnp.maximum(index, 0), :, lane]
+        row = table[_row_at(starts, jax.lax.stop_gradient(t)) * L + jnp.arange(L, dtype=jnp.int32)[:, None]]
         taken = jnp.stack(values_of(jnp.moveaxis(row, -1, 0), jnp.where(covered, t, 0.0)), axis=1)
         taken = jnp.where(covered[:, None, :], taken, jnp.nan)
         return write(values, taken, at), at + jnp.sum(covered, axis=1, dtype=jnp.int32)
