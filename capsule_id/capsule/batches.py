@@ -37,14 +37,23 @@ def lanes_of(tree: object, times: ArrayLike) -> tuple[Lanes, bool]:
     Raises
     ------
     InputError
-        A leaf or ``times`` of another shape, batch axes of different lengths, concrete times that do not increase.
+        A leaf or ``times`` of another shape, batch axes of different lengths, concrete times that do not increase or
+        are not finite, values traced in single precision.
     """
     xp = jnp if is_traced((tree, times)) else np
     leaves, structure = jax.tree.flatten(tree)
+    if any(is_traced(leaf) and leaf.dtype == jnp.float32 for leaf in (*leaves, times)):
+        raise InputError(
+            "traced values must be float64",
+            "float32",
+            "import capsule_id.capsule.model, or set jax_enable_x64, before the first jax.jit",
+        )
     leaves = [xp.asarray(leaf, float) for leaf in leaves]
     grid = xp.asarray(times, float)
     if grid.ndim not in (1, 2) or grid.shape[-1] == 0:
         raise InputError("times must have shape (n,) or (batch, n)", str(grid.shape), "give at least one time")
+    if xp is np and not bool(np.isfinite(grid).all()):
+        raise InputError("times must be finite", "an infinite or undefined time", "leave it out")
     if xp is np and not bool(np.all(np.diff(grid, axis=-1) > 0.0)):
         raise InputError("times must increase", "found a step that is not positive", "sort them, drop repeated ones")
     if any(leaf.ndim > 1 for leaf in leaves):

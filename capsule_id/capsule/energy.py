@@ -74,7 +74,7 @@ def energy_balance(
     half = 0.5 * (np.concatenate([begins[1:], times[None, :, 1]]) - begins)
     node, weight = np.polynomial.legendre.leggauss(NODES)
     t = begins[..., None] + half[..., None] * (1.0 + node)
-    _, Y1, _, Y2 = (np.asarray(x) for x in values_of(rows[..., None], t, np.asarray(p.G)[:, None]))
+    _, Y1, _, Y2 = (np.asarray(x) for x in values_of(rows[..., None], t))
     column = CapsuleParameters(*(np.asarray(x)[:, None] for x in vars(p).values()))
 
     def total(power: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ def energy_balance(
     damper = total(column.c * (Y1 - Y2) ** 2)
     friction = total(0.5 * F_b * (1.0 + np.exp(-np.abs(Y2) / column.v_s)) * np.abs(Y2))
     last = rows[:, np.maximum(taken.sum(axis=0) - 1, 0), np.arange(len(status))]
-    end = values_of(last, times[:, 1], np.asarray(p.G))
+    end = values_of(last, times[:, 1])
     change = _stored(p, *(np.asarray(x) for x in end)) - _stored(p, *(np.asarray(x) for x in initial))
     fields = (drive, damper, friction, change, status)
     return EnergyBalance(*(fields if batched else (x[0] for x in fields)))

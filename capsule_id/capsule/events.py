@@ -4,44 +4,66 @@ In a mode three functions must stay >= 0: the gap's (d in contact, -d out of it)
 mode's direction, or, while stuck, F_b - f and F_b + f. All are linear in the state, so they are polynomials in s.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
-from capsule_id.capsule.taylor import Mode, Motion, Rig, Series, State
+from capsule_id.capsule.taylor import Mode, Motion, Rig, Series, State, horner, size
 
 # Kinds of events.
 NONE, GAP, VELOCITY, UPPER, LOWER = 0, 1, 2, 3, 4
-# The march ends when its next leap is this small a part of the step; it converges quadratically, so the root is exact.
+# The march arrives when its next leap is this small a part of the step, or, at a root that is crossed at a definite
+# rate, when a leap below SURE_LEAP agrees with Newton's to SURE_AGREEMENT: the correction in ``met`` does the rest.
 LEAP_TOLERANCE = 1e-9
+SURE_LEAP, SURE_AGREEMENT = 1e-3, 1e-4
 # Leaps on one step. Where they do not suffice (a root closely missed) the step ends early, with nothing lost.
 MAX_LEAPS = 100
-# An event is met at a fraction of the step no smaller than this, so that time always goes on.
-SMALLEST_FRACTION = 1e-13
+# An event is met at a fraction of the step no smaller than this, so that time always goes on; ``met`` steps back.
+SMALLEST_FRACTION = 1e-9
+# Coefficients of an event function below this part of its size are rounding, where only their sign would matter.
+ROUNDING_NOISE = 1e-14
 # |f| within this many roundings of F_b counts as at the threshold; the rate of |f| then decides.
 THRESHOLD_ROUNDINGS = 16.0
 
 
 def _divided(p: Series) -> Series:
-    """p/s where p(0) = 0 exactly, as right after an event of that kind: removes the root that was just met."""
-    zero = p[0] == 0.0
-    return [jnp.where(zero, high, low) for low, high in zip(p, [*p[1:], jnp.zeros_like(p[0])], strict=True)]
+    """p over that power of s which removes the root at s = 0, where p(0) = 0 exactly, as right after an event.
+
+    There the next coefficients, if they are mere rounding, are taken as 0 too: at an onset of slip the first rate is.
+    """
+    scale, zero = size(p) + jnp.finfo(float).tiny, jnp.zeros_like(p[0])
+    once = p[0] == 0.0
+    twice = once & (jnp.abs(p[1]) / scale <= ROUNDING_NOISE)
+    thrice = twice & (jnp.abs(p[2]) / scale <= ROUNDING_NOISE)
+    q = [*p, zero, zero, zero]
+    return [
+        jnp.where(thrice, q[k + 3], jnp.where(twice, q[k + 2], jnp.where(once, q[k + 1], q[k]))) for k in range(len(p))
+    ]
 
 
-def _bend(p: Series, s: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(p_2, R) with p_2 - R <= p''/2 <= p_2 + R on 0..s."""
-    power, rest = s, jnp.zeros_like(s)
+class _Watched(NamedTuple):
+    """An event function p, scaled to size 1, and its bend: p(0) + p'(0) s - bend s^2 <= p(s), anywhere on the step."""
+
+    value: Series
+    slope: Series
+    scale: jax.Array
+    p2: jax.Array
+    rest: jax.Array
+
+    def at(self, s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(p, p') at s; the divisions keep XLA from evaluating them once per use."""
+        return horner(self.value, s) / self.scale, horner(self.slope, s) / self.scale
+
+
+def _watched(p: Series, level: jax.Array, s_end: jax.Array) -> _Watched:
+    """p with p_2 - rest <= p''/2 <= p_2 + rest on 0..s_end; level is a constant that p is compared with."""
+    power, rest = s_end, jnp.zeros_like(s_end)
     for k in range(3, len(p)):
         rest = rest + (0.5 * k * (k - 1)) * jnp.abs(p[k]) * power
-        power = power * s
-    return p[2], rest
-
-
-def _value_and_slope(p: Series, s: jax.Array) -> tuple[jax.Array, jax.Array]:
-    value, slope = p[-1], jnp.zeros_like(s)
-    for x in reversed(p[:-1]):
-        slope = slope * s + value
-        value = value * s + x
-    return value, slope
+        power = power * s_end
+    scale = level + size(p) + jnp.finfo(float).tiny
+    return _Watched(p, [k * x for k, x in enumerate(p)][1:], scale, p[2] / scale, rest / scale)
 
 
 def _leap(p0: jax.Array, p1: jax.Array, bend: jax.Array) -> jax.Array:
@@ -54,6 +76,11 @@ def _leap(p0: jax.Array, p1: jax.Array, bend: jax.Array) -> jax.Array:
     return jnp.where(jnp.where(falling, root2 >= 0.0, bend > 0.0), tau, jnp.inf)
 
 
+def _sure(p0: jax.Array, p1: jax.Array, tau: jax.Array) -> jax.Array:
+    """Whether the leap tau differs so little from Newton's that the root is certain and simple."""
+    return jnp.abs(p0 + p1 * tau) <= SURE_AGREEMENT * p0
+
+
 def first_event(
     rig: Rig, mode: Mode, motion: Motion, s_end: jax.Array, active: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -63,63 +90,66 @@ def first_event(
     step, so no root can be passed, double ones included.
     """
     sliding = mode.sigma != 0.0
-    gap = _divided([jnp.where(mode.contact, x, -x) for x in motion.d])
+    level = jnp.where(sliding, 0.0, rig.F_b)
+    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in motion.d]), jnp.zeros_like(level), s_end)
     speed = _divided([mode.sigma * x for x in motion.v])
-    other = [jnp.where(sliding, a, b) for a, b in zip(speed, motion.f, strict=True)]
-    gap_bend2, gap_rest = _bend(gap, s_end)
-    bend2, rest = _bend(other, s_end)
-
-    def look(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        g0, g1 = _value_and_slope(gap, s)
-        p0, p1 = _value_and_slope(other, s)
-        to_gap = _leap(g0, g1, gap_rest - gap_bend2)
-        level, sign = jnp.where(sliding, 0.0, rig.F_b), jnp.where(sliding, 1.0, -1.0)
-        to_upper = _leap(level + sign * p0, sign * p1, rest - sign * bend2)
-        to_lower = jnp.where(sliding, jnp.inf, _leap(rig.F_b + p0, p1, rest - bend2))
-        to_motion = jnp.minimum(to_upper, to_lower)
-        motion_kind = jnp.where(sliding, VELOCITY, jnp.where(to_upper <= to_lower, UPPER, LOWER))
-        return jnp.minimum(to_gap, to_motion), jnp.where(to_gap <= to_motion, GAP, motion_kind)
-
-    def more(carry: tuple[jax.Array, ...]) -> jax.Array:
-        _, _, going, leaps = carry
-        return jnp.any(going) & (leaps < MAX_LEAPS)
+    # While stuck F_b - f and F_b + f, while sliding sigma Y2, written as level + sign * p.
+    other = _watched([jnp.where(sliding, a, -b) for a, b in zip(speed, motion.f, strict=True)], level, s_end)
+    base = level / other.scale
 
     def leap(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         s, kind, going, leaps = carry
-        tau, which = look(s)
-        arrived = tau <= LEAP_TOLERANCE * s_end
-        onward = s + tau
-        beyond = ~(onward < s_end)
+        g0, g1 = gap.at(s)
+        p0, p1 = other.at(s)
+        to_gap = _leap(g0, g1, gap.rest - gap.p2)
+        to_upper = _leap(base + p0, p1, other.rest - other.p2)
+        to_lower = jnp.where(sliding, jnp.inf, _leap(base - p0, -p1, other.rest + other.p2))
+        to_motion = jnp.minimum(to_upper, to_lower)
+        tau = jnp.minimum(to_gap, to_motion)
+        is_gap, sign = to_gap <= to_motion, jnp.where(to_upper <= to_lower, 1.0, -1.0)
+        sure = jnp.where(is_gap, _sure(g0, g1, tau), _sure(base + sign * p0, sign * p1, tau))
+        arrived = tau <= jnp.where(sure, SURE_LEAP, LEAP_TOLERANCE) * s_end
+        which = jnp.where(is_gap, GAP, jnp.where(sliding, VELOCITY, jnp.where(sign > 0.0, UPPER, LOWER)))
         kind = jnp.where(going & arrived, which, kind)
-        s = jnp.where(going, jnp.minimum(onward, s_end), s)
-        return s, kind, going & ~arrived & ~beyond, leaps + 1
+        onward = s + tau
+        return (
+            jnp.where(going, jnp.minimum(onward, s_end), s),
+            kind,
+            going & ~arrived & (onward < s_end),
+            leaps + 1,
+        )
 
     start = (jnp.zeros_like(s_end), jnp.zeros(s_end.shape, jnp.int32), active, jnp.int32(0))
-    s, kind, _, _ = jax.lax.while_loop(more, leap, start)
+    s, kind, _, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[2]) & (carry[3] < MAX_LEAPS), leap, start)
     return jnp.clip(s, SMALLEST_FRACTION * s_end, s_end), kind
 
 
-def mode_at(rig: Rig, state: State, onset: jax.Array) -> Mode:
-    """The mode that follows from a state: signs of d, v and, where they are 0, of their first rate that is not.
+def motion_at(rig: Rig, state: State, contact: jax.Array, onset: jax.Array) -> jax.Array:
+    """(L,) sigma of the mode that follows from a state: the sign of v or, where v = 0, what |f| and its rate tell.
 
     onset : (L,) bool, the state is at the threshold |f| = F_b of a capsule at rest whatever rounding says
     """
-    k1, k2, c, F_b = rig.k1, rig.k2, rig.c, rig.F_b
-    closing = (state.d == 0.0) & (state.w > 0.0)
-    k2 = jnp.where((state.d > 0.0) | closing, k2, 0.0)
-    r = state.d + rig.G
-    f = k1 * r + c * state.w + k2 * state.d
-    w_rate = (rig.P_d * state.C - f) / rig.m1
-    f_rate = (k1 + k2) * state.w + c * w_rate
-    rounding = jnp.finfo(float).eps * (jnp.abs(k1 * r) + jnp.abs(c * state.w) + jnp.abs(k2 * state.d) + F_b)
-    tolerance, excess = THRESHOLD_ROUNDINGS * rounding, jnp.abs(f) - F_b
-    at_threshold = onset | (jnp.abs(excess) <= tolerance)
-    slips = jnp.where(at_threshold, f * f_rate > 0.0, excess > 0.0)
+    F_b, k2 = rig.F_b, jnp.where(contact, rig.k2, 0.0)
+    spring, damper, support = rig.k1 * state.r, rig.c * state.w, k2 * state.d
+    f = spring + damper + support
+    f_rate = (rig.k1 + k2) * state.w + rig.c * (rig.P_d * state.C - f) / rig.m1
+    tolerance = (
+        (jnp.abs(spring) + jnp.abs(damper) + jnp.abs(support) + F_b) * THRESHOLD_ROUNDINGS * jnp.finfo(float).eps
+    )
+    at_threshold = onset | (jnp.abs(jnp.abs(f) - F_b) <= tolerance)
+    slips = jnp.where(at_threshold, f * f_rate > 0.0, jnp.abs(f) > F_b)
     # Without friction nothing ever sticks, and a force of zero leaves the direction to its rate, then to the drive's.
     later = jnp.where(f_rate != 0.0, jnp.sign(f_rate), jnp.where(state.C < 0.0, -1.0, 1.0))
     direction = jnp.where((F_b == 0.0) & (jnp.abs(f) <= tolerance), later, jnp.sign(f))
     sigma = jnp.where(slips | (F_b == 0.0), direction, 0.0)
-    sigma = jnp.where(state.v != 0.0, jnp.sign(state.v), sigma)
-    d_bend = w_rate - jnp.where(sigma != 0.0, (f - sigma * F_b) / rig.m2, 0.0)
-    touching = (state.d == 0.0) & (state.w == 0.0) & (d_bend > 0.0)
-    return Mode((state.d > 0.0) | closing | touching, sigma)
+    return jnp.where(state.v != 0.0, jnp.sign(state.v), sigma)
+
+
+def mode_at(rig: Rig, state: State) -> Mode:
+    """The mode that any state begins in: signs of d, v and, where they are 0, of their first rate that is not."""
+    meeting = (state.d > 0.0) | ((state.d == 0.0) & (state.w > 0.0))
+    sigma = motion_at(rig, state, meeting, jnp.zeros(state.d.shape, bool))
+    f = rig.k1 * state.r + rig.c * state.w
+    w_rate = (rig.P_d * state.C - f) / rig.m1 - jnp.where(sigma != 0.0, (f - sigma * rig.F_b) / rig.m2, 0.0)
+    touching = (state.d == 0.0) & (state.w == 0.0) & (w_rate > 0.0)
+    return Mode(meeting | touching, sigma)

@@ -1,10 +1,10 @@
 """The event-driven engine: Taylor steps inside a mode, located changes of mode, a clock of its own for every lane.
 
-    mode_at -> [series -> trusted -> first_event -> advance -> met -> mode_at] ... -> samples read off the polynomials
+    mode_at -> [series -> trusted -> first_event -> advance -> met -> motion_at] ... -> samples read off the rows
 
 Each lane has its own time, mode and step; one loop runs them all. Derivatives: forward mode goes through the loop. Step
-lengths and located times are held constant; at an event the state and the time get one implicit-function correction,
-dt = -dg/g', whose value is zero and whose tangent is the event's own (the saltation matrix).
+lengths and located times are held constant; at an event the state and the time get one Newton correction, dt = -g/g',
+whose value is next to nothing and whose tangent is the event's own (the saltation matrix).
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from jax.lax import stop_gradient
 
 from capsule_id.capsule.batches import is_traced
 from capsule_id.capsule.dense import WIDTH, Samples, read_off, row_of, samples_at
-from capsule_id.capsule.events import GAP, LOWER, NONE, UPPER, VELOCITY, first_event, mode_at
+from capsule_id.capsule.events import GAP, LOWER, NONE, UPPER, VELOCITY, first_event, mode_at, motion_at
 from capsule_id.capsule.model import CapsuleParameters, Excitation, Initial, Status, Trajectory
 from capsule_id.capsule.taylor import (
     Mode,
@@ -31,6 +31,7 @@ from capsule_id.capsule.taylor import (
     rig_of,
     series,
     size,
+    spring_force,
     trusted,
 )
 from capsule_id.precision import require_float64
@@ -66,7 +67,7 @@ def met(rig: Rig, mode: Mode, motion: Motion, s: jax.Array, at: State, kind: jax
     s, at : the located time and the state there, in the mode before the event
     """
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
-    f = rig.k1 * rig.G + stiffness * at.d + rig.c * at.w
+    f = spring_force(rig, at, mode.contact)
     a2 = jnp.where(mode.sigma != 0.0, (f - friction(rig, mode.sigma, at.v)[0]) / rig.m2, 0.0)
     w_rate = (rig.P_d * at.C - f) / rig.m1 - a2
     f_rate = stiffness * at.w + rig.c * w_rate
@@ -78,9 +79,10 @@ def met(rig: Rig, mode: Mode, motion: Motion, s: jax.Array, at: State, kind: jax
     typical = jnp.where(kind == GAP, size(motion.w, s), onset_or_stop)
     rate, a2, w_rate, before, typical, Omega = stop_gradient((rate, a2, w_rate, at, typical, rig.Omega))
     grazing = (kind != NONE) & ~(jnp.abs(rate) > GRAZING_RATE * typical)
-    dt = (stop_gradient(g) - g) / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
+    dt = -g / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
     return State(
         at.t + dt,
+        at.r + before.w * dt,
         jnp.where(kind == GAP, 0.0, at.d + before.w * dt),
         at.w + w_rate * dt,
         at.X2 + before.v * dt,
@@ -96,17 +98,18 @@ def step(rig: Rig, t_end: jax.Array, max_steps: jax.Array, lanes: Lanes) -> tupl
     left = t_end - stop_gradient(state.t)
     motion = series(rig, state, mode, left)
     held = stop_gradient(motion)
-    s_end = trusted(held)
-    s, kind = first_event(stop_gradient(rig), mode, held, s_end, active)
-    new, grazing = met(rig, mode, motion, s, advance(rig, state, motion, s), kind)
-    event = kind != NONE
-    finished = ~event & (s >= 1.0) & held.last
+    s, kind = first_event(stop_gradient(rig), mode, held, trusted(held), active)
+    at = advance(rig, state, motion, s)
+    new, grazing = met(rig, mode, motion, s, at, kind)
+    finished = (kind == NONE) & (s >= 1.0) & held.last
     new = new._replace(t=jnp.where(finished, t_end, new.t))
-    after = mode_at(stop_gradient(rig), stop_gradient(new), (kind == UPPER) | (kind == LOWER))
-    after = Mode(*(jnp.where(event, x, y) for x, y in zip(after, mode, strict=True)))
+    finished = finished | (at.t >= t_end)
+    # The gap and the capsule's motion change mode one at a time; what happens at the same instant is met next.
+    contact = jnp.where(kind == GAP, new.w > 0.0, mode.contact)
+    sigma = motion_at(stop_gradient(rig), stop_gradient(new), mode.contact, (kind == UPPER) | (kind == LOWER))
+    after = Mode(contact, jnp.where(kind > GAP, sigma, mode.sigma))
     steps = lanes.steps + active
-    finite = jnp.isfinite(new.d + new.w + new.X2 + new.v)
-    finished = finished | (finite & (new.t >= t_end))
+    finite = jnp.isfinite(at.d + at.w + at.X2 + at.v)
     status = jnp.where(active & grazing, jnp.maximum(lanes.status, Status.GRAZING), lanes.status)
     status = jnp.where(active & ~finished & (steps >= max_steps), jnp.int32(Status.TOO_MANY_STEPS), status)
     status = jnp.where(active & ~finite, jnp.int32(Status.NOT_FINITE), status)
@@ -116,8 +119,8 @@ def step(rig: Rig, t_end: jax.Array, max_steps: jax.Array, lanes: Lanes) -> tupl
         Mode(*(jnp.where(moved, x, y) for x, y in zip(after, mode, strict=True))),
         active & ~finished & (status <= Status.GRAZING),
         status,
-        lanes.contacts + (moved & after.contact & ~mode.contact),
-        lanes.events + (moved & event),
+        lanes.contacts + (moved & contact & ~mode.contact),
+        lanes.events + (moved & (kind != NONE)),
         steps,
     ), motion
 
@@ -128,14 +131,14 @@ def start(rig: Rig, t: jax.Array, t_end: jax.Array, initial: Initial) -> Lanes:
     d = (X1 - X2) - rig.G
     rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2) + rig.G)
     d = jnp.where(jnp.abs(d) <= rounding, d - stop_gradient(d), d)
-    state = State(t, d, Y1 - Y2, X2, Y2, *cos_sin(rig.Omega * t + rig.phase))
+    state = State(t, X1 - X2, d, Y1 - Y2, X2, Y2, *cos_sin(rig.Omega * t + rig.phase))
     given = jnp.stack([*rig, *state, t_end])
     positive = (rig.m1 > 0.0) & (rig.m2 > 0.0) & (rig.v_s > 0.0)
     not_negative = jnp.all(jnp.stack([rig.k1, rig.k2, rig.c, rig.F_b, rig.G]) >= 0.0, axis=0)
     valid = jnp.all(jnp.isfinite(given), axis=0) & positive & not_negative
     zero = jnp.zeros(d.shape, jnp.int32)
     status = jnp.where(valid, jnp.int32(Status.OK), jnp.int32(Status.INVALID))
-    mode = mode_at(stop_gradient(rig), stop_gradient(state), jnp.zeros(d.shape, bool))
+    mode = mode_at(stop_gradient(rig), stop_gradient(state))
     return Lanes(state, mode, valid & (t < t_end), status, zero, zero, zero)
 
 
@@ -170,7 +173,7 @@ def run(
 
     def stretch(carry: tuple[Lanes, Samples]) -> tuple[Lanes, Samples]:
         lanes, rows, starts = march(rig, t_end, max_steps, carry[0], ROWS)
-        return lanes, read_off(carry[1], rows, starts, lanes.state.t, rig.G)
+        return lanes, read_off(carry[1], rows, starts, lanes.state.t)
 
     lanes, samples = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
     X1, Y1, X2, Y2 = (samples.values[:, i, :n] for i in range(4))

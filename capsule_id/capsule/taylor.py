@@ -5,7 +5,9 @@ the coefficients follow from each other by one Cauchy product per order. All arr
 series is a list of coefficients in the scaled time s = (t - t0)/h. Written in relative coordinates, which lose no
 digits when the capsule has travelled far:
 
-    d = X1 - X2 - G (penetration of the support spring if positive),  w = d' = Y1 - Y2,  X2,  v = Y2
+    r = X1 - X2,  d = r - G (penetration of the support spring if positive),  w = r' = d' = Y1 - Y2,  X2,  v = Y2
+
+r and d are carried side by side: one is exactly 0 at the gap, the other keeps its digits where the gap is wide.
 
 XLA recomputes a cheap expression in every place that uses it, which for recursions grows without bound, but never a
 division by a value known only at run time. So every quantity that is used often ends in such a division (``over``), on
@@ -50,6 +52,7 @@ class State(NamedTuple):
     """Time (s), relative state (m, m/s), cosine and sine of the drive's phase there; every leaf (L,)."""
 
     t: jax.Array
+    r: jax.Array
     d: jax.Array
     w: jax.Array
     X2: jax.Array
@@ -161,12 +164,17 @@ def friction(rig: Rig, sigma: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.A
     return sigma * (0.5 * rig.F_b) * (1.0 + u), u
 
 
+def spring_force(rig: Rig, state: State, contact: jax.Array) -> jax.Array:
+    """f in N: springs, support and damper, what the rod puts on the capsule."""
+    return rig.k1 * state.r + rig.c * state.w + jnp.where(contact, rig.k2, 0.0) * state.d
+
+
 def series(rig: Rig, state: State, mode: Mode, left: jax.Array) -> Motion:
     """Series of degree ORDER about the state, in the mode; left (L,) s bounds the step."""
     sliding = mode.sigma != 0.0
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
     F0, u0 = friction(rig, mode.sigma, state.v)
-    f0 = rig.k1 * rig.G + stiffness * state.d + rig.c * state.w
+    f0 = spring_force(rig, state, mode.contact)
     rate, rate_left = jax.lax.stop_gradient((step_rate(rig, mode), 1.0 / left))
     h = 1.0 / jnp.maximum(rate, rate_left)
     half, m2 = mode.sigma * (0.5 * rig.F_b), jnp.where(sliding, over(rig.m2, h), jnp.inf)
@@ -224,7 +232,6 @@ def mean(p: Series, s: jax.Array) -> jax.Array:
 def advance(rig: Rig, state: State, motion: Motion, s: jax.Array) -> State:
     """The state at the scaled time s of the step."""
     per = 1.0 / (motion.h * s)
-    t, d, X2 = state.t + motion.h * s, state.d + over(mean(motion.w, s), per), state.X2 + over(mean(motion.v, s), per)
-    return State(
-        t, d, state.w + gain(motion.w, s), X2, state.v + gain(motion.v, s), *cos_sin(rig.Omega * t + rig.phase)
-    )
+    t, way, X2 = state.t + motion.h * s, over(mean(motion.w, s), per), state.X2 + over(mean(motion.v, s), per)
+    w, v = state.w + gain(motion.w, s), state.v + gain(motion.v, s)
+    return State(t, state.r + way, state.d + way, w, X2, v, *cos_sin(rig.Omega * t + rig.phase))
