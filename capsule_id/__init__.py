@@ -10,25 +10,43 @@ The public names are imported on first use, so that ``import capsule_id`` is fre
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from capsule_id.api import Fit as Fit
     from capsule_id.api import fit as fit
+    from capsule_id.capsule.model import CapsuleParameters as CapsuleParameters
+    from capsule_id.capsule.model import Excitation as Excitation
+    from capsule_id.capsule.model import Status as Status
+    from capsule_id.capsule.model import Trajectory as Trajectory
+    from capsule_id.capsule.model import simulate as simulate
+    from capsule_id.capsule.model import status_message as status_message
+    from capsule_id.capsule.response import Response as Response
+    from capsule_id.capsule.response import response as response
+    from capsule_id.capsule.smooth import Smoothing as Smoothing
     from capsule_id.errors import InputError as InputError
     from capsule_id.rig.read import read_rig as read_rig
     from capsule_id.synthetic import synthesize as synthesize
 
 _HOME = {
+    "CapsuleParameters": "capsule_id.capsule.model",
+    "Excitation": "capsule_id.capsule.model",
     "Fit": "capsule_id.api",
     "fit": "capsule_id.api",
     "InputError": "capsule_id.errors",
     "read_rig": "capsule_id.rig.read",
+    "Response": "capsule_id.capsule.response",
+    "response": "capsule_id.capsule.response",
+    "simulate": "capsule_id.capsule.model",
+    "Smoothing": "capsule_id.capsule.smooth",
+    "Status": "capsule_id.capsule.model",
+    "status_message": "capsule_id.capsule.model",
     "synthesize": "capsule_id.synthetic",
+    "Trajectory": "capsule_id.capsule.model",
 }
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     """Import a public name from its room when it is first asked for."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,82 @@
+"""Settled motions: the labels of the reference cases, longer periods, aperiodic motion, the paper's claims."""
+
+import jax
+import numpy as np
+import pytest
+
+from capsule_id.capsule.model import CapsuleParameters, Excitation, Status
+from capsule_id.capsule.response import period_of, response
+from capsule_id.errors import InputError
+from tests.capsule_cases import Cases
+
+# Motions of other periods, found by a scan: (m2, k2, c, mu, G, P_d, Omega) -> label.
+OTHERS = {
+    "P-2-F-9/2": (0.11, 5000.0, 0.5, 0.66, 0.5e-3, 4.0, 34.56),
+    "P-2-B-2": (0.3, 5000.0, 0.5, 0.66, 0.5e-3, 8.0, 73.58),
+    "P-3-F-3": (0.53, 18960.0, 0.5, 0.2, 0.5e-3, 4.0, 60.0),
+    "P-4-B-11/2": (0.3, 18960.0, 0.5, 0.2, 1e-3, 8.0, 20.0),
+    "aperiodic": (0.3, 56410.0, 0.5, 0.2, 0.5e-3, 8.0, 34.56),
+}
+
+
+def test_labels_and_mean_velocities_of_the_reference_cases(cases: Cases) -> None:
+    r = response(cases.p, cases.e)
+    np.testing.assert_array_equal(r.label, [case["label"] for case in cases.raw])
+    expected = np.array([case["mean_velocity_mm_per_s"] for case in cases.raw])
+    # One in a thousand, and half of the last printed digit.
+    assert (np.abs(1e3 * r.mean_velocity - expected) <= 1e-3 * np.abs(expected) + 5e-7).all()
+    np.testing.assert_array_equal(r.period, 1)
+    np.testing.assert_array_equal(r.status, Status.OK)
+    for i, label in enumerate(r.label):
+        assert label == f"P-1-{r.direction[i]}-{r.contacts_per_period[i]:.0f}"
+
+
+def test_longer_periods_and_aperiodic_motion() -> None:
+    m2, k2, c, mu, G, P_d, Omega = np.array(list(OTHERS.values())).T
+    p = CapsuleParameters(m1=0.11, m2=m2, k1=1420.0, k2=k2, c=c, mu=mu, v_s=0.3, G=G)
+    r = response(p, Excitation(P_d, Omega))
+    np.testing.assert_array_equal(r.label, list(OTHERS))
+    np.testing.assert_array_equal(r.period, [2, 2, 3, 4, 0])
+    assert r.contacts_per_period[0] == 4.5
+    assert 6.0 < r.contacts_per_period[-1] < 7.0
+
+
+def test_a_single_run_and_one_that_fails() -> None:
+    p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=56410.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
+    r = response(p, Excitation(0.8, 73.58))
+    assert (r.label, r.period, r.direction, r.contacts_per_period, r.mean_velocity) == ("P-1-S-0", 1, "S", 0.0, 0.0)
+    failed = response(p, Excitation(0.8, 73.58), max_steps=1000)
+    assert (failed.label, failed.period, failed.direction) == ("failed", 0, "")
+    assert failed.status == Status.TOO_MANY_STEPS
+    assert np.isnan(failed.mean_velocity)
+
+
+def test_grazing_load_of_the_resting_capsule() -> None:
+    """P_graze = G k1 sqrt((1 - rho^2)^2 + (2 zeta rho)^2): contacts begin between 0.1 % below and 0.1 % above."""
+    m1, k1, c, G, Omega = 0.11, 1420.0, 3.89, 1e-3, 73.58
+    rho, zeta = Omega * np.sqrt(m1 / k1), c / (2.0 * np.sqrt(k1 * m1))
+    P_graze = G * k1 * np.hypot(1.0 - rho**2, 2.0 * zeta * rho)
+    p = CapsuleParameters(m1=m1, m2=0.53, k1=k1, k2=56410.0, c=c, mu=0.66, v_s=0.3, G=G)
+    r = response(p, Excitation(P_graze * np.array([0.999, 1.001]), Omega))
+    assert list(r.label) == ["P-1-S-0", "P-1-S-1"]
+
+
+def test_period_is_the_shortest_that_repeats() -> None:
+    k = np.arange(49)
+    for n in (1, 2, 5, 16):
+        x, w = 1e-3 * np.cos(2.0 * np.pi * k / n), 0.02 * np.sin(2.0 * np.pi * k / n)
+        assert period_of(x, w, 30.0) == n
+    # A motion of a tenth of a micrometre must repeat to its own scale.
+    small = 1e-7 * np.cos(2.0 * np.pi * k / 3)
+    assert period_of(small, 0.0 * small, 30.0) == 3
+    assert period_of(1e-3 * np.cos(k), 0.02 * np.sin(k), 30.0) == 0
+    assert period_of(1e-3 * np.cos(2.0 * np.pi * k / 17), 0.0 * k, 30.0) == 0
+    assert period_of(0.0 * k, 0.0 * k, 30.0) == 1
+
+
+def test_errors() -> None:
+    p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=2e4, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
+    with pytest.raises(InputError, match="Omega must be positive"):
+        response(p, Excitation(1.0, 0.0))
+    with pytest.raises(InputError, match="concrete values"):
+        jax.jit(lambda P_d: response(p, Excitation(P_d, 30.0)))(1.0)

@@ -1,0 +1,33 @@
+"""Figures of simulated motions draw what they are given, where they are told to."""
+
+import numpy as np
+import pytest
+
+from capsule_id.capsule.bias import BiasStudy
+from capsule_id.report.figures_capsule import MotionView, motion, phase_plane, smoothing_bias
+from capsule_id.report.style import new_figure, png
+
+
+def _study() -> BiasStudy:
+    widths = np.geomspace(1e-4, 1e-2, 5)
+    return BiasStudy("velocity", widths, np.stack([3.0 * widths**2, 5.0 * widths**2, 7.0 * widths**2], axis=1))
+
+
+def test_slope_of_a_power_law_is_found_and_shown() -> None:
+    assert _study().slope == pytest.approx(2.0, abs=1e-12)
+    ax = smoothing_bias(_study())
+    assert any("slope 2.00" in text.get_text() for text in ax.get_legend().get_texts())
+    assert ax.get_xscale() == ax.get_yscale() == "log"
+
+
+def test_phase_plane_shows_impact_line_and_section() -> None:
+    s = np.linspace(0.0, 1.0, 50)
+    view = MotionView(s, 1e-3 * s, s, 0.1 * s, np.array([5e-4]), np.array([0.05]), 8e-4)
+    figure = new_figure(4.0, 3.0)
+    ax = figure.subplots()
+    assert phase_plane(view, ax) is ax
+    path, impact, section = ax.lines
+    np.testing.assert_allclose(path.get_xdata(), s)
+    np.testing.assert_allclose(impact.get_xdata(), 0.8)
+    np.testing.assert_allclose([section.get_xdata()[0], section.get_ydata()[0]], [0.5, 0.05])
+    assert png(motion(view)).startswith(b"\x89PNG")
