@@ -28,6 +28,8 @@ SERIES_TOLERANCE = 1e-9
 STEP_GUESS = 3.0
 # Coefficients that tell the size of a motion; the later ones may be large only because the guess was.
 LEADING = 4
+# Motions smaller than this, in m or m/s, are none: keeps quotients of sizes away from underflow.
+VANISHING = 1e-150
 
 Series = list[jax.Array]
 
@@ -200,18 +202,17 @@ def series(rig: Rig, state: State, mode: Mode, left: jax.Array) -> Motion:
 
 def size(p: Series, s: jax.Array | float = 1.0) -> jax.Array:
     """Size of a motion from its leading coefficients, taken up to the scaled time s."""
-    return horner([jnp.abs(x) for x in p[:LEADING]], s)
+    return horner([jnp.abs(x) for x in p[:LEADING]], s) + VANISHING
 
 
 def trusted(motion: Motion) -> jax.Array:
     """(L,) the s <= 1 up to which the series of w and v hold to SERIES_TOLERANCE of their leading terms' size."""
-    tiny = jnp.finfo(float).tiny
-    last = [jnp.maximum(jnp.abs(p[-1]), jnp.abs(p[-2])) / (size(p) + tiny) for p in (motion.w, motion.v)]
+    last = [jnp.maximum(jnp.abs(p[-1]), jnp.abs(p[-2])) / size(p) for p in (motion.w, motion.v)]
     excess = jnp.maximum(jnp.maximum(*last), SERIES_TOLERANCE) / SERIES_TOLERANCE
     return jnp.exp(jnp.log(excess) * (-1.0 / (ORDER - 1)))
 
 
-def horner(p: Series, s: jax.Array) -> jax.Array:
+def horner(p: Series, s: jax.Array | float) -> jax.Array:
     """Value of the polynomial with coefficients p at s."""
     value = p[-1]
     for x in reversed(p[:-1]):
