@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any, TypeVar
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,7 +43,7 @@ def lanes_of(tree: object, times: ArrayLike) -> tuple[Lanes, bool]:
     """
     xp = jnp if is_traced((tree, times)) else np
     leaves, structure = jax.tree.flatten(tree)
-    if any(is_traced(leaf) and leaf.dtype == jnp.float32 for leaf in (*leaves, times)):
+    if any(isinstance(leaf, jax.core.Tracer) and leaf.dtype == jnp.float32 for leaf in (*leaves, times)):
         raise InputError(
             "traced values must be float64",
             "float32",

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from capsule_id.capsule.model import Initial
 from capsule_id.capsule.taylor import ORDER, Motion, State, horner, mean
 
 WIDTH = 4 + 2 * (ORDER + 1)
@@ -24,12 +25,12 @@ class Samples(NamedTuple):
     next: jax.Array
 
 
-def samples_at(times: jax.Array, initial: tuple[jax.Array, ...], valid: jax.Array) -> Samples:
+def samples_at(times: jax.Array, initial: Initial, valid: jax.Array) -> Samples:
     """No sample taken yet but the first, which is the initial state."""
     L, n = times.shape
     padded = jnp.concatenate([times, jnp.full((L, WINDOW), jnp.inf)], axis=1)
     values = jnp.full((L, 4, n + WINDOW), jnp.nan)
-    first = jnp.where(valid[:, None], jnp.stack(initial, axis=1), jnp.nan)
+    first = jnp.where(valid[:, None], jnp.stack([jnp.asarray(x) for x in initial], axis=1), jnp.nan)
     return Samples(padded, values.at[:, :, 0].set(first), jnp.ones(L, jnp.int32))
 
 

@@ -63,8 +63,8 @@ def energy_balance(
         A lane that does not run to the end (status in the message), shapes that do not agree.
     """
     given = (p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
-    ((p, e, initial), times), batched = lanes_of(given, np.asarray(span))
-    rows, starts, status = jax.device_get(_recorded(max_steps, p, e, times, initial))
+    ((p, e, begun), times), batched = lanes_of(given, np.asarray(span))
+    rows, starts, status = jax.device_get(_recorded(max_steps, p, e, times, begun))
     if not all(Status(int(code)).usable for code in status):
         worst = Status(int(status.max()))
         raise InputError("every lane must run to the end of the span", worst.name, worst.sentence)
@@ -74,27 +74,29 @@ def energy_balance(
     half = 0.5 * (np.concatenate([begins[1:], times[None, :, 1]]) - begins)
     node, weight = np.polynomial.legendre.leggauss(NODES)
     t = begins[..., None] + half[..., None] * (1.0 + node)
-    _, Y1, _, Y2 = (np.asarray(x) for x in values_of(rows[..., None], t))
-    column = CapsuleParameters(*(np.asarray(x)[:, None] for x in vars(p).values()))
+    _, Y1, _, Y2 = (np.asarray(x) for x in values_of(jnp.asarray(rows[..., None]), jnp.asarray(t)))
+    m1, m2, _, _, c, mu, v_s, _, g, P_d, Omega, phase = (
+        np.asarray(x)[:, None] for x in (*vars(p).values(), *vars(e).values())
+    )
 
     def total(power: np.ndarray) -> np.ndarray:
         return np.sum(power * weight * half[..., None], axis=(0, 2))
 
-    P_d, Omega, phase = (np.asarray(x)[:, None] for x in vars(e).values())
-    F_b = column.mu * (column.m1 + column.m2) * column.g
+    F_b = mu * (m1 + m2) * g
     drive = total(P_d * np.cos(Omega * t + phase) * Y1)
-    damper = total(column.c * (Y1 - Y2) ** 2)
-    friction = total(0.5 * F_b * (1.0 + np.exp(-np.abs(Y2) / column.v_s)) * np.abs(Y2))
+    damper = total(c * (Y1 - Y2) ** 2)
+    friction = total(0.5 * F_b * (1.0 + np.exp(-np.abs(Y2) / v_s)) * np.abs(Y2))
     last = rows[:, np.maximum(taken.sum(axis=0) - 1, 0), np.arange(len(status))]
-    end = values_of(last, times[:, 1])
-    change = _stored(p, *(np.asarray(x) for x in end)) - _stored(p, *(np.asarray(x) for x in initial))
+    end = values_of(jnp.asarray(last), jnp.asarray(times[:, 1]))
+    change = _stored(p, *(np.asarray(x) for x in end)) - _stored(p, *(np.asarray(x) for x in begun))
     fields = (drive, damper, friction, change, status)
     return EnergyBalance(*(fields if batched else (x[0] for x in fields)))
 
 
 def _stored(p: CapsuleParameters, X1: np.ndarray, Y1: np.ndarray, X2: np.ndarray, Y2: np.ndarray) -> np.ndarray:
+    m1, m2, k1, k2, _, _, _, G, _ = (np.asarray(x) for x in vars(p).values())
     r = X1 - X2
-    return 0.5 * (p.m1 * Y1**2 + p.m2 * Y2**2 + p.k1 * r**2 + p.k2 * np.maximum(r - p.G, 0.0) ** 2)
+    return 0.5 * (m1 * Y1**2 + m2 * Y2**2 + k1 * r**2 + k2 * np.maximum(r - G, 0.0) ** 2)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -27,15 +27,15 @@ ROUNDING_NOISE = 1e-14
 THRESHOLD_ROUNDINGS = 16.0
 
 
-def _divided(p: Series) -> Series:
+def _divided(p: Series, s_end: jax.Array) -> Series:
     """p over that power of s which removes the root at s = 0, where p(0) = 0 exactly, as right after an event.
 
     There the next coefficients, if they are mere rounding, are taken as 0 too: at an onset of slip the first rate is.
     """
-    scale, zero = size(p) + jnp.finfo(float).tiny, jnp.zeros_like(p[0])
+    scale, zero = size(p, s_end), jnp.zeros_like(p[0])
     once = p[0] == 0.0
-    twice = once & (jnp.abs(p[1]) / scale <= ROUNDING_NOISE)
-    thrice = twice & (jnp.abs(p[2]) / scale <= ROUNDING_NOISE)
+    twice = once & (jnp.abs(p[1]) * s_end / scale <= ROUNDING_NOISE)
+    thrice = twice & (jnp.abs(p[2]) * s_end**2 / scale <= ROUNDING_NOISE)
     q = [*p, zero, zero, zero]
     return [
         jnp.where(thrice, q[k + 3], jnp.where(twice, q[k + 2], jnp.where(once, q[k + 1], q[k]))) for k in range(len(p))
@@ -62,7 +62,7 @@ def _watched(p: Series, level: jax.Array, s_end: jax.Array) -> _Watched:
     for k in range(3, len(p)):
         rest = rest + (0.5 * k * (k - 1)) * jnp.abs(p[k]) * power
         power = power * s_end
-    scale = level + size(p) + jnp.finfo(float).tiny
+    scale = level + size(p)
     return _Watched(p, [k * x for k, x in enumerate(p)][1:], scale, p[2] / scale, rest / scale)
 
 
@@ -91,8 +91,8 @@ def first_event(
     """
     sliding = mode.sigma != 0.0
     level = jnp.where(sliding, 0.0, rig.F_b)
-    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in motion.d]), jnp.zeros_like(level), s_end)
-    speed = _divided([mode.sigma * x for x in motion.v])
+    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in motion.d], s_end), jnp.zeros_like(level), s_end)
+    speed = _divided([mode.sigma * x for x in motion.v], s_end)
     # While stuck F_b - f and F_b + f, while sliding sigma Y2, written as level + sign * p.
     other = _watched([jnp.where(sliding, a, -b) for a, b in zip(speed, motion.f, strict=True)], level, s_end)
     base = level / other.scale

@@ -180,15 +180,14 @@ def run(
     return Trajectory(times, X1, Y1, X2, Y2, lanes.contacts, lanes.status, lanes.steps, lanes.events)
 
 
-@jax.jit
 @custom_vmap
-def _run(
+def _folding(
     p: CapsuleParameters, e: Excitation, times: jax.Array, t_end: jax.Array, initial: Initial, max_steps: jax.Array
 ) -> Trajectory:
     return run(p, e, times, t_end, initial, max_steps)
 
 
-@_run.__wrapped__.def_vmap
+@_folding.def_vmap
 def _fold(size: int, batched: list[object], *args: object) -> tuple[Trajectory, Trajectory]:
     """Fold a new axis into the lanes: a loop inside a loop over lanes would copy its buffers at every step."""
     flat, structure = jax.tree.flatten(args)
@@ -199,8 +198,11 @@ def _fold(size: int, batched: list[object], *args: object) -> tuple[Trajectory, 
     full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(flat, flags, strict=True)]
     L = full[0].shape[1]
     lanes = jax.tree.unflatten(structure, [x.reshape(size * L, *x.shape[2:]) for x in full])
-    out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), _run(*lanes))
+    out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), _folding(*lanes))
     return out, jax.tree.map(lambda _: True, out)
+
+
+_run = jax.jit(_folding)
 
 
 def kernel(max_steps: int) -> Kernel:
@@ -217,7 +219,7 @@ def kernel(max_steps: int) -> Kernel:
         length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
         padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
         t = _run(p, e, padded, t_end, initial, bound)
-        cut = (x[:, :n] for x in (t.times, t.X1, t.Y1, t.X2, t.Y2))
-        return Trajectory(*cut, t.contacts, t.status, t.steps, t.events)
+        times, X1, Y1, X2, Y2 = (x[:, :n] for x in (t.times, t.X1, t.Y1, t.X2, t.Y2))
+        return Trajectory(times, X1, Y1, X2, Y2, t.contacts, t.status, t.steps, t.events)
 
     return simulate_exact

@@ -67,7 +67,7 @@ def response(p: CapsuleParameters, e: Excitation, *, max_steps: int = MAX_STEPS)
     state = np.stack([np.asarray(x)[:, 1:] for x in (run.X1, run.Y1, run.X2, run.Y2)])
     contacts, contact_status = _contacts(p, e, T[:, None] * periods, state, max_steps)
     status = np.maximum(np.asarray(run.status), contact_status)
-    found = [_describe(state[:, i], float(e.Omega[i]), contacts[i], int(status[i])) for i in range(len(T))]
+    found = [_describe(state[:, i], 2.0 * np.pi / T[i], contacts[i], int(status[i])) for i in range(len(T))]
     label, period, direction, per_period = (list(column) for column in zip(*found, strict=True))
     velocity = (state[2, :, -1] - state[2, :, 0]) / (OBSERVED * T)
     if not batched:

@@ -28,6 +28,8 @@ SERIES_TOLERANCE = 1e-9
 STEP_GUESS = 3.0
 # Coefficients that tell the size of a motion; the later ones may be large only because the guess was.
 LEADING = 4
+# Motions smaller than this, in m or m/s, are none: keeps quotients of sizes away from underflow.
+VANISHING = 1e-150
 
 Series = list[jax.Array]
 
@@ -151,11 +153,14 @@ def _cos_sin_jvp(
     return (c, s), (-s * tangents[0], c * tangents[0])
 
 
-def step_rate(rig: Rig, mode: Mode) -> jax.Array:
-    """(L,) 1/s: inverse of a step of the order of the mode's fastest time scale, beyond which no series is worth it."""
+def step_rate(rig: Rig, mode: Mode, F_rate: jax.Array) -> jax.Array:
+    """(L,) 1/s: inverse of a step of the order of the mode's fastest time scale, beyond which no series is worth it.
+
+    F_rate : (L,) 1/s, how fast friction changes, relative to its share that depends on speed
+    """
     compliance = 1.0 / rig.m1 + jnp.where(mode.sigma != 0.0, 1.0 / rig.m2, 0.0)
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
-    return (jnp.sqrt(stiffness * compliance) + rig.c * compliance + jnp.abs(rig.Omega)) / STEP_GUESS
+    return (jnp.sqrt(stiffness * compliance) + rig.c * compliance + jnp.abs(rig.Omega) + F_rate) / STEP_GUESS
 
 
 def friction(rig: Rig, sigma: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -175,7 +180,8 @@ def series(rig: Rig, state: State, mode: Mode, left: jax.Array) -> Motion:
     stiffness = rig.k1 + jnp.where(mode.contact, rig.k2, 0.0)
     F0, u0 = friction(rig, mode.sigma, state.v)
     f0 = spring_force(rig, state, mode.contact)
-    rate, rate_left = jax.lax.stop_gradient((step_rate(rig, mode), 1.0 / left))
+    F_rate = jnp.where(sliding, u0 * jnp.abs(f0 - F0) / (rig.m2 * rig.v_s), 0.0)
+    rate, rate_left = jax.lax.stop_gradient((step_rate(rig, mode, F_rate), 1.0 / left))
     h = 1.0 / jnp.maximum(rate, rate_left)
     half, m2 = mode.sigma * (0.5 * rig.F_b), jnp.where(sliding, over(rig.m2, h), jnp.inf)
     m1, v_s, turn = over(rig.m1, h), jnp.where(sliding, -mode.sigma * rig.v_s, jnp.inf), -((rig.Omega * h) ** 2)
@@ -200,18 +206,17 @@ def series(rig: Rig, state: State, mode: Mode, left: jax.Array) -> Motion:
 
 def size(p: Series, s: jax.Array | float = 1.0) -> jax.Array:
     """Size of a motion from its leading coefficients, taken up to the scaled time s."""
-    return horner([jnp.abs(x) for x in p[:LEADING]], s)
+    return horner([jnp.abs(x) for x in p[:LEADING]], s) + VANISHING
 
 
 def trusted(motion: Motion) -> jax.Array:
     """(L,) the s <= 1 up to which the series of w and v hold to SERIES_TOLERANCE of their leading terms' size."""
-    tiny = jnp.finfo(float).tiny
-    last = [jnp.maximum(jnp.abs(p[-1]), jnp.abs(p[-2])) / (size(p) + tiny) for p in (motion.w, motion.v)]
+    last = [jnp.maximum(jnp.abs(p[-1]), jnp.abs(p[-2])) / size(p) for p in (motion.w, motion.v)]
     excess = jnp.maximum(jnp.maximum(*last), SERIES_TOLERANCE) / SERIES_TOLERANCE
     return jnp.exp(jnp.log(excess) * (-1.0 / (ORDER - 1)))
 
 
-def horner(p: Series, s: jax.Array) -> jax.Array:
+def horner(p: Series, s: jax.Array | float) -> jax.Array:
     """Value of the polynomial with coefficients p at s."""
     value = p[-1]
     for x in reversed(p[:-1]):
