@@ -11,7 +11,8 @@ import pandas as pd
 
 from capsule_id.experiments import compare, make_experiments, paper_estimates
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.checks import Setting, informed, run_checks
+from capsule_id.inference.checks import informed, run_checks
+from capsule_id.inference.experiment_checks import Setting
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.notes import make_notes
 from capsule_id.inference.point_fit import point_fit

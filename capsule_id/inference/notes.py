@@ -9,7 +9,7 @@ from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.line import Line
 from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.experiments.support_spring import SupportSpring
-from capsule_id.inference.checks import LEVEL, Setting, stiffness_by_record, whiteness
+from capsule_id.inference.experiment_checks import LEVEL, Setting, stiffness_by_record, whiteness
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.regression_checks import refit

@@ -12,7 +12,7 @@ import pytest
 
 from capsule_id.experiments.decay_moments import fold
 from capsule_id.experiments.free_vibration import FreeVibration, autocorrelation
-from capsule_id.inference.checks import ljung_box
+from capsule_id.inference.experiment_checks import ljung_box
 from capsule_id.inference.least_squares import QUICK_COMPILE
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_fit import point_fit

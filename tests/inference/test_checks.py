@@ -9,7 +9,8 @@ import pytest
 from capsule_id.experiments import free_vibration, make_experiments, static_friction
 from capsule_id.experiments.decay_models import dry_decay
 from capsule_id.experiments.line import Line
-from capsule_id.inference.checks import Setting, run_checks
+from capsule_id.inference.checks import run_checks
+from capsule_id.inference.experiment_checks import Setting
 from capsule_id.inference.fit import fit_rig
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_fit import point_fit
