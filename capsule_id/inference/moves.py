@@ -44,7 +44,7 @@ class BlockProposal:
             - 0.5 * (DEGREES_OF_FREEDOM + d) * np.log1p(square / width**2 / DEGREES_OF_FREEDOM)
             for width, weight in zip(WIDTHS, WEIGHTS, strict=True)
         ]
-        return logsumexp(parts, axis=0)
+        return np.asarray(logsumexp(parts, axis=0))
 
     def draw(self, block: int, rng: np.random.RandomState, size: int) -> np.ndarray:
         """(size, d_block)."""

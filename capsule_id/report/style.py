@@ -57,7 +57,7 @@ def set_text(ax: Axes, x_label: str, y_label: str, title: str = "") -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def set_legend(ax: Axes, place: Literal["best", "upper right", "above"] = "best") -> None:
+def set_legend(ax: Axes, place: Literal["best", "upper right", "lower right", "above"] = "best") -> None:
     """A legend of the labelled artists, as plain text; ``above``: in one row over the axes, at the right."""
     handles, labels = ax.get_legend_handles_labels()
     if not handles:
