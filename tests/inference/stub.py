@@ -57,6 +57,7 @@ class Gaussian:
         self.precision = np.linalg.inv(covariance)
         self.names = tuple(f"x{i}" for i in range(len(mean)))
         self.dimension = len(mean)
+        self.blocks = [np.arange(len(mean))]
 
     def batch(self, u: Any) -> np.ndarray:
         """(w, d) -> (w,)."""
