@@ -44,6 +44,7 @@ def _or_ok(findings: list[Finding], check: str, text: str) -> list[Finding]:
 
 
 def check_whiteness(s: Setting) -> list[Finding]:
+    """Expected: residuals of every record white (Ljung–Box)."""
     records = [e for e in s.experiments if e.time_series]
     findings = []
     for e in records:
@@ -80,6 +81,7 @@ def ljung_box(residuals: np.ndarray, lags: int) -> tuple[float, float]:
 
 
 def check_outliers(s: Setting, flagged: dict[str, list[int]]) -> list[Finding]:
+    """Expected: no reading far from the rest of its table; fills ``flagged``, rows by label."""
     tables = [e for e in s.experiments if not e.time_series]
     findings = []
     for e in tables:
@@ -113,6 +115,7 @@ def check_outliers(s: Setting, flagged: dict[str, list[int]]) -> list[Finding]:
 
 
 def check_linearity(s: Setting, flagged: Mapping[str, list[int]]) -> list[Finding]:
+    """Expected: calibration lines that rise and are straight, flagged rows left out."""
     lines = [e for e in s.experiments if isinstance(e, Line)]
     findings = []
     for e in lines:
@@ -137,6 +140,7 @@ def check_linearity(s: Setting, flagged: Mapping[str, list[int]]) -> list[Findin
 
 
 def check_stated_errors(s: Setting, flagged: Mapping[str, list[int]]) -> list[Finding]:
+    """Expected: where reading errors are stated, they explain the scatter (chi-square)."""
     known = [e for e in s.experiments if e.scale_known and e.label not in flagged]
     findings = []
     for e in known:
@@ -182,6 +186,7 @@ def stiffness_by_record(
 
 
 def check_friction(s: Setting) -> list[Finding]:
+    """Expected: tilts and slides tell of one surface."""
     tilts = [e for e in s.experiments if isinstance(e, StaticFriction)]
     slides = [e for e in s.experiments if isinstance(e, DynamicFriction | SlidingFriction)]
     if not tilts or not slides:
@@ -199,6 +204,7 @@ def check_friction(s: Setting) -> list[Finding]:
 
 
 def check_cantilever(s: Setting, flagged: Mapping[str, list[int]]) -> list[Finding]:
+    """Expected, where lengths are stated: k2 ~ L^-3 over the springs."""
     springs = [e for e in s.experiments if isinstance(e, SupportSpring) and e.length is not None]
     if len({e.spring for e in springs}) < 2:
         return []
