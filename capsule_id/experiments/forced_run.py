@@ -1,0 +1,241 @@
+"""Forced runs: the capsule driven by the motor, recorded in full motion (paper, sections 3 and 4).
+
+    theta -> capsule model from the first sample on -> channels -> misfit of each channel
+
+The channels that are recorded (x_rel, x_capsule, acceleration_rod, current) are independent given the motion; each has
+its own noise, and an offset that enters linearly and is integrated out (a gain too, where its sd is stated). X2 = 0 at
+the first sample by convention: X2 and the offset of x_capsule cannot both be free.
+"""
+
+from dataclasses import replace
+from functools import cached_property
+from types import ModuleType
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory, simulate
+from capsule_id.capsule.smooth import Smoothing
+from capsule_id.experiments.base import Experiment, Misfit, Start, Theta
+from capsule_id.experiments.linear import NUISANCE_WIDTH
+from capsule_id.experiments.run_start import RunStart, rough_start
+from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.rig.model import Quantity, Rig, Table
+
+#: Channel of the table -> symbol of its noise; the order of the misfits.
+NOISES = {
+    "x_rel": "noise_x_rel",
+    "x_capsule": "noise_x_capsule",
+    "acceleration_rod": "noise_acceleration",
+    "current": "noise_current",
+}
+#: Default prior of a channel's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
+NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
+#: Default prior of the current's amplitude: log-normal about half its range.
+AMPLITUDE_FACTOR = 3.0
+#: sd of the normal prior of the drive's phase, rad: wide, and proper.
+PHASE_WIDTH = np.pi
+#: Periods from rest after which a motion counts as settled (start = "settled").
+SETTLING_PERIODS = 40
+
+Model = Literal["exact", "smooth"]
+
+
+class ForcedRun(Experiment):
+    """One record of the driven capsule.
+
+    Initial state, by ``start`` in rig.toml: "stuck" (capsule at rest and held: Y2 = 0), "moving" (Y2 sampled too),
+    "settled" (the periodic motion that the capsule settles on from rest), or "auto": stuck or moving, as the record
+    shows it.
+
+    The drive is K times the recorded current, whose amplitude and phase are sampled; without a current it is the stated
+    P_d. Where both are there, P_d is a second reading of the same amplitude.
+    """
+
+    time_series = True
+    masses = ("m1", "m2")
+    ARRAYS = ("time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "reading_variance", "smoothing")
+    STATIC = ("channels", "start", "gap_known", "drive_known", "colours", "model")
+
+    def __init__(self, table: Table, rig: Rig) -> None:
+        super().__init__(table, rig)
+        self.channels = tuple(name for name in NOISES if name in table.columns)
+        self.time = table["time"]
+        self.values = np.stack([table[name] for name in self.channels])
+        self.Omega = _angular_frequency(table)
+        self.spring = str(table.settings["spring"])
+        gap, drive = table.settings["gap"], table.settings.get("P_d")
+        assert isinstance(gap, Quantity), "the schema makes it one"
+        self.gap, self.gap_sd = gap.value, gap.sd
+        self.gap_known = gap.sd == 0.0
+        assert drive is None or isinstance(drive, Quantity), "the schema makes it one"
+        self.drive, self.drive_sd = (0.0, 0.0) if drive is None else (drive.value, drive.sd)
+        self.drive_known = drive is not None and drive.sd == 0.0
+        self.reading_variance = np.array([table.columns[name].reading_sd ** 2 for name in self.channels])
+        self.ranges = np.array([max(float(np.ptp(y)), _floor(table, name)) for name, y in self._by_channel()])
+        self.widths = NUISANCE_WIDTH * self.ranges
+        self.gains = np.array([float(table.settings.get(f"{name}_gain_sd", 0.0)) for name in self.channels])  # type: ignore[arg-type]
+        self.colours = tuple(table.settings.get("noise") == "ar1" for _ in self.channels)
+        self.model: Model = "exact"
+        self.smoothing = np.zeros(4)
+        wanted = str(table.settings.get("start", "auto"))
+        self.start = self.rough.kind if wanted == "auto" else wanted
+
+    def _by_channel(self) -> list[tuple[str, np.ndarray]]:
+        return list(zip(self.channels, self.values, strict=True))
+
+    @cached_property
+    def rough(self) -> RunStart:
+        """State and drive at the first sample, read off the record."""
+        return rough_start(self.time, dict(self._by_channel()), self.Omega)
+
+    def with_start(self, start: str) -> "ForcedRun":
+        """The same record with another kind of initial state."""
+        other = ForcedRun(replace(self.table, settings={**self.table.settings, "start": start}), self.rig)
+        other.model, other.smoothing = self.model, self.smoothing
+        return other
+
+    def smoothed(self, widths: Smoothing | None) -> "ForcedRun":
+        """The same record with the smoothed model of these ``widths`` as forward model; None: the exact one."""
+        other = ForcedRun(replace(self.table, settings={**self.table.settings, "start": self.start}), self.rig)
+        if widths is not None:
+            other.model = "smooth"
+            numbers = (widths.velocity, widths.penetration, widths.rounding, widths.tolerance)
+            other.smoothing = np.array([float(x) for x in numbers])
+        return other
+
+    @property
+    def driven_by_current(self) -> bool:
+        return "current" in self.channels
+
+    @property
+    def observed(self) -> np.ndarray:
+        """Channel after channel, then the stated P_d where the current is recorded too."""
+        readings = list(self.values)
+        return np.concatenate([*readings, [self.drive]] if self._second_reading else readings)
+
+    @property
+    def _second_reading(self) -> bool:
+        return self.driven_by_current and self.drive_sd > 0.0
+
+    # -- parameters -------------------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        of = self.label
+        rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")] + [parameter("k2", self.spring)]
+        if not self.gap_known:
+            rows.append(parameter("G", of, Prior("positive_normal", self.gap, self.gap_sd)))
+        if self.driven_by_current:
+            amplitude = 0.5 * float(np.ptp(self.table["current"]))
+            rows += [parameter("K"), parameter("I_d", of, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
+        elif not self.drive_known:
+            rows.append(parameter("P_d", of, Prior("positive_normal", self.drive, self.drive_sd)))
+        rows.append(parameter("phase", of, Prior("normal", 0.0, PHASE_WIDTH)))
+        if self.start != "settled":
+            length = NUISANCE_WIDTH * self.rough.length
+            rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
+            rows.append(parameter("y_start", of, Prior("normal", 0.0, self.Omega * length)))
+        if self.start == "moving":
+            rows.append(parameter("capsule_start", of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length)))
+        for name, scale in zip(self.channels, self.ranges, strict=True):
+            rows.append(parameter(NOISES[name], of, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
+        rows += [parameter(f"ar1_{name}", of) for name, on in zip(self.channels, self.colours, strict=True) if on]
+        return tuple(rows)
+
+    @property
+    def scatters(self) -> tuple[str | None, ...]:
+        own: tuple[str | None, ...] = tuple(NOISES[name] for name in self.channels)
+        return (*own, None) if self._second_reading else own
+
+    def starts(self) -> dict[str, Start]:
+        """From the record: nuisances alone; what the bench measures has its start there, or at its prior's centre."""
+        rough, of = self.rough, self.label
+        starts = {f"phase[{of}]": Start(rough.phase, 0.02)}
+        if not self.gap_known:
+            starts[f"G[{of}]"] = Start(self.gap, 0.5 * self.gap_sd / self.gap)
+        if self.driven_by_current:
+            starts[f"I_d[{of}]"] = Start(rough.amplitude, 0.005)
+        elif not self.drive_known:
+            starts[f"P_d[{of}]"] = Start(self.drive, 0.5 * self.drive_sd / self.drive)
+        if self.start != "settled":
+            starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
+            starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * self.Omega * rough.length)
+        if self.start == "moving":
+            starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * self.Omega * rough.length)
+        for name, noise in rough.noise.items():
+            starts[f"{NOISES[name]}[{of}]"] = Start(noise, 0.1)
+        for name, on in zip(self.channels, self.colours, strict=True):
+            if on:
+                starts[f"ar1_{name}[{of}]"] = Start(0.0, 0.1)
+        return starts
+
+    # -- the motion and what is seen of it --------------------------------------------------------------------------
+
+    def capsule(self, theta: Theta) -> tuple[CapsuleParameters, Excitation]:
+        """Parameters and drive of this run; leaves as in ``theta``."""
+        gap = self.gap if self.gap_known else theta["G"]
+        if self.driven_by_current:
+            force = theta["K"] * theta["I_d"]
+        else:
+            force = self.drive if self.drive_known else theta["P_d"]
+        names = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "g")
+        return CapsuleParameters(G=gap, **{name: theta[name] for name in names}), Excitation(force, self.Omega, theta["phase"])
+
+    def motion(self, theta: Theta, xp: ModuleType = jnp) -> Trajectory:
+        """The model's motion at the samples (n,), X2 = 0 at the first."""
+        p, e = self.capsule(theta)
+        smoothing = None if self.model == "exact" else Smoothing(*(self.smoothing[i] for i in range(4)))
+        if self.start == "settled":
+            early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
+            run = simulate(p, e, xp.concatenate([early, self.time]), model=self.model, smoothing=smoothing)
+            settled = {name: getattr(run, name)[1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
+            X2 = settled["X2"][0]
+            return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})
+        Y2 = theta["capsule_start"] if self.start == "moving" else 0.0 * theta["x_start"]
+        initial = (theta["x_start"], theta["y_start"] + Y2, 0.0, Y2)
+        return simulate(p, e, self.time, initial, model=self.model, smoothing=smoothing)
+
+    def predict(self, theta: Theta, xp: ModuleType = jnp) -> list[Any]:
+        """Noise-free channels (n,), offsets and gains left out, in the order of ``channels``."""
+        p, e = self.capsule(theta)
+        run = self.motion(theta, xp)
+        x_rel, rate = run.X1 - run.X2, run.Y1 - run.Y2
+        drive = xp.cos(self.Omega * self.time + e.phase)
+        seen: list[Any] = []
+        for name in self.channels:
+            if name == "x_rel":
+                seen.append(x_rel)
+            elif name == "x_capsule":
+                seen.append(run.X2)
+            elif name == "acceleration_rod":
+                penetration = xp.maximum(x_rel - p.G, 0.0)
+                seen.append((e.P_d * drive - p.k1 * x_rel - p.c * rate - p.k2 * penetration) / p.m1)
+            else:
+                seen.append(theta["I_d"] * drive)
+        return [xp.asarray(channel) for channel in seen]
+
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
+        parts = []
+        for i, (name, seen) in enumerate(zip(self.channels, self.predict(theta, xp), strict=True)):
+            columns = [self.widths[i] * xp.ones(len(self.time))]
+            if f"{name}_gain_sd" in self.table.settings:
+                columns.append(self.gains[i] * seen)
+            raw, design = self.values[i] - seen, xp.stack(columns, axis=1)
+            parts.append(Misfit(raw, self.reading_variance[i], 1.0, design))
+        if self._second_reading:
+            raw = self.drive - theta["K"] * theta["I_d"]
+            parts.append(Misfit(xp.reshape(raw, (1,)), self.drive_sd**2, 0.0, xp.zeros((1, 0))))
+        return tuple(parts)
+
+
+def _angular_frequency(table: Table) -> float:
+    """Stated drive frequency, rad/s; ``rules.py`` sees to it that one is stated."""
+    stated = table.settings.get("Omega")
+    return float(stated) if stated is not None else 2.0 * np.pi * float(table.settings["f"])  # type: ignore[arg-type]
+
+
+def _floor(table: Table, name: str) -> float:
+    """A channel that does not vary has the size of its reading step, or next to none."""
+    return max(table.columns[name].reading_sd, 1e-9)
