@@ -16,7 +16,12 @@ QUANTILE_975 = float(stats.norm.ppf(0.975))
 
 
 #: Symbols of standard deviations.
-SCATTERS = frozenset({"noise_sd", "tilt_sd", "push_scatter", "sliding_scatter", "scatter"})
+SCATTERS = frozenset(
+    {
+        "noise_sd", "tilt_sd", "push_scatter", "sliding_scatter", "scatter",
+        "noise_x_rel", "noise_x_capsule", "noise_acceleration", "noise_current",
+    }
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -107,11 +112,20 @@ TABLE: Mapping[str, Parameter] = {
         Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0)),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
+        Parameter("G", "m", "gap between rod and support spring in a run", "G", None),
+        Parameter("P_d", "N", "amplitude of the drive in a run", "P_d", None),
+        Parameter("I_d", "A", "amplitude of the current in a run", "I_d", None, physical=False),
+        Parameter("phase", "rad", "phase of the drive in a run", r"\varphi", None, physical=False),
         Parameter("noise_sd", "m", "noise of a record", r"\sigma", None, physical=False),
+        Parameter("noise_x_rel", "m", "noise of x_rel in a run", r"\sigma_{x}", None, physical=False),
+        Parameter("noise_x_capsule", "m", "noise of x_capsule in a run", r"\sigma_{X2}", None, physical=False),
+        Parameter("noise_acceleration", "m/s^2", "noise of the acceleration in a run", r"\sigma_{a}", None, False),
+        Parameter("noise_current", "A", "noise of the current in a run", r"\sigma_{I}", None, physical=False),
         Parameter("amplitude", "m", "first turning point of a decay", "a_0", None, physical=False),
         Parameter("turning_time", "s", "time of the first turning point of a decay", "t_0", None, physical=False),
-        Parameter("x_start", "m", "x_rel at the start of a decay", "x_0", None, physical=False),
-        Parameter("y_start", "m/s", "rate of x_rel at the start of a decay", "y_0", None, physical=False),
+        Parameter("x_start", "m", "x_rel at the start of a record", "x_0", None, physical=False),
+        Parameter("y_start", "m/s", "rate of x_rel at the start of a record", "y_0", None, physical=False),
+        Parameter("capsule_start", "m/s", "speed of the capsule at the start of a run", "v_0", None, physical=False),
         Parameter(
             "tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", _halfnormal(np.deg2rad(1.0)), False
         ),
