@@ -8,7 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Experiment, Misfit, Start, Theta, no_design
+from capsule_id.experiments.base import Experiment, Start, Theta, no_design
+from capsule_id.experiments.misfit import Misfit
 from capsule_id.inference.result import PointFit
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
@@ -39,8 +40,8 @@ class Nothing(Experiment):
     def observed(self) -> np.ndarray:
         return np.zeros(0)
 
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
-        return Misfit(xp.zeros(0), xp.ones(0), no_design(0, xp))
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+        return (Misfit(xp.zeros(0), 1.0, 0.0, no_design(0, xp)),)
 
     def starts(self) -> dict[str, Start]:
         return {}
