@@ -11,6 +11,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Theta
 from capsule_id.experiments.dynamic_friction import DynamicFriction
+from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
 from capsule_id.experiments.line import Line
@@ -28,9 +29,10 @@ KINDS: Mapping[str, type[Experiment]] = {
     "sliding_friction": SlidingFriction,
     "motor_current": MotorCurrent,
     "support_spring": SupportSpring,
+    "forced_run": ForcedRun,
 }
 #: Experiments on the bench, as against forced runs.
-BENCH = tuple(KINDS)
+BENCH = tuple(kind for kind in KINDS if kind != "forced_run")
 
 
 def make_experiments(rig: Rig, which: str = "all") -> tuple[Experiment, ...]:
@@ -43,16 +45,12 @@ def make_experiments(rig: Rig, which: str = "all") -> tuple[Experiment, ...]:
     Raises
     ------
     InputError
-        If nothing is left to fit, or a kind has no likelihood yet.
+        If nothing is left to fit.
     """
     tables = [t for t in rig.tables if which == "all" or (t.kind in BENCH) == (which == "bench")]
     if not tables:
         rule = "the rig folder must hold an experiment to fit"
         raise InputError(rule, f"none with --experiments {which}", "add one to rig.toml", rig.folder / "rig.toml")
-    for table in tables:
-        if table.kind not in KINDS:
-            remedy = "fit the bench tests with --experiments bench"
-            raise InputError(f"{table.kind} has no likelihood yet", table.label, remedy, rig.folder / "rig.toml")
     return tuple(KINDS[table.kind](table, rig) for table in tables)
 
 
@@ -93,5 +91,5 @@ def compare(
         panels.append(friction_comparison(friction, everything[0], everything[1:]))
     for e in experiments:
         if not isinstance(e, FrictionExperiment):
-            panels.append(e.comparison(e.local(values), [e.local(draw) for draw in draws]))
+            panels += e.comparisons(e.local(values), [e.local(draw) for draw in draws])
     return tuple(panels)

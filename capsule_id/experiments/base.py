@@ -132,6 +132,10 @@ class Experiment(ABC):
     def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
         """Measured beside predicted at the point fit ``theta``, with a band from posterior ``draws`` (may be [])."""
 
+    def comparisons(self, theta: Theta, draws: list[Theta]) -> tuple[Comparison, ...]:
+        """All panels of the experiment."""
+        return (self.comparison(theta, draws),)
+
     def lint(self, theta: Theta) -> list[Finding]:
         """What the settings themselves say against the experiment, at the point fit."""
         del theta

@@ -17,11 +17,14 @@ import numpy as np
 
 from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory, simulate
 from capsule_id.capsule.smooth import Smoothing
-from capsule_id.experiments.base import Experiment, Misfit, Start, Theta
+from capsule_id.experiments.base import Experiment, Start, Theta
 from capsule_id.experiments.linear import NUISANCE_WIDTH
+from capsule_id.experiments.misfit import Misfit, ScaledMisfit
 from capsule_id.experiments.run_start import RunStart, rough_start
+from capsule_id.experiments.run_views import run_comparisons
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.views import Comparison
 
 #: Channel of the table -> symbol of its noise; the order of the misfits.
 NOISES = {
@@ -56,7 +59,7 @@ class ForcedRun(Experiment):
     time_series = True
     masses = ("m1", "m2")
     ARRAYS = ("time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "reading_variance", "smoothing")
-    STATIC = ("channels", "start", "gap_known", "drive_known", "colours", "model")
+    STATIC = ("channels", "start", "gap_known", "drive_known", "gained", "coloured", "second_reading", "model")
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)
@@ -76,7 +79,9 @@ class ForcedRun(Experiment):
         self.ranges = np.array([max(float(np.ptp(y)), _floor(table, name)) for name, y in self._by_channel()])
         self.widths = NUISANCE_WIDTH * self.ranges
         self.gains = np.array([float(table.settings.get(f"{name}_gain_sd", 0.0)) for name in self.channels])  # type: ignore[arg-type]
-        self.colours = tuple(table.settings.get("noise") == "ar1" for _ in self.channels)
+        self.gained = tuple(f"{name}_gain_sd" in table.settings for name in self.channels)
+        self.second_reading = self.driven_by_current and self.drive_sd > 0.0
+        self.coloured = table.settings.get("noise") == "ar1"
         self.model: Model = "exact"
         self.smoothing = np.zeros(4)
         wanted = str(table.settings.get("start", "auto"))
@@ -113,11 +118,7 @@ class ForcedRun(Experiment):
     def observed(self) -> np.ndarray:
         """Channel after channel, then the stated P_d where the current is recorded too."""
         readings = list(self.values)
-        return np.concatenate([*readings, [self.drive]] if self._second_reading else readings)
-
-    @property
-    def _second_reading(self) -> bool:
-        return self.driven_by_current and self.drive_sd > 0.0
+        return np.concatenate([*readings, [self.drive]] if self.second_reading else readings)
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
@@ -141,13 +142,14 @@ class ForcedRun(Experiment):
             rows.append(parameter("capsule_start", of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length)))
         for name, scale in zip(self.channels, self.ranges, strict=True):
             rows.append(parameter(NOISES[name], of, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
-        rows += [parameter(f"ar1_{name}", of) for name, on in zip(self.channels, self.colours, strict=True) if on]
+        if self.coloured:
+            rows += [parameter(f"ar1_{name}", of) for name in self.channels]
         return tuple(rows)
 
     @property
     def scatters(self) -> tuple[str | None, ...]:
         own: tuple[str | None, ...] = tuple(NOISES[name] for name in self.channels)
-        return (*own, None) if self._second_reading else own
+        return (*own, None) if self.second_reading else own
 
     def starts(self) -> dict[str, Start]:
         """From the record: nuisances alone; what the bench measures has its start there, or at its prior's centre."""
@@ -166,9 +168,8 @@ class ForcedRun(Experiment):
             starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * self.Omega * rough.length)
         for name, noise in rough.noise.items():
             starts[f"{NOISES[name]}[{of}]"] = Start(noise, 0.1)
-        for name, on in zip(self.channels, self.colours, strict=True):
-            if on:
-                starts[f"ar1_{name}[{of}]"] = Start(0.0, 0.1)
+        if self.coloured:
+            starts |= {f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in self.channels}
         return starts
 
     # -- the motion and what is seen of it --------------------------------------------------------------------------
@@ -198,36 +199,70 @@ class ForcedRun(Experiment):
         return simulate(p, e, self.time, initial, model=self.model, smoothing=smoothing)
 
     def predict(self, theta: Theta, xp: ModuleType = jnp) -> list[Any]:
-        """Noise-free channels (n,), offsets and gains left out, in the order of ``channels``."""
+        """Noise-free channels (n,), offsets and gains left out, in the order of ``channels``.
+
+        Concrete values in ``theta`` may carry a batch axis (draws,): then (draws, n).
+        """
         p, e = self.capsule(theta)
         run = self.motion(theta, xp)
-        x_rel, rate = run.X1 - run.X2, run.Y1 - run.Y2
-        drive = xp.cos(self.Omega * self.time + e.phase)
+        x_rel, rate = xp.asarray(run.X1 - run.X2), xp.asarray(run.Y1 - run.Y2)
+
+        def column(leaf: Any) -> Any:
+            return xp.asarray(leaf)[..., None]
+
+        drive = xp.cos(self.Omega * self.time + column(e.phase))
         seen: list[Any] = []
         for name in self.channels:
             if name == "x_rel":
                 seen.append(x_rel)
             elif name == "x_capsule":
-                seen.append(run.X2)
+                seen.append(xp.asarray(run.X2))
             elif name == "acceleration_rod":
-                penetration = xp.maximum(x_rel - p.G, 0.0)
-                seen.append((e.P_d * drive - p.k1 * x_rel - p.c * rate - p.k2 * penetration) / p.m1)
+                spring = column(p.k1) * x_rel + column(p.k2) * xp.maximum(x_rel - column(p.G), 0.0)
+                seen.append((column(e.P_d) * drive - spring - column(p.c) * rate) / column(p.m1))
             else:
-                seen.append(theta["I_d"] * drive)
-        return [xp.asarray(channel) for channel in seen]
+                seen.append(column(theta["I_d"]) * drive)
+        return seen
 
     def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
         parts = []
         for i, (name, seen) in enumerate(zip(self.channels, self.predict(theta, xp), strict=True)):
             columns = [self.widths[i] * xp.ones(len(self.time))]
-            if f"{name}_gain_sd" in self.table.settings:
+            if self.gained[i]:
                 columns.append(self.gains[i] * seen)
             raw, design = self.values[i] - seen, xp.stack(columns, axis=1)
-            parts.append(Misfit(raw, self.reading_variance[i], 1.0, design))
-        if self._second_reading:
+            if self.coloured:
+                parts.append(_coloured(raw, self.reading_variance[i], design, xp.tanh(theta[f"ar1_{name}"]), xp))
+            else:
+                parts.append(Misfit(raw, self.reading_variance[i], 1.0, design))
+        if self.second_reading:
             raw = self.drive - theta["K"] * theta["I_d"]
             parts.append(Misfit(xp.reshape(raw, (1,)), self.drive_sd**2, 0.0, xp.zeros((1, 0))))
         return tuple(parts)
+
+
+    # -- what the report sees -----------------------------------------------------------------------------------------
+
+    def scaled(self, theta: Theta) -> list[ScaledMisfit]:
+        """The misfits at the scatters of ``theta``, NumPy."""
+        return self._scaled(theta, np)
+
+    def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
+        return self.comparisons(theta, draws)[0]
+
+    def comparisons(self, theta: Theta, draws: list[Theta]) -> tuple[Comparison, ...]:
+        return run_comparisons(self, theta, draws)
+
+
+def _coloured(raw: Any, variance: Any, design: Any, rho: Any, xp: ModuleType) -> Misfit:
+    """Readings with AR(1) noise as their innovations: e_t = rho e_(t-1) + N(0, variance + scatter^2), stationary."""
+
+    def whiten(y: Any) -> Any:
+        return xp.concatenate([y[:1], y[1:] - rho * y[:-1]])
+
+    first = 1.0 / xp.sqrt(1.0 - rho**2)
+    scale = xp.concatenate([xp.reshape(first, (1,)), xp.ones(raw.shape[0] - 1)])
+    return Misfit(whiten(raw), variance * scale**2, scale, whiten(design))
 
 
 def _angular_frequency(table: Table) -> float:

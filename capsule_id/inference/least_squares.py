@@ -103,6 +103,7 @@ def least_squares(
     tolerance: float = 1e-9,
     max_steps: int = 1024,
     normal_equations: bool = False,
+    by_effect: bool = False,
 ) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
@@ -121,6 +122,8 @@ def least_squares(
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
     normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
         times as fast where there are thousands of residuals
+    by_effect : scale each parameter by its effect on the residuals at the start (Marquardt 1963) instead of by its size:
+        for parameters whose size says nothing, such as logarithms and phases
 
     Raises
     ------
@@ -131,7 +134,7 @@ def least_squares(
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
     _, jacobian = _linearise(residual, jnp.asarray(starts))
-    scale, unit = jax.vmap(_scales)(jacobian, jnp.asarray(starts))
+    scale, unit = jax.vmap(_effects if by_effect else _scales)(jacobian, jnp.asarray(starts))
     solve = partial(_solve, residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations)
     # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
     ends, steps, results = zip(*map(solve, jnp.asarray(starts), scale, unit), strict=True)
@@ -239,7 +242,7 @@ def _solve(
 ) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
     """From one start (d,): x (d,), steps, result code."""
     solution = optx.least_squares(
-        lambda v, _: residual(v * scale) / unit,
+        lambda v, _: _differentiable(v * scale, residual) / unit,
         optx.LevenbergMarquardt(
             rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR()
         ),
@@ -248,6 +251,31 @@ def _solve(
         throw=False,
     )
     return solution.value * scale, solution.stats["num_steps"], solution.result
+
+
+@eqx.filter_custom_jvp
+def _differentiable(x: jax.Array, residual: Residual) -> jax.Array:
+    """residual(x) with its tangents through the whole Jacobian, by forward mode: an event-driven run has no other.
+
+    The solver linearises once and applies the result many times, which it cannot do with a loop of unknown length.
+    """
+    return residual(x)
+
+
+@_differentiable.def_jvp
+def _differentiable_jvp(
+    primals: tuple[jax.Array, Residual], tangents: tuple[jax.Array, object]
+) -> tuple[jax.Array, jax.Array]:
+    x, residual = primals
+    return residual(x), jax.jacfwd(residual)(x) @ tangents[0]
+
+
+def _effects(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """As ``_scales``: every column of the Jacobian gets the same norm, which is then the unit of the residuals."""
+    column_norm = jnp.linalg.norm(jacobian, axis=0)
+    unit = jnp.max(column_norm)
+    unit = jnp.where(unit > 0, unit, 1.0)
+    return jnp.where(column_norm > 0, unit / column_norm, jnp.ones_like(start)), unit
 
 
 def _scales(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:

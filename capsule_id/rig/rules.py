@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.rig.tables import TableFile
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
@@ -140,3 +140,7 @@ def _check_drive(document: TomlDocument, path: KeyPath, table: Table, file: Tabl
         rule = "forced_run must have P_d where current is not recorded"
         remedy = 'add P_d = { value = ..., sd = ..., unit = "N" }'
         raise document.error(path, rule, f"columns {' '.join(file.columns)}", remedy)
+    drive = table.settings.get("P_d")
+    if "current" in table.columns and isinstance(drive, Quantity) and drive.sd == 0.0:
+        rule = "P_d beside a recorded current is a second reading of the same amplitude and must have an sd"
+        raise document.error((*path, "P_d"), rule, "none", 'add sd = ... to it, or leave P_d out')
