@@ -76,10 +76,14 @@ def constrain(structure: Structure, u: Any, xp: ModuleType = jnp) -> Any:
 
 def log_prior(structure: Structure, numbers: Numbers, u: Any) -> Any:
     """Normalised log prior density of u (d,), Jacobian included; scalar."""
-    prior = numbers["prior"]
-    z = prior_residuals(structure, prior, u)
+    return jnp.sum(prior_terms(numbers["prior"], u, constrain(structure, u)))
+
+
+def prior_terms(prior: Mapping[str, Any], u: Any, value: Any) -> Any:
+    """The same parameter by parameter: of u, constrained ``value``, shaped as the arrays of ``prior``."""
+    z = (jnp.where(prior["lognormal"], u, value) - prior["centre"]) / prior["width"]
     density = -0.5 * (z**2 + LOG_2PI) - jnp.log(prior["width"]) + prior["constant"]
-    return jnp.sum(density + jnp.where(prior["jacobian"], u, 0.0))
+    return density + jnp.where(prior["jacobian"], u, 0.0)
 
 
 def prior_residuals(structure: Structure, prior: Mapping[str, Any], u: Any, xp: ModuleType = jnp) -> Any:

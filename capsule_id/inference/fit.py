@@ -14,6 +14,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks import informed, run_checks
 from capsule_id.inference.experiment_checks import Setting
 from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.notes import make_notes
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit, Posterior, Result
@@ -59,7 +60,7 @@ def fit_rig(
     point = point_fit(target, seeds[0])
     posterior = None
     if budget is not None:
-        posterior = sample(target, point, seeds[1], budget, store, progress)
+        posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)
     values = {**target.fixed, **point.values}
     setting = Setting(rig, experiments, target, point, posterior, values)
     findings, flagged = run_checks(setting)

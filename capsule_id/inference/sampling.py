@@ -3,17 +3,15 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import emcee
 import numpy as np
 
 from capsule_id.inference.chain_store import ChainStore
-from capsule_id.inference.curvature import in_batches
 from capsule_id.inference.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
-from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.moves import Moves, candidates, differential_evolution
-from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.moves import Moves, block_move, candidates
+from capsule_id.inference.result import Posterior
 
 ENSEMBLES = 4
 #: Walkers of an ensemble: at least 64, and at least three for every parameter.
@@ -32,8 +30,10 @@ DEFAULT_BUDGET = 20_000
 #: One draw is stored per this part of the pilot's autocorrelation time, but at least one per MAX_THIN steps: a short
 #: pilot knows that time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
-#: Steps of the pilot's burn-in, and of each candidate move that it times.
-PILOT_BURN_IN, PILOT_STEPS = 300, 300
+#: Steps of the pilot's burn-in, half of which shapes the block proposal, and of each candidate move that it times.
+PILOT_BURN_IN, PILOT_STEPS = 100, 200
+#: The pilot looks no further once a move has an autocorrelation time, in steps, below this.
+GOOD_TAU = 10.0
 
 Progress = Callable[[int, int, str], None]
 
@@ -49,9 +49,24 @@ class Schedule:
     burn_in: int
 
 
+class Target(Protocol):
+    """What is sampled; see ``capsule_id.inference.marginal.MarginalPosterior``."""
+
+    names: tuple[str, ...]
+    dimension: int
+    blocks: list[np.ndarray]
+    centre: np.ndarray
+    covariance: np.ndarray
+
+    def parts(self, v: np.ndarray) -> np.ndarray: ...
+
+    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def theta(self, u: np.ndarray) -> np.ndarray: ...
+
+
 def sample(
-    target: LogPosterior,
-    fit: PointFit,
+    target: Target,
     seed: int,
     budget: int = DEFAULT_BUDGET,
     store: Path | None = None,
@@ -68,13 +83,11 @@ def sample(
     """
     report = progress or (lambda done, total, text: None)
     report(0, 1, "pilot")
-    seeds = np.random.SeedSequence(seed).generate_state(ENSEMBLES + 1)
-    schedule = pilot(target, fit, int(seeds[0]))
+    pilot_seed, restore_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 2))
+    schedule = pilot(target, pilot_seed)
     chains = None if store is None else ChainStore(store)
-    samplers = [_sampler(target, fit, schedule, int(s), i, store) for i, s in enumerate(seeds[1:])]
+    samplers = [_sampler(target, schedule, s, i, store) for i, s in enumerate(seeds)]
     last = max(budget // schedule.thin, 2)
-    draws = np.empty((ENSEMBLES, 0, 0, target.dimension))
-    tau, converged = np.empty((ENSEMBLES, target.dimension)), False
     for goal in _checks(last):
         if goal < last and all(sampler.iteration > goal for sampler in samplers):
             continue
@@ -83,40 +96,48 @@ def sample(
                 if chains is not None:
                     chains.between_draws()
                 report(sum(s.iteration for s in samplers), ENSEMBLES * goal, schedule.move)
-        draws = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
-        tau, rhat = ensemble_time(draws), split_rhat(draws)
-        converged = bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
-        if converged:
+        if _converged(np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])):
             break
     if chains is not None:
         chains.save()
+    draws, lp = target.restore(np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers]), restore_seed)
+    theta = target.theta(draws)
     return Posterior(
         names=target.names,
-        draws=target.theta(draws),
-        lp=np.stack([np.asarray(sampler.get_log_prob())[: draws.shape[1]] for sampler in samplers]),
+        draws=theta,
+        lp=lp,
         acceptance=np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers]),
-        tau=np.max(tau, axis=0),
-        rhat=split_rhat(target.theta(draws)),
-        ess=effective_sample_size(draws, integrated_time(target.theta(draws))),
-        converged=converged,
+        tau=np.max(ensemble_time(draws), axis=0),
+        rhat=split_rhat(theta),
+        ess=effective_sample_size(draws, integrated_time(theta)),
+        converged=_converged(draws),
         moves={schedule.move: schedule.measured[schedule.move], **schedule.measured},
         steps=draws.shape[1] * schedule.thin,
         thin=schedule.thin,
     )
 
 
-def pilot(target: LogPosterior, fit: PointFit, seed: int) -> Schedule:
-    """Burn in one ensemble, then measure the autocorrelation time of every candidate move on it."""
+def _converged(draws: np.ndarray) -> bool:
+    """Long enough and in agreement: (ensemble, draw, walker, d)."""
+    tau, rhat = ensemble_time(draws), split_rhat(draws)
+    return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
+
+
+def pilot(target: Target, seed: int) -> Schedule:
+    """Burn in one ensemble, then measure the autocorrelation time of candidate moves on it until one is good."""
     random = np.random.RandomState(seed)
-    state: Any = emcee.State(_initial(target, fit, random), random_state=random.get_state())
-    sampler = _ensemble(target, state.coords.shape[0], differential_evolution())
-    state = sampler.run_mcmc(state, 2 * PILOT_BURN_IN)
-    sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN, flat=True))
+    state: Any = emcee.State(_initial(target, random), random_state=random.get_state())
+    rough = block_move(target.blocks, target.centre, OVERDISPERSION**2 * target.covariance)
+    sampler = _ensemble(target, state.coords.shape[0], rough)
+    state = sampler.run_mcmc(state, PILOT_BURN_IN)
+    sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN // 2, flat=True))
     measured, moves = {}, candidates(sample, target.blocks)
     for name, candidate in moves.items():
         sampler = _ensemble(target, state.coords.shape[0], candidate)
         state = sampler.run_mcmc(state, PILOT_STEPS)
         measured[name] = float(np.max(ensemble_time(np.asarray(sampler.get_chain())[None])))
+        if measured[name] < GOOD_TAU:
+            break
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
@@ -142,12 +163,10 @@ def _advance(sampler: emcee.EnsembleSampler, goal: int, thin: int) -> Iterator[e
             yield state
 
 
-def _sampler(
-    target: LogPosterior, fit: PointFit, schedule: Schedule, seed: int, number: int, store: Path | None
-) -> emcee.EnsembleSampler:
+def _sampler(target: Target, schedule: Schedule, seed: int, number: int, store: Path | None) -> emcee.EnsembleSampler:
     """One ensemble: burnt in from its own overdispersed start, or taken up where ``store`` left it."""
     random = np.random.RandomState(seed)
-    start = _initial(target, fit, random)
+    start = _initial(target, random)
     backend: Any = None if store is None else emcee.backends.HDFBackend(str(store), name=f"ensemble_{number}")
     if backend is not None and backend.initialized and backend.iteration > 0:
         sampler = _ensemble(target, len(start), schedule.moves, backend)
@@ -162,21 +181,23 @@ def _sampler(
     return sampler
 
 
-def _ensemble(target: LogPosterior, walkers: int, moves: Moves, backend: Any = None) -> emcee.EnsembleSampler:
-    def log_density(u: np.ndarray) -> np.ndarray:
-        return in_batches(target.batch, u)
+def _ensemble(target: Target, walkers: int, moves: Moves, backend: Any = None) -> emcee.EnsembleSampler:
+    def log_density(v: np.ndarray) -> np.ndarray:
+        """(w, 1 + blocks): emcee keeps what follows the log-density as blobs, and ``BlockMove`` reads them."""
+        parts = target.parts(v)
+        return np.concatenate([np.sum(parts, axis=1, keepdims=True), parts], axis=1)
 
     return emcee.EnsembleSampler(walkers, target.dimension, log_density, vectorize=True, moves=moves, backend=backend)
 
 
-def _initial(target: LogPosterior, fit: PointFit, random: np.random.RandomState) -> np.ndarray:
+def _initial(target: Target, random: np.random.RandomState) -> np.ndarray:
     """(walkers, d) from the widened Laplace approximation, every one where the posterior is not zero."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
-    root = OVERDISPERSION * np.linalg.cholesky(fit.covariance)
-    u = fit.u + random.standard_normal((walkers, target.dimension)) @ root.T
+    root = OVERDISPERSION * np.linalg.cholesky(target.covariance)
+    u = target.centre + random.standard_normal((walkers, target.dimension)) @ root.T
     for _ in range(100):
-        bad = ~np.isfinite(in_batches(target.batch, u))
+        bad = ~np.all(np.isfinite(target.parts(u)), axis=1)
         if not bad.any():
             return u
-        u[bad] = fit.u + random.standard_normal((int(bad.sum()), target.dimension)) @ root.T
+        u[bad] = target.centre + random.standard_normal((int(bad.sum()), target.dimension)) @ root.T
     raise RuntimeError("no finite log-posterior near the point fit: the Laplace approximation does not hold there")
