@@ -126,8 +126,14 @@ TABLE: Mapping[str, Parameter] = {
         Parameter("x_start", "m", "x_rel at the start of a record", "x_0", None, physical=False),
         Parameter("y_start", "m/s", "rate of x_rel at the start of a record", "y_0", None, physical=False),
         *(
-            Parameter(f"ar1_{name}", "1", f"atanh of the noise's lag-1 correlation, {name} of a run", r"\alpha",
-                      Prior("normal", 0.0, 1.0), False)
+            Parameter(
+                f"ar1_{name}",
+                "1",
+                f"atanh of the noise's lag-1 correlation, {name} of a run",
+                r"\alpha",
+                Prior("normal", 0.0, 1.0),
+                False,
+            )
             for name in ("x_rel", "x_capsule", "acceleration_rod", "current")
         ),
         Parameter("capsule_start", "m/s", "speed of the capsule at the start of a run", "v_0", None, physical=False),

@@ -58,8 +58,11 @@ class ForcedRun(Experiment):
 
     time_series = True
     masses = ("m1", "m2")
-    ARRAYS = ("time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "reading_variance", "smoothing")
-    STATIC = ("channels", "start", "gap_known", "drive_known", "gained", "coloured", "second_reading", "model")
+    ARRAYS = (
+        "time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "reading_variance", "smoothing",
+        "moves",
+    )  # fmt: skip
+    STATIC = ("channels", "settled", "gap_known", "drive_known", "gained", "coloured", "second_reading", "model")
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)
@@ -86,6 +89,9 @@ class ForcedRun(Experiment):
         self.smoothing = np.zeros(4)
         wanted = str(table.settings.get("start", "auto"))
         self.start = self.rough.kind if wanted == "auto" else wanted
+        self.settled = self.start == "settled"
+        #: Factor of ``capsule_start``, so that runs of both kinds are computed together.
+        self.moves = float(self.start == "moving")
 
     def _by_channel(self) -> list[tuple[str, np.ndarray]]:
         return list(zip(self.channels, self.values, strict=True))
@@ -134,12 +140,14 @@ class ForcedRun(Experiment):
         elif not self.drive_known:
             rows.append(parameter("P_d", of, Prior("positive_normal", self.drive, self.drive_sd)))
         rows.append(parameter("phase", of, Prior("normal", 0.0, PHASE_WIDTH)))
-        if self.start != "settled":
+        if not self.settled:
             length = NUISANCE_WIDTH * self.rough.length
             rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
             rows.append(parameter("y_start", of, Prior("normal", 0.0, self.Omega * length)))
         if self.start == "moving":
-            rows.append(parameter("capsule_start", of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length)))
+            rows.append(
+                parameter("capsule_start", of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length))
+            )
         for name, scale in zip(self.channels, self.ranges, strict=True):
             rows.append(parameter(NOISES[name], of, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
         if self.coloured:
@@ -161,7 +169,7 @@ class ForcedRun(Experiment):
             starts[f"I_d[{of}]"] = Start(rough.amplitude, 0.005)
         elif not self.drive_known:
             starts[f"P_d[{of}]"] = Start(self.drive, 0.5 * self.drive_sd / self.drive)
-        if self.start != "settled":
+        if not self.settled:
             starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
             starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * self.Omega * rough.length)
         if self.start == "moving":
@@ -177,24 +185,24 @@ class ForcedRun(Experiment):
     def capsule(self, theta: Theta) -> tuple[CapsuleParameters, Excitation]:
         """Parameters and drive of this run; leaves as in ``theta``."""
         gap = self.gap if self.gap_known else theta["G"]
-        if self.driven_by_current:
-            force = theta["K"] * theta["I_d"]
-        else:
-            force = self.drive if self.drive_known else theta["P_d"]
+        stated = self.drive if self.drive_known else theta.get("P_d")
+        force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
         names = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "g")
-        return CapsuleParameters(G=gap, **{name: theta[name] for name in names}), Excitation(force, self.Omega, theta["phase"])
+        return CapsuleParameters(G=gap, **{name: theta[name] for name in names}), Excitation(
+            force, self.Omega, theta["phase"]
+        )
 
     def motion(self, theta: Theta, xp: ModuleType = jnp) -> Trajectory:
         """The model's motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
         smoothing = None if self.model == "exact" else Smoothing(*(self.smoothing[i] for i in range(4)))
-        if self.start == "settled":
+        if self.settled:
             early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
             run = simulate(p, e, xp.concatenate([early, self.time]), model=self.model, smoothing=smoothing)
             settled = {name: getattr(run, name)[1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
             X2 = settled["X2"][0]
             return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})
-        Y2 = theta["capsule_start"] if self.start == "moving" else 0.0 * theta["x_start"]
+        Y2 = self.moves * theta.get("capsule_start", 0.0) + 0.0 * theta["x_start"]
         initial = (theta["x_start"], theta["y_start"] + Y2, 0.0, Y2)
         return simulate(p, e, self.time, initial, model=self.model, smoothing=smoothing)
 
@@ -239,7 +247,6 @@ class ForcedRun(Experiment):
             raw = self.drive - theta["K"] * theta["I_d"]
             parts.append(Misfit(xp.reshape(raw, (1,)), self.drive_sd**2, 0.0, xp.zeros((1, 0))))
         return tuple(parts)
-
 
     # -- what the report sees -----------------------------------------------------------------------------------------
 

@@ -29,7 +29,7 @@ class Group:
     Attributes
     ----------
     signature : of every member, see ``Experiment.signature``
-    entries : symbol and, for every member, which entry of u it is
+    entries : symbol and, for every member, which entry of u it is (d: none, its value is 0)
     constants : symbols that are not sampled (g, masses stated as exact)
     first : the member whose code is traced
     """
@@ -59,12 +59,22 @@ def make_groups(
     groups, arrays = [], []
     for signature, group in members.items():
         first = group[0]
-        sampled = [row.symbol for row in first.parameters] + [m for m in first.masses if m in names]
         own = [{row.symbol: row.name for row in e.parameters} for e in group]
-        entries = tuple((s, tuple(names.index(table.get(s, s)) for table in own)) for s in sampled)
+        sampled = list(dict.fromkeys(s for table in own for s in table)) + [m for m in first.masses if m in names]
+        entries = tuple((s, tuple(_entry(table.get(s, s), names) for table in own)) for s in sampled)
         groups.append(Group(signature, entries, tuple(sorted(fixed)), first))
         arrays.append({a: jnp.stack([jnp.asarray(getattr(e, a), dtype=float) for e in group]) for a in first.ARRAYS})
     return tuple(groups), arrays
+
+
+def _entry(name: str, names: Sequence[str]) -> int:
+    """Which entry of u; one past the last for what this member of a group lacks and others have."""
+    return names.index(name) if name in names else len(names)
+
+
+def pick(values: Any, entries: Sequence[int]) -> Any:
+    """(members,) of the values (d,); 0 for what a member lacks."""
+    return jnp.concatenate([values, jnp.zeros(1)])[jnp.array(entries)]
 
 
 def constrain(structure: Structure, u: Any, xp: ModuleType = jnp) -> Any:
@@ -79,11 +89,11 @@ def log_prior(structure: Structure, numbers: Numbers, u: Any) -> Any:
     return jnp.sum(prior_terms(numbers["prior"], u, constrain(structure, u)))
 
 
-def prior_terms(prior: Mapping[str, Any], u: Any, value: Any) -> Any:
+def prior_terms(prior: Mapping[str, Any], u: Any, value: Any, xp: ModuleType = jnp) -> Any:
     """The same parameter by parameter: of u, constrained ``value``, shaped as the arrays of ``prior``."""
-    z = (jnp.where(prior["lognormal"], u, value) - prior["centre"]) / prior["width"]
-    density = -0.5 * (z**2 + LOG_2PI) - jnp.log(prior["width"]) + prior["constant"]
-    return density + jnp.where(prior["jacobian"], u, 0.0)
+    z = (xp.where(prior["lognormal"], u, value) - prior["centre"]) / prior["width"]
+    density = -0.5 * (z**2 + LOG_2PI) - xp.log(prior["width"]) + prior["constant"]
+    return density + xp.where(prior["jacobian"], u, 0.0)
 
 
 def prior_residuals(structure: Structure, prior: Mapping[str, Any], u: Any, xp: ModuleType = jnp) -> Any:
@@ -134,7 +144,7 @@ def _per_group(
     values, results = constrain(structure, u), []
     for group, arrays in zip(structure.groups, numbers["arrays"], strict=True):
         constants = {name: numbers["fixed"][name] for name in group.constants}
-        theta = {symbol: values[jnp.array(entries)] for symbol, entries in group.entries}
+        theta = {symbol: pick(values, entries) for symbol, entries in group.entries}
 
         def one(arrays: Any, theta: Any, constants: Any = constants, first: Experiment = group.first) -> Any:
             return function(first.with_arrays(arrays), {**theta, **constants})

@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments import compare, make_experiments, paper_estimates
+from capsule_id.experiments import BENCH, compare, make_experiments, paper_estimates
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.checks import informed, run_checks
 from capsule_id.inference.experiment_checks import Setting
+from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.notes import make_notes
-from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit, Posterior, Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, Progress, sample
 from capsule_id.parameters import Parameter, parameter
@@ -26,6 +28,8 @@ from capsule_id.views import Comparison, NoteTable
 #: Posterior draws behind bands and predictive p-values, and behind the pointwise log-likelihood.
 BAND_DRAWS = 200
 PRIOR_DRAWS = 2000
+#: Starts of the fit of forced runs, each of which costs seconds.
+JOINT_STARTS = 3
 PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
 
@@ -57,7 +61,7 @@ def fit_rig(
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
     if progress:
         progress(0, 1, "point fit")
-    point = point_fit(target, seeds[0])
+    point = _fit(rig, target, seeds[0])
     posterior = None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)
@@ -84,6 +88,18 @@ def fit_rig(
         },
         groups=_groups(target, experiments, posterior, rng),
     )
+
+
+def _fit(rig: Rig, target: LogPosterior, seed: int) -> PointFit:
+    """The point fit: of bench experiments directly, of runs starting from what the bench tells."""
+    bench = [e for e in target.experiments if not isinstance(e, ForcedRun)]
+    if len(bench) == len(target.experiments):
+        return point_fit(target, seed)
+    starts = dispersed_starts(target, seed, JOINT_STARTS)
+    if bench:
+        return joint_fit(target, point_fit(LogPosterior(rig, bench), seed), starts)
+    measured = [table for table in rig.tables if table.kind in BENCH]
+    return joint_fit(target, paper_estimates(make_experiments(rig, "bench")) if measured else {}, starts)
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:

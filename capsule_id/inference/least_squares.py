@@ -4,9 +4,10 @@ Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the mini
 σ² (JᵀJ)⁻¹ with σ² = Σ r² / (n − d) unless it is known (Seber & Wild, *Nonlinear Regression*, 1989, ch. 2).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -103,7 +104,7 @@ def least_squares(
     tolerance: float = 1e-9,
     max_steps: int = 1024,
     normal_equations: bool = False,
-    by_effect: bool = False,
+    heavy: bool = False,
 ) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
@@ -122,8 +123,8 @@ def least_squares(
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
     normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
         times as fast where there are thousands of residuals
-    by_effect : scale each parameter by its effect on the residuals at the start (Marquardt 1963) instead of by its size:
-        for parameters whose size says nothing, such as logarithms and phases
+    heavy : the residuals take milliseconds, so that compiling them well pays; each parameter is then scaled by its
+        effect at the start (Marquardt 1963) instead of by its size, which says nothing of logarithms and phases
 
     Raises
     ------
@@ -133,13 +134,15 @@ def least_squares(
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    _, jacobian = _linearise(residual, jnp.asarray(starts))
-    scale, unit = jax.vmap(_effects if by_effect else _scales)(jacobian, jnp.asarray(starts))
-    solve = partial(_solve, residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations)
+    linearise, solver = _PROGRAMS[heavy]
+    jacobian = jnp.stack([linearise(residual, x)[1] for x in jnp.asarray(starts)])
+    scale, unit = jax.vmap(_effects if heavy else _scales)(jacobian, jnp.asarray(starts))
+    solve = partial(solver, residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations)
     # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
     ends, steps, results = zip(*map(solve, jnp.asarray(starts), scale, unit), strict=True)
     x, steps = np.stack(ends), np.array(steps, dtype=int)
-    residuals, jacobian = (np.asarray(array) for array in _linearise(residual, jnp.asarray(x)))
+    ended = [linearise(residual, point) for point in jnp.asarray(x)]
+    residuals, jacobian = (np.stack(parts) for parts in zip(*ended, strict=True))
     message = []
     for i in range(len(starts)):
         reason = optx.RESULTS[results[i]]
@@ -221,15 +224,6 @@ def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) ->
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
-# Equinox hands the options of jax.jit on; its annotations leave them out.
-@eqx.filter_jit(compiler_options=QUICK_COMPILE)  # pyright: ignore[reportCallIssue]
-def _linearise(residual: Residual, points: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Residuals (s, n) and Jacobians (s, n, d) at points (s, d)."""
-    return eqx.filter_vmap(lambda x: (residual(x), jax.jacfwd(residual)(x)))(points)
-
-
-# Equinox hands the options of jax.jit on; its annotations leave them out.
-@eqx.filter_jit(compiler_options=QUICK_COMPILE)  # pyright: ignore[reportCallIssue]
 def _solve(
     residual: Residual,
     start: jax.Array,
@@ -266,8 +260,32 @@ def _differentiable(x: jax.Array, residual: Residual) -> jax.Array:
 def _differentiable_jvp(
     primals: tuple[jax.Array, Residual], tangents: tuple[jax.Array, object]
 ) -> tuple[jax.Array, jax.Array]:
-    x, residual = primals
-    return residual(x), jax.jacfwd(residual)(x) @ tangents[0]
+    residual = primals[1]
+    value, jacobian = _linearise(residual, primals[0])
+    return value, jacobian @ tangents[0]
+
+
+def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Residuals (n,) and Jacobian (n, d) at x (d,), forward mode, the residuals compiled once for both."""
+
+    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value = residual(x)
+        return value, value
+
+    jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
+    return value, jacobian
+
+
+def _compiled(function: Callable[..., Any], options: Mapping[str, int]) -> Callable[..., Any]:
+    # Equinox hands the options of jax.jit on; its annotations leave them out.
+    return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+
+
+#: (linearise, solve) by whether the residuals take long.
+_PROGRAMS = {
+    heavy: tuple(_compiled(function, {} if heavy else QUICK_COMPILE) for function in (_linearise, _solve))
+    for heavy in (False, True)
+}
 
 
 def _effects(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:

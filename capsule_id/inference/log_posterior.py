@@ -18,6 +18,9 @@ from capsule_id.inference import density
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
 from capsule_id.rig.model import PriorOverride, Rig
 
+#: Starts from a prior alone are dispersed by no more than this, natural-log units.
+WIDEST_START = 0.3
+
 
 class LogPosterior:
     """Experiments and priors, joined.
@@ -61,7 +64,7 @@ class LogPosterior:
         return np.array([row.scatter for row in self.parameters])
 
     @cached_property
-    def _priors(self) -> dict[str, np.ndarray]:
+    def priors(self) -> dict[str, np.ndarray]:
         """Kinds and numbers of the priors as arrays, so that the density is one expression."""
         priors = [_prior(row) for row in self.parameters]
         kinds = np.array([prior.kind for prior in priors])
@@ -85,7 +88,7 @@ class LogPosterior:
         """(d,) sd of u under the prior (half-normal: of its logarithm, pi/sqrt(8))."""
         kinds = np.array([_prior(row).kind for row in self.parameters])
         location = np.array([_prior(row).location for row in self.parameters])
-        width = self._priors["width"]
+        width = self.priors["width"]
         sd = np.where(kinds == "positive_normal", width / np.where(location == 0.0, 1.0, location), width)
         return np.where(kinds == "halfnormal", np.pi / np.sqrt(8.0), sd)
 
@@ -115,7 +118,7 @@ class LogPosterior:
     @cached_property
     def numbers(self) -> dict[str, Any]:
         """Readings, priors and constants, on the device."""
-        prior = {name: jnp.asarray(value) for name, value in self._priors.items()}
+        prior = {name: jnp.asarray(value) for name, value in self.priors.items()}
         fixed = {name: jnp.asarray(value) for name, value in self.fixed.items()}
         return {"arrays": self._arrays, "prior": prior, "fixed": fixed}
 
@@ -141,7 +144,7 @@ class LogPosterior:
 
     def prior_residuals(self, u: np.ndarray) -> np.ndarray:
         """(d,) (value - centre)/width: half their sum of squares is the parameter-dependent part of -log prior."""
-        return np.asarray(density.prior_residuals(self.structure, self._priors, u, np))
+        return np.asarray(density.prior_residuals(self.structure, self.priors, u, np))
 
     def plain_residuals(self, u: np.ndarray) -> np.ndarray:
         """The same residuals as ``residuals`` in NumPy, in the order of the experiments, nothing compiled."""
@@ -162,9 +165,10 @@ class LogPosterior:
                 centres = np.array([s.centre for s in starts])
                 centre = np.exp(np.mean(np.log(centres))) if row.positive else np.mean(centres)
                 merged[row.name] = Start(float(centre), min(s.spread for s in starts))
-            else:  # a mass: its weighing
+            else:  # a mass: its weighing; what only runs know: the middle of its prior
                 prior = _prior(row)
-                merged[row.name] = Start(prior.location, prior.spread / prior.location)
+                spread = np.log(prior.spread) if prior.kind == "lognormal" else prior.spread / prior.location
+                merged[row.name] = Start(prior.location, min(spread, WIDEST_START))
         return merged
 
     def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, np.ndarray]:

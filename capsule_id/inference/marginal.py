@@ -189,7 +189,7 @@ def _conditional(
     for group, arrays in zip(layout.structure.groups, numbers["arrays"], strict=True):
         symbols, entries = group.first.scatters, dict(group.entries)
         places = [None if s is None else [layout.scatter.index(i) for i in entries[s]] for s in symbols]
-        theta = {s: values[jnp.array(i)] for s, i in entries.items() if s not in symbols}
+        theta = {s: density.pick(values, i) for s, i in entries.items() if s not in symbols}
         constants = {name: numbers["fixed"][name] for name in group.constants}
         members = len(group.entries[0][1])
         own = tuple(jnp.zeros(members) if p is None else sizes[jnp.array(p)] for p in places)

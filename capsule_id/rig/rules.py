@@ -143,4 +143,4 @@ def _check_drive(document: TomlDocument, path: KeyPath, table: Table, file: Tabl
     drive = table.settings.get("P_d")
     if "current" in table.columns and isinstance(drive, Quantity) and drive.sd == 0.0:
         rule = "P_d beside a recorded current is a second reading of the same amplitude and must have an sd"
-        raise document.error((*path, "P_d"), rule, "none", 'add sd = ... to it, or leave P_d out')
+        raise document.error((*path, "P_d"), rule, "none", "add sd = ... to it, or leave P_d out")
