@@ -26,6 +26,10 @@ Residual = Callable[[jax.Array], jax.Array]
 #: XLA options for what is compiled to run once: it runs for milliseconds, compiling it well takes seconds.
 QUICK_COMPILE = {"xla_backend_optimization_level": 0}
 
+FIRST_DAMPING = 1e-6
+"""Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
+strongly correlated, and a start near the minimum must not look converged for heavy damping."""
+
 SMALLEST_EFFECT = 0.01
 """Dimensionless. Where changing a parameter by 100 % of its start moves the residuals by less than this share of what
 the strongest parameter does, the parameter's scale is the step that moves them by this share: zero has no size."""
@@ -293,7 +297,9 @@ def _effects(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Arra
     column_norm = jnp.linalg.norm(jacobian, axis=0)
     unit = jnp.max(column_norm)
     unit = jnp.where(unit > 0, unit, 1.0)
-    return jnp.where(column_norm > 0, unit / column_norm, jnp.ones_like(start)), unit
+    scale = jnp.where(column_norm > 0, unit / column_norm, jnp.ones_like(start))
+    # The solver begins with a damping of 1: beside residuals in larger units it is weaker by their square.
+    return scale, jnp.sqrt(FIRST_DAMPING) * unit
 
 
 def _scales(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
