@@ -97,6 +97,8 @@ def _windows(
     for _ in range(ROUNDS):
         grid = Grid(low, width / (FEWEST - 1), straight, FEWEST)
         known, density, integral = terms(probes, grid)
+        # A walker without density anywhere keeps its window; it has no mass either.
+        density = np.where(np.any(np.isfinite(density), axis=-1, keepdims=True), density, 0.0)
         density = np.where(np.isnan(density), -np.inf, density)
         density = density - np.max(density, axis=-1, keepdims=True)
         core = low + np.argmax(density > -CORE, axis=-1) * grid.step
@@ -108,6 +110,8 @@ def _windows(
         if settled:
             break
     posterior = known[:, block] + integral @ (block[:, None] == block)
+    if not np.all(np.isfinite(posterior[0])):
+        raise RuntimeError("the posterior is not finite at the point fit: no scatter can be integrated out there")
     return low, core, low + width, posterior > posterior[0] - NO_MASS
 
 
