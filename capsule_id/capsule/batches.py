@@ -84,10 +84,11 @@ def run_lanes(kernel: Callable[..., Tree], lanes: Lanes, batched: bool) -> Tree:
     def run(index: np.ndarray) -> Tree:
         return jax.block_until_ready(kernel(*jax.tree.map(lambda leaf: leaf[index], (p, e, times, initial))))
 
-    results = [run(chunks[0])] if len(chunks) == 1 else list(_pool().map(run, chunks))
+    results = [run(chunks[0])] if len(chunks) == 1 else list(pool().map(run, chunks))
     return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate([np.asarray(x) for x in parts])[:size]), *results)
 
 
 @lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
+def pool() -> ThreadPoolExecutor:
+    """Threads, as many as cores, that compiled functions are called from."""
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="capsule-lanes")

@@ -9,6 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from capsule_id.capsule.batches import pool
+
 #: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
 STEP, RATIO = 0.05, 2.0
 #: A batch has this many rows always, so that it is compiled for one shape.
@@ -16,9 +18,10 @@ BATCH = 32
 
 
 def in_batches(function: Callable[[np.ndarray], np.ndarray], points: np.ndarray) -> np.ndarray:
-    """``function`` of (m, d) points, called with exactly ``BATCH`` rows at a time; (m,)."""
+    """``function`` of (m, d) points, called with exactly ``BATCH`` rows at a time, on all cores; (m,)."""
     padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % BATCH, axis=0)])
-    parts = [np.asarray(function(padded[i : i + BATCH])) for i in range(0, len(padded), BATCH)]
+    chunks = [padded[i : i + BATCH] for i in range(0, len(padded), BATCH)]
+    parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
     return np.concatenate(parts)[: len(points)]
 
 

@@ -14,8 +14,8 @@ from capsule_id.inference.moves import Moves, block_move, candidates
 from capsule_id.inference.result import Posterior
 
 ENSEMBLES = 4
-#: Walkers of an ensemble: at least 64, and at least three for every parameter.
-MIN_WALKERS, WALKERS_PER_PARAMETER = 64, 3
+#: Walkers of an ensemble: at least 64, and at least two for every parameter.
+MIN_WALKERS, WALKERS_PER_PARAMETER = 64, 2
 #: A sample is long enough when every parameter has more draws than this many autocorrelation times ...
 LENGTH_IN_TAU = 50.0
 #: ... and its ensembles agree when no split R-hat is above this.
