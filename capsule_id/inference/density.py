@@ -63,7 +63,9 @@ def make_groups(
         own = [{row.symbol: row.name for row in e.parameters} for e in group]
         entries = tuple((s, tuple(names.index(table.get(s, s)) for table in own)) for s in sampled)
         groups.append(Group(signature, entries, tuple(sorted(fixed)), first))
-        arrays.append({a: jnp.stack([jnp.asarray(getattr(e, a), dtype=float) for e in group]) for a in first.ARRAYS})
+        arrays.append(
+            {a: jnp.asarray(np.stack([np.asarray(getattr(e, a), dtype=float) for e in group])) for a in first.ARRAYS}
+        )
     return tuple(groups), arrays
 
 
