@@ -154,6 +154,10 @@ class Experiment(ABC):
         parts = [part.at_nuisance_mean(xp) for part in self._scaled(theta, xp)]
         return xp.concatenate([rest for rest, _ in parts] + [b for _, b in parts])
 
+    def records(self, theta: Theta) -> list[tuple[str, np.ndarray]]:
+        """Residuals of every record of the experiment, (n,) each in units of the noise, by label; NumPy."""
+        return [(self.label, np.asarray(self.residuals(theta, np))[: self.n])]
+
     def nuisance_mean(self, theta: Theta) -> np.ndarray:
         """(p,) conditional mean of the linear nuisances, in units of their priors."""
         return self.misfit(theta).at_nuisance_mean(np)[1]

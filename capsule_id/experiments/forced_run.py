@@ -254,6 +254,11 @@ class ForcedRun(Experiment):
         """The misfits at the scatters of ``theta``, NumPy."""
         return self._scaled(theta, np)
 
+    def records(self, theta: Theta) -> list[tuple[str, np.ndarray]]:
+        scaled = self.scaled(theta)[: len(self.channels)]
+        parts = zip(self.channels, scaled, strict=True)
+        return [(f"{self.label} {name}", np.asarray(part.at_nuisance_mean(np)[0])) for name, part in parts]
+
     def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
         return self.comparisons(theta, draws)[0]
 

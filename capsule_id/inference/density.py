@@ -63,7 +63,9 @@ def make_groups(
         sampled = list(dict.fromkeys(s for table in own for s in table)) + [m for m in first.masses if m in names]
         entries = tuple((s, tuple(_entry(table.get(s, s), names) for table in own)) for s in sampled)
         groups.append(Group(signature, entries, tuple(sorted(fixed)), first))
-        arrays.append({a: jnp.stack([jnp.asarray(getattr(e, a), dtype=float) for e in group]) for a in first.ARRAYS})
+        arrays.append(
+            {a: jnp.asarray(np.stack([np.asarray(getattr(e, a), dtype=float) for e in group])) for a in first.ARRAYS}
+        )
     return tuple(groups), arrays
 
 

@@ -22,6 +22,8 @@ from capsule_id.precision import require_float64
 require_float64()
 
 Residual = Callable[[jax.Array], jax.Array]
+#: Points (s, d) -> residuals (s, n) and their Jacobians (s, n, d).
+Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 #: XLA options for what is compiled to run once: it runs for milliseconds, compiling it well takes seconds.
 QUICK_COMPILE = {"xla_backend_optimization_level": 0}
@@ -109,6 +111,7 @@ def least_squares(
     max_steps: int = 1024,
     normal_equations: bool = False,
     heavy: bool = False,
+    linearise: Linearise | None = None,
 ) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
@@ -127,6 +130,8 @@ def least_squares(
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
     normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
         times as fast where there are thousands of residuals
+    linearise : the residuals and Jacobians that scale the starts and judge the ends, by another route; None compiles
+        forward-mode differentiation for them
     heavy : the residuals take milliseconds, so that compiling them well pays; each parameter is then scaled by its
         effect at the start (Marquardt 1963) instead of by its size, which says nothing of logarithms and phases
 
@@ -138,15 +143,15 @@ def least_squares(
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    linearise, solver = _PROGRAMS[heavy]
-    jacobian = jnp.stack([linearise(residual, x)[1] for x in jnp.asarray(starts)])
-    scale, unit = jax.vmap(_effects if heavy else _scales)(jacobian, jnp.asarray(starts))
+    linearise = linearise or partial(_forward_mode, residual, heavy)
+    scale, unit = zip(*map(_effects if heavy else _scales, linearise(starts)[1], starts), strict=True)
+    solver = _PROGRAMS[heavy][1]
     solve = partial(solver, residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations)
     # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
-    ends, steps, results = zip(*map(solve, jnp.asarray(starts), scale, unit), strict=True)
+    arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
+    ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
     x, steps = np.stack(ends), np.array(steps, dtype=int)
-    ended = [linearise(residual, point) for point in jnp.asarray(x)]
-    residuals, jacobian = (np.stack(parts) for parts in zip(*ended, strict=True))
+    residuals, jacobian = linearise(x)
     message = []
     for i in range(len(starts)):
         reason = optx.RESULTS[results[i]]
@@ -228,6 +233,13 @@ def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) ->
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
+def _forward_mode(residual: Residual, heavy: bool, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (s, n) and Jacobians (s, n, d) at points (s, d)."""
+    parts = [_PROGRAMS[heavy][0](residual, point) for point in jnp.asarray(points)]
+    residuals, jacobians = (np.stack(part) for part in zip(*parts, strict=True))
+    return residuals, jacobians
+
+
 def _solve(
     residual: Residual,
     start: jax.Array,
@@ -292,25 +304,26 @@ _PROGRAMS = {
 }
 
 
-def _effects(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _effects(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
     """As ``_scales``: every column of the Jacobian gets the same norm, which is then the unit of the residuals."""
-    column_norm = jnp.linalg.norm(jacobian, axis=0)
-    unit = jnp.max(column_norm)
-    unit = jnp.where(unit > 0, unit, 1.0)
-    scale = jnp.where(column_norm > 0, unit / column_norm, jnp.ones_like(start))
+    column_norm = np.linalg.norm(jacobian, axis=0)
+    column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
+    unit = float(np.max(column_norm)) or 1.0
+    scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), np.ones_like(start))
     # The solver begins with a damping of 1: beside residuals in larger units it is weaker by their square.
-    return scale, jnp.sqrt(FIRST_DAMPING) * unit
+    return scale, float(np.sqrt(FIRST_DAMPING)) * unit
 
 
-def _scales(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Scale of each parameter (d,) and unit of the residuals (): the largest column norm in the scaled parameters."""
-    column_norm = jnp.linalg.norm(jacobian, axis=0)
-    size = jnp.abs(start)
-    strongest = jnp.max(column_norm * size)
+def _scales(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
+    column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
+    # Not finite: the solver will say so.
+    column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
+    strongest = np.max(column_norm * size)
     # All starts at zero: there is no size to compare with, so every parameter counts as equally strong.
-    step = jnp.where(strongest > 0, SMALLEST_EFFECT * strongest, 1.0) / column_norm
-    scale = jnp.maximum(size, jnp.where(column_norm > 0, step, 0.0))
+    step = SMALLEST_EFFECT * strongest if strongest > 0 else 1.0
+    scale = np.maximum(size, np.divide(step, column_norm, out=np.zeros_like(size), where=column_norm > 0))
     # Neither a start nor an effect: any scale does, the parameter will not move.
-    scale = jnp.where(scale > 0, scale, 1.0)
-    unit = jnp.max(column_norm * scale)
-    return scale, jnp.where(unit > 0, unit, 1.0)
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = float(np.max(column_norm * scale))
+    return scale, unit if unit > 0 else 1.0
