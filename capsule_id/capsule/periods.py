@@ -116,7 +116,7 @@ def _noted(rig: Rig, before: Lanes, after: Lanes, motion: Motion, merge: jax.Arr
 def _work(rig: Rig, state: State, motion: Motion, t: jax.Array) -> jax.Array:
     """(L,) J: work of the drive over the step from ``state`` to the time t, by Gauss-Legendre quadrature."""
     dt = t - state.t
-    since = _NODE[:, None] * dt
+    since = jnp.asarray(_NODE)[:, None] * dt
     s = since / motion.h
     Y1 = horner(motion.w, s) + horner(motion.v, s)
     cosine, _ = cos_sin(rig.Omega * (state.t + since) + rig.phase)

@@ -177,22 +177,21 @@ def settle(
     X1, Y1, X2, Y2 = states
     velocity = (X2[:, -1] - X2[:, 0]) / (settling.observed * T)
     work = np.where(np.isfinite(velocity), seen.work[:, before:].mean(axis=1), np.nan)
-    exponent = _exponents(p, e, states[:, :, -1], label == "aperiodic", settling)
+    exponent = exponents(p, e, tuple(states[:, :, -1]), label == "aperiodic", settling)
     columns = (label, period, direction, per_period, velocity, status, work, exponent)
     return Settled(*columns, x_rel=X1 - X2, rate=Y1 - Y2, Y2=Y2)
 
 
-def _exponents(
-    p: CapsuleParameters, e: Excitation, states: np.ndarray, chosen: np.ndarray, settling: Settling
+def exponents(
+    p: CapsuleParameters, e: Excitation, ends: tuple[np.ndarray, ...], chosen: np.ndarray, settling: Settling
 ) -> np.ndarray:
-    """(lanes,) 1/s: Lyapunov exponents from ``states`` (4, lanes) where ``chosen`` (lanes,), NaN elsewhere."""
-    exponents = np.full(len(chosen), np.nan)
+    """(lanes,) 1/s: Lyapunov exponents of lanes from the states ``ends`` where ``chosen`` (lanes,), NaN elsewhere."""
+    found = np.full(len(chosen), np.nan)
     if settling.exponent_periods and chosen.any():
-        p, e = jax.tree.map(lambda leaf: leaf[chosen], (p, e))
-        X1, Y1, X2, Y2 = states[:, chosen]
-        found = largest_exponent(p, e, (X1, Y1, X2, Y2), settling.exponent_periods, settling.max_steps)
-        exponents[chosen] = found.exponent
-    return exponents
+        p, e, (X1, Y1, X2, Y2) = jax.tree.map(lambda leaf: leaf[chosen], (p, e, ends))
+        rates = largest_exponent(p, e, (X1, Y1, X2, Y2), settling.exponent_periods, settling.max_steps)
+        found[chosen] = rates.exponent
+    return found
 
 
 def _describe(state: np.ndarray, Omega: float, contacts: np.ndarray, status: int) -> tuple[str, int, str, float]:
