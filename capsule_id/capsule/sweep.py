@@ -64,7 +64,7 @@ def diagram(
     InputError
         A quantity that does not exist, values or starts that are no list of finite numbers, leaves with a batch axis.
     """
-    grid = _grid({over: values})
+    grid = grid_of({over: values})
     begin = _starts(starts)
     branches, n = len(begin[0]), len(grid[over])
     lanes = {over: np.tile(grid[over], branches)}
@@ -97,7 +97,7 @@ def continuation(
     InputError
         As ``diagram``; no direction, or one that does not exist.
     """
-    grid = _grid({over: values})
+    grid = grid_of({over: values})
     begin = _starts(starts)
     if not directions or not set(directions) <= {"forward", "backward"}:
         raise InputError("a direction is forward or backward", str(tuple(directions)), "give one of them or both")
@@ -149,7 +149,7 @@ def motion_map(
     InputError
         As ``diagram``; a store of other points.
     """
-    grid = _grid(over)
+    grid = grid_of(over)
     mesh = np.meshgrid(*grid.values(), indexing="ij")
     points = points_of(*_single(p, e), {name: axis.ravel() for name, axis in zip(grid, mesh, strict=True)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client, block=block)
@@ -215,6 +215,20 @@ def spread_starts(p: CapsuleParameters, e: Excitation, count: int, seed: int = 0
     return X1, Y1, X2, Y2
 
 
+def grid_of(over: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+    """The quantities that are varied, symbol -> values (n,), checked.
+
+    Raises
+    ------
+    InputError
+        A quantity that does not exist, values that are no list of finite numbers.
+    """
+    for name in over:
+        if name not in SWEPT:
+            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(SWEPT)}")
+    return {name: _values(name, values) for name, values in over.items()}
+
+
 def _single(p: CapsuleParameters, e: Excitation) -> tuple[CapsuleParameters, Excitation]:
     if any(np.ndim(leaf) for leaf in jax.tree.leaves((p, e))):
         raise InputError("a sweep starts from one set of parameters", "a batch", "give each leaf as one number")
@@ -226,13 +240,6 @@ def _values(name: str, values: ArrayLike) -> np.ndarray:
     if x.ndim != 1 or not x.size or not np.isfinite(x).all():
         raise InputError(f"{name} takes a list of finite numbers", f"shape {x.shape}", "give at least one value")
     return x
-
-
-def _grid(over: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
-    for name in over:
-        if name not in SWEPT:
-            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(SWEPT)}")
-    return {name: _values(name, values) for name, values in over.items()}
 
 
 def _starts(starts: Initial | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
