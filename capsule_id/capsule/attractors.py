@@ -15,17 +15,16 @@ def attractors_of(columns: Columns) -> np.ndarray:
     columns : as ``points.columns_of``, of n motions
 
     Periodic motions are one attractor if their labels agree and the points of one period of their sections agree up
-    to where they begin. Aperiodic motions of one direction count as one: their points cannot be matched.
+    to where they begin. Aperiodic motions count as one: their points, and the sign of a slow drift, cannot be matched.
     """
-    label, period, direction = columns["label"], columns["period"], columns["direction"]
+    label, period = columns["label"], columns["period"]
     numbers = np.full(len(label), -1, np.int32)
     found: list[int] = []
     for i in range(len(label)):
         if label[i] == "failed":
             continue
         for number, j in enumerate(found):
-            same = label[i] == label[j] and direction[i] == direction[j]
-            if same and (period[i] == 0 or _same_orbit(columns, i, j, int(period[i]))):
+            if label[i] == label[j] and (period[i] == 0 or _same_orbit(columns, i, j, int(period[i]))):
                 numbers[i] = number
                 break
         else:

@@ -22,8 +22,8 @@ from capsule_id.errors import InputError
 if TYPE_CHECKING:
     from distributed import Client
 
-# Points of one block: several seconds of work, so that little is lost with a worker.
-BLOCK = 1024
+# Points of one block: seconds of work, a multiple of the lanes of one call.
+BLOCK = 256
 FINGERPRINT = "points.json"
 
 Progress = Callable[[int, int, str], None]  # points done, of how many, what is being done

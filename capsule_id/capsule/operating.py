@@ -5,6 +5,7 @@
 Where the draws come from is no matter of the physics: they are arrays of leaves.
 """
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import jax
@@ -14,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from capsule_id.capsule.batches import lanes_of
 from capsule_id.capsule.blocks import Progress, compute
+from capsule_id.capsule.datasets import grid_of
 from capsule_id.capsule.leaves import SWEPT
 from capsule_id.capsule.model import CapsuleParameters, Excitation
 from capsule_id.capsule.points import SEEN, SUMMARY, points_of
 from capsule_id.capsule.response import SETTLING, Settling
-from capsule_id.capsule.sweep import grid_of
 from capsule_id.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ def draws_diagram(
         for name in SUMMARY
     }
     axis = (over, grid[over], {"units": SWEPT[over].unit, "long_name": SWEPT[over].meaning})
-    return xr.Dataset(variables, {over: axis, "draw": np.arange(draws)})
+    about = {**asdict(settling), "method": "rest", "model": "exact", "semantics": "stick-slip"}
+    return xr.Dataset(variables, {over: axis, "draw": np.arange(draws)}, about)
 
 
 def bands(seen: xr.Dataset, objective: str = "mean_velocity") -> xr.Dataset:
@@ -123,7 +125,7 @@ def bands(seen: xr.Dataset, objective: str = "mean_velocity") -> xr.Dataset:
             f"chosen_{objective}_quantiles": ("quantile", np.nanquantile(goal[chosen], QUANTILES), about),
         },
         {over: (over, axis, value), "label": names, "quantile": list(QUANTILES)},
-        {"objective": objective, "draws": goal.shape[1]},
+        {**seen.attrs, "objective": objective, "draws": goal.shape[1]},
     )
 
 

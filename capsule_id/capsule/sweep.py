@@ -11,10 +11,8 @@ run that was given up is labelled "failed", and ``status`` says why.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-import jax
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -23,7 +21,16 @@ from scipy.stats import qmc
 from capsule_id.capsule.attractors import attractors_of
 from capsule_id.capsule.batches import CHUNK
 from capsule_id.capsule.blocks import BLOCK, Progress, compute
-from capsule_id.capsule.leaves import SWEPT
+from capsule_id.capsule.datasets import (
+    ATTRACTOR,
+    ATTRACTORS,
+    branched,
+    dataset_of,
+    grid_of,
+    provenance,
+    single,
+    values_of,
+)
 from capsule_id.capsule.model import CapsuleParameters, Excitation, Initial
 from capsule_id.capsule.points import SECTION, SEEN, SUMMARY, Columns, Points, columns, points_of
 from capsule_id.capsule.response import SETTLING, Settling, exponents, settle
@@ -33,9 +40,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from distributed import Client
-
-_ATTRACTOR = {"units": "1", "long_name": "number of the attractor among those found here, -1 if the run failed"}
-_ATTRACTORS = {"units": "1", "long_name": "number of different attractors found here"}
 
 
 def diagram(
@@ -69,10 +73,10 @@ def diagram(
     branches, n = len(begin[0]), len(grid[over])
     lanes = {over: np.tile(grid[over], branches)}
     X1, Y1, X2, Y2 = (np.repeat(x, n) for x in begin)
-    points = points_of(*_single(p, e), lanes, (X1, Y1, X2, Y2))
+    points = points_of(*single(p, e), lanes, (X1, Y1, X2, Y2))
     seen = compute(points, settling, progress=progress)
     names = ["rest"] if starts is None else [f"start {i}" for i in range(branches)]
-    return _branched(seen, names, grid, _provenance(p, e, [over], settling, "rest" if starts is None else "starts"))
+    return branched(seen, names, grid, provenance(p, e, [over], settling, "rest" if starts is None else "starts"))
 
 
 def continuation(
@@ -111,7 +115,7 @@ def continuation(
     for i in range(len(x)):
         if progress is not None:
             progress(i, len(x), "values")
-        points = points_of(*_single(p, e), {over: x[order[:, i]]}, state)
+        points = points_of(*single(p, e), {over: x[order[:, i]]}, state)
         # As many lanes as there are branches: a full chunk would cost many times as much.
         seen = settle(points.p, points.e, points.initial, plain, width=min(len(order), CHUNK))
         parts.append(columns(seen, points))
@@ -121,9 +125,9 @@ def continuation(
     stacked = {name: np.stack([part[name] for part in parts], axis=1) for name in SEEN}
     sorted_ = {name: np.stack([a[k] for a, k in zip(column, place, strict=True)]) for name, column in stacked.items()}
     flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in sorted_.items()}
-    _add_exponents(flat, points_of(*_single(p, e), {over: np.tile(x, len(order))}), settling)
+    _add_exponents(flat, points_of(*single(p, e), {over: np.tile(x, len(order))}), settling)
     names = [way if each == 1 else f"{way} {i}" for way in directions for i in range(each)]
-    return _branched(flat, names, grid, _provenance(p, e, [over], settling, "continuation"))
+    return branched(flat, names, grid, provenance(p, e, [over], settling, "continuation"))
 
 
 def motion_map(
@@ -151,9 +155,9 @@ def motion_map(
     """
     grid = grid_of(over)
     mesh = np.meshgrid(*grid.values(), indexing="ij")
-    points = points_of(*_single(p, e), {name: axis.ravel() for name, axis in zip(grid, mesh, strict=True)})
+    points = points_of(*single(p, e), {name: axis.ravel() for name, axis in zip(grid, mesh, strict=True)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client, block=block)
-    return _dataset(seen, grid, tuple(grid), mesh[0].shape, _provenance(p, e, list(grid), settling, "rest"))
+    return dataset_of(seen, grid, tuple(grid), mesh[0].shape, provenance(p, e, list(grid), settling, "rest"))
 
 
 def basins(
@@ -175,20 +179,20 @@ def basins(
     InputError
         Values that are no list of finite numbers, leaves with a batch axis.
     """
-    axes = {"x_rel_0": _values("x_rel", x_rel), "rate_0": _values("rate", rate)}
+    axes = {"x_rel_0": values_of("x_rel", x_rel), "rate_0": values_of("rate", rate)}
     mesh = np.meshgrid(*axes.values(), indexing="ij")
     X1, Y1 = mesh[0].ravel(), mesh[1].ravel() + Y2
-    points = points_of(*_single(p, e), {}, (X1, Y1, np.zeros_like(X1), np.full_like(X1, Y2)))
+    points = points_of(*single(p, e), {}, (X1, Y1, np.zeros_like(X1), np.full_like(X1, Y2)))
     seen = compute(points, settling, progress=progress)
     numbers = attractors_of(seen)
-    data = _dataset(seen, {}, tuple(axes), mesh[0].shape, _provenance(p, e, [], settling, "basins") | {"Y2_0": Y2})
+    data = dataset_of(seen, {}, tuple(axes), mesh[0].shape, provenance(p, e, [], settling, "basins") | {"Y2_0": Y2})
     data = data.assign_coords(
         x_rel_0=("x_rel_0", axes["x_rel_0"], {"units": "m", "long_name": "X1 - X2 at the start"}),
         rate_0=("rate_0", axes["rate_0"], {"units": "m/s", "long_name": "Y1 - Y2 at the start"}),
     )
     found = np.int32(numbers.max(initial=-1) + 1)
     return data.assign(
-        attractor=(tuple(axes), numbers.reshape(mesh[0].shape), _ATTRACTOR), attractors=((), found, _ATTRACTORS)
+        attractor=(tuple(axes), numbers.reshape(mesh[0].shape), ATTRACTOR), attractors=((), found, ATTRACTORS)
     )
 
 
@@ -215,37 +219,10 @@ def spread_starts(p: CapsuleParameters, e: Excitation, count: int, seed: int = 0
     return X1, Y1, X2, Y2
 
 
-def grid_of(over: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
-    """The quantities that are varied, symbol -> values (n,), checked.
-
-    Raises
-    ------
-    InputError
-        A quantity that does not exist, values that are no list of finite numbers.
-    """
-    for name in over:
-        if name not in SWEPT:
-            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(SWEPT)}")
-    return {name: _values(name, values) for name, values in over.items()}
-
-
-def _single(p: CapsuleParameters, e: Excitation) -> tuple[CapsuleParameters, Excitation]:
-    if any(np.ndim(leaf) for leaf in jax.tree.leaves((p, e))):
-        raise InputError("a sweep starts from one set of parameters", "a batch", "give each leaf as one number")
-    return p, e
-
-
-def _values(name: str, values: ArrayLike) -> np.ndarray:
-    x = np.asarray(values, float)
-    if x.ndim != 1 or not x.size or not np.isfinite(x).all():
-        raise InputError(f"{name} takes a list of finite numbers", f"shape {x.shape}", "give at least one value")
-    return x
-
-
 def _starts(starts: Initial | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     given = starts if starts is not None else (np.zeros(1),) * 4
     columns = [
-        _values(name, np.atleast_1d(np.asarray(x))) for name, x in zip(("X1", "Y1", "X2", "Y2"), given, strict=True)
+        values_of(name, np.atleast_1d(np.asarray(x))) for name, x in zip(("X1", "Y1", "X2", "Y2"), given, strict=True)
     ]
     X1, Y1, X2, Y2 = np.broadcast_arrays(*columns)
     return X1, Y1, X2, Y2
@@ -256,49 +233,3 @@ def _add_exponents(seen: Columns, points: Points, settling: Settling) -> None:
     x_rel, rate, Y2 = (seen[name][:, -1] for name in SECTION)
     ends = (x_rel, rate + Y2, np.zeros_like(x_rel), Y2)
     seen["lyapunov"] = exponents(points.p, points.e, ends, seen["label"] == "aperiodic", settling)
-
-
-def _provenance(
-    p: CapsuleParameters, e: Excitation, over: Sequence[str], settling: Settling, method: str
-) -> dict[str, Any]:
-    """Attributes: every parameter that is not swept, and how the motions were settled."""
-    swept = {"Omega" if name == "f" else name for name in over}
-    given = {**vars(p), **vars(e)}
-    held = {name: float(np.asarray(value)) for name, value in given.items() if name not in swept}
-    return {**held, **asdict(settling), "method": method, "model": "exact", "semantics": "stick-slip"}
-
-
-def _dataset(
-    seen: Columns,
-    grid: Mapping[str, np.ndarray],
-    dims: tuple[str, ...],
-    shape: tuple[int, ...],
-    attributes: Mapping[str, Any],
-) -> xr.Dataset:
-    """Columns (points, ...) as variables over ``dims`` (and the section where a column has one value a period)."""
-    variables = {}
-    for name, column in seen.items():
-        unit, meaning = SEEN[name]
-        extra = ("section",) if name in SECTION and "branch" in dims else ()
-        if name in SUMMARY or extra:
-            values = column.reshape(*shape, *column.shape[1:])
-            variables[name] = ((*dims, *extra), values, {"units": unit, "long_name": meaning})
-    coordinates = {
-        name: (name, x, {"units": SWEPT[name].unit, "long_name": SWEPT[name].meaning}) for name, x in grid.items()
-    }
-    return xr.Dataset(variables, coordinates, dict(attributes))
-
-
-def _branched(
-    seen: Columns, names: Sequence[str], grid: Mapping[str, np.ndarray], attributes: Mapping[str, Any]
-) -> xr.Dataset:
-    """Columns (branches x values, ...) as a Dataset over (branch, value), with the attractors at each value."""
-    ((over, x),) = grid.items()
-    shape = (len(names), len(x))
-    numbers = np.empty(shape, np.int32)
-    for i in range(len(x)):
-        numbers[:, i] = attractors_of({name: column[i :: len(x)] for name, column in seen.items()})
-    data = _dataset(seen, grid, ("branch", over), shape, attributes).assign_coords(branch=("branch", list(names)))
-    return data.assign(
-        attractor=(("branch", over), numbers, _ATTRACTOR), attractors=(over, numbers.max(axis=0) + 1, _ATTRACTORS)
-    )
