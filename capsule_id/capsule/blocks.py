@@ -155,7 +155,7 @@ def _taken_up(store: Path | None, begin: int) -> Columns | None:
     if store is None or not _file(store, begin).exists():
         return None
     try:
-        with np.load(_file(store, begin), allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+        with _file(store, begin).open("rb") as file, np.load(file, allow_pickle=False) as saved:
+            return {name: saved[name] for name in saved.files}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

@@ -124,13 +124,13 @@ def draw(
     data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredMotion]" = (), synthetic: bool = False
 ) -> "Figure":
     """The picture of what ``run`` has computed; measured runs are laid over a diagram, each with its own label."""
-    from capsule_id.report import figures_map, figures_sweep
+    from capsule_id.report import figures_bands, figures_map, figures_sweep
     from capsule_id.report.style import mark
 
     units = {axis.name: figures_sweep.AxisUnit(axis.unit, axis.factor) for axis in axes}
     title = str(data.attrs["rig"])
     if "probability" in data:
-        figure = figures_sweep.bands(data, units, title)
+        figure = figures_bands.bands(data, units, title)
     elif len(axes) == 2:
         figure = figures_map.motion_map(data, units, title)
     else:

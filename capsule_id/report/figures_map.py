@@ -9,7 +9,8 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from capsule_id.report.figures_sweep import AxisUnit, label_classes
+from capsule_id.report.figures_sweep import AxisUnit
+from capsule_id.report.motion_looks import label_classes
 from capsule_id.report.style import SMALL, TEXT, new_figure, own_axes, set_text
 
 _MM = 1e3
@@ -28,7 +29,7 @@ def motion_map(data: xr.Dataset, units: Mapping[str, AxisUnit] | None = None, ti
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
     figure.subplots_adjust(left=0.055, right=0.96, bottom=0.14, top=0.91, wspace=0.36)
     labels(data, units, axes[0])
-    axes[0].set_title(title, fontsize=SMALL + 1.0, loc="left", parse_math=False)
+    axes[0].set_title(" ".join(["settled motion", title]).strip(), fontsize=TEXT - 0.5, loc="left", parse_math=False)
     for name, ax in zip(_WORDS, axes[1:], strict=True):
         quantity(data, name, units, ax)
         ax.set_ylabel("")

@@ -1,12 +1,13 @@
-"""Figures of sweeps: bifurcation diagram, two-parameter map, and what a posterior says of both.
+"""Bifurcation diagrams: Poincaré section, mean velocity, labels, and measured runs beside them.
 
-Datasets come from ``capsule.sweep`` and ``capsule.operating`` in SI; an ``AxisUnit`` says in what unit a quantity is
-drawn. Direction has a colour everywhere: blue forward, vermilion backward, grey standing.
+Datasets come from ``capsule.sweep`` in SI; an ``AxisUnit`` says in what unit a quantity is drawn. Direction has a
+colour everywhere: blue forward, vermilion backward, grey standing.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -18,7 +19,6 @@ from capsule_id.report.style import (
     BLUE,
     GREEN,
     GREY,
-    PALE_BLUE,
     PURPLE,
     SMALL,
     VERMILION,
@@ -39,10 +39,10 @@ _BRANCH_LOOKS = (
 )
 # Periods of motions, first to last, of one colour.
 _PERIODS = {
+    (0, 0): (GREY, "aperiodic"),
     (1, 1): (BLUE, "period 1"),
     (2, 2): (VERMILION, "period 2"),
     (3, 99): (GREEN, "longer"),
-    (0, 0): (BLACK, "aperiodic"),
 }
 
 
@@ -74,7 +74,7 @@ def bifurcation(
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.0, 1.15]})
     figure.subplots_adjust(left=0.115, right=0.975, bottom=0.095, top=0.93, hspace=0.2)
     poincare(data, units, upper)
-    upper.set_title(title, fontsize=SMALL + 1.0, loc="left", parse_math=False)
+    figure.text(0.01, 0.99, title, fontsize=SMALL, va="top", fontweight="bold", parse_math=False)
     upper.set_xlabel("")
     mean_velocity(data, units, measured, lower)
     return figure
@@ -87,7 +87,7 @@ def poincare(data: xr.Dataset, units: Mapping[str, AxisUnit] | None = None, ax: 
     Values at which branches have come to different attractors are marked at the bottom.
     """
     ax = own_axes(ax, 6.4, 4.4)
-    over, x = _axis(data, units)
+    over, x = axis_of(data, units)
     y = _MM * data["x_rel"].transpose("branch", over, "section").to_numpy()
     branches = [str(name) for name in data["branch"].to_numpy()]
     if len(branches) <= len(_BRANCH_LOOKS):
@@ -107,8 +107,11 @@ def poincare(data: xr.Dataset, units: Mapping[str, AxisUnit] | None = None, ax: 
         ax.plot(x[several], low, label="several attractors", clip_on=False, **look)
     if over != "G" and "G" in data.attrs:
         ax.axhline(_MM * float(data.attrs["G"]), color=BLACK, ls="--", lw=0.9, label="impact line")
-    set_text(ax, _label(data, over, units), "X1 - X2 once a period, mm")
-    set_legend(ax, place="above")
+    set_text(ax, axis_label(data, over, units), "X1 - X2 once a period, mm")
+    handles, words = ax.get_legend_handles_labels()
+    tight: dict[str, Any] = {"columnspacing": 1.1, "handletextpad": 0.2, "borderaxespad": 0.1, "handlelength": 1.4}
+    place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": len(words)}
+    ax.legend(handles, words, fontsize=SMALL - 0.5, frameon=False, **place, **tight)
     return ax
 
 
@@ -120,7 +123,7 @@ def mean_velocity(
 ) -> Axes:
     """Mean velocity against the swept quantity, marked by direction, with labels and measured runs."""
     ax = own_axes(ax, 6.4, 4.4)
-    over, x = _axis(data, units)
+    over, x = axis_of(data, units)
     velocity = _MM * data["mean_velocity"].transpose("branch", over).to_numpy()
     direction = data["direction"].transpose("branch", over).to_numpy()
     label = data["label"].transpose("branch", over).to_numpy()
@@ -137,7 +140,7 @@ def mean_velocity(
     low, high = ax.get_ylim()
     ax.set_ylim(low, high + 0.36 * (high - low))
     _write_labels(ax, x, label[0])
-    set_text(ax, _label(data, over, units), "mean velocity of the capsule, mm/s")
+    set_text(ax, axis_label(data, over, units), "mean velocity of the capsule, mm/s")
     set_legend(ax, place="above")
     return ax
 
@@ -174,130 +177,19 @@ def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:
         begin = end
 
 
-def bands(data: xr.Dataset, units: Mapping[str, AxisUnit] | None = None, title: str = "") -> Figure:
-    """A Dataset of ``operating.bands``: probability of each motion above, objective with its band below."""
-    figure = new_figure(7.4, 6.6)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    figure.subplots_adjust(left=0.115, right=0.775, bottom=0.095, top=0.94, hspace=0.14)
-    probabilities(data, units, upper)
-    upper.set_title(title, fontsize=SMALL + 1.0, loc="left", parse_math=False)
-    upper.set_xlabel("")
-    objective_band(data, units, lower)
-    return figure
-
-
-def probabilities(data: xr.Dataset, units: Mapping[str, AxisUnit] | None = None, ax: Axes | None = None) -> Axes:
-    """Probability of each motion label, stacked, against the swept quantity."""
-    ax = own_axes(ax, 6.4, 4.4)
-    over, x = _axis(data, units)
-    names, heights = _shown([str(name) for name in data["label"].to_numpy()], data["probability"].to_numpy())
-    colours, hatches = _label_looks(names)
-    areas = ax.stackplot(x, heights, colors=colours, labels=names, edgecolor="white", lw=0.3)
-    for area, hatch in zip(areas, hatches, strict=True):
-        area.set_hatch(hatch)
-    ax.set(xlim=(x.min(), x.max()), ylim=(0.0, 1.0))
-    set_text(ax, _label(data, over, units), "probability of the motion, 1")
-    handles, labels = ax.get_legend_handles_labels()
-    ax.legend(handles[::-1], labels[::-1], fontsize=SMALL - 1.0, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    return ax
-
-
-def objective_band(data: xr.Dataset, units: Mapping[str, AxisUnit] | None = None, ax: Axes | None = None) -> Axes:
-    """Median and 95 % band of the objective, the value chosen, and the interval of the best value over the draws."""
-    ax = own_axes(ax, 6.4, 4.4)
-    over, x = _axis(data, units)
-    objective = str(data.attrs["objective"])
-    factor = (units or {}).get(over, AxisUnit("")).factor
-    low, middle, high = _MM * data[f"{objective}_quantiles"].to_numpy()
-    ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.fill_between(x, low, high, color=PALE_BLUE, lw=0, label="95 % band")
-    ax.plot(x, middle, color=BLUE, lw=1.5, label="median")
-    chosen = float(data["chosen"]) / factor
-    span = _MM * data[f"chosen_{objective}_quantiles"].to_numpy()
-    ax.errorbar(
-        [chosen], [span[1]], yerr=[[span[1] - span[0]], [span[2] - span[1]]], color=BLACK, marker="o", ms=5, capsize=3,
-        ls="none", clip_on=False,
-        label="best in the mean"
-    )  # fmt: skip
-    best = data["best_quantiles"].to_numpy() / factor
-    ax.axvspan(best[0], best[2], color=VERMILION, alpha=0.16, lw=0, label="best, 95 % of draws")
-    words = {"mean_velocity": "mean velocity, mm/s", "efficiency": "advance per work, mm/J"}
-    set_text(ax, _label(data, over, units), words[objective])
-    ax.legend(fontsize=SMALL - 1.0, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return ax
-
-
-# Shades of a direction, dark to light; what does not fit goes into "other".
-_SHADES = {
-    "F": ("#08306B", "#0072B2", "#56B4E9", "#A6D3EE", "#DCEEF9"),
-    "B": ("#7F2704", "#D55E00", "#F0944D", "#F8C496", "#FDE6D2"),
-    "S": ("#6E6E6E", "#8F8F8F", "#ADADAD", "#C8C8C8"),
-}
-_OTHER, _APERIODIC, _FAILED = "#E8D9A0", BLACK, "#FFFFFF"
-
-
-def _shown(names: list[str], heights: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Labels that have a look of their own, by direction, and "other"; heights (labels, ...) go with them."""
-    kept: dict[str, list[int]] = {}
-    rest: list[int] = []
-    for i in np.argsort(-heights.reshape(len(names), -1).sum(axis=1), kind="stable"):
-        direction = _direction_of(names[i])
-        family = kept.setdefault(direction, [])
-        (family if len(family) < len(_SHADES.get(direction, " ")) else rest).append(int(i))
-    order = [
-        i
-        for direction in ("F", "S", "B", "aperiodic", "failed")
-        for i in sorted(kept.get(direction, []), key=lambda i: names[i])
-    ]
-    shown = heights[order]
-    if rest:
-        return [*(names[i] for i in order), "other"], np.concatenate([shown, heights[rest].sum(axis=0)[None]])
-    return [names[i] for i in order], shown
-
-
-def _direction_of(name: str) -> str:
-    return name.split("-")[2] if name.startswith("P-") else name
-
-
-def _label_looks(names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Colour and hatch of each label."""
-    used: dict[str, int] = {}
-    colours: list[str] = []
-    hatches: list[str] = []
-    for name in names:
-        direction = _direction_of(name)
-        if direction in _SHADES:
-            shade = used.get(direction, 0)
-            used[direction] = shade + 1
-            colours.append(_SHADES[direction][shade])
-        else:
-            colours.append({"other": _OTHER, "aperiodic": _APERIODIC}.get(name, _FAILED))
-        hatches.append("xx" if name == "failed" else "")
-    return colours, hatches
-
-
-def label_classes(label: np.ndarray) -> tuple[list[str], list[str], np.ndarray]:
-    """(names, colours, classes) of an array of labels: classes has its shape and holds indices into names."""
-    found = [str(name) for name in np.unique(label)]
-    share = np.stack([label == name for name in found]).astype(float)
-    names, _ = _shown(found, share)
-    index = {name: i for i, name in enumerate(names)}
-    classes = np.vectorize(lambda name: index.get(str(name), index.get("other", 0)), otypes=[int])(label)
-    return names, _label_looks(names)[0], classes
-
-
 def _dots(ax: Axes, x: np.ndarray, y: np.ndarray, **look: object) -> None:
     """Points y (n, section) over x (n,) as one artist."""
     ax.plot(np.repeat(x, y.shape[1]), y.ravel(), ls="none", **look)  # pyright: ignore[reportArgumentType]
 
 
-def _axis(data: xr.Dataset, units: Mapping[str, AxisUnit] | None) -> tuple[str, np.ndarray]:
+def axis_of(data: xr.Dataset, units: Mapping[str, AxisUnit] | None) -> tuple[str, np.ndarray]:
     """(symbol, values in the unit to be drawn) of the one swept quantity."""
     other = {"branch", "section", "label", "quantile", "draw"}
     over = str(next(name for name in data.dims if name not in other))
     return over, data[over].to_numpy() / (units or {}).get(over, AxisUnit("")).factor
 
 
-def _label(data: xr.Dataset, over: str, units: Mapping[str, AxisUnit] | None) -> str:
+def axis_label(data: xr.Dataset, over: str, units: Mapping[str, AxisUnit] | None) -> str:
+    """``symbol, unit`` as it stands on the axis."""
     unit = units[over].unit if units and over in units else str(data[over].attrs["units"])
     return f"{over}, {unit}"
