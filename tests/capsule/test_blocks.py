@@ -2,8 +2,6 @@
 
 import os
 import signal
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -95,28 +93,23 @@ def test_an_address_where_nobody_answers() -> None:
         pass
 
 
-def killed_on_the_way(over: dict[str, np.ndarray], settling: Settling, block: int) -> tuple[xr.Dataset, int]:
-    """(the map through a cluster of processes of which one is killed, times that a worker was found dead)."""
-    lost: list[str] = []
+def killed_on_the_way(over: dict[str, np.ndarray], settling: Settling, block: int) -> xr.Dataset:
+    """The map through a cluster of processes of which one is killed when a quarter is done."""
+    killed: list[int] = []
     with cluster("processes") as client:
-        workers = client.scheduler_info()["workers"]
-        assert len(workers) >= 2, "with one worker there is nobody to take over"
-        victim = next(iter(workers.values()))["id"]
-        pids = client.run(os.getpid)
-        pid = pids[next(iter(workers))]
+        pids = list(client.run(os.getpid).values())
+        assert len(pids) >= 2, "with one worker there is nobody to take over"
 
         def kill(done: int, total: int, what: str) -> None:
-            if done > total // 4 and not lost:
-                lost.append(str(victim))
-                os.kill(pid, signal.SIGKILL)
+            if total // 4 < done < total // 2 and not killed:
+                killed.append(pids[0])
+                os.kill(pids[0], signal.SIGKILL)
 
         data = motion_map(P, E, over, settling=settling, block=block, client=client, progress=kill)
-        # The nanny starts another process in the place of the one that was killed.
-        deadline = time.monotonic() + 60.0
-        while pid in client.run(os.getpid).values() and time.monotonic() < deadline:
-            threading.Event().wait(0.2)
-        assert pid not in client.run(os.getpid).values()
-    return data, len(lost)
+        # It was this cluster's worker, and it is gone (another process stands in its place, or will).
+        assert killed == pids[:1]
+        assert pids[0] not in client.run(os.getpid).values()
+    return data
 
 
 @pytest.mark.slow
@@ -124,7 +117,6 @@ def test_a_map_of_200_x_200_through_a_cluster_that_loses_a_worker() -> None:
     over = {"k2": np.linspace(1e3, 55e3, 200), "P_d": np.linspace(1.0, 8.0, 200)}
     settling = Settling(dropped=40, observed=12, exponent_periods=0)
     alone = motion_map(P, E, over, settling=settling)
-    data, lost = killed_on_the_way(over, settling, block=1024)
-    assert lost == 1
+    data = killed_on_the_way(over, settling, block=1024)
     xr.testing.assert_identical(data, alone)
     assert (alone["label"] != "failed").all()
