@@ -1,6 +1,9 @@
 """``capsule-id bifurcate``: files, units, maps that go on, bands, parameters of a rig, errors."""
 
+import argparse
 import json
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,7 @@ from capsule_id.cli import capsule_id
 from capsule_id.commands import bifurcate as command
 from capsule_id.commands.progress import Progress
 from capsule_id.report.figures_sweep import MeasuredMotion
-from tests.cli_tools import listing, small_rig
+from tests.cli_tools import ROOT, listing, small_rig
 
 SHORT = ["--dropped", "20", "--observed", "6", "--quiet"]
 OVER = ["--over", "k2", "--from", "5", "--to", "50", "--unit", "kN/m", "--points", "4"]
@@ -196,3 +199,16 @@ def test_progress_has_a_rate_and_the_time_left(capsys: pytest.CaptureFixture[str
         progress._stage, progress._began = "points", -100.0
         assert "point/s" in progress._line(50, 100, 10.0)
         assert "<00:10" in progress._line(50, 100, 10.0)
+
+
+def test_the_commands_of_readme_are_understood() -> None:
+    """Parsed and checked as far as that goes without a rig that has been fitted."""
+    lines = re.findall(r"^capsule-id bifurcate (.*)$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(lines) >= 4
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    for line in lines:
+        args = parser.parse_args(shlex.split(line))
+        axes = command._axes(args)
+        command._check_combination(args, axes)
+        assert args.data is None or (ROOT / args.data / "rig.toml").is_file()
