@@ -22,21 +22,29 @@ if TYPE_CHECKING:
     from capsule_id.capsule.model import simulate as simulate
     from capsule_id.capsule.model import status_message as status_message
     from capsule_id.capsule.response import Response as Response
+    from capsule_id.capsule.response import Settling as Settling
     from capsule_id.capsule.response import response as response
     from capsule_id.capsule.smooth import Smoothing as Smoothing
+    from capsule_id.capsule.sweep import continuation as continuation
+    from capsule_id.capsule.sweep import diagram as diagram
+    from capsule_id.capsule.sweep import motion_map as motion_map
     from capsule_id.errors import InputError as InputError
     from capsule_id.rig.read import read_rig as read_rig
     from capsule_id.synthetic import synthesize as synthesize
 
 _HOME = {
     "CapsuleParameters": "capsule_id.capsule.model",
+    "continuation": "capsule_id.capsule.sweep",
+    "diagram": "capsule_id.capsule.sweep",
     "Excitation": "capsule_id.capsule.model",
     "Fit": "capsule_id.api",
     "fit": "capsule_id.api",
     "InputError": "capsule_id.errors",
+    "motion_map": "capsule_id.capsule.sweep",
     "read_rig": "capsule_id.rig.read",
     "Response": "capsule_id.capsule.response",
     "response": "capsule_id.capsule.response",
+    "Settling": "capsule_id.capsule.response",
     "simulate": "capsule_id.capsule.model",
     "Smoothing": "capsule_id.capsule.smooth",
     "Status": "capsule_id.capsule.model",

@@ -13,7 +13,7 @@ from types import FrameType
 from typing import NoReturn
 
 from capsule_id import console
-from capsule_id.commands import check, fit, init, report, simulate, synthesize
+from capsule_id.commands import bifurcate, check, fit, init, report, simulate, synthesize
 from capsule_id.errors import InputError
 
 BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
@@ -45,6 +45,7 @@ def capsule_id(arguments: Sequence[str] | None = None) -> int:
         ("check", check, "read and lint a rig folder"),
         ("synthesize", synthesize, "a rig folder with known truth"),
         ("simulate", simulate, "the capsule model: time histories and phase plane"),
+        ("bifurcate", bifurcate, "the motions of the model over one quantity or two: bifurcation diagrams and maps"),
         ("report", report, "the parameter table and findings of a result"),
     ):
         sub = commands.add_parser(name, help=text, description=text)

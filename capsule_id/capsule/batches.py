@@ -71,15 +71,18 @@ def lanes_of(tree: object, times: ArrayLike) -> tuple[Lanes, bool]:
     return (jax.tree.unflatten(structure, spread), xp.broadcast_to(grid, (lanes, grid.shape[-1]))), batched
 
 
-def run_lanes(kernel: Callable[..., Tree], lanes: Lanes, batched: bool) -> Tree:
-    """Run ``kernel(p, e, times, initial)`` on lanes from ``lanes_of``; drops the lane axis where none was given."""
+def run_lanes(kernel: Callable[..., Tree], lanes: Lanes, batched: bool, width: int = CHUNK) -> Tree:
+    """Run ``kernel(p, e, times, initial)`` on lanes from ``lanes_of``; drops the lane axis where none was given.
+
+    width : lanes of one call; another width is another program, whose results may differ in the last bit
+    """
     (p, e, initial), times = lanes
     if not batched:
         return jax.tree.map(lambda leaf: leaf[0], kernel(p, e, times, initial))
     size = times.shape[0]
     if is_traced(lanes):
         return kernel(p, e, times, initial)
-    chunks = [np.minimum(np.arange(start, start + CHUNK), size - 1) for start in range(0, size, CHUNK)]
+    chunks = [np.minimum(np.arange(start, start + width), size - 1) for start in range(0, size, width)]
 
     def run(index: np.ndarray) -> Tree:
         return jax.block_until_ready(kernel(*jax.tree.map(lambda leaf: leaf[index], (p, e, times, initial))))

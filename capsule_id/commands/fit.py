@@ -1,18 +1,15 @@
 """``fit-params DATA``: from a rig folder to parameters, posterior and report."""
 
 import argparse
-import shutil
 import sys
-import time
 from pathlib import Path
 
+from capsule_id.commands.progress import Progress
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress
 from capsule_id.rig.read import read_rig
 
-#: Seconds between two updates of the progress, on a terminal and in a file.
-TERMINAL_INTERVAL, FILE_INTERVAL = 0.1, 10.0
 DEFAULT_MAX_STEPS = 20_000
 
 
@@ -71,54 +68,3 @@ def run(args: argparse.Namespace) -> int:
     failed = sorted({finding.check for finding in result.findings if finding.level == "fail"})
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
     return 3
-
-
-class Progress:
-    """Stage, rate and time left on standard error: a bar on a terminal, a line now and then in a file."""
-
-    def __init__(self, enabled: bool) -> None:
-        self._enabled = enabled
-        self._terminal = sys.stderr.isatty()
-        self._stage, self._began, self._first, self._shown = "", 0.0, 0, 0.0
-        self._open = False
-
-    def __enter__(self) -> "Progress":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end_line()
-
-    def __call__(self, done: int, total: int, stage: str) -> None:
-        """``done`` of ``total`` draws in ``stage``; a stage that cannot be counted has a total of 1."""
-        if not self._enabled:
-            return
-        now = time.monotonic()
-        if stage != self._stage:
-            self._end_line()
-            self._stage, self._began, self._first = stage, now, done
-        elif now - self._shown < (TERMINAL_INTERVAL if self._terminal else FILE_INTERVAL):
-            return
-        self._shown = now
-        self._show(self._line(done, total, now - self._began))
-
-    def _line(self, done: int, total: int, elapsed: float) -> str:
-        if total <= 1:
-            return f"{self._stage} ..."
-        from tqdm import tqdm
-
-        width = shutil.get_terminal_size().columns - 1 if self._terminal else None
-        plain = not self._terminal
-        return tqdm.format_meter(done, total, elapsed, width, self._stage, plain, "draw", initial=self._first)
-
-    def _show(self, line: str) -> None:
-        try:
-            sys.stderr.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
-            sys.stderr.flush()
-        except OSError:
-            self._enabled = False  # nobody reads
-        self._open = self._terminal
-
-    def _end_line(self) -> None:
-        if self._open and self._enabled:
-            sys.stderr.write("\n")
-            self._open = False

@@ -4,8 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, Status
-from capsule_id.capsule.response import period_of, response
+from capsule_id.capsule.energy import energy_balance
+from capsule_id.capsule.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.capsule.response import Settling, period_of, response, settle
 from capsule_id.errors import InputError
 from tests.capsule_cases import Cases
 
@@ -74,9 +75,54 @@ def test_period_is_the_shortest_that_repeats() -> None:
     assert period_of(0.0 * k, 0.0 * k, 30.0) == 1
 
 
+def _contacts_a_period(p: CapsuleParameters, e: Excitation, start: tuple, T: float, merge: float) -> int:
+    """Contacts in the second of two periods, those parted by less than ``merge`` as one, from 4,000 samples."""
+    grid = np.linspace(0.0, 2.0 * T, 64 * 63 + 1)[1:].reshape(64, 63)
+    times = np.concatenate([np.zeros((64, 1)), grid], axis=1)
+    touching = np.asarray(simulate(p, e, times, start).x_rel)[:, 1:].ravel() >= p.G
+    change = np.diff(touching.astype(int))
+    closings, openings = (grid.ravel()[1:][change == sign] for sign in (1, -1))
+    before = openings[np.searchsorted(openings, closings) - 1]
+    return int(((closings > T) & (closings - before >= merge)).sum())
+
+
+def test_contacts_parted_by_less_than_the_stated_time_are_one(cases: Cases) -> None:
+    p, e, T = cases.one("fig6_k2_51.05")
+    start = tuple(x[0] for x in settle(p, e).end)
+    counts = {}
+    for merge in (0.0, 4e-3, 8e-3, 2e-2):
+        r = response(p, e, settling=Settling(merge_contacts=merge))
+        counts[merge] = r.contacts_per_period
+        assert r.label == f"P-1-F-{r.contacts_per_period:.0f}"
+        assert _contacts_a_period(p, e, start, T, merge) == r.contacts_per_period
+    assert list(counts.values()) == [7.0, 4.0, 2.0, 1.0]
+    with pytest.raises(InputError, match="less than half a period"):
+        response(p, e, settling=Settling(merge_contacts=0.6 * T))
+
+
+def test_work_of_the_drive_is_what_damper_and_friction_take(cases: Cases) -> None:
+    """Over a period of a periodic motion nothing is stored; the dissipation comes from another quadrature."""
+    seen = settle(cases.p, cases.e)
+    for i in (0, 4, 6, 12, 18, 21):
+        lane = jax.tree.map(lambda leaf, i=i: leaf[i], (cases.p, cases.e, seen.end))
+        balance = energy_balance(lane[0], lane[1], (0.0, float(cases.T[i])), lane[2])
+        np.testing.assert_allclose(seen.work_per_period[i], balance.damper + balance.friction, rtol=1e-6)
+
+
+def test_settled_state_starts_the_same_motion_again(cases: Cases) -> None:
+    seen = settle(cases.p, cases.e)
+    again = settle(cases.p, cases.e, seen.end, Settling(dropped=0, observed=3))
+    np.testing.assert_array_equal(again.label, seen.label)
+    np.testing.assert_allclose(again.x_rel[:, 0], seen.x_rel[:, -1], rtol=0.0, atol=0.0)
+    np.testing.assert_allclose(again.mean_velocity, seen.mean_velocity, rtol=1e-4, atol=1e-8)
+
+
 def test_errors() -> None:
     p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=2e4, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
     with pytest.raises(InputError, match="Omega must be positive"):
         response(p, Excitation(1.0, 0.0))
     with pytest.raises(InputError, match="concrete values"):
         jax.jit(lambda P_d: response(p, Excitation(P_d, 30.0)))(1.0)
+    for wrong in ({"dropped": -1}, {"observed": 2}, {"merge_contacts": float("nan")}, {"max_steps": 0}):
+        with pytest.raises(InputError, match=f"{next(iter(wrong))} must"):
+            Settling(**wrong)

@@ -11,6 +11,7 @@ import xarray as xr
 from PIL import Image
 
 from capsule_id.capsule.model import CapsuleParameters, Excitation, simulate
+from capsule_id.commands import capsule_options as options
 from capsule_id.commands import simulate as command
 from capsule_id.errors import InputError
 
@@ -62,13 +63,13 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     drive = ["--G", "1e-3", "--P_d", "4", "--Omega", "30", "--out", "x.csv", "--result", str(tmp_path)]
-    values = command._values(parser.parse_args([*drive, "--c", "5"]))
+    values = options.capsule_values(parser.parse_args([*drive, "--c", "5"]))
     assert (values["k1"], values["k2"], values["c"], values["m1"]) == (1500.0, 2e4, 5.0, 0.11)
     with pytest.raises(InputError, match="choose from L60"):
-        command._values(parser.parse_args([*drive, "--spring", "L70"]))
+        options.capsule_values(parser.parse_args([*drive, "--spring", "L70"]))
     (tmp_path / "parameters.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="takes a result"):
-        command._values(parser.parse_args(drive))
+        options.capsule_values(parser.parse_args(drive))
 
 
 @pytest.mark.parametrize(
@@ -102,12 +103,12 @@ def test_outputs_must_have_a_known_suffix_and_a_folder(tmp_path: Path) -> None:
 
 
 def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command.sys, "modules", {})
+    monkeypatch.setattr(options.sys, "modules", {})
     for before, after in (
-        ("", command.WHOLE_LOOPS),
-        ("--xla_a=1", f"--xla_a=1 {command.WHOLE_LOOPS}"),
+        ("", options.WHOLE_LOOPS),
+        ("--xla_a=1", f"--xla_a=1 {options.WHOLE_LOOPS}"),
         ("--xla_backend_extra_options=other", "--xla_backend_extra_options=other"),
     ):
         monkeypatch.setenv("XLA_FLAGS", before)
-        command._prefer_whole_loops()
-        assert command.os.environ["XLA_FLAGS"] == after
+        options.prefer_whole_loops()
+        assert options.os.environ["XLA_FLAGS"] == after

@@ -1,0 +1,106 @@
+"""Parameters and drive of the capsule as options: the option itself, else a result of fit-params, else the paper's."""
+
+import argparse
+import json
+import math
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from capsule_id.capsule.leaves import LEAVES
+from capsule_id.errors import InputError
+
+# From the paper's Table 1; what is not here must be given.
+DEFAULTS: Mapping[str, float] = {
+    "m1": 0.11,
+    "m2": 0.53,
+    "k1": 1420.0,
+    "c": 3.89,
+    "mu": 0.66,
+    "v_s": 0.3,
+    "g": 9.81,
+    "phase": 0.0,
+}
+
+# Compiles the engines' loops as one function each, several times faster for a single run (internal to XLA's CPU part).
+WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+
+
+def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str, float] = DEFAULTS) -> None:
+    """An option per parameter, in SI, and those that take fitted values; numbers are read by ``capsule_values``."""
+    group = parser.add_argument_group("parameters", "plain numbers in SI units")
+    for name, leaf in LEAVES.items():
+        text = f"default {defaults[name]:g}" if name in defaults else "required"
+        group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text})")
+    group.add_argument(
+        "--result", metavar="DIR", type=Path, help="take the fitted parameters of a result of fit-params"
+    )
+    group.add_argument("--spring", metavar="NAME", help="with --result: which support spring")
+
+
+def capsule_values(
+    args: argparse.Namespace, defaults: Mapping[str, float] = DEFAULTS, free: frozenset[str] = frozenset()
+) -> dict[str, float]:
+    """Every parameter by symbol, SI; those of ``free`` need not be given (they get their default or 1).
+
+    Raises
+    ------
+    InputError
+        One that is missing or no number, a result that cannot be read.
+    """
+    fitted = _fitted(args.result, args.spring) if args.result is not None else {}
+    values = {}
+    for name, leaf in LEAVES.items():
+        text = getattr(args, name)
+        value = number(name, text) if text is not None else fitted.get(name, defaults.get(name))
+        if value is None and name in free:
+            value = 1.0
+        if value is None:
+            raise InputError(
+                f"{name} ({leaf.meaning}) must be given", "it is missing", f"add --{name} X, in {leaf.unit}"
+            )
+        values[name] = value
+    return values
+
+
+def number(name: str, text: str) -> float:
+    """A finite number from the option --name.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"--{name} takes a number", repr(text), "give a plain number in SI units") from None
+    if not math.isfinite(value):
+        raise InputError(f"--{name} must be finite", repr(text), "give a plain number in SI units")
+    return value
+
+
+def prefer_whole_loops() -> None:
+    """Set XLA's option for this process, unless JAX already runs or the user has set options of that kind."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "jax" not in sys.modules and "xla_backend_extra_options" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {WHOLE_LOOPS}".strip()
+
+
+def _fitted(directory: Path, spring: str | None) -> dict[str, float]:
+    """Fitted values (the most probable set) of DIR/parameters.json by symbol."""
+    file = directory / "parameters.json"
+    try:
+        table = json.loads(file.read_text(encoding="utf-8"))["parameters"]
+        values = {name: float(row["map"]) for name, row in table.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError("--result takes a result of fit-params", type(error).__name__, "check DIR", file) from None
+    springs = [name[3:-1] for name in values if name.startswith("k2[")]
+    if spring is None and len(springs) == 1:
+        spring = springs[0]
+    if spring is not None:
+        if spring not in springs:
+            raise InputError("--spring must be a fitted one", spring, f"choose from {', '.join(springs) or 'none'}")
+        values["k2"] = values[f"k2[{spring}]"]
+    return {name: value for name, value in values.items() if name in LEAVES}
