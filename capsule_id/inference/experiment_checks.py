@@ -45,17 +45,20 @@ def _or_ok(findings: list[Finding], check: str, text: str) -> list[Finding]:
 
 def check_whiteness(s: Setting) -> list[Finding]:
     """Expected: residuals of every record white (Ljung–Box)."""
-    records = [e for e in s.experiments if e.time_series]
+    records = [
+        (e, label, residuals)
+        for e in s.experiments
+        if e.time_series
+        for label, residuals in e.records(e.local(s.values))
+    ]
     findings = []
-    for e in records:
-        q, p, lags = whiteness(e, s.values)
+    for e, label, residuals in records:
+        lags = min(LAGS, len(residuals) // 5)
+        q, p = ljung_box(residuals, lags)
         if p * len(records) < LEVEL:
-            drift = e.damping_trend() if isinstance(e, FreeVibration) else ""
             text = (
-                f"{e.label}: expected white residuals; Ljung–Box Q = {q:.0f} over {lags} lags "
-                f"(p = {p:.1g}), so the model misses something or the noise is coloured, and the intervals are too "
-                f"narrow{'; ' + drift if drift else ''}: compare the damping models below, cut the record to free decay "
-                "with start/stop"
+                f"{label}: expected white residuals; Ljung–Box Q = {q:.0f} over {lags} lags (p = {p:.1g}), so the model "
+                f"misses something or the noise is coloured, and the intervals are not to be trusted{_advice(e)}"
             )
             findings.append(Finding("residuals white", "fail", text, e.label))
     if not records:
@@ -65,10 +68,21 @@ def check_whiteness(s: Setting) -> list[Finding]:
     )
 
 
+def _advice(experiment: Experiment) -> str:
+    """What a coloured record calls for."""
+    if isinstance(experiment, FreeVibration):
+        drift = experiment.damping_trend()
+        return f"{'; ' + drift if drift else ''}: compare the damping models below, cut the record to free decay with start/stop"
+    return (
+        ': look at its residuals and phase portrait, check spring, gap and friction law, or state noise = "ar1" where the '
+        "sensor filters"
+    )
+
+
 def whiteness(experiment: Experiment, values: Mapping[str, float]) -> tuple[float, float, int]:
-    """Ljung–Box Q of the experiment's residuals at ``values`` by name, its p-value, and the number of lags."""
-    residuals = np.asarray(experiment.residuals(experiment.local(values), np))[: experiment.n]
-    lags = min(LAGS, experiment.n // 5)
+    """Ljung–Box Q of the residuals of a single record at ``values`` by name, its p-value, and the number of lags."""
+    ((_, residuals),) = experiment.records(experiment.local(values))
+    lags = min(LAGS, len(residuals) // 5)
     return *ljung_box(residuals, lags), lags
 
 

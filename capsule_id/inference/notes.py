@@ -34,7 +34,8 @@ def make_notes(
     notes = []
     if records:
         notes.append(_decays(records, setting.values))
-    if any(f.check == "residuals white" and f.level == "fail" for f in findings):
+    labels = {record.label for record in records}
+    if any(f.check == "residuals white" and f.level == "fail" and f.experiment in labels for f in findings):
         notes.append(damping_models(setting, records, seed))
     if lines:
         notes.append(_lines(lines, setting.values, flagged))

@@ -1,0 +1,133 @@
+"""Do the runs agree with the bench, and can their motion be predicted at all?"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from capsule_id.capsule.model import Status, simulate
+from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.views import Finding
+
+#: Family-wise false-alarm rate of the comparison of bench and runs.
+LEVEL = 0.02
+#: A parameter whose posterior the runs narrow by less than this part cannot disagree with them.
+SMALLEST_GAIN = 0.02
+#: An error in the initial state that grows by this factor within the record makes an open-loop fit meaningless.
+LARGEST_GROWTH = 1e3
+
+
+def disagreement(target: LogPosterior, joint: PointFit, bench: PointFit, sample: Posterior | None) -> dict[str, float]:
+    """z of every parameter that bench and runs share, by name, largest first.
+
+    Bench estimate minus joint estimate, over its sd under agreement: the joint estimate uses all that the bench tells,
+    so the variance of the difference is that of the bench less that of the joint one (Hausman, Econometrica 46, 1251,
+    1978). The tails of what few trials tell are those of the bench's sample, where there is one.
+    """
+    z = {}
+    for name in bench.names:
+        i, j = target.names.index(name), bench.names.index(name)
+        if target.scatter[i]:
+            continue
+        wide, narrow = bench.covariance[j, j], joint.covariance[i, i]
+        if narrow > (1.0 - SMALLEST_GAIN) ** 2 * wide:
+            continue
+        distance = (bench.u[j] - joint.u[i]) / np.sqrt(wide)
+        if sample is not None:
+            distance = _by_sample(sample.draws[..., j].ravel(), joint.values[name], distance)
+        z[name] = float(distance / np.sqrt(1.0 - narrow / wide))
+    return dict(sorted(z.items(), key=lambda item: -abs(item[1])))
+
+
+def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
+    """Standard normal quantile of where ``value`` lies among ``draws``, sign as ``laplace``.
+
+    Beyond the outermost hundredth the tail is continued as that of a Student t with the sample's own reach.
+    """
+    below = np.mean(draws < value)
+    if 0.005 < below < 0.995:
+        return float(-stats.norm.ppf(below))
+    # The outer quantiles at two levels give the number of degrees of freedom of the tail.
+    levels = np.array([0.005, 0.05]) if below < 0.5 else np.array([0.995, 0.95])
+    centre = float(np.median(draws))
+    outer, inner = np.abs(np.quantile(draws, levels) - centre)
+    freedom = _freedom(outer / inner)
+    scale = outer / stats.t.isf(0.005, freedom)
+    tail = stats.t.logsf(abs(value - centre) / scale, freedom)
+    return float(np.copysign(_quantile_of_log_tail(float(tail)), laplace))
+
+
+def _freedom(ratio: float) -> float:
+    """Degrees of freedom of a Student t whose 0.5 % and 5 % points stand in ``ratio``."""
+    grid = np.geomspace(1.0, 1e3, 200)
+    return float(grid[np.argmin(np.abs(stats.t.isf(0.005, grid) / stats.t.isf(0.05, grid) - ratio))])
+
+
+def _quantile_of_log_tail(log_tail: float) -> float:
+    """z with log(1 - Phi(z)) = ``log_tail``, also where the tail itself underflows."""
+    z = np.linspace(0.0, 40.0, 8001)
+    return float(np.interp(-log_tail, -stats.norm.logsf(z), z))
+
+
+def check_agreement(
+    target: LogPosterior, joint: PointFit, bench: PointFit | None, sample: Posterior | None
+) -> list[Finding]:
+    """Expected: bench and runs tell of one capsule (Hausman, Šidák over the shared parameters)."""
+    z = {} if bench is None else disagreement(target, joint, bench, sample)
+    if not z:
+        return []
+    worst = next(iter(z))
+    p = -np.expm1(len(z) * np.log1p(-2.0 * stats.norm.sf(abs(z[worst]))))
+    seen = f"largest disagreement in {worst} ({z[worst]:+.1f} sd, p = {p:.2g} over {len(z)} shared parameters)"
+    if p >= LEVEL:
+        return [Finding("bench and runs agree", "ok", seen)]
+    others = [f"{name} ({value:+.1f})" for name, value in z.items() if name != worst and abs(value) > 3.0]
+    text = (
+        f"expected bench and runs to tell of one capsule; {seen}: the bench's {worst} does not fit the recorded motion"
+        f"{'; then ' + ', '.join(others) if others else ''}: repeat its bench test, or ask what differs in the runs"
+    )
+    return [Finding("bench and runs agree", "fail", text)]
+
+
+def growth(run: ForcedRun, values: dict[str, float]) -> float:
+    """Largest factor by which a small error of the initial state has grown at the end of the record, 1.
+
+    Positions count in units of the motion's length, velocities in that times Omega.
+    """
+    p, e = run.capsule(values)
+    size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
+    times = run.time[[0, -1]]
+
+    def end(state: jax.Array) -> jax.Array:
+        t = simulate(p, e, times, (state[0], state[1] + state[2], 0.0, state[2]))
+        return jnp.stack([t.X1[-1] - t.X2[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]]) / size
+
+    motion = run.motion(values, np)
+    rate = np.asarray(motion.Y1 - motion.Y2)
+    start = jnp.array([float(motion.x_rel[0]), float(rate[0]), float(motion.Y2[0])])
+    derivative = np.asarray(jax.jit(jax.jacfwd(end))(start)) * size
+    return float(np.linalg.norm(derivative, 2))
+
+
+def check_runs(runs: Sequence[ForcedRun], values: dict[str, float]) -> list[Finding]:
+    """Expected: every run's motion predictable over its record, and complete."""
+    findings = []
+    for run in runs:
+        local = run.local(values)
+        status = Status(int(run.motion(local, np).status))
+        if status is Status.GRAZING:
+            text = f"{run.label}: {status.sentence} Its covariance at the point fit may be off; the sample does not use it"
+            findings.append(Finding("runs predictable", "warn", text, run.label))
+        factor = growth(run, local)
+        if not factor < LARGEST_GROWTH:
+            text = (
+                f"{run.label}: expected a motion that forgets its start; an error of the initial state grows {factor:.2g} "
+                f"times over the record, so one initial state cannot predict it: state segments, or record less of it"
+            )
+            findings.append(Finding("runs predictable", "fail", text, run.label))
+    seen = f"none of {len(runs)} runs amplifies an error of its start {LARGEST_GROWTH:g} times"
+    return findings or ([Finding("runs predictable", "ok", seen)] if runs else [])
