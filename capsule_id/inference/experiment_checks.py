@@ -74,8 +74,8 @@ def _advice(experiment: Experiment) -> str:
         drift = experiment.damping_trend()
         return f"{'; ' + drift if drift else ''}: compare the damping models below, cut the record to free decay with start/stop"
     return (
-        ': look at its residuals and phase portrait, check spring, gap and friction law, or state noise = "ar1" where the '
-        "sensor filters"
+        ": look at its residuals and phase portrait, check spring, gap and friction law, or state "
+        'noise = "ar1" where the sensor filters'
     )
 
 

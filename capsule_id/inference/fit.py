@@ -20,6 +20,8 @@ from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.notes import make_notes
 from capsule_id.inference.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit, Posterior, Result
+from capsule_id.inference.run_checks import check_agreement, check_runs
+from capsule_id.inference.run_notes import BenchFit, run_notes
 from capsule_id.inference.sampling import DEFAULT_BUDGET, Progress, sample
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig
@@ -28,8 +30,12 @@ from capsule_id.views import Comparison, NoteTable
 #: Posterior draws behind bands and predictive p-values, and behind the pointwise log-likelihood.
 BAND_DRAWS = 200
 PRIOR_DRAWS = 2000
+#: Pointwise log-likelihoods kept: of every walker's last draw, or of fewer walkers where there are many readings.
+POINTWISE_SIZE = 2_000_000
 #: Starts of the fit of forced runs, each of which costs seconds.
 JOINT_STARTS = 3
+#: emcee steps of the bench's own sample, which shows what the runs add and whether they agree.
+BENCH_BUDGET = 1000
 PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
 
@@ -61,13 +67,15 @@ def fit_rig(
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
     if progress:
         progress(0, 1, "point fit")
-    point = _fit(rig, target, seeds[0])
+    point, bench = _fit(rig, target, seeds[0], sampled=budget is not None)
     posterior = None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)
     values = {**target.fixed, **point.values}
     setting = Setting(rig, experiments, target, point, posterior, values)
     findings, flagged = run_checks(setting)
+    runs = [e for e in experiments if isinstance(e, ForcedRun)]
+    findings += [*check_agreement(target, point, bench.fit, bench.sample), *check_runs(runs, values)]
     rng = np.random.default_rng(seeds[2])
     draws = _draws(target, posterior)
     tables = _tables(rig, target, point, posterior, experiments)
@@ -79,7 +87,11 @@ def fit_rig(
         posterior=posterior,
         findings=tuple(findings),
         comparisons=_comparisons(experiments, values, draws, flagged, rng),
-        notes=(*make_notes(setting, findings, flagged, seeds[0]), *_predictive(experiments, draws, rng)),
+        notes=(
+            *run_notes(target, point, posterior, bench, draws),
+            *make_notes(setting, findings, flagged, seeds[0]),
+            *_predictive(experiments, draws, rng),
+        ),
         provenance={
             "seed": seed,
             "experiments": which,
@@ -90,16 +102,20 @@ def fit_rig(
     )
 
 
-def _fit(rig: Rig, target: LogPosterior, seed: int) -> PointFit:
-    """The point fit: of bench experiments directly, of runs starting from what the bench tells."""
+def _fit(rig: Rig, target: LogPosterior, seed: int, sampled: bool) -> tuple[PointFit, BenchFit]:
+    """The point fit: of bench experiments directly, of runs starting from what the bench tells; and the bench's own."""
     bench = [e for e in target.experiments if not isinstance(e, ForcedRun)]
     if len(bench) == len(target.experiments):
-        return point_fit(target, seed)
+        return point_fit(target, seed), BenchFit()
     starts = dispersed_starts(target, seed, JOINT_STARTS)
-    if bench:
-        return joint_fit(target, point_fit(LogPosterior(rig, bench), seed), starts)
-    measured = [table for table in rig.tables if table.kind in BENCH]
-    return joint_fit(target, paper_estimates(make_experiments(rig, "bench")) if measured else {}, starts)
+    if not bench:
+        measured = [table for table in rig.tables if table.kind in BENCH]
+        rough = paper_estimates(make_experiments(rig, "bench")) if measured else {}
+        return joint_fit(target, rough, starts), BenchFit()
+    alone = LogPosterior(rig, bench)
+    fit = point_fit(alone, seed)
+    own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
+    return joint_fit(target, fit, starts), BenchFit(fit, own)
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:
@@ -214,11 +230,13 @@ def _groups(
     groups["prior"] = target.sample_prior(rng, PRIOR_DRAWS)
     if posterior is not None:
         ensembles, draws, walkers, _ = posterior.draws.shape
-        last = posterior.draws[:, -1].reshape(ensembles * walkers, -1)
+        every = max(1, ensembles * walkers * sum(e.n for e in experiments) // POINTWISE_SIZE)
+        chains = np.arange(0, ensembles * walkers, every)
+        last = posterior.draws[:, -1].reshape(ensembles * walkers, -1)[chains]
         values = [target.mapping(theta) for theta in last]
         groups["log_likelihood"] = {
             e.label: np.stack([e.pointwise(e.local(v), rng) for v in values])[:, None] for e in experiments
         }
-        groups["log_likelihood_chain"] = np.arange(ensembles * walkers)
+        groups["log_likelihood_chain"] = chains
         groups["log_likelihood_draw"] = np.array([draws - 1])
     return groups

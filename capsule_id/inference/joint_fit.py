@@ -28,7 +28,7 @@ TOLERANCE, MAX_STEPS = 1e-7, 80
 #: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
 ROUNDS, STILL = 8, 0.01
 #: Starts leave the bench's estimates by this many of its standard deviations.
-DISPERSION = 2.0
+DISPERSION = 1.0
 #: Relative sd of the starts about rough values.
 ROUGH = 0.01
 #: A scatter's conditional maximum is looked for within this factor (logarithm) of where it stands.

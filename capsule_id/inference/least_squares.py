@@ -292,6 +292,12 @@ def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return value, jacobian
 
 
+def linearised(residual: Residual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n,) and Jacobian (n, d) of heavy residuals at x (d,)."""
+    value, jacobian = _PROGRAMS[True][0](residual, jnp.asarray(x))
+    return np.asarray(value), np.asarray(jacobian)
+
+
 def _compiled(function: Callable[..., Any], options: Mapping[str, int]) -> Callable[..., Any]:
     # Equinox hands the options of jax.jit on; its annotations leave them out.
     return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]

@@ -33,7 +33,7 @@ class LogPosterior:
     """
 
     def __init__(self, rig: Rig, experiments: Sequence[Experiment]) -> None:
-        self.experiments = tuple(experiments)
+        self.rig, self.experiments = rig, tuple(experiments)
         self.fixed: dict[str, float] = {"g": rig.g.value}
         rows: dict[str, Parameter] = {}
         for symbol, mass in (("m1", rig.m1), ("m2", rig.m2)):

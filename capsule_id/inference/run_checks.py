@@ -120,7 +120,9 @@ def check_runs(runs: Sequence[ForcedRun], values: dict[str, float]) -> list[Find
         local = run.local(values)
         status = Status(int(run.motion(local, np).status))
         if status is Status.GRAZING:
-            text = f"{run.label}: {status.sentence} Its covariance at the point fit may be off; the sample does not use it"
+            text = (
+                f"{run.label}: {status.sentence} Its covariance at the point fit may be off; the sample does not use it"
+            )
             findings.append(Finding("runs predictable", "warn", text, run.label))
         factor = growth(run, local)
         if not factor < LARGEST_GROWTH:

@@ -1,0 +1,188 @@
+"""Tables about forced runs: what they buy, scaled groups, what the model predicts of them, what smoothing would do."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from capsule_id.capsule.smooth import Smoothing
+from capsule_id.experiments.base import Theta
+from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.inference.density import HeldResiduals
+from capsule_id.inference.least_squares import linearised
+from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.views import NoteTable
+
+#: Parameters that bench and runs may share.
+SHARED = ("m1", "m2", "k1", "c", "mu", "v_s", "K", "k2")
+
+
+@dataclass(frozen=True)
+class BenchFit:
+    """What the bench experiments tell by themselves; None where there are none, or nothing was sampled."""
+
+    fit: PointFit | None = None
+    sample: Posterior | None = None
+
+
+def run_notes(
+    target: LogPosterior, fit: PointFit, sample: Posterior | None, bench: BenchFit, draws: Sequence[Mapping[str, float]]
+) -> list[NoteTable]:
+    """All tables about forced runs; [] without runs."""
+    runs = [e for e in target.experiments if isinstance(e, ForcedRun)]
+    if not runs:
+        return []
+    values = target.mapping(target.theta(fit.u))
+    notes = [bought(target, fit, sample, bench), predicted_motion(runs, values, draws)]
+    if draws:
+        notes.append(scaled_groups(runs, draws))
+    return [*notes, smoothing_certificate(target, fit)]
+
+
+def bought(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> NoteTable:
+    """Posterior sd with bench only, runs only, both; from samples where there are any, else from point fits."""
+    runs = _runs_alone(target, joint)
+    rows = {}
+    for i, name in enumerate(target.names):
+        if target.parameters[i].symbol not in SHARED:
+            continue
+        rows[name] = [_sd(bench.fit, bench.sample, name), runs[name], _sd(joint, sample, name)]
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["bench only", "runs only", "both"])
+    frame["bench only / both"] = frame["bench only"] / frame["both"]
+    caption = (
+        "Posterior standard deviation, SI. Runs only: from the curvature of their likelihood and the priors at the joint "
+        "point fit; bench and both: from the samples, where they were drawn."
+    )
+    return NoteTable("What the runs buy", caption, frame.rename_axis("parameter"))
+
+
+def _runs_alone(target: LogPosterior, fit: PointFit) -> dict[str, float]:
+    """sd of every located parameter, SI, from the runs' residuals and the priors."""
+    located = np.flatnonzero(~target.scatter)
+    residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(fit.u))
+    _, jacobian = linearised(residual, fit.u[located])
+    values = target.mapping(target.theta(fit.u))
+    wanted: list[np.ndarray] = []
+    for group in target.structure.groups:
+        own = group.first
+        parts = own.misfits(own.local(values), np)
+        size = sum(part.raw.shape[0] + part.design.shape[1] for part in parts) * len(group.entries[0][1])
+        wanted.append(np.full(size, isinstance(own, ForcedRun)))
+    rows = np.concatenate([*wanted, np.ones(target.dimension, dtype=bool)])
+    kept = jacobian[rows]
+    sd = np.sqrt(np.diag(np.linalg.inv(kept.T @ kept)))
+    return {target.names[i]: float(s * abs(fit.values[target.names[i]])) for i, s in zip(located, sd, strict=True)}
+
+
+def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:
+    if sample is not None and name in sample.names:
+        return float(np.std(sample.draws[..., sample.names.index(name)], ddof=1))
+    if fit is None or name not in fit.names:
+        return float("nan")
+    i = fit.names.index(name)
+    return float(np.sqrt(fit.covariance[i, i]) * abs(fit.values[name]))
+
+
+def scaled_groups(runs: Sequence[ForcedRun], draws: Sequence[Mapping[str, float]]) -> NoteTable:
+    """The paper's nondimensional groups, mean and sd over posterior ``draws`` by name.
+
+    Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0, with Omega0 = sqrt(k1/m1) and F_b = mu (m1 + m2) g.
+    """
+    columns: dict[str, list[float]] = {}
+    for values in draws:
+        for run in runs:
+            for name, value in _groups(run, run.local(values)).items():
+                columns.setdefault(name, []).append(value)
+    rows = {name: [np.mean(column), np.std(column, ddof=1)] for name, column in columns.items()}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["mean", "sd"]).rename_axis("group")
+    caption = (
+        "Groups that carry the rig over to a prototype of another size: equal groups, equal motion. Omega0 = √(k1/m1), "
+        "zeta = c/(2 m1 Omega0), F_b = mu (m1 + m2) g; a shared group is listed once."
+    )
+    return NoteTable("Nondimensional groups", caption, frame)
+
+
+def _groups(run: ForcedRun, theta: Theta) -> dict[str, float]:
+    p, e = run.capsule(theta)
+    m1, m2, k1, k2, c, mu, v_s, G, g = (
+        float(getattr(p, name)) for name in ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")
+    )
+    Omega0, F_b = np.sqrt(k1 / m1), mu * (m1 + m2) * g
+    length, of = F_b / k1, run.label
+    return {
+        "Omega0, rad/s": Omega0,
+        "zeta": c / (2.0 * m1 * Omega0),
+        "m2/m1": m2 / m1,
+        "v_s / (Omega0 F_b/k1)": v_s / (Omega0 * length),
+        f"k2/k1 [{run.spring}]": k2 / k1,
+        f"Omega/Omega0 [{of}]": run.Omega / Omega0,
+        f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore[reportArgumentType]
+        f"G k1/F_b [{of}]": G / length,
+    }
+
+
+def predicted_motion(
+    runs: Sequence[ForcedRun], values: Mapping[str, float], draws: Sequence[Mapping[str, float]]
+) -> NoteTable:
+    """Contacts and mean velocity of the capsule over the record: observed, at the point fit, 95 % band over ``draws``."""
+    rows = {}
+    for run in runs:
+        fit = run.motion(run.local(values), np)
+        span = run.time[-1] - run.time[0]
+        local = [run.local(draw) for draw in draws]
+        stacked = {name: np.array([theta[name] for theta in local]) for name in (local[0] if local else {})}
+        sample = run.motion(stacked, np) if local else None
+        row: dict[str, object] = {"contacts, model": int(fit.contacts)}
+        if sample is not None:
+            low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
+            row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"
+        row["mean velocity, model, mm/s"] = 1e3 * float(fit.X2[-1]) / span
+        if sample is not None:
+            band = np.quantile(1e3 * np.asarray(sample.X2)[:, -1] / span, [0.025, 0.975])
+            row["95 % band, mm/s"] = f"{band[0]:.4g} to {band[1]:.4g}"
+        if "x_capsule" in run.channels:
+            place = run.values[run.channels.index("x_capsule")]
+            row["mean velocity, record, mm/s"] = 1e3 * float(np.mean(place[-5:]) - np.mean(place[:5])) / span
+        rows[run.label] = row
+    caption = (
+        "Over the record, from its first sample to its last; the record's velocity from five samples at either end."
+    )
+    return NoteTable(
+        "Motion predicted and observed", caption, pd.DataFrame.from_dict(rows, orient="index").rename_axis("run")
+    )
+
+
+def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing | None = None) -> NoteTable:
+    """By how much a fit of the smoothed model would differ from this one, in posterior sd, at ``widths``.
+
+    One Gauss–Newton step: the difference of the residuals of both models, through the exact model's Jacobian. ``widths``
+    None: the certified ones.
+    """
+    widths = widths or Smoothing()
+    shift, sd = smoothing_shift(target, fit, widths)
+    located = np.flatnonzero(~target.scatter)
+    rows = {target.names[i]: [d, s, d / s] for i, d, s in zip(located, shift, sd, strict=True)}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["shift of u", "sd of u", "shift / sd"])
+    frame = frame.loc[[name for name in frame.index if target.parameters[target.names.index(name)].physical]]
+    caption = (
+        f"The posterior is the exact model's. Had the smoothed model been fitted (velocity {widths.velocity:g} m/s, "
+        f"penetration {widths.penetration:g} m), the estimates would have moved by this much (u: logarithm)."
+    )
+    return NoteTable("What smoothing would do", caption, frame.rename_axis("parameter"))
+
+
+def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing) -> tuple[np.ndarray, np.ndarray]:
+    """(d_located,) shift of u between a fit with the smoothed model of ``widths`` and the exact one, and the sd of u."""
+    located = np.flatnonzero(~target.scatter)
+    smoothed = [e.smoothed(widths) if isinstance(e, ForcedRun) else e for e in target.experiments]
+    free, centre = tuple(int(i) for i in located), jnp.asarray(fit.u)
+    other = LogPosterior(target.rig, smoothed)
+    misses = jax.jit(HeldResiduals(other.structure, free, other.numbers, centre))(centre[located])
+    exact, jacobian = linearised(HeldResiduals(target.structure, free, target.numbers, centre), fit.u[located])
+    normal = jacobian.T @ jacobian
+    step = -np.linalg.solve(normal, jacobian.T @ (np.asarray(misses) - exact))
+    return step, np.sqrt(np.diag(np.linalg.inv(normal)))
