@@ -176,9 +176,7 @@ def _write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _rig_toml(
-    name: str, seed: int, g: float, masses: dict[str, float], priors: list[str], entries: list[str]
-) -> str:
+def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], priors: list[str], entries: list[str]) -> str:
     """The text of ``rig.toml``."""
     head = [
         f"# SYNTHETIC: computed with known parameters (seed {seed}), not measured.",

@@ -6,6 +6,7 @@ Standard errors are those of linearised least squares. For a long record they ar
 with unknown frequency: D. C. Rife, R. R. Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974).
 """
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,10 +71,9 @@ def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic
         rule = f"a tone needs at least {FEWEST_SAMPLES} samples"
         raise InputError(rule, f"{len(time)}", "record for longer or faster")
     guesses = [Omega]
-    try:
+    # an unevenly sampled record has only the stated frequency to start from
+    with contextlib.suppress(InputError):
         guesses.append(2.0 * np.pi * dominant_frequency(time, values))
-    except InputError:  # unevenly sampled: only the stated frequency is left to start from
-        pass
     found = min((_refine(time, values, guess) for guess in guesses), key=lambda pair: pair[1])[0]
     return _describe(time, values, found, Omega)
 

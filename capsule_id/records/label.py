@@ -81,9 +81,7 @@ def _cycle(table: Table, Omega: float, period: float, noise_sd: float) -> Cycle:
     return Cycle(table["time"], table["x_rel"], acceleration, Omega, period, gap.value, gap.sd, noise_sd)
 
 
-def _label(
-    repeat: Repeat | None, progress: Progress | None, contacts: Contacts | None
-) -> tuple[str, tuple[str, ...]]:
+def _label(repeat: Repeat | None, progress: Progress | None, contacts: Contacts | None) -> tuple[str, tuple[str, ...]]:
     """The label and, where it is "undecided", all that stands in its way."""
     if repeat is None:
         return UNDECIDED, ("x_rel was not recorded",)
