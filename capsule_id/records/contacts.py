@@ -26,10 +26,20 @@ _WIDE = 0.02  # of the period of the drive, half-width for the linear law: rates
 _CLEAR = 0.05  # of the travel of x_rel: this far below the gap counts as clear of it ...
 _CLEAR_SD = 5.0  # ... and as many sd of the stated gap
 _IN_CONTACT = 6.0  # standard errors of a spike that count for placing the impact line
+_LINE_ERRORS = (-2.0, 0.0, 2.0)  # sd of the impact line at which crossings are counted
 _LINE_SAMPLES = 2  # of the folded record in contact, for placing the line
 _FEWEST = 10  # samples per unknown of the linear law
 _SINGLE = 3  # samples whose mean is looked at where a single period is counted; a contact lasts longer
 _LAW = 5  # unknowns of the linear law
+
+
+@dataclass(frozen=True)
+class Line:
+    """The impact line: x_rel where contacts begin and its sd, m (sensor zero included); scatter of x_rel about it."""
+
+    value: float
+    sd: float
+    scatter: float
 
 
 @dataclass(frozen=True)
@@ -38,8 +48,8 @@ class Contacts:
 
     count : contacts per period of the motion, None where the evidence disagrees
     spikes : counts by ``SPIKE_LEVELS``, () without acceleration
-    crossings : counts by ``CROSSING_LEVELS``; at an uncertain gap, by these at both of its ends and at it
-    gap_seen : x_rel where the spikes vanish, m (sensor zero included), None where there are too few
+    crossings : counts by ``CROSSING_LEVELS`` at the impact line less 2 of its sd, at it, and at it plus 2 sd
+    gap_seen : the impact line where the record shows it, None where there are too few spikes: then it is the stated gap
     duration : of the shortest contact, s, None without contacts
     agreeing, cycles : periods of the motion counted singly with the same result, and all that were counted
     reason : why there is no count, or ""
@@ -48,7 +58,7 @@ class Contacts:
     count: int | None
     spikes: tuple[int, ...]
     crossings: tuple[int, ...]
-    gap_seen: float | None
+    gap_seen: Line | None
     duration: float | None
     agreeing: int
     cycles: int
@@ -92,14 +102,11 @@ class Cycle:
 def find_contacts(cycle: Cycle) -> Contacts:
     """Count the contacts of a record whose motion has the period ``cycle.period``."""
     push = _push(cycle)
-    line, line_sd = _impact_line(cycle, push)
-    if line is None:
-        ends = (cycle.gap - 2.0 * cycle.gap_sd, cycle.gap, cycle.gap + 2.0 * cycle.gap_sd)
-        single = cycle.x_rel - cycle.gap
-    else:
-        ends, single = (line,), cycle.x_rel - line
+    seen = _impact_line(cycle, push)
+    line = seen or Line(cycle.gap, cycle.gap_sd, cycle.noise_sd)
+    single = cycle.x_rel - line.value
     mean, sd = cycle.mean(cycle.x_rel)
-    above = [(mean - end) / (sd * line_sd) for end in ends]
+    above = [(mean - line.value - shift * line.sd) / (sd * line.scatter) for shift in _LINE_ERRORS]
     crossings = tuple(len(intervals_above(z, *levels)) for z in above for levels in CROSSING_LEVELS)
     if push is None:
         spikes, z, single, levels = (), above[len(above) // 2], single / cycle.noise_sd, CROSSING_LEVELS[-1]
@@ -119,7 +126,7 @@ def find_contacts(cycle: Cycle) -> Contacts:
         reason = f"contacts: {agreeing} of {cycles} single periods show the {counts.pop()} of all together"
     count = None if reason else counts.pop()
     shortest = min((length for _, length in stretches), default=0) * cycle.period / len(z)
-    return Contacts(count, spikes, crossings, line, shortest or None, agreeing, cycles, reason)
+    return Contacts(count, spikes, crossings, seen, shortest or None, agreeing, cycles, reason)
 
 
 def _shown(counts: tuple[int, ...]) -> str:
@@ -181,22 +188,29 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     return below & (distance > _WIDE * _drive(cycle))
 
 
-def _impact_line(cycle: Cycle, push: _Push | None) -> tuple[float | None, float]:
-    """(x_rel where the spikes vanish, by regression of x_rel on them, or None; sd of one reading of x_rel about it)."""
+def _impact_line(cycle: Cycle, push: _Push | None) -> Line | None:
+    """Where the spikes vanish, by regression of x_rel on them."""
     if push is None:
-        return None, cycle.noise_sd
+        return None
     (force, sd), (x_rel, _) = cycle.mean(push.shortfall), cycle.mean(cycle.x_rel)
-    touching = force > _IN_CONTACT * sd * push.sd
-    if touching.sum() < _LINE_SAMPLES * _GRID:
-        return None, cycle.noise_sd
+    deep = force > _IN_CONTACT * sd * push.sd
+    # a mean over an edge of a contact is no reading of a contact: half a sampling step more on either side
+    touching = np.all([np.roll(deep, shift) for shift in range(-_GRID // 2, _GRID // 2 + 1)], axis=0)
+    count = touching.sum() / _GRID
+    if count < _LINE_SAMPLES:
+        return None
+    shared_sd = float(np.mean(cycle.mean(push.shared_sd)[0][touching]))
     force, x_rel, sd = force[touching], x_rel[touching], sd[touching]
     # noise in the regressor flattens a regression; its variance is known and comes off
-    spread = np.var(force) - np.mean(sd**2) * push.sd**2
-    if spread <= 0.0:
-        return None, cycle.noise_sd
-    slope = np.mean((force - force.mean()) * (x_rel - x_rel.mean())) / spread
-    line = x_rel.mean() - slope * force.mean()
-    return float(line), max(float(np.std((x_rel - slope * force - line) / sd)), cycle.noise_sd)
+    variance = float(np.var(force) - np.mean(sd**2) * push.sd**2)
+    if variance <= 0.0:
+        return None
+    slope = float(np.mean((force - force.mean()) * (x_rel - x_rel.mean())) / variance)
+    value = float(x_rel.mean() - slope * force.mean())
+    residual = x_rel - slope * force - value
+    regression_sd = np.std(residual) * np.sqrt((1.0 + force.mean() ** 2 / variance) / count)
+    scatter = max(float(np.std(residual / sd)), cycle.noise_sd)
+    return Line(value, float(np.hypot(regression_sd, slope * shared_sd)), scatter)
 
 
 def _single_cycles(

@@ -21,7 +21,7 @@ from capsule_id.rig.model import Table
 OMEGA_ERRORS, OMEGA_SHARE = 4.0, 1e-3
 FEWEST_SAMPLES = 8  # for five unknowns, the noise among them
 _SCAN = 1.5  # half-width of the search about a first guess, in 1 / duration: a peak of the spectrum is 1 wide
-_SCAN_POINTS = 61
+_SCAN_POINTS = 25
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,9 @@ def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic
     guesses = [Omega]
     # an unevenly sampled record has only the stated frequency to start from
     with contextlib.suppress(InputError):
-        guesses.append(2.0 * np.pi * dominant_frequency(time, values))
+        strongest = 2.0 * np.pi * dominant_frequency(time, values)
+        near = abs(strongest - Omega) < _width(time)
+        guesses = [strongest] if near else [Omega, strongest]
     found = min((_refine(time, values, guess) for guess in guesses), key=lambda pair: pair[1])[0]
     return _describe(time, values, found, Omega)
 
@@ -85,12 +87,18 @@ def _design(time: np.ndarray, Omega: float) -> np.ndarray:
 def _misfit(time: np.ndarray, values: np.ndarray, Omega: float) -> float:
     """Sum of squares left by the best tone of this frequency."""
     design = _design(time, Omega)
-    return float(np.sum((values - design @ np.linalg.lstsq(design, values)[0]) ** 2))
+    unknowns = np.linalg.solve(design.T @ design, design.T @ values)
+    return float(np.sum((values - design @ unknowns) ** 2))
+
+
+def _width(time: np.ndarray) -> float:
+    """Half-width of the search about a guess, rad/s."""
+    return float(2.0 * np.pi * _SCAN / (time[-1] - time[0]))
 
 
 def _refine(time: np.ndarray, values: np.ndarray, guess: float) -> tuple[float, float]:
     """(Omega, sum of squares) of the deepest minimum about ``guess``."""
-    width = 2.0 * np.pi * _SCAN / (time[-1] - time[0])
+    width = _width(time)
     grid = np.linspace(max(guess - width, 0.05 * guess), guess + width, _SCAN_POINTS)
     best = int(np.argmin([_misfit(time, values, Omega) for Omega in grid]))
     step = grid[1] - grid[0]

@@ -57,9 +57,12 @@ def _line(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]
     angle = 2.0 * np.pi / T * np.multiply.outer(time, np.arange(1, most + 1))
     middle = time - time.mean()
     design = np.concatenate([np.ones((len(time), 1)), middle[:, None], np.cos(angle), np.sin(angle)], axis=1)
-    unknowns, _, rank, _ = np.linalg.lstsq(design, values)
-    variance = float(np.sum((values - design @ unknowns) ** 2)) / max(len(time) - int(rank), 1)
-    return float(unknowns[1]), float(np.sqrt(variance * np.linalg.inv(design.T @ design)[1, 1]))
+    q, triangle = np.linalg.qr(design)
+    values = values - values.mean()
+    coordinates = q.T @ values
+    variance = max(float(np.sum(values**2) - np.sum(coordinates**2)), 0.0) / max(len(time) - design.shape[1], 1)
+    slope = np.linalg.solve(triangle.T, np.eye(design.shape[1])[1])  # the row of the pseudoinverse is q @ slope
+    return float(slope @ coordinates), float(np.sqrt(variance) * np.linalg.norm(slope))
 
 
 def _advances(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]:

@@ -12,7 +12,8 @@ from capsule_id.rig.model import Table
 def describe_run(table: Table) -> list[str]:
     """Lines about a ``forced_run``, without its name in front."""
     motion = measured_motion(table)
-    lines = [f"motion {motion.label} ({'; '.join(_evidence(motion))})"]
+    evidence = "; ".join(_evidence(motion))
+    lines = [f"motion {motion.label} ({evidence})" if evidence else f"motion {motion.label}"]
     if motion.evidence.reasons:
         lines.append(f"undecided because of {'; '.join(motion.evidence.reasons)}")
     if motion.evidence.drive:
