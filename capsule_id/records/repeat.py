@@ -14,7 +14,7 @@ LONGEST = 16  # as ``response`` of the model has it
 #: A repeat leaves at most this share of the motion's rms beyond the noise ...
 SAME = 0.01
 #: ... and a record is clean enough to tell where a part of this share of the motion would have been seen.
-VISIBLE = 0.05
+VISIBLE = 0.03
 #: The smallest period of motion that passes must be seen repeating over at least this many periods of the drive.
 FEWEST_PERIODS = 4
 FEWEST_OVERLAP = 2  # periods of the drive that a comparison rests on
@@ -68,7 +68,8 @@ def find_period(time: np.ndarray, x_rel: np.ndarray, T: float, floor: float = 0.
 
     Rule: n repeats where the mean square of the differences exceeds that of the noise by no more than 5 of its standard
     errors, or by less than 1 % of the motion's rms. The record must hold 2n periods and at least 4, and be clean enough
-    that a part of another period with 5 % of the motion's rms would have been seen. "Nothing repeats" needs
+    that a part of another period with 3 % of the motion's rms would have been seen; a smaller one, or chaos in as narrow
+    bands, passes for a repeat. "Nothing repeats" needs
     comparisons up to n = 16, each over 2 periods or more.
     """
     step = (time[-1] - time[0]) / (len(time) - 1)
