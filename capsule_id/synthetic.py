@@ -17,6 +17,7 @@ from capsule_id.experiments import (
     support_spring,
 )
 from capsule_id.rig.schema import NAME_PATTERN
+from capsule_id.synthetic_runs import RUN_SPRINGS, make_runs, spring_priors, truths
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,10 @@ class Truth:
             truth = replace(truth, k2={**truth.k2, spring: value}) if spring else replace(truth, **{name: value})
         return truth
 
+    def with_runs(self) -> "Truth":
+        """The same with the springs that only forced runs meet."""
+        return replace(self, k2={**self.k2, **{name: k2 for name, k2 in RUN_SPRINGS.items() if name not in self.k2}})
+
     def flat(self) -> dict[str, float]:
         """Values by parameter name."""
         values = asdict(self)
@@ -74,10 +79,18 @@ MASS_SD = {"m1": 0.2e-3, "m2": 0.5e-3}
 LENGTH, LENGTH_OF, LENGTH_SD = 60e-3, 18960.0, 0.1e-3
 
 
-def synthesize(folder: Path, seed: int, truth: Truth | None = None, name: str | None = None) -> Truth:
+def synthesize(
+    folder: Path, seed: int, truth: Truth | None = None, name: str | None = None, runs: bool = False
+) -> Truth:
     """Write a rig folder measured on ``truth`` and, beside it, ``<folder>.truth.json``.
 
-    ``name`` is the rig's, by default the folder's.
+    Parameters
+    ----------
+    folder : new or empty
+    seed : of every reading error; the bench's readings are the same with and without runs
+    truth : true parameters, by default the paper's
+    name : of the rig, by default the folder's
+    runs : add forced runs of the exact model, with the springs that only they meet
 
     Raises
     ------
@@ -85,6 +98,7 @@ def synthesize(folder: Path, seed: int, truth: Truth | None = None, name: str | 
         If ``folder`` exists and is not empty: nothing is overwritten.
     """
     truth = truth or Truth()
+    truth = truth.with_runs() if runs else truth
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError("synthesize writes a new folder", "it exists and is not empty", "choose another name", folder)
@@ -94,12 +108,21 @@ def synthesize(folder: Path, seed: int, truth: Truth | None = None, name: str | 
     rng = np.random.default_rng(seed)
     tables, entries = _measure(rng, truth)
     masses = {symbol: getattr(truth, symbol) + sd * rng.standard_normal() for symbol, sd in MASS_SD.items()}
+    known: dict[str, object] = {"seed": seed, "parameters": truth.flat()}
+    priors: list[str] = []
+    if runs:
+        measured = make_runs(truth.flat(), seed)
+        files = {f"run_{number}.csv": run for number, run in enumerate(measured, start=1)}
+        tables |= {file: run.table() for file, run in files.items()}
+        entries += [run.entry(file) for file, run in files.items()]
+        priors = spring_priors(truth.flat(), seed)
+        known["runs"] = truths(measured)
     folder.mkdir(parents=True, exist_ok=True)
     for file, columns in tables.items():
         _write_csv(folder / file, columns)
-    (folder / "rig.toml").write_text(_rig_toml(name, seed, truth.g, masses, entries), encoding="utf-8")
+    (folder / "rig.toml").write_text(_rig_toml(name, seed, truth.g, masses, priors, entries), encoding="utf-8")
     beside = folder.resolve().with_name(folder.resolve().name + ".truth.json")
-    beside.write_text(json.dumps({"seed": seed, "parameters": truth.flat()}, indent=1) + "\n", encoding="utf-8")
+    beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
     return truth
 
 
@@ -134,6 +157,8 @@ def _measure(rng: np.random.Generator, truth: Truth) -> tuple[dict[str, dict[str
         f'current_sd = {{ value = {CURRENT_SD:g}, unit = "A" }}',
     )
     for spring, k2 in truth.k2.items():
+        if spring in RUN_SPRINGS:
+            continue
         length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
         add(
             "support_spring",
@@ -151,7 +176,8 @@ def _write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], entries: list[str]) -> str:
+def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], priors: list[str], entries: list[str]) -> str:
+    """The text of ``rig.toml``."""
     head = [
         f"# SYNTHETIC: computed with known parameters (seed {seed}), not measured.",
         "[rig]",
@@ -163,5 +189,6 @@ def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], entries:
         ),
         f'g = {{ value = {g:g}, unit = "m/s^2" }}',
         "",
+        *(["[prior]", *priors, ""] if priors else []),
     ]
     return "\n".join([*head, *entries])

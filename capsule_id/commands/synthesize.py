@@ -8,10 +8,11 @@ from capsule_id.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """DIR --seed N --set NAME=VALUE ..."""
+    """DIR --seed N --runs --set NAME=VALUE ..."""
     parser.add_argument("directory", metavar="DIR", type=Path, help="new folder to write")
     parser.add_argument("--seed", type=int, default=0, help="of the reading errors (default 0)")
     parser.add_argument("--name", help="name of the rig (default: the folder's)")
+    parser.add_argument("--runs", action="store_true", help="add forced runs, computed with the exact model")
     parser.add_argument(
         "--set", nargs="+", default=[], metavar="NAME=VALUE", help="true values, SI: k1=1500 'k2[soft]=2500'"
     )
@@ -29,9 +30,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
     from capsule_id.synthetic import Truth, synthesize
 
-    truth = Truth().with_values(dict(_assignment(text) for text in args.set))
+    truth = Truth().with_runs() if args.runs else Truth()
+    truth = truth.with_values(dict(_assignment(text) for text in args.set))
     try:
-        synthesize(args.directory, args.seed, truth, args.name)
+        synthesize(args.directory, args.seed, truth, args.name, args.runs)
     except OSError as error:
         raise InputError("DIR must be writable", str(error.strerror), "name another one", args.directory) from None
     say(f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and its truth beside it")

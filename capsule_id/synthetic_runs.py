@@ -1,0 +1,164 @@
+"""Forced runs with known truth: the exact model, cut out of full motion, as the channels of the rig would record it."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from capsule_id.capsule.model import CapsuleParameters, Excitation, Status, simulate, status_message
+from capsule_id.errors import InputError
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What the experimenter sets for one run, SI: the spring by name, the drive and the gap."""
+
+    spring: str
+    Omega: float
+    P_d: float
+    G: float
+
+
+#: One run near the paper's Fig. 6, one of its Fig. 11, two of its Fig. 10.
+RUNS = (
+    RunSettings("medium", 34.56, 4.0, 1.0e-3),
+    RunSettings("stiff", 73.58, 1.2, 1.0e-3),
+    RunSettings("hard", 26.58, 2.5, 1.5e-3),
+    RunSettings("hard", 46.0, 2.5, 1.5e-3),
+)
+#: Springs that only runs meet (Fig. 10): no static test, a rough stiffness stated as a prior with this factor.
+RUN_SPRINGS = {"hard": 59410.0}
+SPRING_FACTOR = 1.5
+_QUANTILE_975 = 1.959963984540054
+#: Excitation periods from rest that are left out before the cut; the cut itself falls at a random phase.
+SETTLED = 40
+SAMPLES, RATE = 2000, 1000.0
+NOISE_SD = {"x_rel": 10e-6, "x_capsule": 5e-6, "acceleration_rod": 1.0, "current": 5e-3}
+#: Zero errors of the channels, sd. The capsule's place has none: it counts from the first sample of the run.
+OFFSET_SD = {"x_rel": 20e-6, "acceleration_rod": 0.5, "current": 20e-3}
+GAP_SD = 0.02e-3
+
+
+@dataclass(frozen=True)
+class RunTruth:
+    """Everything behind one run, SI. ``x_rel``, ``Y1``, ``Y2``: the state at the first sample, where X2 = 0."""
+
+    spring: str
+    G: float
+    P_d: float
+    Omega: float
+    phase: float
+    current_amplitude: float
+    x_rel: float
+    Y1: float
+    Y2: float
+    offsets: dict[str, float]
+    noise_sd: dict[str, float]
+
+
+@dataclass(frozen=True)
+class SyntheticRun:
+    """A run as measured: ``channels`` of (n,) SI beside ``time``, the gap as read off, and the truth."""
+
+    time: np.ndarray
+    channels: dict[str, np.ndarray]
+    stated_gap: float
+    truth: RunTruth
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Columns of the file, in the order and the units of its header; digits far below the noise are not written."""
+        return {
+            "time [s]": self.time,
+            "x_rel [mm]": np.round(1e3 * self.channels["x_rel"], 5),
+            "x_capsule [mm]": np.round(1e3 * self.channels["x_capsule"], 5),
+            "acceleration_rod [m/s^2]": np.round(self.channels["acceleration_rod"], 3),
+            "current [A]": np.round(self.channels["current"], 5),
+        }
+
+    def entry(self, file: str) -> str:
+        """The ``[[experiment]]`` of ``rig.toml``."""
+        gap = f'gap = {{ value = {1e3 * self.stated_gap:.3f}, sd = {1e3 * GAP_SD:g}, unit = "mm" }}'
+        Omega = f'Omega = {{ value = {self.truth.Omega:g}, unit = "rad/s" }}'
+        lines = ['kind = "forced_run"', f'file = "{file}"', f'spring = "{self.truth.spring}"', gap, Omega]
+        return "\n".join(["[[experiment]]", *lines, ""])
+
+
+def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSettings, ...] = RUNS) -> list[SyntheticRun]:
+    """Simulate and measure every run; each has a generator of its own, none is the bench's.
+
+    Parameters
+    ----------
+    parameters : true values by name, SI: m1 m2 k1 c mu v_s g K, and k2[spring] of every spring that a run meets
+    seed : of the rig
+    runs : settings; the current is set so that K times its amplitude is P_d
+
+    Raises
+    ------
+    InputError
+        If the model cannot complete a run with these parameters.
+    """
+    generators = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(len(runs))]
+    cuts = np.array([SETTLED + rng.uniform() for rng in generators])
+    T = np.array([2.0 * np.pi / run.Omega for run in runs])
+    time = np.arange(SAMPLES) / RATE
+    start = (cuts * T)[:, None]
+    shared = {name: parameters[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
+    k2 = np.array([parameters[f"k2[{run.spring}]"] for run in runs])
+    p = CapsuleParameters(**shared, k2=k2, G=np.array([run.G for run in runs]))
+    e = Excitation(np.array([run.P_d for run in runs]), np.array([run.Omega for run in runs]))
+    t = simulate(p, e, np.concatenate([np.zeros_like(start), start + time], axis=1))
+    if not all(Status(int(code)).usable for code in np.asarray(t.status)):
+        raise InputError("every run must be complete", "a run was given up", status_message(t.status))
+    states = np.stack([np.asarray(x)[:, 1:] for x in (t.X1, t.Y1, t.X2, t.Y2)], axis=1)
+    return [
+        _measure(rng, parameters, run, time, state, 2.0 * np.pi * (cut % 1.0))
+        for rng, run, state, cut in zip(generators, runs, states, cuts, strict=True)
+    ]
+
+
+def _measure(
+    rng: np.random.Generator,
+    parameters: Mapping[str, float],
+    run: RunSettings,
+    time: np.ndarray,
+    state: np.ndarray,
+    phase: float,
+) -> SyntheticRun:
+    """One run through its sensors: state (4, n) is the exact motion from the cut on."""
+    X1, Y1, X2, Y2 = state
+    x_rel, drive = X1 - X2, np.cos(run.Omega * time + phase)
+    contact = parameters[f"k2[{run.spring}]"] * np.maximum(x_rel - run.G, 0.0)
+    force = parameters["k1"] * x_rel + parameters["c"] * (Y1 - Y2) + contact
+    amplitude = run.P_d / parameters["K"]
+    exact = {
+        "x_rel": x_rel,
+        "x_capsule": X2 - X2[0],
+        "acceleration_rod": (run.P_d * drive - force) / parameters["m1"],
+        "current": amplitude * drive,
+    }
+    offsets = {name: float(sd * rng.standard_normal()) for name, sd in OFFSET_SD.items()}
+    stated_gap = run.G + GAP_SD * float(rng.standard_normal())
+    channels = {
+        name: values + offsets.get(name, 0.0) + NOISE_SD[name] * rng.standard_normal(len(time))
+        for name, values in exact.items()
+    }
+    first = (float(x_rel[0]), float(Y1[0]), float(Y2[0]))
+    truth = RunTruth(run.spring, run.G, run.P_d, run.Omega, phase, amplitude, *first, offsets, dict(NOISE_SD))
+    return SyntheticRun(time, channels, stated_gap, truth)
+
+
+def spring_priors(parameters: Mapping[str, float], seed: int) -> list[str]:
+    """Lines of ``[prior]`` for the springs that only runs meet, each off its truth as its factor says."""
+    spread = np.log(SPRING_FACTOR) / _QUANTILE_975
+    # a key that no run's generator has, so that neither depends on how many there are of the other
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**20,)))
+    lines = []
+    for spring in RUN_SPRINGS:
+        median = parameters[f"k2[{spring}]"] * np.exp(spread * rng.standard_normal())
+        lines.append(f'"k2[{spring}]" = {{ median = {1e-3 * median:.3g}, factor = {SPRING_FACTOR:g}, unit = "kN/m" }}')
+    return lines
+
+
+def truths(runs: list[SyntheticRun]) -> dict[str, dict]:
+    """The truth of every run by label, for the truth file."""
+    return {f"run_{number}": asdict(run.truth) for number, run in enumerate(runs, start=1)}
