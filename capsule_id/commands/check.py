@@ -4,6 +4,7 @@ import argparse
 
 from capsule_id.console import say
 from capsule_id.errors import InputError
+from capsule_id.records.text import describe_run, run_warning
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.lint import lint
 from capsule_id.rig.model import Table
@@ -26,7 +27,10 @@ def run(args: argparse.Namespace) -> int:
     rig = read_rig(args.data)
     lines = [f"{rig.name}: {len(rig.tables)} experiments{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
-    findings = lint(rig)
+    runs = [table for table in rig.tables if table.kind == "forced_run"]
+    lines += [f"{table.label}: {line}" for table in runs for line in describe_run(table)]
+    warnings = {table.label: run_warning(table) for table in runs}
+    findings = lint(rig) + [f"{label}: {text}" for label, text in warnings.items() if text]
     lines += [f"lint: {finding}" for finding in findings]
     say("\n".join([*lines, f"{len(findings)} findings" if findings else "no findings"]))
     return 0

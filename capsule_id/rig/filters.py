@@ -85,23 +85,33 @@ def window_samples(window: float, step: float) -> int:
     return 2 * max(0, round((window / step - 1.0) / 2.0)) + 1
 
 
-def gain(frequency: np.ndarray | float, samples: int, order: int) -> np.ndarray:
-    """Gain of the smoothing filter away from the edges, from its coefficients: sum of c_k cos(2 pi f k).
+def gain(frequency: np.ndarray | float, samples: int, order: int, derivative: int = 0) -> np.ndarray:
+    """Gain of the filter away from the edges, from its coefficients: what comes out over what should.
+
+    Smoothing: sum of c_k cos(2 pi f k), which should be 1. A derivative of order d: the response over (2 pi f)^d, the
+    true derivative's; 1 at f = 0.
 
     Parameters
     ----------
     frequency : any shape, cycles per sample (Hz times the sampling step)
     samples : length of the window, odd
     order : of the polynomial, less than ``samples``
+    derivative : 0 to ``order``
 
     Returns
     -------
-    array of the shape of ``frequency``; real, since the filter is symmetric: it never shifts a phase by less than pi
+    array of the shape of ``frequency``; real, since the filter is even or odd: it never shifts a phase by less than pi
     """
-    q, _, _ = _least_squares(samples, order, 0)
-    coefficients = q @ q[samples // 2]
-    lags = np.arange(samples) - samples // 2
-    return np.cos(2.0 * np.pi * np.multiply.outer(np.asarray(frequency, float), lags)) @ coefficients
+    frequency = np.asarray(frequency, float)
+    half = samples // 2
+    q, triangle, rows = _least_squares(samples, order, derivative)
+    coefficients = np.linalg.solve(triangle.T, rows[half]) @ q.T / max(half, 1) ** derivative
+    angle = 2.0 * np.pi * np.multiply.outer(frequency, np.arange(samples) - half)
+    # the d-th derivative of cos(x) at 0 for even d, of sin(x) for odd d, is (-1)^(d//2)
+    wave = np.sin(angle) if derivative % 2 else np.cos(angle)
+    response = (-1) ** (derivative // 2) * (wave @ coefficients)
+    ideal = (2.0 * np.pi * frequency) ** derivative
+    return np.divide(response, ideal, out=np.ones_like(response), where=ideal > 0.0)
 
 
 def choose_window(time: np.ndarray, values: np.ndarray, order: int) -> float:

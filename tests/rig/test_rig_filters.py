@@ -51,6 +51,19 @@ def test_gain_is_what_the_filter_does_to_cosines(samples: int, order: int) -> No
     assert gain(np.array([0.0, 0.0]), samples, order) == pytest.approx([1.0, 1.0], abs=1e-14)
 
 
+@pytest.mark.parametrize(("samples", "order"), [(5, 2), (21, 2), (21, 4), (51, 3)])
+def test_gain_of_derivatives_is_what_the_filter_does_to_waves(samples: int, order: int) -> None:
+    """Beside the true derivative of cos(2 pi f k + 0.7), which is neither even nor odd."""
+    time = STEP * np.arange(401)
+    for derivative in (1, 2):
+        for frequency in (0.004, 0.02, 0.1, 0.37):
+            angle = 2.0 * np.pi * frequency * (np.arange(401) - 200) + 0.7
+            filtered = savitzky_golay(time, np.cos(angle), samples * STEP, order, derivative)[200]
+            true = (2.0 * np.pi * frequency / STEP) ** derivative * np.cos(0.7 + 0.5 * np.pi * derivative)
+            assert filtered / true == pytest.approx(float(gain(frequency, samples, order, derivative)), abs=1e-9)
+        assert gain(np.array([0.0, 1e-3]), samples, order, derivative) == pytest.approx([1.0, 1.0], abs=0.02)
+
+
 @pytest.mark.parametrize(("samples", "order"), [(1, 0), (3, 0), (5, 4), (11, 2), (31, 3), (31, 4)])
 def test_short_windows_agree_with_scipy(samples: int, order: int) -> None:
     time = STEP * np.arange(100)

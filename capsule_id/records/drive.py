@@ -1,0 +1,124 @@
+"""Frequency, amplitude and phase of the drive, from the recorded current by harmonic least squares.
+
+    y(t) = A cos(Omega t + phase) + offset + white noise
+
+Standard errors are those of linearised least squares. For a long record they are the Cramér–Rao bounds of a single tone
+with unknown frequency: D. C. Rife, R. R. Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974).
+"""
+
+import contextlib
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from capsule_id.errors import InputError
+from capsule_id.records.columns import stated_Omega
+from capsule_id.rig.filters import dominant_frequency
+from capsule_id.rig.model import Table
+
+#: The stated frequency is wrong where the fitted one is further off than this many standard errors and this share.
+OMEGA_ERRORS, OMEGA_SHARE = 4.0, 1e-3
+FEWEST_SAMPLES = 8  # for five unknowns, the noise among them
+_SCAN = 1.5  # half-width of the search about a first guess, in 1 / duration: a peak of the spectrum is 1 wide
+_SCAN_POINTS = 25
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """A fitted tone, SI: ``amplitude`` cos(``Omega`` t + ``phase``) + ``offset``, t the record's own time.
+
+    ``_sd`` are standard errors; phase in (-pi, pi]; ``noise_sd`` of the residuals; ``stated_Omega`` as in the table.
+    """
+
+    Omega: float
+    Omega_sd: float
+    amplitude: float
+    amplitude_sd: float
+    phase: float
+    phase_sd: float
+    offset: float
+    noise_sd: float
+    stated_Omega: float
+
+    @property
+    def disagrees(self) -> bool:
+        """The stated frequency is not the recorded one: off by 4 standard errors and by one in a thousand."""
+        off = abs(self.Omega - self.stated_Omega)
+        return off > OMEGA_ERRORS * self.Omega_sd and off > OMEGA_SHARE * self.stated_Omega
+
+
+def drive_of(table: Table) -> Harmonic | None:
+    """The tone of the recorded current (A), or None where the table has no current."""
+    return fit_harmonic(table["time"], table["current"], stated_Omega(table)) if "current" in table.columns else None
+
+
+def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic:
+    """Fit one tone; its frequency is searched about ``Omega`` and about the strongest peak of the spectrum.
+
+    Parameters
+    ----------
+    time : (n,) s, increasing; the spectrum is looked at only where it is evenly spaced
+    values : (n,)
+    Omega : stated, rad/s
+
+    Raises
+    ------
+    InputError
+        With fewer than 8 samples.
+    """
+    if len(time) < FEWEST_SAMPLES:
+        rule = f"a tone needs at least {FEWEST_SAMPLES} samples"
+        raise InputError(rule, f"{len(time)}", "record for longer or faster")
+    guesses = [Omega]
+    # an unevenly sampled record has only the stated frequency to start from
+    with contextlib.suppress(InputError):
+        strongest = 2.0 * np.pi * dominant_frequency(time, values)
+        near = abs(strongest - Omega) < _width(time)
+        guesses = [strongest] if near else [Omega, strongest]
+    found = min((_refine(time, values, guess) for guess in guesses), key=lambda pair: pair[1])[0]
+    return _describe(time, values, found, Omega)
+
+
+def _design(time: np.ndarray, Omega: float) -> np.ndarray:
+    return np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones_like(time)], axis=1)
+
+
+def _misfit(time: np.ndarray, values: np.ndarray, Omega: float) -> float:
+    """Sum of squares left by the best tone of this frequency."""
+    design = _design(time, Omega)
+    unknowns = np.linalg.solve(design.T @ design, design.T @ values)
+    return float(np.sum((values - design @ unknowns) ** 2))
+
+
+def _width(time: np.ndarray) -> float:
+    """Half-width of the search about a guess, rad/s."""
+    return float(2.0 * np.pi * _SCAN / (time[-1] - time[0]))
+
+
+def _refine(time: np.ndarray, values: np.ndarray, guess: float) -> tuple[float, float]:
+    """(Omega, sum of squares) of the deepest minimum about ``guess``."""
+    width = _width(time)
+    grid = np.linspace(max(guess - width, 0.05 * guess), guess + width, _SCAN_POINTS)
+    best = int(np.argmin([_misfit(time, values, Omega) for Omega in grid]))
+    step = grid[1] - grid[0]
+    bounds = (grid[best] - step, grid[best] + step)
+    found = minimize_scalar(
+        lambda Omega: _misfit(time, values, Omega), bounds=bounds, method="bounded", options={"xatol": 1e-9 * guess}
+    )
+    return float(found.x), float(found.fun)
+
+
+def _describe(time: np.ndarray, values: np.ndarray, Omega: float, stated: float) -> Harmonic:
+    """The tone at ``Omega`` with the standard errors of all four unknowns together."""
+    design = _design(time, Omega)
+    cosine, sine, offset = np.linalg.lstsq(design, values)[0]
+    amplitude, phase = float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine))
+    angle = Omega * time + phase
+    slope = -amplitude * np.sin(angle)
+    jacobian = np.stack([np.cos(angle), slope, slope * time, np.ones_like(time)], axis=1)
+    scale = np.linalg.norm(jacobian, axis=0)
+    noise_sd = float(np.sqrt(np.sum((values - design @ [cosine, sine, offset]) ** 2) / (len(time) - 4)))
+    errors = noise_sd * np.sqrt(np.diag(np.linalg.inv((jacobian / scale).T @ (jacobian / scale)))) / scale
+    sd = [float(error) for error in errors]
+    return Harmonic(Omega, sd[2], amplitude, sd[0], phase, sd[1], float(offset), noise_sd, stated)

@@ -1,0 +1,75 @@
+"""How the capsule gets on: mean velocity with its standard error, and the direction that follows from it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+#: A capsule that advances less than this per excitation period (m) stands still, as ``response`` of the model has it.
+STANDING = 1e-7
+#: Both statements, "it moves" and "it stands", need this confidence.
+CONFIDENCE = 0.99
+_HARMONICS = 24  # of the motion's frequency that the periodic part of X2 may have
+_READINGS_EACH = 4  # at least this many readings per unknown
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Mean velocity of the capsule, m/s, its standard error, and "F", "B", "S", or None where it cannot be told."""
+
+    velocity: float
+    velocity_sd: float
+    direction: str | None
+    reason: str = ""
+
+
+def progress_of(time: np.ndarray, x_capsule: np.ndarray, T: float, period: int | None) -> Progress:
+    """Mean velocity over the record.
+
+    With a known period n of the motion: the slope of a straight line plus harmonics of 1/(n T), by least squares; its
+    standard error is that of white noise. Otherwise: the mean of the advances over successive excitation periods, with
+    the standard error of their scatter.
+
+    Direction: "F" or "B" where the 99 % interval of the advance per period lies beyond 1e-7 m, "S" where it lies
+    within ±1e-7 m, else None.
+
+    Parameters
+    ----------
+    time, x_capsule : (n,) s and m
+    T : period of the drive, s
+    period : of the motion in excitation periods; None or 0 where there is none
+    """
+    velocity, sd = _line(time, x_capsule, period * T) if period else _advances(time, x_capsule, T)
+    margin = norm.ppf(0.5 + CONFIDENCE / 2.0) * sd * T
+    advance = velocity * T
+    if np.isfinite(margin) and abs(advance) - margin > STANDING:
+        return Progress(velocity, sd, "F" if advance > 0.0 else "B")
+    if np.isfinite(margin) and abs(advance) + margin < STANDING:
+        return Progress(velocity, sd, "S")
+    reason = f"direction: advance {1e6 * advance:.3g} ± {1e6 * sd * T:.2g} um per period, standing is below 0.1 um"
+    return Progress(velocity, sd, None, reason)
+
+
+def _line(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]:
+    """Slope and its standard error beside harmonics of 1/T."""
+    step = (time[-1] - time[0]) / (len(time) - 1)
+    most = min(_HARMONICS, int(0.5 * T / step) - 1, len(time) // (2 * _READINGS_EACH) - 1)
+    angle = 2.0 * np.pi / T * np.multiply.outer(time, np.arange(1, most + 1))
+    middle = time - time.mean()
+    design = np.concatenate([np.ones((len(time), 1)), middle[:, None], np.cos(angle), np.sin(angle)], axis=1)
+    q, triangle = np.linalg.qr(design)
+    values = values - values.mean()
+    coordinates = q.T @ values
+    variance = max(float(np.sum(values**2) - np.sum(coordinates**2)), 0.0) / max(len(time) - design.shape[1], 1)
+    slope = np.linalg.solve(triangle.T, np.eye(design.shape[1])[1])  # the row of the pseudoinverse is q @ slope
+    return float(slope @ coordinates), float(np.sqrt(variance) * np.linalg.norm(slope))
+
+
+def _advances(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]:
+    """Mean advance over successive whole periods, per second, and its standard error."""
+    count = int((time[-1] - time[0]) / T)
+    if count < 1:
+        return float((values[-1] - values[0]) / (time[-1] - time[0])), float("inf")
+    places = np.interp(time[0] + T * np.arange(count + 1), time, values)
+    sd = float(np.std(np.diff(places), ddof=1) / np.sqrt(count) / T) if count > 1 else float("inf")
+    return float((places[-1] - places[0]) / (count * T)), sd

@@ -1,0 +1,65 @@
+"""A recorded run in a few lines: label with evidence, drive, filter."""
+
+from collections.abc import Iterator
+
+from capsule_id.errors import InputError
+from capsule_id.records.drive import Harmonic
+from capsule_id.records.label import Evidence, MeasuredMotion, measured_motion
+from capsule_id.records.view import ORDER, view_record
+from capsule_id.rig.model import Table
+
+
+def describe_run(table: Table) -> list[str]:
+    """Lines about a ``forced_run``, without its name in front."""
+    motion = measured_motion(table)
+    evidence = "; ".join(_evidence(motion))
+    lines = [f"motion {motion.label} ({evidence})" if evidence else f"motion {motion.label}"]
+    if motion.evidence.reasons:
+        lines.append(f"undecided because of {'; '.join(motion.evidence.reasons)}")
+    if motion.evidence.drive:
+        lines.append(_drive(motion.evidence.drive))
+    try:
+        view = view_record(table, motion)
+    except InputError:
+        return lines
+    gains = [("drive", view.at_drive), *([("contacts", view.at_contact)] if view.at_contact else [])]
+    passed = ", ".join(f"{g.smoothing:.3f} (rate {g.rate:.3f}) at {g.f:.3g} Hz, {name}" for name, g in gains)
+    return [*lines, f"Savitzky-Golay over {view.samples} samples, order {ORDER}: gain {passed}"]
+
+
+def run_warning(table: Table) -> str | None:
+    """What to mind about the drive of a ``forced_run``: a stated frequency that the current does not have."""
+    drive = measured_motion(table).evidence.drive
+    if drive is None or not drive.disagrees:
+        return None
+    return (
+        f"Omega {drive.stated_Omega:g} rad/s is stated, the current has {drive.Omega:.6g} ± {drive.Omega_sd:.2g} rad/s; "
+        "correct one of them"
+    )
+
+
+def _evidence(motion: MeasuredMotion) -> Iterator[str]:
+    evidence: Evidence = motion.evidence
+    if evidence.repeat:
+        repeat = evidence.repeat
+        yield f"{repeat.periods:.1f} periods of the drive, noise of x_rel {1e6 * repeat.noise_sd:.3g} um"
+        if repeat.period:
+            excess = repeat.ratios[repeat.period - 1]
+            yield f"repeats after {repeat.period}, mean square {excess:.2f} of the noise's"
+    if evidence.progress:
+        yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.progress.velocity_sd:.2g} mm/s"
+    if evidence.contacts:
+        contacts = evidence.contacts
+        spikes = "/".join(map(str, contacts.spikes)) or "not recorded"
+        crossings = "/".join(map(str, contacts.crossings))
+        yield (
+            f"contacts by spikes {spikes}, by crossings {crossings}, "
+            f"the same in {contacts.agreeing} of {contacts.cycles} single periods"
+        )
+
+
+def _drive(drive: Harmonic) -> str:
+    return (
+        f"drive Omega {drive.Omega:.6g} ± {drive.Omega_sd:.2g} rad/s (stated {drive.stated_Omega:g}), "
+        f"current {drive.amplitude:.5g} ± {drive.amplitude_sd:.2g} A, phase {drive.phase:.4f} ± {drive.phase_sd:.2g} rad"
+    )

@@ -1,0 +1,124 @@
+"""A record made ready for looking at: filtered, differentiated, cut at the drive's phase; as the paper's Figs. 4, 9, 12.
+
+For pictures and starting values only. Likelihoods use the raw channels.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from capsule_id.errors import InputError
+from capsule_id.records.columns import stated_gap
+from capsule_id.records.label import MeasuredMotion, measured_motion
+from capsule_id.rig.filters import gain, sampling_step, savitzky_golay
+from capsule_id.rig.model import Table
+
+ORDER = 3  # of the filter's polynomial
+SHORTEST_WINDOW = 5  # samples, the first that smooths at this order
+#: The filter's window is the longest that leaves this share of a rate at the contact frequency ...
+PASSED = 0.9
+#: ... or, in a record without contacts, at this multiple of the frequency of the drive.
+MULTIPLE = 5.0
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What the filter leaves of a motion at some frequency f, Hz: of x_rel and of its rate (1: everything)."""
+
+    f: float
+    smoothing: float
+    rate: float
+
+
+@dataclass(frozen=True)
+class RecordView:
+    """A record, SI.
+
+    time : (n,)
+    channels : raw, (n,) by column name
+    x_rel, rate : (n,) filtered, and its derivative
+    section_x_rel, section_rate : (m,) where the drive's phase is a multiple of 2 pi, half windows at the ends left out
+    gap : as stated        gap_seen : x_rel where contacts begin, None where the record does not show it
+    force : (n,) K times the current, its zero error taken off, N, None without current or K
+    samples : window of the filter
+    at_drive, at_contact : the filter's gains; ``at_contact`` is None without contacts
+    """
+
+    label: str
+    time: np.ndarray
+    channels: Mapping[str, np.ndarray]
+    x_rel: np.ndarray
+    rate: np.ndarray
+    section_x_rel: np.ndarray
+    section_rate: np.ndarray
+    gap: float
+    gap_seen: float | None
+    force: np.ndarray | None
+    samples: int
+    at_drive: Gains
+    at_contact: Gains | None
+
+
+def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | None = None) -> RecordView:
+    """Filter, differentiate and cut a recorded run.
+
+    Parameters
+    ----------
+    table : a ``forced_run`` with x_rel, evenly sampled
+    motion : what ``measured_motion`` found, if it is already known
+    K : force per current, N/A
+
+    Raises
+    ------
+    InputError
+        Without x_rel, with uneven sampling, or in a record shorter than the filter.
+    """
+    if "x_rel" not in table.columns:
+        rule = "a phase plane needs x_rel"
+        raise InputError(rule, f"columns {' '.join(table.columns)}", "record x_rel", table.file)
+    motion = motion or measured_motion(table)
+    time, evidence = table["time"], motion.evidence
+    step = sampling_step(time)
+    f = evidence.Omega / (2.0 * np.pi)
+    contacts = evidence.contacts
+    f_contact = 0.5 / contacts.duration if contacts and contacts.duration else None
+    samples = _window(f_contact or MULTIPLE * f, step, len(time))
+    x_rel, rate = (savitzky_golay(time, table["x_rel"], samples * step, ORDER, d) for d in (0, 1))
+    phase = evidence.drive.phase if evidence.drive else 0.0
+    half = samples // 2
+    section = _section(time[half : len(time) - half], evidence.Omega, phase)
+    return RecordView(
+        label=motion.label,
+        time=time,
+        channels={name: column.values for name, column in table.columns.items() if name != "time"},
+        x_rel=x_rel,
+        rate=rate,
+        section_x_rel=CubicSpline(time, x_rel)(section),
+        section_rate=CubicSpline(time, rate)(section),
+        gap=stated_gap(table).value,
+        gap_seen=contacts.gap_seen.value if contacts and contacts.gap_seen else None,
+        force=K * (table["current"] - evidence.drive.offset) if K is not None and evidence.drive else None,
+        samples=samples,
+        at_drive=_gains(f, step, samples),
+        at_contact=_gains(f_contact, step, samples) if f_contact else None,
+    )
+
+
+def _window(f: float, step: float, most: int) -> int:
+    """Samples of the longest window, at least the shortest, that leaves the rate at f Hz alone."""
+    samples = SHORTEST_WINDOW
+    while samples + 2 <= most and gain(f * step, samples + 2, ORDER, 1) >= PASSED:
+        samples += 2
+    return samples
+
+
+def _gains(f: float, step: float, samples: int) -> Gains:
+    return Gains(f, *(float(gain(f * step, samples, ORDER, d)) for d in (0, 1)))
+
+
+def _section(time: np.ndarray, Omega: float, phase: float) -> np.ndarray:
+    """Times within the record at which Omega t + phase is a multiple of 2 pi."""
+    first, last = ((Omega * t + phase) / (2.0 * np.pi) for t in (time[0], time[-1]))
+    return (2.0 * np.pi * np.arange(np.ceil(first), np.floor(last) + 1.0) - phase) / Omega

@@ -1,0 +1,91 @@
+"""Recorded runs with known labels: the reference cases and motions of longer period, measured by the synthetic rig."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from capsule_id.records.label import MeasuredMotion, measured_motion
+from capsule_id.rig.model import Column, Quantity, Table
+from capsule_id.synthetic_runs import GAP_SD, NOISE_SD, RunSettings, SyntheticRun, make_runs
+from tests.capsule_cases import read_cases
+
+#: (k2, mu, G, P_d, Omega) with Table 1's masses and k1, c = 1 N s/m, v_s = 0.3 m/s, and the model's label (``response``;
+#: a slow test compares).
+LONGER = {
+    (56410.0, 0.4, 1.107e-3, 5.718, 79.77): "P-2-B-2",
+    (56410.0, 0.376, 0.387e-3, 5.417, 136.35): "P-2-F-1",
+    (56410.0, 0.527, 0.405e-3, 4.584, 86.05): "P-2-F-2",
+    (56410.0, 0.656, 1.395e-3, 2.232, 68.09): "P-2-F-2",
+    (18960.0, 0.532, 0.52e-3, 5.878, 127.89): "P-2-F-1",
+    (56410.0, 0.185, 0.505e-3, 2.146, 124.11): "P-2-F-1",
+    (18960.0, 0.646, 0.453e-3, 4.356, 116.78): "P-2-F-3/2",
+    (18960.0, 0.358, 0.413e-3, 5.442, 77.7): "P-4-B-5/2",
+    (56410.0, 0.697, 1.023e-3, 1.12, 65.79): "aperiodic",
+    (56410.0, 0.646, 1.145e-3, 5.69, 118.14): "aperiodic",
+    (18960.0, 0.262, 0.808e-3, 4.888, 113.74): "aperiodic",
+}
+
+
+@dataclass(frozen=True)
+class Known:
+    """A run as measured, its model's label and mean velocity (m/s, NaN where not known)."""
+
+    name: str
+    label: str
+    mean_velocity: float
+    run: SyntheticRun
+
+    @cached_property
+    def nominal(self) -> MeasuredMotion:
+        """What the whole record says."""
+        return self.motion()
+
+    def motion(self, factor: float = 1.0, **changes: object) -> MeasuredMotion:
+        """What the record says with ``factor`` times the rig's noise, or less of it, or other settings."""
+        return measured_motion(table_of(noisier(self.run, factor, len(self.name)), **changes))  # type: ignore[arg-type]
+
+
+def noisier(run: SyntheticRun, factor: float, seed: int) -> dict[str, np.ndarray]:
+    """The channels with more noise, ``factor`` times its sd in all."""
+    rng = np.random.default_rng(seed)
+    more = np.sqrt(factor**2 - 1.0)
+    channels = {
+        name: values + more * NOISE_SD[name] * rng.standard_normal(len(values)) for name, values in run.channels.items()
+    }
+    settings = {"spring": "s", "gap": Quantity(run.stated_gap, GAP_SD), "Omega": run.truth.Omega}
+    return {"time": run.time, **channels, "settings": settings}  # type: ignore[dict-item]
+
+
+def table_of(
+    record: Mapping[str, np.ndarray], samples: int | None = None, only: tuple[str, ...] = (), **settings: object
+) -> Table:
+    """A ``forced_run``: the first ``samples`` rows, ``only`` these channels, some settings changed."""
+    channels = {k: v for k, v in record.items() if k != "settings" and (not only or k in (*only, "time"))}
+    columns = {name: Column(name, "", 1.0, values[:samples]) for name, values in channels.items()}
+    stated = dict(record["settings"]) | settings  # type: ignore[call-overload]
+    return Table("forced_run", "run", "run.csv", columns, stated, np.arange(len(columns["time"].values)) + 2)
+
+
+@cache
+def reference() -> tuple[Known, ...]:
+    """The 25 reference cases, each as one record."""
+    known = []
+    for seed, case in enumerate(read_cases().raw):
+        parameters = {name: case[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
+        settings = RunSettings("s", case["Omega"], case["P_d"], case["G"])
+        run = make_runs({**parameters, "K": 2.0, "k2[s]": case["k2"]}, 100 + seed, (settings,))[0]
+        known.append(Known(case["name"], case["label"], 1e-3 * case["mean_velocity_mm_per_s"], run))
+    return tuple(known)
+
+
+@cache
+def longer() -> tuple[Known, ...]:
+    """Motions of longer period."""
+    known = []
+    for seed, ((k2, mu, G, P_d, Omega), label) in enumerate(LONGER.items()):
+        parameters = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 1.0, "mu": mu, "v_s": 0.3, "g": 9.81, "K": 2.0}
+        run = make_runs({**parameters, "k2[s]": k2}, 200 + seed, (RunSettings("s", Omega, P_d, G),))[0]
+        known.append(Known(f"{k2:g} N/m, {Omega:g} rad/s", label, float("nan"), run))
+    return tuple(known)

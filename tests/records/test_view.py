@@ -1,0 +1,119 @@
+"""What is shown of a record: filter, Poincaré points, force; pictures; the lines of ``capsule-id check``."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.errors import InputError
+from capsule_id.records.text import describe_run, run_warning
+from capsule_id.records.view import PASSED, RecordView, view_record
+from capsule_id.report.figures_runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
+from capsule_id.report.style import new_figure, png
+from capsule_id.rig.filters import gain
+from tests.records.runs import Known, noisier, reference, table_of
+
+STEP = 1e-3
+
+
+@pytest.fixture(scope="module")
+def case() -> Known:
+    return next(case for case in reference() if case.name == "fig11_Pd_1.2")
+
+
+@pytest.fixture(scope="module")
+def view(case: Known) -> RecordView:
+    return view_record(table_of(noisier(case.run, 1.0, 0)), case.nominal, K=2.0)
+
+
+def test_the_window_is_the_longest_that_leaves_contacts_alone(view: RecordView) -> None:
+    assert view.at_contact is not None
+    assert view.at_contact.rate >= PASSED > gain(view.at_contact.f * STEP, view.samples + 2, 3, 1)
+    assert view.at_drive.rate > 0.999
+    # Half a period of the frequency of the contacts is a contact: 4.5 ms by the model's k2 and masses
+    m = 0.11 * 0.53 / 0.64
+    assert 0.5 / view.at_contact.f == pytest.approx(np.pi * np.sqrt(m / 56410.0), rel=0.25)
+
+
+def test_without_contacts_the_drive_sets_the_window() -> None:
+    quiet = next(case for case in reference() if case.name == "fig11_Pd_0.8")
+    view = view_record(table_of(noisier(quiet.run, 1.0, 0)))
+    assert view.at_contact is None
+    assert view.label == "P-1-S-0"
+    assert view.force is None  # without K
+
+
+def test_rate_is_the_derivative_of_x_rel(view: RecordView) -> None:
+    inside = slice(10, -10)
+    central = np.gradient(view.x_rel, STEP)
+    scale = np.std(view.rate)
+    assert np.std((central - view.rate)[inside]) < 0.1 * scale
+    assert np.std((central + view.rate)[inside]) > scale  # the sign
+
+
+def test_poincare_points_stand_at_the_drives_phase(view: RecordView, case: Known) -> None:
+    periods = 2.0 * case.run.truth.Omega / (2.0 * np.pi)
+    assert periods - 2.0 < len(view.section_x_rel) <= periods + 1.0
+    # period 1: one point, but for the filtered noise
+    assert np.std(view.section_x_rel) < 1.2 * 10e-6
+    # where the current is largest
+    near = np.argsort(view.channels["current"])[-10:]
+    assert np.abs(view.x_rel[near] - view.section_x_rel.mean()).max() < 0.25 * np.ptp(view.x_rel)
+
+
+def test_force_is_K_times_the_current_without_its_zero_error(view: RecordView, case: Known) -> None:
+    assert view.force is not None
+    truth = case.run.truth
+    exact = truth.P_d * np.cos(truth.Omega * view.time + truth.phase)
+    assert np.std(view.force - exact) == pytest.approx(2.0 * 5e-3, rel=0.1)
+    assert abs(np.mean(view.force - exact)) < 1e-3
+
+
+def test_a_view_needs_x_rel(case: Known) -> None:
+    with pytest.raises(InputError, match="a phase plane needs x_rel"):
+        view_record(table_of(noisier(case.run, 1.0, 0), only=("current",)))
+
+
+def test_pictures_draw_what_they_are_given(view: RecordView) -> None:
+    figure = new_figure(4.0, 3.0)
+    ax = figure.subplots()
+    assert phase_plane_of_run(view, ax) is ax
+    path, gap, seen, section = ax.lines
+    assert len(path.get_xdata()) == len(view.time) - 2 * (view.samples // 2)  # pyright: ignore
+    assert [gap.get_xdata()[0], seen.get_xdata()[0]] == [1e3 * view.gap, 1e3 * view.gap_seen]  # type: ignore
+    np.testing.assert_allclose(section.get_ydata(), view.section_rate)
+    model = (view.time[:5], view.time[:5])
+    force = force_on_rod(view, model=model)
+    assert [line.get_label() for line in force.lines] == ["K times current", "model"]
+    assert channel_history(view, "acceleration_rod").get_ylabel().endswith("m/s²")
+    assert png(run_overview(view)).startswith(b"\x89PNG")
+    fewer = replace(view, channels={"x_rel": view.channels["x_rel"]}, gap_seen=None, force=None)
+    assert len(run_overview(fewer).axes) == 2
+    with pytest.raises(ValueError, match="no force"):
+        force_on_rod(fewer)
+
+
+def test_check_says_it_in_a_few_lines(case: Known) -> None:
+    table = table_of(noisier(case.run, 1.0, 0))
+    motion, drive, filtered = describe_run(table)
+    assert motion.startswith("motion P-1-F-1 (23.4 periods of the drive, noise of x_rel 9.")
+    assert "contacts by spikes 1/1/1, by crossings 1/1/1/1/1/1, the same in 22 of 22 single periods" in motion
+    assert drive.startswith("drive Omega 73.5")
+    assert "(stated 73.58), current 0.6" in drive
+    assert filtered.startswith("Savitzky-Golay over 7 samples, order 3: gain 1.000 (rate 1.000) at 11.7 Hz, drive, 0.9")
+    assert run_warning(table) is None
+    wrong = run_warning(table_of(noisier(case.run, 1.0, 0), Omega=80.0))
+    assert wrong is not None
+    assert wrong.startswith("Omega 80 rad/s is stated, the current has 73.5")
+
+
+def test_check_says_why_it_cannot_tell(case: Known) -> None:
+    lines = describe_run(table_of(noisier(case.run, 1.0, 0), only=("current",)))
+    assert lines[:2] == ["motion undecided", "undecided because of x_rel was not recorded"]
+    assert [line[:5] for line in lines[2:]] == ["drive"]
+
+
+def test_records_know_no_model() -> None:
+    for file in (Path(__file__).parents[2] / "capsule_id" / "records").glob("*.py"):
+        assert "capsule_id.capsule" not in file.read_text(encoding="utf-8"), file.name
