@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import block_diag
 
-from capsule_id.experiments.linear import LOG_2PI, conditional_draw
+from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter
 from capsule_id.precision import require_float64
@@ -165,11 +165,8 @@ class Experiment(ABC):
     def pointwise(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
         """(n,) log-density of each reading, conditional on one draw of the linear nuisances."""
         misfit = self.misfit(theta)
-        raw = misfit.raw
-        if misfit.design.shape[1]:
-            _, ay, aa = misfit.moments()
-            raw = raw - misfit.design @ conditional_draw(ay, aa, rng)
-        return -0.5 * (raw / misfit.sd) ** 2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
+        scaled = misfit.at_nuisance_draw(rng)
+        return -0.5 * scaled**2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
 
     def predictive_p(self, draws: list[Theta], rng: np.random.Generator) -> float | None:
         """Posterior predictive p-value of the chi-square discrepancy; None without draws.
@@ -179,12 +176,8 @@ class Experiment(ABC):
         """
         if not draws:
             return None
-        tails = []
-        for theta in draws:
-            misfit = self.misfit(theta)
-            square = -2.0 * np.sum(self.pointwise(theta, rng) + np.log(misfit.sd) + 0.5 * LOG_2PI - misfit.log_measure)
-            tails.append(stats.chi2.sf(square, self.n))
-        return float(np.mean(tails))
+        squares = [np.sum(self.misfit(theta).at_nuisance_draw(rng) ** 2) for theta in draws]
+        return float(np.mean(stats.chi2.sf(squares, self.n)))
 
 
 def no_design(n: int, xp: ModuleType = jnp) -> Any:

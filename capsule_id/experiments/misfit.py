@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.linear import LOG_2PI, conditional_mean, marginal_log_density
+from capsule_id.experiments.linear import LOG_2PI, conditional_draw, conditional_mean, marginal_log_density
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,14 @@ class ScaledMisfit:
         _, ay, aa = self.moments()
         b = conditional_mean(ay, aa, xp)
         return (self.raw - self.design @ b) / self.sd, b
+
+    def at_nuisance_draw(self, rng: np.random.Generator) -> np.ndarray:
+        """Residuals (n,) in units of the noise at one draw of the nuisances given the readings."""
+        raw = self.raw
+        if self.design.shape[1]:
+            _, ay, aa = self.moments()
+            raw = raw - self.design @ conditional_draw(ay, aa, rng)
+        return raw / self.sd
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 
 from capsule_id.experiments.base import Experiment, Theta
 from capsule_id.experiments.linear import LOG_2PI
+from capsule_id.inference.compiling import COMPILE
 
 #: Readings, priors and constants: a tree of arrays.
 Numbers = Mapping[str, Any]
@@ -115,7 +116,7 @@ def log_posterior(structure: Structure, numbers: Numbers, u: Any) -> Any:
     return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILE)
 def batched_log_posterior(structure: Structure, numbers: Numbers, u: Any) -> Any:
     """(w, d) -> (w,)."""
     return jax.vmap(lambda v: log_posterior(structure, numbers, v))(u)

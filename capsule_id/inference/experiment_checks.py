@@ -72,11 +72,10 @@ def _advice(experiment: Experiment) -> str:
     """What a coloured record calls for."""
     if isinstance(experiment, FreeVibration):
         drift = experiment.damping_trend()
-        return f"{'; ' + drift if drift else ''}: compare the damping models below, cut the record to free decay with start/stop"
-    return (
-        ": look at its residuals and phase portrait, check spring, gap and friction law, or state "
-        'noise = "ar1" where the sensor filters'
-    )
+        remedy = "compare the damping models below, cut the record to free decay with start/stop"
+        return f"{'; ' + drift if drift else ''}: {remedy}"
+    remedy = 'check spring, gap and friction law, or state noise = "ar1" where the sensor filters'
+    return f": look at its residuals and phase portrait, {remedy}"
 
 
 def whiteness(experiment: Experiment, values: Mapping[str, float]) -> tuple[float, float, int]:

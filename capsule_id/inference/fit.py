@@ -2,6 +2,7 @@
 
 import platform
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +17,7 @@ from capsule_id.inference.checks import informed, run_checks
 from capsule_id.inference.experiment_checks import Setting
 from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.marginal import MarginalPosterior, compile_ahead
 from capsule_id.inference.notes import make_notes
 from capsule_id.inference.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit, Posterior, Result
@@ -67,7 +68,11 @@ def fit_rig(
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
     if progress:
         progress(0, 1, "point fit")
-    point, bench = _fit(rig, target, seeds[0], sampled=budget is not None)
+    with ThreadPoolExecutor(1) as pool:
+        if budget is not None:
+            # What goes wrong in it comes up again where its result is used.
+            pool.submit(compile_ahead, target)
+        point, bench = _fit(rig, target, seeds[0], sampled=budget is not None)
     posterior = None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)

@@ -17,6 +17,7 @@ import numpy as np
 import optimistix as optx
 
 from capsule_id.errors import InputError
+from capsule_id.inference.compiling import COMPILE, COMPILE_QUICKLY
 from capsule_id.precision import require_float64
 
 require_float64()
@@ -24,9 +25,6 @@ require_float64()
 Residual = Callable[[jax.Array], jax.Array]
 #: Points (s, d) -> residuals (s, n) and their Jacobians (s, n, d).
 Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-#: XLA options for what is compiled to run once: it runs for milliseconds, compiling it well takes seconds.
-QUICK_COMPILE = {"xla_backend_optimization_level": 0}
 
 FIRST_DAMPING = 1e-6
 """Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
@@ -110,8 +108,8 @@ def least_squares(
     tolerance: float = 1e-9,
     max_steps: int = 1024,
     normal_equations: bool = False,
-    heavy: bool = False,
     linearise: Linearise | None = None,
+    heavy: bool = False,
 ) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
@@ -145,8 +143,9 @@ def least_squares(
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
     linearise = linearise or partial(_forward_mode, residual, heavy)
     scale, unit = zip(*map(_effects if heavy else _scales, linearise(starts)[1], starts), strict=True)
-    solver = _PROGRAMS[heavy][1]
-    solve = partial(solver, residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations)
+    solve = partial(
+        _PROGRAMS[heavy][1], residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations
+    )
     # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
     arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
     ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
@@ -240,6 +239,23 @@ def _forward_mode(residual: Residual, heavy: bool, points: np.ndarray) -> tuple[
     return residuals, jacobians
 
 
+def linearised(residual: Residual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n,) and Jacobian (n, d) of heavy residuals at x (d,)."""
+    residuals, jacobians = _forward_mode(residual, True, x[None])
+    return residuals[0], jacobians[0]
+
+
+def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Residuals (n,) and Jacobian (n, d) at x (d,), in one pass."""
+
+    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value = residual(x)
+        return value, value
+
+    jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
+    return value, jacobian
+
+
 def _solve(
     residual: Residual,
     start: jax.Array,
@@ -251,8 +267,9 @@ def _solve(
     normal_equations: bool,
 ) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
     """From one start (d,): x (d,), steps, result code."""
+    function = _with_jacobian(lambda v: residual(v * scale) / unit)
     solution = optx.least_squares(
-        lambda v, _: _differentiable(v * scale, residual) / unit,
+        lambda v, _: function(v),
         optx.LevenbergMarquardt(
             rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR()
         ),
@@ -263,49 +280,30 @@ def _solve(
     return solution.value * scale, solution.stats["num_steps"], solution.result
 
 
-@eqx.filter_custom_jvp
-def _differentiable(x: jax.Array, residual: Residual) -> jax.Array:
-    """residual(x) with its tangents through the whole Jacobian, by forward mode: an event-driven run has no other.
+def _with_jacobian(function: Residual) -> Residual:
+    """``function`` whose tangents come from its whole Jacobian, found in one pass with its value.
 
-    The solver linearises once and applies the result many times, which it cannot do with a loop of unknown length.
+    The solver linearises and then asks for every column: this compiles a third faster than transposing its way there,
+    and an event-driven run, a loop of unknown length, cannot be transposed.
     """
-    return residual(x)
+    wrapped = jax.custom_jvp(function)
+
+    @wrapped.defjvp
+    def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+        value, jacobian = _linearise(function, *primals)
+        return value, jacobian @ tangents[0]
+
+    return wrapped
 
 
-@_differentiable.def_jvp
-def _differentiable_jvp(
-    primals: tuple[jax.Array, Residual], tangents: tuple[jax.Array, object]
-) -> tuple[jax.Array, jax.Array]:
-    residual = primals[1]
-    value, jacobian = _linearise(residual, primals[0])
-    return value, jacobian @ tangents[0]
-
-
-def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Residuals (n,) and Jacobian (n, d) at x (d,), forward mode, the residuals compiled once for both."""
-
-    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        value = residual(x)
-        return value, value
-
-    jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
-    return value, jacobian
-
-
-def linearised(residual: Residual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (n,) and Jacobian (n, d) of heavy residuals at x (d,)."""
-    value, jacobian = _PROGRAMS[True][0](residual, jnp.asarray(x))
-    return np.asarray(value), np.asarray(jacobian)
-
-
-def _compiled(function: Callable[..., Any], options: Mapping[str, int]) -> Callable[..., Any]:
+def _compiled(function: Callable[..., Any], options: Mapping[str, object]) -> Callable[..., Any]:
     # Equinox hands the options of jax.jit on; its annotations leave them out.
     return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
 
 
-#: (linearise, solve) by whether the residuals take long.
+#: (linearise, solve) by whether the residuals are heavy.
 _PROGRAMS = {
-    heavy: tuple(_compiled(function, {} if heavy else QUICK_COMPILE) for function in (_linearise, _solve))
+    heavy: tuple(_compiled(function, COMPILE if heavy else COMPILE_QUICKLY) for function in (_linearise, _solve))
     for heavy in (False, True)
 }
 

@@ -7,7 +7,7 @@ their conditional distributions: one of the nodes, drawn by weight, of a grid th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.inference import density
+from capsule_id.inference.compiling import COMPILE
 from capsule_id.inference.curvature import BATCH, in_batches
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.quadrature import Grid, choose_grid, log_stretch, position
+from capsule_id.inference.quadrature import FEWEST, Grid, add_to_blocks, choose_grid, log_stretch, position
 from capsule_id.inference.result import PointFit
 
 #: The nodes are chosen by walkers this near to and this far from the point fit, in standard deviations: the tails of
@@ -61,17 +62,12 @@ class MarginalPosterior:
     """
 
     def __init__(self, target: LogPosterior, fit: PointFit) -> None:
-        self.target, self.names = target, target.names
-        self._located, self._scatter = np.flatnonzero(~target.scatter), np.flatnonzero(target.scatter)
+        self.target, self.names, self._layout = target, target.names, _layout(target)
+        self._located, self._scatter = np.array(self._layout.located), np.array(self._layout.scatter, dtype=int)
+        self._label = np.array(self._layout.block)
         self.dimension = len(self._located)
         self.centre, self.covariance = fit.u[self._located], fit.covariance[np.ix_(self._located, self._located)]
-        # A block of scatters alone, whose readings nothing predicts, has no place among the located ones.
-        joint = sorted(target.blocks, key=lambda block: bool(np.all(target.scatter[block])))
-        label = np.zeros(target.dimension, dtype=int)
-        for i, block in enumerate(joint):
-            label[block] = i
-        self._label = label
-        own = [np.flatnonzero(label[self._located] == i) for i in range(len(joint))]
+        own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
         self.blocks = [block for block in own if len(block)]
         self.grid = choose_grid(self._terms, fit.u[self._scatter], self._label[self._scatter], self._probes())
 
@@ -80,7 +76,7 @@ class MarginalPosterior:
 
         def one(v: np.ndarray) -> np.ndarray:
             known, _, integrals = self._terms(v, self.grid)
-            return known + integrals @ (self._label[self._scatter][:, None] == np.arange(known.shape[1]))
+            return add_to_blocks(known, self._label[self._scatter], integrals)
 
         values = in_batches(one, v)
         # Scatters that nothing depends on add a constant.
@@ -123,13 +119,7 @@ class MarginalPosterior:
 
     def _terms(self, v: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """``conditional`` of (w, dimension), in batches."""
-        layout = Layout(
-            self.target.structure,
-            tuple(self._scatter.tolist()),
-            tuple(self._located.tolist()),
-            tuple(self._label.tolist()),
-            grid.nodes,
-        )
+        layout = replace(self._layout, nodes=grid.nodes)
         size = (len(v), len(self._scatter))
         start, step = np.broadcast_to(grid.start, size), np.broadcast_to(grid.step, size)
         parts = [
@@ -153,7 +143,25 @@ class MarginalPosterior:
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
 
 
-@partial(jax.jit, static_argnums=0)
+def compile_ahead(target: LogPosterior) -> None:
+    """Compile what a ``MarginalPosterior`` of ``target`` needs: in another thread, while the point fit is at work."""
+    layout = _layout(target)
+    v, nodes = np.zeros((BATCH, len(layout.located))), np.ones((BATCH, len(layout.scatter)))
+    conditional(layout, target.numbers, v, nodes, nodes, nodes[0])
+
+
+def _layout(target: LogPosterior) -> Layout:
+    """With as many nodes as will do for most rigs."""
+    # A block of scatters alone, whose readings nothing predicts, has no place among the located ones.
+    blocks = sorted(target.blocks, key=lambda block: bool(np.all(target.scatter[block])))
+    label = np.zeros(target.dimension, dtype=int)
+    for i, block in enumerate(blocks):
+        label[block] = i
+    scatter, located = (tuple(np.flatnonzero(which).tolist()) for which in (target.scatter, ~target.scatter))
+    return Layout(target.structure, scatter, located, tuple(label.tolist()), FEWEST)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILE)
 def conditional(layout: Layout, numbers: density.Numbers, v: Any, start: Any, step: Any, bend: Any) -> tuple[Any, ...]:
     """The log-posterior of the located v (w, dimension), scatters at their nodes: the forward models run once a walker.
 

@@ -64,6 +64,13 @@ def log_stretch(t: Any, bend: Any, xp: ModuleType = jnp) -> Any:
 Terms = Callable[[np.ndarray, Grid], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
+def add_to_blocks(known: np.ndarray, block: np.ndarray, integrals: np.ndarray) -> np.ndarray:
+    """(w, blocks) log-posterior: what is ``known`` without scatters and the integrals (w, scatters), ``block`` each."""
+    total = known.T.copy()
+    np.add.at(total, block, integrals.T)
+    return total.T
+
+
 def choose_grid(terms: Terms, centre: np.ndarray, block: np.ndarray, probes: np.ndarray) -> Grid:
     """Windows and number of nodes for scatters that are ``centre`` (scatters,) at the point fit.
 
@@ -109,7 +116,7 @@ def _windows(
         low, width = low + first * grid.step, (last - first) * grid.step
         if settled:
             break
-    posterior = known[:, block] + integral @ (block[:, None] == block)
+    posterior = add_to_blocks(known, block, integral)[:, block]
     if not np.all(np.isfinite(posterior[0])):
         raise RuntimeError("the posterior is not finite at the point fit: no scatter can be integrated out there")
     return low, core, low + width, posterior > posterior[0] - NO_MASS

@@ -1,6 +1,7 @@
 """emcee: independent ensembles, run until they agree or the budget is spent, saved while they run."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -30,8 +31,8 @@ DEFAULT_BUDGET = 20_000
 #: One draw is stored per this part of the pilot's autocorrelation time, but at least one per MAX_THIN steps: a short
 #: pilot knows that time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
-#: Steps of the pilot's burn-in, half of which shapes the block proposal, and of each candidate move that it times.
-PILOT_BURN_IN, PILOT_STEPS = 100, 200
+#: Steps of the pilot's burn-in, half of which shapes the block proposal, and of the moves that it times.
+PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
 #: The pilot looks no further once a move has an autocorrelation time, in steps, below this.
 GOOD_TAU = 10.0
 
@@ -85,28 +86,34 @@ def sample(
     report(0, 1, "pilot")
     pilot_seed, restore_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 2))
     schedule = pilot(target, pilot_seed)
-    chains = None if store is None else ChainStore(store)
-    samplers = [_sampler(target, schedule, s, i, store) for i, s in enumerate(seeds)]
-    last = max(budget // schedule.thin, 2)
-    for goal in _checks(last):
-        if goal < last and all(sampler.iteration > goal for sampler in samplers):
-            continue
-        for sampler in samplers:
-            for _ in _advance(sampler, goal, schedule.thin):
-                if chains is not None:
-                    chains.between_draws()
-                report(sum(s.iteration for s in samplers), ENSEMBLES * goal, schedule.move)
-        if _converged(np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])):
-            break
-    if chains is not None:
-        chains.save()
-    draws, lp = target.restore(np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers]), restore_seed)
+    with nullcontext() if store is None else ChainStore(store) as chains:
+        backends = [None if chains is None else chains.backend(f"ensemble_{i}") for i in range(ENSEMBLES)]
+        samplers = [_sampler(target, schedule, *one) for one in zip(seeds, backends, strict=True)]
+        done = [sampler.iteration for sampler in samplers]
+        draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
+        last = max(budget // schedule.thin, 2)
+        for goal in _checks(last):
+            if goal < last and min(done) > goal:
+                continue
+            for i, sampler in enumerate(samplers):
+                for _ in _advance(sampler, goal - done[i], schedule.thin):
+                    done[i] += 1
+                    if chains is not None:
+                        chains.between_draws()
+                    report(sum(done), ENSEMBLES * goal, schedule.move)
+            located = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
+            draws, lp = target.restore(located, restore_seed)
+            if _converged(draws):
+                break
+        if chains is not None:
+            chains.save()
+        acceptance = np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers])
     theta = target.theta(draws)
     return Posterior(
         names=target.names,
         draws=theta,
         lp=lp,
-        acceptance=np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers]),
+        acceptance=acceptance,
         tau=np.max(ensemble_time(draws), axis=0),
         rhat=split_rhat(theta),
         ess=effective_sample_size(draws, integrated_time(theta)),
@@ -131,10 +138,11 @@ def pilot(target: Target, seed: int) -> Schedule:
     sampler = _ensemble(target, state.coords.shape[0], rough)
     state = sampler.run_mcmc(state, PILOT_BURN_IN)
     sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN // 2, flat=True))
-    measured, moves = {}, candidates(sample, target.blocks)
-    for name, candidate in moves.items():
-        sampler = _ensemble(target, state.coords.shape[0], candidate)
-        state = sampler.run_mcmc(state, PILOT_STEPS)
+    measured, moves = {}, candidates(sample, target.blocks, target.centre, target.covariance)
+    # The most promising one first, briefly; where it is not good, all of them for longer.
+    for name, steps in [(next(iter(moves)), PILOT_STEPS), *((name, LONG_PILOT_STEPS) for name in moves)]:
+        sampler = _ensemble(target, state.coords.shape[0], moves[name])
+        state = sampler.run_mcmc(state, steps)
         measured[name] = float(np.max(ensemble_time(np.asarray(sampler.get_chain())[None])))
         if measured[name] < GOOD_TAU:
             break
@@ -153,9 +161,8 @@ def _checks(last: int) -> Iterator[int]:
     yield last
 
 
-def _advance(sampler: emcee.EnsembleSampler, goal: int, thin: int) -> Iterator[emcee.State]:
-    """Run until ``goal`` draws are stored; every draw is saved as it is made."""
-    missing = goal - sampler.iteration
+def _advance(sampler: emcee.EnsembleSampler, missing: int, thin: int) -> Iterator[emcee.State]:
+    """Run until ``missing`` more draws are stored; every draw is saved as it is made."""
     if missing > 0:
         for state in sampler.sample(sampler._previous_state, iterations=missing, thin_by=thin, store=True):
             # emcee keeps no state of a run that is iterated over: the next call would start from the same one again.
@@ -163,11 +170,10 @@ def _advance(sampler: emcee.EnsembleSampler, goal: int, thin: int) -> Iterator[e
             yield state
 
 
-def _sampler(target: Target, schedule: Schedule, seed: int, number: int, store: Path | None) -> emcee.EnsembleSampler:
-    """One ensemble: burnt in from its own overdispersed start, or taken up where ``store`` left it."""
+def _sampler(target: Target, schedule: Schedule, seed: int, backend: Any) -> emcee.EnsembleSampler:
+    """One ensemble: burnt in from its own overdispersed start, or taken up where ``backend`` left it."""
     random = np.random.RandomState(seed)
     start = _initial(target, random)
-    backend: Any = None if store is None else emcee.backends.HDFBackend(str(store), name=f"ensemble_{number}")
     if backend is not None and backend.initialized and backend.iteration > 0:
         sampler = _ensemble(target, len(start), schedule.moves, backend)
         sampler._previous_state = backend.get_last_sample()

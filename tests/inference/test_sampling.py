@@ -110,7 +110,7 @@ def test_log_density_belongs_to_the_draws(posterior: Posterior) -> None:
 
 def test_interrupted_chains_go_on(tmp_path: Path) -> None:
     """Stopped after half the budget and taken up again: the draws stored before are kept, the whole still passes."""
-    half = draw(5, budget=130, store=tmp_path / "chains.h5")
+    half = draw(5, budget=60, store=tmp_path / "chains.h5")
     whole = draw(5, store=tmp_path / "chains.h5")
     stored = half.draws.shape[1]
     np.testing.assert_array_equal(whole.draws[:, :stored], half.draws)
