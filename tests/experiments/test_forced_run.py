@@ -1,0 +1,177 @@
+"""A forced run: its likelihood against SciPy's densities, its start, its kinds of initial state."""
+
+from functools import cache
+
+import bench
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from capsule_id.capsule.model import CapsuleParameters, Excitation, simulate
+from capsule_id.experiments.forced_run import NOISES, SETTLING_PERIODS, ForcedRun
+from capsule_id.experiments.run_start import rough_start
+from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.rig.model import Quantity, Table
+from capsule_id.synthetic import Truth
+from capsule_id.synthetic_runs import SyntheticRun, make_runs
+
+SAMPLES = 120
+NOISE = {"noise_x_rel": 1.1e-5, "noise_x_capsule": 5.2e-6, "noise_acceleration": 0.9, "noise_current": 4.8e-3}
+TRUTH = Truth().with_runs().flat()
+
+
+@cache
+def recorded() -> tuple[SyntheticRun, ...]:
+    """The twin's four runs; at seed 0 the first starts with the capsule moving, the others with it stuck."""
+    return tuple(make_runs(TRUTH, 0))
+
+
+def table(number: int = 0, samples: int = SAMPLES, without: tuple[str, ...] = (), **settings: object) -> Table:
+    run = recorded()[number]
+    columns = [bench.column("time", run.time[:samples])]
+    columns += [bench.column(name, run.channels[name][:samples]) for name in run.channels if name not in without]
+    given = {"spring": run.truth.spring, "gap": Quantity(run.stated_gap, 2e-5), "Omega": run.truth.Omega}
+    return bench.table("forced_run", columns, f"run_{number + 1}", **given, **settings)
+
+
+def make(number: int = 0, **options: object) -> ForcedRun:
+    own = table(number, **options)  # type: ignore[arg-type]
+    return ForcedRun(own, bench.rig(own))
+
+
+def theta(number: int = 0) -> dict[str, float]:
+    """The truth as one experiment sees it, with noise near the recorded one."""
+    truth = recorded()[number].truth
+    shared = {name: TRUTH[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g", "K")}
+    drive = {"G": truth.G, "I_d": truth.current_amplitude, "P_d": truth.P_d, "phase": truth.phase}
+    start = {"x_start": truth.x_rel, "y_start": truth.Y1 - truth.Y2, "capsule_start": truth.Y2}
+    return {**shared, **drive, **start, **NOISE, "k2": TRUTH[f"k2[{truth.spring}]"]}
+
+
+def channels(number: int, samples: int = SAMPLES) -> list[np.ndarray]:
+    """Noise-free x_rel, x_capsule, acceleration, current, from one call of the model and Newton's second law."""
+    truth, values = recorded()[number].truth, theta(number)
+    time = recorded()[number].time[:samples]
+    p = CapsuleParameters(*(values[name] for name in ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")))
+    t = simulate(p, Excitation(truth.P_d, truth.Omega, truth.phase), time, (truth.x_rel, truth.Y1, 0.0, truth.Y2))
+    x_rel, rate = np.asarray(t.X1 - t.X2), np.asarray(t.Y1 - t.Y2)
+    force = values["k1"] * x_rel + values["c"] * rate + values["k2"] * np.clip(x_rel - truth.G, 0.0, None)
+    cosine = np.cos(truth.Omega * time + truth.phase)
+    acceleration = (truth.P_d * cosine - force) / values["m1"]
+    return [x_rel, np.asarray(t.X2), acceleration, truth.current_amplitude * cosine]
+
+
+def density(observed: np.ndarray, predicted: np.ndarray, covariance: np.ndarray, gain_sd: float = 0.0) -> float:
+    """SciPy's normal log-density: noise ``covariance``, an offset of sd ten times the range, a gain."""
+    one, width = np.ones(len(observed)), 10.0 * np.ptp(observed)
+    full = covariance + width**2 * np.outer(one, one) + gain_sd**2 * np.outer(predicted, predicted)
+    spread = stats.Covariance.from_cholesky(np.linalg.cholesky(full))
+    return float(stats.multivariate_normal(predicted, spread).logpdf(observed))
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_channels_are_independent_normal_densities_with_offsets_integrated_out(number: int) -> None:
+    run = make(number)
+    observed = [recorded()[number].channels[name][:SAMPLES] for name in run.channels]
+    expected = sum(
+        density(y, seen, NOISE[NOISES[name]] ** 2 * np.eye(SAMPLES))
+        for name, y, seen in zip(run.channels, observed, channels(number), strict=True)
+    )
+    assert float(run.log_likelihood(theta(number), np)) == pytest.approx(expected, rel=1e-9)
+    assert float(run.log_likelihood(theta(number), jnp)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_gain_is_integrated_out_where_it_is_asked_for() -> None:
+    run = make(0, x_rel_gain_sd=0.02, start="moving", without=("acceleration_rod", "x_capsule"))
+    covariance = [NOISE["noise_x_rel"] ** 2 * np.eye(SAMPLES), NOISE["noise_current"] ** 2 * np.eye(SAMPLES)]
+    seen = [channels(0)[0], channels(0)[3]]
+    observed = [recorded()[0].channels[name][:SAMPLES] for name in ("x_rel", "current")]
+    parts = [density(y, s, v, g) for y, s, v, g in zip(observed, seen, covariance, (0.02, 0.0), strict=True)]
+    assert float(run.log_likelihood(theta(0), np)) == pytest.approx(sum(parts), rel=1e-9)
+    assert float(
+        make(0, start="moving", without=("acceleration_rod", "x_capsule")).log_likelihood(theta(0), np)
+    ) != pytest.approx(sum(parts), rel=1e-6)
+
+
+def test_coloured_noise_is_a_stationary_first_order_process() -> None:
+    run = make(0, noise="ar1", start="moving", without=("acceleration_rod", "x_capsule"))
+    rho = {"ar1_x_rel": 0.6, "ar1_current": -0.3}
+    lag = np.abs(np.subtract.outer(np.arange(SAMPLES), np.arange(SAMPLES)))
+    observed = [recorded()[0].channels[name][:SAMPLES] for name in ("x_rel", "current")]
+    parts = [
+        density(y, seen, noise**2 / (1.0 - r**2) * r**lag)
+        for y, seen, noise, r in zip(
+            observed, (channels(0)[0], channels(0)[3]), (1.1e-5, 4.8e-3), rho.values(), strict=True
+        )
+    ]
+    values = theta(0) | {name: np.arctanh(r) for name, r in rho.items()}
+    assert float(run.log_likelihood(values, np)) == pytest.approx(sum(parts), rel=1e-9)
+
+
+def test_a_stated_drive_beside_the_current_is_a_second_reading() -> None:
+    stated = make(0, P_d=Quantity(4.1, 0.1))
+    more = float(stated.log_likelihood(theta(0), np)) - float(make(0).log_likelihood(theta(0), np))
+    assert more == pytest.approx(float(stats.norm.logpdf(4.1, 4.0, 0.1)), abs=1e-6)
+    assert stated.n == make(0).n + 1
+
+
+def test_without_a_current_the_drive_is_the_stated_one() -> None:
+    run = make(0, start="moving", without=("current",), P_d=Quantity(4.0, 0.05))
+    names = [row.name for row in run.parameters]
+    assert "P_d[run_1]" in names
+    assert not {"K", "I_d[run_1]"} & set(names)
+    assert np.allclose(run.predict(theta(0), np)[0], channels(0)[0], rtol=0, atol=1e-13)
+
+
+def test_runs_of_both_kinds_of_start_are_one_group_and_add_up() -> None:
+    tables = [table(0), table(1)]
+    rig = bench.rig(*tables)
+    runs = [ForcedRun(own, rig) for own in tables]
+    assert [run.start for run in runs] == ["moving", "stuck"]
+    target = LogPosterior(rig, runs)
+    assert len(target.structure.groups) == 1
+    rng = np.random.default_rng(0)
+    centre = {name: start.centre for name, start in target.starts().items()}
+    u = target.unconstrain(np.array([centre[name] for name in target.names]))
+    u = u + 1e-3 * np.abs(u) * rng.standard_normal(len(u))
+    values = target.mapping(target.theta(u))
+    expected = sum(float(run.log_likelihood(run.local(values), np)) for run in runs)
+    assert float(target.log_likelihood(u)) == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_settled_run_starts_on_the_motion_that_it_settles_on_from_rest() -> None:
+    run = make(1, start="settled")
+    values, truth = theta(1), recorded()[1].truth
+    assert not {"x_start[run_2]", "y_start[run_2]"} & {row.name for row in run.parameters}
+    p, e = run.capsule(values)
+    T = 2.0 * np.pi / truth.Omega
+    t = simulate(p, e, np.concatenate([[-SETTLING_PERIODS * T], run.time]))
+    assert np.allclose(run.predict(values, np)[0], np.asarray(t.X1 - t.X2)[1:], rtol=0, atol=1e-13)
+    assert float(run.motion(values, np).X2[0]) == 0.0
+    # The recorded run is itself settled: the same motion, up to what is left of the transient.
+    assert np.max(np.abs(run.predict(values, np)[0] - channels(1)[0])) < 1e-6
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_the_record_tells_where_the_fit_may_start(number: int) -> None:
+    run, truth = recorded()[number], recorded()[number].truth
+    rough = rough_start(run.time, run.channels, truth.Omega)
+    assert rough.kind == ("moving" if truth.Y2 else "stuck")
+    assert abs(np.angle(np.exp(1j * (rough.phase - truth.phase)))) < 1e-3
+    assert rough.amplitude == pytest.approx(truth.current_amplitude, rel=1e-3)
+    assert rough.x_rel - truth.x_rel == pytest.approx(truth.offsets["x_rel"], abs=4e-5)
+    assert rough.rate == pytest.approx(truth.Y1 - truth.Y2, abs=0.06)
+    assert rough.capsule_rate == pytest.approx(truth.Y2, abs=0.01)
+    for name, sd in truth.noise_sd.items():
+        assert rough.noise[name] == pytest.approx(sd, rel=0.25)
+
+
+def test_draws_are_predicted_in_one_batch() -> None:
+    run = make(0)
+    values = [theta(0), theta(0) | {"k2": 1.05 * theta(0)["k2"], "phase": theta(0)["phase"] + 0.01}]
+    stacked = {name: np.array([v[name] for v in values]) for name in values[0]}
+    together = run.predict(stacked, np)
+    for i, one in enumerate(values):
+        for batch, alone in zip(together, run.predict(one, np), strict=True):
+            assert np.allclose(batch[i], alone, rtol=1e-12, atol=1e-12)
