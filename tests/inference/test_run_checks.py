@@ -1,0 +1,83 @@
+"""Bench against runs, and what an error of the start becomes: against closed forms, each with a negative control."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.run_checks import LARGEST_GROWTH, _by_sample, check_agreement, check_runs, disagreement, growth
+from tests.forced_runs import make, theta
+
+NAMES = ("k1", "c")
+
+
+class Target:
+    """Two located parameters, logarithms."""
+
+    names = NAMES
+    scatter = np.array([False, False])
+
+
+def fit(u: np.ndarray, covariance: np.ndarray) -> PointFit:
+    values = dict(zip(NAMES, np.exp(u), strict=True))
+    none = np.zeros((1, 2))
+    return PointFit(NAMES, u, values, covariance, values, none, none, np.zeros(1), True, np.zeros(1, dtype=bool))
+
+
+def estimates(rng: np.random.Generator, shift: float) -> tuple[PointFit, PointFit]:
+    """Bench and joint estimates of two linear experiments; the runs see the first parameter ``shift`` too high."""
+    bench_cov = np.array([[4e-6, 1e-6], [1e-6, 9e-6]])
+    runs_cov = np.array([[1e-6, -5e-7], [-5e-7, 2e-6]])
+    one = rng.multivariate_normal(np.zeros(2), bench_cov)
+    other = rng.multivariate_normal([shift, 0.0], runs_cov)
+    joint_cov = np.linalg.inv(np.linalg.inv(bench_cov) + np.linalg.inv(runs_cov))
+    joint = joint_cov @ (np.linalg.solve(bench_cov, one) + np.linalg.solve(runs_cov, other))
+    return fit(one, bench_cov), fit(joint, joint_cov)
+
+
+def test_the_disagreement_is_standard_normal_where_there_is_none() -> None:
+    rng = np.random.default_rng(1)
+    z = np.array([list(_ordered(*estimates(rng, 0.0))) for _ in range(3000)])
+    assert stats.kstest(z[:, 0], "norm").pvalue > 1e-3
+    assert stats.kstest(z[:, 1], "norm").pvalue > 1e-3
+
+
+def _ordered(one: PointFit, joint: PointFit) -> list[float]:
+    z = disagreement(Target(), joint, one, None)  # type: ignore[arg-type]
+    return [z[name] for name in NAMES]
+
+
+def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
+    rng = np.random.default_rng(2)
+    clean = [check_agreement(Target(), *estimates(rng, 0.0)[::-1], None) for _ in range(1500)]  # type: ignore[arg-type]
+    alarms = np.mean([found[0].level == "fail" for found in clean])
+    assert 0.01 < alarms < 0.03
+    planted = [check_agreement(Target(), *estimates(rng, 0.015)[::-1], None) for _ in range(50)]  # type: ignore[arg-type]
+    assert all(found[0].level == "fail" and "largest disagreement in k1" in found[0].text for found in planted)
+
+
+def test_tails_follow_the_sample() -> None:
+    draws = stats.t(5).rvs(100_000, random_state=3)
+    for value in (0.5, 2.0, 6.0, 12.0):
+        expected = -stats.norm.isf(stats.t(5).sf(value))
+        assert _by_sample(draws, value, -1.0) == pytest.approx(expected, abs=0.35)
+    # The normal density would call the farthest of these twelve sd.
+    assert abs(_by_sample(draws, 12.0, -1.0)) < 5.0
+
+
+def test_a_motion_that_forgets_its_start_is_predictable_and_a_chaotic_one_is_not() -> None:
+    run = make(0, samples=2000)
+    assert growth(run, theta(0)) < 1.0
+    assert check_runs([run], _named(run, theta(0)))[0].level == "ok"
+    # The chaotic motion of tests/capsule/test_lyapunov.py.
+    wild = theta(0) | {"m2": 0.3, "k2": 56410.0, "c": 0.5, "mu": 0.2, "G": 0.5e-3, "I_d": 4.0}
+    assert growth(run, wild) > LARGEST_GROWTH
+    found = check_runs([run], _named(run, wild))
+    assert found[0].level == "fail"
+    assert "run_1" in found[0].text
+
+
+def _named(run: ForcedRun, values: dict[str, float]) -> dict[str, float]:
+    by_symbol = {row.symbol: row.name for row in run.parameters}
+    return {by_symbol.get(symbol, symbol): value for symbol, value in values.items()}
