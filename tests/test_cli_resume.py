@@ -17,7 +17,7 @@ from capsule_id.cli import fit_params
 from capsule_id.commands.fit import Progress
 from tests.cli_tools import CODE, environment, listing, small_rig
 
-WORDS = ("rig", "--quiet", "--max-steps", "200")
+WORDS = ("rig", "--quiet", "--max-steps", "60")
 #: A short run that is checked often and never converges, so that every ensemble goes on after several checks; and
 #: chains saved after every draw.
 SHORT = {"sampling.FIRST_CHECK": 15, "sampling.CHECK_EVERY": 15, "sampling.PILOT_STEPS": 60, "sampling.MAX_RHAT": 0.0}

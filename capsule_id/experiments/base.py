@@ -1,8 +1,8 @@
 """What every experiment offers to inference and to the report.
 
-An experiment says, for given parameters, by how much each reading misses (``misfit``): the raw misfit, its standard
-deviation and the design of the nuisances that enter linearly. Likelihood, residuals, pointwise densities and the
-posterior predictive p-value all follow from that here, once.
+An experiment says, for given parameters, by how much each reading misses (``misfits``): the raw misfit, how its
+standard deviation depends on a scatter, and the design of the nuisances that enter linearly. Likelihood, residuals,
+pointwise densities and the posterior predictive p-value all follow from that here, once.
 """
 
 from abc import ABC, abstractmethod
@@ -15,8 +15,10 @@ from typing import Any, Self
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
+from scipy.linalg import block_diag
 
-from capsule_id.experiments.linear import LOG_2PI, conditional_draw, conditional_mean, marginal_log_density
+from capsule_id.experiments.linear import LOG_2PI
+from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter
 from capsule_id.precision import require_float64
 from capsule_id.rig.model import Column, Rig, Table
@@ -37,34 +39,10 @@ class Start:
     spread: float
 
 
-@dataclass(frozen=True)
-class Misfit:
-    """By how much the readings miss a model.
-
-    Attributes
-    ----------
-    raw : (n,) measured minus predicted
-    sd : (n,) its standard deviation
-    design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
-    log_measure : () or (n,) what the measure of an integrated true abscissa adds to the log-density of each reading
-        (errors in both columns, see ``capsule_id.experiments.line``)
-    """
-
-    raw: Any
-    sd: Any
-    design: Any
-    log_measure: Any = 0.0
-
-    def moments(self) -> tuple[Any, Any, Any]:
-        """y'y, A'y, A'A in units of the noise."""
-        y, a = self.raw / self.sd, self.design / self.sd[:, None]
-        return y @ y, a.T @ y, a.T @ a
-
-
 class Experiment(ABC):
     """One rig test: its readings, the paper's estimator, its likelihood, what the report shows of it."""
 
-    #: The unit of ``misfit`` is known beforehand (no scatter is estimated): chi-square has a meaning of its own.
+    #: The unit of the misfit is known beforehand (no scatter is estimated): chi-square has a meaning of its own.
     scale_known = False
     #: Readings follow each other in time: residuals must be white.
     time_series = False
@@ -72,6 +50,8 @@ class Experiment(ABC):
     #: of the former and in the values of the latter are evaluated together, in one batch (see ``signature``).
     ARRAYS: tuple[str, ...] = ()
     STATIC: tuple[str, ...] = ()
+    #: Symbol of the scatter of each of ``misfits``; None where its sd is known.
+    scatters: tuple[str | None, ...] = (None,)
     #: Masses that the likelihood reads.
     masses: tuple[str, ...] = ()
 
@@ -120,8 +100,29 @@ class Experiment(ABC):
         """(n,) the readings that the likelihood is a density of, SI."""
 
     @abstractmethod
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
-        """Misfit for parameters ``theta``; ``xp`` is ``jax.numpy`` or ``numpy``."""
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
+        """Misfits of the independent groups of readings, in the order of ``observed``, at any value of their scatters.
+
+        ``theta`` need not hold scatters; ``xp`` is ``jax.numpy`` or ``numpy``.
+        """
+
+    def summaries(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
+        """The same for the likelihood alone: moments where they say it all."""
+        return tuple(misfit.summary() for misfit in self.misfits(theta, xp))
+
+    def misfit(self, theta: Theta) -> ScaledMisfit:
+        """All groups together at the scatters of ``theta``, NumPy."""
+        parts = self._scaled(theta, np)
+        return ScaledMisfit(
+            np.concatenate([part.raw for part in parts]),
+            np.concatenate([part.sd for part in parts]),
+            block_diag(*(part.design for part in parts)),
+            np.concatenate([part.log_measure for part in parts]),
+        )
+
+    def _scaled(self, theta: Theta, xp: ModuleType) -> list[ScaledMisfit]:
+        pairs = zip(self.misfits(theta, xp), self.scatters, strict=True)
+        return [misfit.at(theta[symbol] if symbol else 0.0, xp) for misfit, symbol in pairs]
 
     @abstractmethod
     def starts(self) -> dict[str, Start]:
@@ -138,38 +139,26 @@ class Experiment(ABC):
 
     def log_likelihood(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings, linear nuisances integrated out; scalar."""
-        misfit = self.misfit(theta, xp)
-        scale = xp.sum(misfit.log_measure - xp.log(misfit.sd))
-        if misfit.design.shape[1] == 0:
-            y = misfit.raw / misfit.sd
-            return -0.5 * (self.n * LOG_2PI + y @ y) + scale
-        return marginal_log_density(*misfit.moments(), self.n, xp) + scale
+        pairs = zip(self.summaries(theta, xp), self.scatters, strict=True)
+        return sum(part.log_density(theta[symbol] if symbol else 0.0, xp) for part, symbol in pairs)
 
     def residuals(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """(n + p,) residuals in units of the noise at the conditional mean of the p linear nuisances, then those.
 
         Half their sum of squares is the parameter-dependent part of -log_likelihood but for its log-determinant.
         """
-        misfit = self.misfit(theta, xp)
-        if misfit.design.shape[1] == 0:
-            return misfit.raw / misfit.sd
-        _, ay, aa = misfit.moments()
-        b = conditional_mean(ay, aa, xp)
-        return xp.concatenate([(misfit.raw - misfit.design @ b) / misfit.sd, b])
+        parts = [part.at_nuisance_mean(xp) for part in self._scaled(theta, xp)]
+        return xp.concatenate([rest for rest, _ in parts] + [b for _, b in parts])
 
     def nuisance_mean(self, theta: Theta) -> np.ndarray:
         """(p,) conditional mean of the linear nuisances, in units of their priors."""
-        _, ay, aa = self.misfit(theta, np).moments()
-        return conditional_mean(ay, aa, np) if len(ay) else np.zeros(0)
+        return self.misfit(theta).at_nuisance_mean(np)[1]
 
     def pointwise(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
         """(n,) log-density of each reading, conditional on one draw of the linear nuisances."""
-        misfit = self.misfit(theta, np)
-        raw = misfit.raw
-        if misfit.design.shape[1]:
-            _, ay, aa = misfit.moments()
-            raw = raw - misfit.design @ conditional_draw(ay, aa, rng)
-        return -0.5 * (raw / misfit.sd) ** 2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
+        misfit = self.misfit(theta)
+        scaled = misfit.at_nuisance_draw(rng)
+        return -0.5 * scaled**2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
 
     def predictive_p(self, draws: list[Theta], rng: np.random.Generator) -> float | None:
         """Posterior predictive p-value of the chi-square discrepancy; None without draws.
@@ -179,12 +168,8 @@ class Experiment(ABC):
         """
         if not draws:
             return None
-        tails = []
-        for theta in draws:
-            misfit = self.misfit(theta, np)
-            square = -2.0 * np.sum(self.pointwise(theta, rng) + np.log(misfit.sd) + 0.5 * LOG_2PI - misfit.log_measure)
-            tails.append(stats.chi2.sf(square, self.n))
-        return float(np.mean(tails))
+        squares = [np.sum(self.misfit(theta).at_nuisance_draw(rng) ** 2) for theta in draws]
+        return float(np.mean(stats.chi2.sf(squares, self.n)))
 
 
 def no_design(n: int, xp: ModuleType = jnp) -> Any:

@@ -5,8 +5,9 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Misfit, Start, Theta, no_design
+from capsule_id.experiments.base import Start, Theta, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient, slide_distance
+from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig, Table
 
@@ -19,6 +20,7 @@ class DynamicFriction(FrictionExperiment):
     """
 
     role = "dynamic"
+    scatters = ("push_scatter",)
     ARRAYS = ("speed", "distance", "speed_sd", "distance_sd")
 
     def __init__(self, table: Table, rig: Rig) -> None:
@@ -35,12 +37,12 @@ class DynamicFriction(FrictionExperiment):
     def observed(self) -> np.ndarray:
         return self.distance
 
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
         mu, v_s, g = theta["mu"], theta["v_s"], theta["g"]
         distance = slide_distance(self.speed, mu, v_s, g, xp)
         slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))
-        variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2 + (theta["push_scatter"] * distance) ** 2
-        return Misfit(self.distance - distance, xp.sqrt(variance), no_design(self.n, xp))
+        variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
+        return (Misfit(self.distance - distance, variance, distance, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Pushes are read as mu = v^2/(2gd) at their initial speed."""

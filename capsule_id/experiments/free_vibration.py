@@ -3,18 +3,18 @@
 from dataclasses import replace
 from functools import cached_property
 from types import ModuleType
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment, Misfit, Start, Theta, axis_label, band
+from capsule_id.experiments.base import Experiment, Start, Theta, axis_label, band
 from capsule_id.experiments.decay_models import STEP_PHASE, dry_decay, quadratic_decay, rates, viscous_basis
 from capsule_id.experiments.decay_moments import decay_moments, fold, uniform_step
 from capsule_id.experiments.decay_trend import describe_trend
 from capsule_id.experiments.decrement import Decrement, equilibrium, logarithmic_decrement, noise_level
-from capsule_id.experiments.linear import NUISANCE_WIDTH, marginal_log_density
+from capsule_id.experiments.linear import NUISANCE_WIDTH
+from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Quantity, Rig, Table
@@ -36,6 +36,7 @@ class FreeVibration(Experiment):
 
     time_series = True
     masses = ("m1",)
+    scatters = ("noise_sd",)
     ARRAYS = ("time", "values", "width", "reading_sd", "side", "folded", "step")
     STATIC = ("damping", "half_cycles", "substeps", "uniform")
 
@@ -81,11 +82,7 @@ class FreeVibration(Experiment):
             return *shared, parameter("c_q"), noise, x_start, y_start
         return *shared, noise
 
-    def noise_sd(self, theta: Theta, xp: ModuleType = jnp) -> Any:
-        """Noise and reading error, m."""
-        return xp.sqrt(theta["noise_sd"] ** 2 + self.reading_sd**2)
-
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
         k1, c, m1 = theta["k1"], theta["c"], theta["m1"]
         one = xp.ones((len(self.time), 1))
         raw, design = self.values, one
@@ -105,16 +102,14 @@ class FreeVibration(Experiment):
             raw = raw - quadratic_decay(self.time, k1, c, m1, theta["c_q"], *start, substeps=self.substeps)
         else:
             design = xp.concatenate([viscous_basis(self.time, k1, c, m1, xp), one], axis=1)
-        return Misfit(raw, self.noise_sd(theta, xp) * xp.ones(self.n), self.width * design)
+        return (Misfit(raw, self.reading_sd**2, 1.0, self.width * design),)
 
-    def log_likelihood(self, theta: Theta, xp: ModuleType = jnp) -> Any:
+    def summaries(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         if not self.uniform or xp is np:
-            return super().log_likelihood(theta, xp)
-        sd = self.noise_sd(theta)
+            return super().summaries(theta, xp)
         gamma, omega = rates(theta["k1"], theta["c"], theta["m1"])
         yy, ay, aa = decay_moments(self.folded, self.n, self.step, gamma, omega)
-        scale = self.width / sd
-        return marginal_log_density(yy / sd**2, scale / sd * ay, scale**2 * aa, self.n) - self.n * jnp.log(sd)
+        return (Moments(yy, self.width * ay, self.width**2 * aa, self.n, self.reading_sd**2),)
 
     # -- the paper's estimator and starts ---------------------------------------------------------------------------
 
@@ -241,8 +236,8 @@ class FreeVibration(Experiment):
 
     def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
         def curve(values: Theta) -> np.ndarray:
-            misfit = self.misfit(values, np)
-            return self.values - np.asarray(misfit.raw) + np.asarray(misfit.design) @ self.nuisance_mean(values)
+            misfit = self.misfit(values)
+            return self.values - misfit.raw + misfit.design @ misfit.at_nuisance_mean(np)[1]
 
         unit, time = self.column.to_display, self.time + self.time0
         lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)

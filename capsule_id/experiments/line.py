@@ -13,8 +13,9 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Experiment, Misfit, Start, Theta, axis_label, band
+from capsule_id.experiments.base import Experiment, Start, Theta, axis_label, band
 from capsule_id.experiments.linear import NUISANCE_WIDTH
+from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Curve, Points
@@ -38,6 +39,7 @@ class Line(Experiment):
         ratio = table.settings.get("sd_ratio")
         self.sd_ratio = None if ratio is None else float(ratio)  # type: ignore[arg-type]
         self.scale_known = self.x_column.sd is not None and self.y_column.sd is not None
+        self.scatters = (None,) if self.scale_known else ("scatter",)
 
     @property
     def errors(self) -> str:
@@ -59,17 +61,13 @@ class Line(Experiment):
     def observed(self) -> np.ndarray:
         return self.y
 
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
-        slope = theta[self.slope.symbol]
-        y_variance, x_variance = self.y_sd**2, self.x_sd**2
-        if not self.scale_known:
-            y_variance = y_variance + theta["scatter"] ** 2
-            if self.sd_ratio is not None:
-                x_variance = x_variance + (theta["scatter"] / self.sd_ratio) ** 2
-        variance = y_variance + slope**2 * x_variance
-        design = self.width * xp.ones((self.n, 1))
-        along = 0.5 * xp.log(variance / y_variance) * xp.ones(self.n)
-        return Misfit(self.y - slope * self.x, xp.sqrt(variance) * xp.ones(self.n), design, along)
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+        slope, design = theta[self.slope.symbol], self.width * xp.ones((self.n, 1))
+        # Readings scatter in y, and in x where the ratio of both errors is stated.
+        across = 0.0 if self.sd_ratio is None else (slope / self.sd_ratio) ** 2
+        estimated = 0.0 if self.scale_known else 1.0
+        fixed, scale = self.y_sd**2 + slope**2 * self.x_sd**2, estimated * xp.sqrt(1.0 + across)
+        return (Misfit(self.y - slope * self.x, fixed, scale, design, (self.y_sd**2, estimated)),)
 
     def intercept(self, theta: Theta) -> float:
         """Conditional mean of y0, SI."""

@@ -16,19 +16,25 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp) -> Any:
-    """log N(y; 0, I + A A') from the moments.
+    """log N(y; 0, I + A A') from the moments, (...).
+
+    There are few nuisances, so that the elimination is written out: one expression for any number of leading axes.
 
     Parameters
     ----------
-    yy : () y'y
-    ay : (p,) A'y
-    aa : (p, p) A'A
+    yy : (...) y'y
+    ay : (..., p) A'y
+    aa : (..., p, p) A'A
     n : length of y
     """
-    chol = xp.linalg.cholesky(xp.eye(aa.shape[-1]) + aa)
-    half = xp.linalg.solve(chol, ay) if aa.shape[-1] > 1 else ay / chol[..., 0]
-    log_det = 2.0 * xp.sum(xp.log(xp.diagonal(chol)))
-    return -0.5 * (n * LOG_2PI + log_det + yy - xp.sum(half**2))
+    rest, rows, log_det = yy, xp.eye(aa.shape[-1]) + aa, 0.0
+    while rows.shape[-1]:
+        pivot, first = rows[..., 0, 0], rows[..., 0, 1:]
+        log_det, rest = log_det + xp.log(pivot), rest - ay[..., 0] ** 2 / pivot
+        ratio = first / pivot[..., None]
+        ay = ay[..., 1:] - ratio * ay[..., :1]
+        rows = rows[..., 1:, 1:] - ratio[..., :, None] * first[..., None, :]
+    return -0.5 * (n * LOG_2PI + log_det + rest)
 
 
 def conditional_mean(ay: Any, aa: Any, xp: ModuleType = jnp) -> Any:

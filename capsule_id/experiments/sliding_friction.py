@@ -6,8 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Misfit, Start, Theta, no_design
+from capsule_id.experiments.base import Start, Theta, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient
+from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig, Table
 
@@ -19,6 +20,7 @@ class SlidingFriction(FrictionExperiment):
     """
 
     role = "sliding"
+    scatters = ("sliding_scatter",)
     ARRAYS = ("speed", "values", "speed_sd", "values_sd")
     STATIC = ("quantity",)
 
@@ -42,12 +44,12 @@ class SlidingFriction(FrictionExperiment):
     def _weight(self, theta: Theta) -> Any:
         return (theta["m1"] + theta["m2"]) * theta["g"] if self.quantity == "force" else 1.0
 
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
         mu, v_s, weight = theta["mu"], theta["v_s"], self._weight(theta)
         predicted = weight * friction_coefficient(self.speed, mu, v_s, xp)
         slope = -0.5 * weight * mu * xp.exp(-self.speed / v_s) / v_s
-        variance = self.values_sd**2 + (slope * self.speed_sd) ** 2 + (theta["sliding_scatter"] * predicted) ** 2
-        return Misfit(self.values - predicted, xp.sqrt(variance), no_design(self.n, xp))
+        variance = self.values_sd**2 + (slope * self.speed_sd) ** 2
+        return (Misfit(self.values - predicted, variance, predicted, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Steady sliding is read as measured."""

@@ -5,8 +5,9 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Misfit, Start, Theta, no_design
+from capsule_id.experiments.base import Start, Theta, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment
+from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig, Table
 
@@ -19,6 +20,7 @@ class StaticFriction(FrictionExperiment):
     """
 
     role = "static"
+    scatters = ("tilt_sd",)
     ARRAYS = ("angle", "reading_sd")
 
     def __init__(self, table: Table, rig: Rig) -> None:
@@ -33,9 +35,8 @@ class StaticFriction(FrictionExperiment):
     def observed(self) -> np.ndarray:
         return self.angle
 
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
-        sd = xp.sqrt(theta["tilt_sd"] ** 2 + self.reading_sd**2)
-        return Misfit(self.angle - xp.arctan(theta["mu"]), sd, no_design(self.n, xp))
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+        return (Misfit(self.angle - xp.arctan(theta["mu"]), self.reading_sd**2, 1.0, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Tilts are read as mu = tan(angle) at speed 0."""

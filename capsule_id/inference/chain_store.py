@@ -7,7 +7,11 @@ which carries its own digest; the file that emcee writes is never trusted after 
 
 import hashlib
 import time
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+
+import emcee
+import h5py
 
 #: Seconds between two copies.
 SAVE_EVERY = 5.0
@@ -20,7 +24,7 @@ def saved_copy(store: Path) -> Path:
 
 
 class ChainStore:
-    """The HDF5 file that emcee writes, and its copy.
+    """The HDF5 file that emcee writes, open as long as this is (a context), and its copy.
 
     Parameters
     ----------
@@ -34,16 +38,40 @@ class ChainStore:
         content = saved[_DIGEST:]
         if content and hashlib.sha256(content).digest() == saved[:_DIGEST]:
             store.write_bytes(content)
+        self._file = h5py.File(store, "a")
+
+    def __enter__(self) -> "ChainStore":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def backend(self, name: str) -> emcee.backends.HDFBackend:
+        """Where an ensemble puts its draws."""
+        return _OpenBackend(self._file, name)
 
     def between_draws(self) -> None:
-        """Copy the file, if the last copy is old enough; to be called while emcee has it closed."""
+        """Copy the file, if the last copy is old enough; to be called while emcee is not writing."""
         if time.monotonic() >= self._next:
             self.save()
 
     def save(self) -> None:
         """Copy the file now; the copy appears by one rename."""
+        self._file.flush()
         content = self._store.read_bytes()
         temporary = self._copy.with_suffix(".saved-new")
         temporary.write_bytes(hashlib.sha256(content).digest() + content)
         temporary.replace(self._copy)
         self._next = time.monotonic() + SAVE_EVERY
+
+
+class _OpenBackend(emcee.backends.HDFBackend):
+    """emcee's backend opens its file six times a step; this one keeps it open."""
+
+    def __init__(self, file: h5py.File, name: str) -> None:
+        super().__init__(file.filename, name)
+        self._file = file
+
+    def open(self, mode: str = "r") -> AbstractContextManager[h5py.File]:
+        del mode
+        return nullcontext(self._file)

@@ -11,6 +11,9 @@ import numpy as np
 
 #: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
 STEP, RATIO = 0.05, 2.0
+#: Step of the gradient's central differences, in standard deviations: an error of 1e-7 where curvature changes by half
+#: over one of them.
+GRADIENT_STEP = 1e-3
 #: A batch has this many rows always, so that it is compiled for one shape.
 BATCH = 32
 
@@ -39,6 +42,13 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray, scale: 
     matrix = np.zeros((d, d))
     matrix[rows, columns] = best / (scale[rows] * scale[columns])
     return matrix + np.triu(matrix, 1).T
+
+
+def gradient(function: Callable[[np.ndarray], np.ndarray], v: np.ndarray) -> np.ndarray:
+    """(d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates of which a standard deviation is 1."""
+    offsets = GRADIENT_STEP * np.eye(len(v))
+    plus, minus = np.split(function(np.concatenate([v + offsets, v - offsets])), 2)
+    return (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
 def root_of_inverse(hessian: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ import numpy as np
 
 from capsule_id.experiments.base import Experiment, Theta
 from capsule_id.experiments.linear import LOG_2PI
+from capsule_id.inference.compiling import COMPILE
 
 #: Readings, priors and constants: a tree of arrays.
 Numbers = Mapping[str, Any]
@@ -63,7 +64,9 @@ def make_groups(
         own = [{row.symbol: row.name for row in e.parameters} for e in group]
         entries = tuple((s, tuple(names.index(table.get(s, s)) for table in own)) for s in sampled)
         groups.append(Group(signature, entries, tuple(sorted(fixed)), first))
-        arrays.append({a: jnp.stack([jnp.asarray(getattr(e, a), dtype=float) for e in group]) for a in first.ARRAYS})
+        arrays.append(
+            {a: jnp.asarray(np.stack([np.asarray(getattr(e, a), dtype=float) for e in group])) for a in first.ARRAYS}
+        )
     return tuple(groups), arrays
 
 
@@ -76,10 +79,14 @@ def constrain(structure: Structure, u: Any, xp: ModuleType = jnp) -> Any:
 
 def log_prior(structure: Structure, numbers: Numbers, u: Any) -> Any:
     """Normalised log prior density of u (d,), Jacobian included; scalar."""
-    prior = numbers["prior"]
-    z = prior_residuals(structure, prior, u)
+    return jnp.sum(prior_terms(numbers["prior"], u, constrain(structure, u)))
+
+
+def prior_terms(prior: Mapping[str, Any], u: Any, value: Any) -> Any:
+    """The same parameter by parameter: of u, constrained ``value``, shaped as the arrays of ``prior``."""
+    z = (jnp.where(prior["lognormal"], u, value) - prior["centre"]) / prior["width"]
     density = -0.5 * (z**2 + LOG_2PI) - jnp.log(prior["width"]) + prior["constant"]
-    return jnp.sum(density + jnp.where(prior["jacobian"], u, 0.0))
+    return density + jnp.where(prior["jacobian"], u, 0.0)
 
 
 def prior_residuals(structure: Structure, prior: Mapping[str, Any], u: Any, xp: ModuleType = jnp) -> Any:
@@ -99,7 +106,7 @@ def log_posterior(structure: Structure, numbers: Numbers, u: Any) -> Any:
     return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILE)
 def batched_log_posterior(structure: Structure, numbers: Numbers, u: Any) -> Any:
     """(w, d) -> (w,)."""
     return jax.vmap(lambda v: log_posterior(structure, numbers, v))(u)

@@ -2,6 +2,7 @@
 
 import platform
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +15,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks import informed, run_checks
 from capsule_id.inference.experiment_checks import Setting
 from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.marginal import MarginalPosterior, compile_ahead
 from capsule_id.inference.notes import make_notes
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit, Posterior, Result
@@ -56,10 +58,14 @@ def fit_rig(
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
     if progress:
         progress(0, 1, "point fit")
-    point = point_fit(target, seeds[0])
+    with ThreadPoolExecutor(1) as pool:
+        if budget is not None:
+            # What goes wrong in it comes up again where its result is used.
+            pool.submit(compile_ahead, target)
+        point = point_fit(target, seeds[0])
     posterior = None
     if budget is not None:
-        posterior = sample(target, point, seeds[1], budget, store, progress)
+        posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)
     values = {**target.fixed, **point.values}
     setting = Setting(rig, experiments, target, point, posterior, values)
     findings, flagged = run_checks(setting)

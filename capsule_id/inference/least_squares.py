@@ -16,14 +16,14 @@ import numpy as np
 import optimistix as optx
 
 from capsule_id.errors import InputError
+from capsule_id.inference.compiling import COMPILE_QUICKLY
 from capsule_id.precision import require_float64
 
 require_float64()
 
 Residual = Callable[[jax.Array], jax.Array]
-
-#: XLA options for what is compiled to run once: it runs for milliseconds, compiling it well takes seconds.
-QUICK_COMPILE = {"xla_backend_optimization_level": 0}
+#: Points (s, d) -> residuals (s, n) and their Jacobians (s, n, d).
+Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 SMALLEST_EFFECT = 0.01
 """Dimensionless. Where changing a parameter by 100 % of its start moves the residuals by less than this share of what
@@ -103,6 +103,7 @@ def least_squares(
     tolerance: float = 1e-9,
     max_steps: int = 1024,
     normal_equations: bool = False,
+    linearise: Linearise | None = None,
 ) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
@@ -121,6 +122,8 @@ def least_squares(
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
     normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
         times as fast where there are thousands of residuals
+    linearise : the residuals and Jacobians that scale the starts and judge the ends, by another route; None compiles
+        forward-mode differentiation for them
 
     Raises
     ------
@@ -130,22 +133,16 @@ def least_squares(
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    _, jacobian = _linearise(residual, jnp.asarray(starts))
-    scale, unit = jax.vmap(_scales)(jacobian, jnp.asarray(starts))
+    linearise = linearise or partial(_forward_mode, residual)
+    scale, unit = zip(*map(_scales, linearise(starts)[1], starts), strict=True)
     solve = partial(_solve, residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations)
     # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
-    ends, steps, results = zip(*map(solve, jnp.asarray(starts), scale, unit), strict=True)
+    arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
+    ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
     x, steps = np.stack(ends), np.array(steps, dtype=int)
-    residuals, jacobian = (np.asarray(array) for array in _linearise(residual, jnp.asarray(x)))
-    message = []
-    for i in range(len(starts)):
-        reason = optx.RESULTS[results[i]]
-        if not _finite(jacobian[i], residuals[i]):
-            reason = "The residuals or their Jacobian are not finite where this start ended: try another start."
-        # A solver that only watches its steps takes heavy damping for convergence.
-        elif not reason and not _stationary(jacobian[i], residuals[i], tolerance * float(unit[i])):
-            reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
-        message.append(reason)
+    residuals, jacobian = linearise(x)
+    rounding = [tolerance * one for one in unit]
+    message = [_reason(*one) for one in zip(results, jacobian, residuals, rounding, strict=True)]
     return LeastSquaresFit(
         x=x,
         cost=0.5 * np.sum(residuals**2, axis=1),
@@ -155,6 +152,17 @@ def least_squares(
         residuals=residuals,
         jacobian=jacobian,
     )
+
+
+def _reason(result: optx.RESULTS, jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> str:
+    """Why an end is none, "" where it is one."""
+    reason = optx.RESULTS[result]
+    if not _finite(jacobian, residuals):
+        return "The residuals or their Jacobian are not finite where this start ended: try another start."
+    # A solver that only watches its steps takes heavy damping for convergence.
+    if not reason and not _stationary(jacobian, residuals, rounding):
+        return "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
+    return reason
 
 
 def covariance(jacobian: np.ndarray, residuals: np.ndarray, residual_sd: float | None = None) -> Covariance:
@@ -218,15 +226,20 @@ def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) ->
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
+def _forward_mode(residual: Residual, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    residuals, jacobians = _linearise(residual, jnp.asarray(points))
+    return np.asarray(residuals), np.asarray(jacobians)
+
+
 # Equinox hands the options of jax.jit on; its annotations leave them out.
-@eqx.filter_jit(compiler_options=QUICK_COMPILE)  # pyright: ignore[reportCallIssue]
+@eqx.filter_jit(compiler_options=COMPILE_QUICKLY)  # pyright: ignore[reportCallIssue]
 def _linearise(residual: Residual, points: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Residuals (s, n) and Jacobians (s, n, d) at points (s, d)."""
     return eqx.filter_vmap(lambda x: (residual(x), jax.jacfwd(residual)(x)))(points)
 
 
 # Equinox hands the options of jax.jit on; its annotations leave them out.
-@eqx.filter_jit(compiler_options=QUICK_COMPILE)  # pyright: ignore[reportCallIssue]
+@eqx.filter_jit(compiler_options=COMPILE_QUICKLY)  # pyright: ignore[reportCallIssue]
 def _solve(
     residual: Residual,
     start: jax.Array,
@@ -238,8 +251,9 @@ def _solve(
     normal_equations: bool,
 ) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
     """From one start (d,): x (d,), steps, result code."""
+    function = _with_jacobian(lambda v: residual(v * scale) / unit)
     solution = optx.least_squares(
-        lambda v, _: residual(v * scale) / unit,
+        lambda v, _: function(v),
         optx.LevenbergMarquardt(
             rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR()
         ),
@@ -250,15 +264,36 @@ def _solve(
     return solution.value * scale, solution.stats["num_steps"], solution.result
 
 
-def _scales(jacobian: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Scale of each parameter (d,) and unit of the residuals (): the largest column norm in the scaled parameters."""
-    column_norm = jnp.linalg.norm(jacobian, axis=0)
-    size = jnp.abs(start)
-    strongest = jnp.max(column_norm * size)
+def _with_jacobian(function: Residual) -> Residual:
+    """``function`` whose tangents come from its whole Jacobian, found in one pass with its value.
+
+    The solver linearises and then asks for every column: this compiles a third faster than transposing its way there.
+    """
+
+    def twice(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value = function(v)
+        return value, value
+
+    wrapped = jax.custom_jvp(function)
+
+    @wrapped.defjvp
+    def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+        jacobian, value = jax.jacfwd(twice, has_aux=True)(*primals)
+        return value, jacobian @ tangents[0]
+
+    return wrapped
+
+
+def _scales(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
+    column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
+    # Not finite: the solver will say so.
+    column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
+    strongest = np.max(column_norm * size)
     # All starts at zero: there is no size to compare with, so every parameter counts as equally strong.
-    step = jnp.where(strongest > 0, SMALLEST_EFFECT * strongest, 1.0) / column_norm
-    scale = jnp.maximum(size, jnp.where(column_norm > 0, step, 0.0))
+    step = SMALLEST_EFFECT * strongest if strongest > 0 else 1.0
+    scale = np.maximum(size, np.divide(step, column_norm, out=np.zeros_like(size), where=column_norm > 0))
     # Neither a start nor an effect: any scale does, the parameter will not move.
-    scale = jnp.where(scale > 0, scale, 1.0)
-    unit = jnp.max(column_norm * scale)
-    return scale, jnp.where(unit > 0, unit, 1.0)
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = float(np.max(column_norm * scale))
+    return scale, unit if unit > 0 else 1.0

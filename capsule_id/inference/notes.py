@@ -114,8 +114,8 @@ def bic(target: LogPosterior, fit: PointFit) -> float:
     unknowns, readings, deviance = target.dimension, 0, 0.0
     for e in target.experiments:
         theta = e.local(values)
-        misfit, rest = e.misfit(theta, np), np.asarray(e.residuals(theta, np))[: e.n]
-        deviance += float(rest @ rest + e.n * LOG_2PI + 2.0 * np.sum(np.log(np.asarray(misfit.sd))))
+        misfit, rest = e.misfit(theta), np.asarray(e.residuals(theta, np))[: e.n]
+        deviance += float(rest @ rest + e.n * LOG_2PI + 2.0 * np.sum(np.log(misfit.sd)))
         unknowns += misfit.design.shape[1]
         readings += e.n
     return unknowns * float(np.log(readings)) + deviance

@@ -1,29 +1,33 @@
 """Maximum of the joint log-posterior from several starts.
 
 Least squares first (it finds the basin, with the scatters held at their starting values), then quasi-Newton on the
-joint log-posterior, scatters included, in coordinates whitened by the curvature at the best least-squares end.
+joint log-posterior, scatters included, in coordinates whitened by the curvature at the best least-squares end. The
+second step has its gradients from batches of log-posteriors: compiled for the Hessian anyhow, where a gradient by
+reverse mode would take seconds to compile, and milliseconds to run.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
+from scipy import optimize
 
-from capsule_id.inference.curvature import hessian, jacobian, root_of_inverse
-from capsule_id.inference.density import HeldResiduals, Numbers, Structure, log_posterior
-from capsule_id.inference.least_squares import QUICK_COMPILE, covariance, least_squares
+from capsule_id.inference.curvature import BATCH, gradient, hessian, in_batches, jacobian, root_of_inverse
+from capsule_id.inference.density import HeldResiduals
+from capsule_id.inference.least_squares import covariance, least_squares
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit
 
 STARTS = 5
 #: Ends count as the same where they differ by less than this many posterior standard deviations.
 AGREEMENT = 0.05
-#: Of a quasi-Newton step, in posterior standard deviations, and of the log-posterior.
-TOLERANCE = 1e-6
+#: Quasi-Newton stops where the gradient, per posterior standard deviation, is below the first; its end counts as a
+#: maximum below the second (rounding of the log-posterior may stop it earlier).
+TOLERANCE, MAXIMUM = 1e-5, 1e-3
 MAX_STEPS = 400
+#: Stands for the log-posterior where there is none: line searches need a number.
+NOWHERE = -1e12
 LEAST_SQUARES_TOLERANCE = 1e-6
 #: Least squares only has to find the basin. A damping term that is not there runs to zero, which its logarithm never
 #: reaches: the prior stops it, and quasi-Newton finds that in fewer steps.
@@ -41,18 +45,23 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
     """
     starts = dispersed_starts(target, seed, number_of_starts)
     located = np.flatnonzero(~target.scatter)
-    rough = least_squares(
-        HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(starts[0])),
-        starts[:, located],
-        tolerance=LEAST_SQUARES_TOLERANCE,
-        max_steps=LEAST_SQUARES_STEPS,
-        normal_equations=True,
-    )
+    # The log-posterior compiles while least squares does.
+    with ThreadPoolExecutor(1) as pool:
+        compiled = pool.submit(target.batch, np.repeat(starts[:1], BATCH, axis=0))
+        rough = least_squares(
+            HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(starts[0])),
+            starts[:, located],
+            tolerance=LEAST_SQUARES_TOLERANCE,
+            max_steps=LEAST_SQUARES_STEPS,
+            normal_equations=True,
+            linearise=partial(_linearise, target, starts[0]),
+        )
+        compiled.result()
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
     scale = _information(target, ends[rough.best]) ** -0.5
     whitening = root_of_inverse(-hessian(target.batch, ends[rough.best], scale))
-    polished = [_polish(target.structure, target.numbers, end, whitening) for end in ends]
+    polished = [_polish(target, end, whitening) for end in ends]
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     scale = _information(target, u[best]) ** -0.5
@@ -85,21 +94,37 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     return centre + spread * z
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILE)
-def _polish(structure: Structure, numbers: Numbers, end: Any, whitening: Any) -> tuple[Any, Any, Any]:
-    """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged.
+def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged."""
 
-    Compiled with few optimisations: it runs for milliseconds, and compiling it well takes seconds.
-    """
-    solution = optx.minimise(
-        lambda v, _: -log_posterior(structure, numbers, end + whitening @ v),
-        optx.BFGS(rtol=TOLERANCE, atol=TOLERANCE),
-        jnp.zeros(end.shape),
-        max_steps=MAX_STEPS,
-        throw=False,
+    def negative(v: np.ndarray) -> np.ndarray:
+        """(m,) of whitened v (m, d)."""
+        value = in_batches(target.batch, end + v @ whitening.T)
+        return -np.where(np.isfinite(value), value, NOWHERE)
+
+    solution = optimize.minimize(
+        lambda v: float(negative(v[None])[0]),
+        np.zeros(len(end)),
+        jac=lambda v: gradient(negative, v),
+        method="BFGS",
+        options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
     )
-    u = end + whitening @ solution.value
-    return u, log_posterior(structure, numbers, u), solution.result == optx.RESULTS.successful
+    value = -float(solution.fun)
+    return end + whitening @ solution.x, value, value > NOWHERE and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
+
+
+def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (s, n) and Jacobians (s, n, d) at located u (s, d), the scatters those of ``start``; not compiled."""
+    located = np.flatnonzero(~target.scatter)
+
+    def residuals(v: np.ndarray) -> np.ndarray:
+        u = start.copy()
+        u[located] = v
+        with np.errstate(all="ignore"):
+            return target.plain_residuals(u)
+
+    step = np.full(len(located), DIFFERENCE)
+    return np.stack([residuals(v) for v in points]), np.stack([jacobian(residuals, v, step) for v in points])
 
 
 def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:

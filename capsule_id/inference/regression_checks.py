@@ -41,12 +41,12 @@ def design(experiment: Experiment, theta: Theta) -> tuple[np.ndarray, np.ndarray
 
     def residuals(v: np.ndarray) -> np.ndarray:
         moved = {**theta, **dict(zip(symbols, v, strict=True))}
-        return np.asarray(experiment.misfit(moved, np).raw)
+        return experiment.misfit(moved).raw
 
-    misfit = experiment.misfit(theta, np)
-    sd, at = np.asarray(misfit.sd), np.array([float(theta[s]) for s in symbols])
+    misfit = experiment.misfit(theta)
+    sd, at = misfit.sd, np.array([float(theta[s]) for s in symbols])
     raw = jacobian(residuals, at, DIFFERENCE * np.maximum(np.abs(at), 1e-12)) / sd[:, None]
-    columns = np.concatenate([raw, np.asarray(misfit.design) / sd[:, None]], axis=1)
+    columns = np.concatenate([raw, misfit.design / sd[:, None]], axis=1)
     columns = columns / np.linalg.norm(columns, axis=0)
     return np.asarray(experiment.residuals(theta, np))[: experiment.n], columns
 
@@ -86,9 +86,9 @@ def _studentised(r: np.ndarray, columns: np.ndarray, known: bool) -> tuple[np.nd
 
 def curvature_test(line: Line, theta: Theta, left_out: list[int]) -> tuple[float, float]:
     """Is a calibration line bent? Relative departure at mid range of the best parabola, and the p-value of "none"."""
-    misfit = line.misfit(theta, np)
+    misfit = line.misfit(theta)
     keep = np.setdiff1d(np.arange(line.n), left_out)
-    x, sd = line.x[keep], np.asarray(misfit.sd)[keep]
+    x, sd = line.x[keep], misfit.sd[keep]
     if len(keep) < 4 or len(np.unique(x)) < 3:
         return 0.0, 1.0
     z = (x - np.mean(x)) / np.ptp(x)
@@ -120,15 +120,15 @@ def refit(experiment: Experiment, theta: Theta, left_out: list[int]) -> dict[str
 
     def residuals(w: np.ndarray) -> np.ndarray:
         moved = {**theta, **dict(zip(symbols, values_of(w), strict=True))}
-        misfit = experiment.misfit(moved, np)
-        sd = np.asarray(misfit.sd)[keep]
-        y = np.asarray(misfit.raw)[keep] / sd
-        a = np.asarray(misfit.design)[keep] / sd[:, None]
+        misfit = experiment.misfit(moved)
+        sd = misfit.sd[keep]
+        y = misfit.raw[keep] / sd
+        a = misfit.design[keep] / sd[:, None]
         return y - a @ np.linalg.lstsq(a, y, rcond=None)[0] if a.shape[1] else y
 
     start = np.ones(len(at)) if falls else np.zeros(len(at))
     solution = least_squares(residuals, start, method="lm", x_scale="jac")
-    nuisances = experiment.misfit(theta, np).design.shape[1]
+    nuisances = experiment.misfit(theta).design.shape[1]
     freedom = len(keep) - len(symbols) - nuisances
     scale = 1.0 if experiment.scale_known else float(2.0 * solution.cost / max(freedom, 1))
     covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * scale

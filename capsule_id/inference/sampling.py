@@ -1,29 +1,28 @@
 """emcee: independent ensembles, run until they agree or the budget is spent, saved while they run."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import emcee
 import numpy as np
 
 from capsule_id.inference.chain_store import ChainStore
-from capsule_id.inference.curvature import in_batches
 from capsule_id.inference.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
-from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.moves import Moves, candidates, differential_evolution
-from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.moves import Moves, block_move, candidates
+from capsule_id.inference.result import Posterior
 
 ENSEMBLES = 4
-#: Walkers of an ensemble: at least 64, and at least three for every parameter.
-MIN_WALKERS, WALKERS_PER_PARAMETER = 64, 3
+#: Walkers of an ensemble: one batch of the log-posterior, or more, and at least three for every parameter.
+MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 3
 #: A sample is long enough when every parameter has more draws than this many autocorrelation times ...
 LENGTH_IN_TAU = 50.0
 #: ... and its ensembles agree when no split R-hat is above this.
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first check, and between the checks that follow.
-FIRST_CHECK, CHECK_EVERY = 120, 60
+FIRST_CHECK, CHECK_EVERY = 120, 30
 #: Autocorrelation times (of the pilot) that every ensemble runs before its first stored draw.
 BURN_IN_IN_TAU = 8.0
 #: Walkers start this much wider than the Laplace approximation.
@@ -32,8 +31,10 @@ DEFAULT_BUDGET = 20_000
 #: One draw is stored per this part of the pilot's autocorrelation time, but at least one per MAX_THIN steps: a short
 #: pilot knows that time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
-#: Steps of the pilot's burn-in, and of each candidate move that it times.
-PILOT_BURN_IN, PILOT_STEPS = 300, 300
+#: Steps of the pilot's burn-in, half of which shapes the block proposal, and of the moves that it times.
+PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
+#: The pilot looks no further once a move has an autocorrelation time, in steps, below this.
+GOOD_TAU = 10.0
 
 Progress = Callable[[int, int, str], None]
 
@@ -49,9 +50,24 @@ class Schedule:
     burn_in: int
 
 
+class Target(Protocol):
+    """What is sampled; see ``capsule_id.inference.marginal.MarginalPosterior``."""
+
+    names: tuple[str, ...]
+    dimension: int
+    blocks: list[np.ndarray]
+    centre: np.ndarray
+    covariance: np.ndarray
+
+    def parts(self, v: np.ndarray) -> np.ndarray: ...
+
+    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def theta(self, u: np.ndarray) -> np.ndarray: ...
+
+
 def sample(
-    target: LogPosterior,
-    fit: PointFit,
+    target: Target,
     seed: int,
     budget: int = DEFAULT_BUDGET,
     store: Path | None = None,
@@ -68,55 +84,69 @@ def sample(
     """
     report = progress or (lambda done, total, text: None)
     report(0, 1, "pilot")
-    seeds = np.random.SeedSequence(seed).generate_state(ENSEMBLES + 1)
-    schedule = pilot(target, fit, int(seeds[0]))
-    chains = None if store is None else ChainStore(store)
-    samplers = [_sampler(target, fit, schedule, int(s), i, store) for i, s in enumerate(seeds[1:])]
-    last = max(budget // schedule.thin, 2)
-    draws = np.empty((ENSEMBLES, 0, 0, target.dimension))
-    tau, converged = np.empty((ENSEMBLES, target.dimension)), False
-    for goal in _checks(last):
-        if goal < last and all(sampler.iteration > goal for sampler in samplers):
-            continue
-        for sampler in samplers:
-            for _ in _advance(sampler, goal, schedule.thin):
-                if chains is not None:
-                    chains.between_draws()
-                report(sum(s.iteration for s in samplers), ENSEMBLES * goal, schedule.move)
-        draws = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
-        tau, rhat = ensemble_time(draws), split_rhat(draws)
-        converged = bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
-        if converged:
-            break
-    if chains is not None:
-        chains.save()
+    pilot_seed, restore_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 2))
+    schedule = pilot(target, pilot_seed)
+    with nullcontext() if store is None else ChainStore(store) as chains:
+        backends = [None if chains is None else chains.backend(f"ensemble_{i}") for i in range(ENSEMBLES)]
+        samplers = [_sampler(target, schedule, *one) for one in zip(seeds, backends, strict=True)]
+        done = [sampler.iteration for sampler in samplers]
+        draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
+        last = max(budget // schedule.thin, 2)
+        for goal in _checks(last):
+            if goal < last and min(done) > goal:
+                continue
+            for i, sampler in enumerate(samplers):
+                for _ in _advance(sampler, goal - done[i], schedule.thin):
+                    done[i] += 1
+                    if chains is not None:
+                        chains.between_draws()
+                    report(sum(done), ENSEMBLES * goal, schedule.move)
+            located = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
+            if goal == last or _converged(located):
+                draws, lp = target.restore(located, restore_seed)
+                if _converged(draws):
+                    break
+        if chains is not None:
+            chains.save()
+        acceptance = np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers])
+    theta = target.theta(draws)
     return Posterior(
         names=target.names,
-        draws=target.theta(draws),
-        lp=np.stack([np.asarray(sampler.get_log_prob())[: draws.shape[1]] for sampler in samplers]),
-        acceptance=np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers]),
-        tau=np.max(tau, axis=0),
-        rhat=split_rhat(target.theta(draws)),
-        ess=effective_sample_size(draws, integrated_time(target.theta(draws))),
-        converged=converged,
+        draws=theta,
+        lp=lp,
+        acceptance=acceptance,
+        tau=np.max(ensemble_time(draws), axis=0),
+        rhat=split_rhat(theta),
+        ess=effective_sample_size(draws, integrated_time(theta)),
+        converged=_converged(draws),
         moves={schedule.move: schedule.measured[schedule.move], **schedule.measured},
         steps=draws.shape[1] * schedule.thin,
         thin=schedule.thin,
     )
 
 
-def pilot(target: LogPosterior, fit: PointFit, seed: int) -> Schedule:
-    """Burn in one ensemble, then measure the autocorrelation time of every candidate move on it."""
+def _converged(draws: np.ndarray) -> bool:
+    """Long enough and in agreement: (ensemble, draw, walker, d)."""
+    tau, rhat = ensemble_time(draws), split_rhat(draws)
+    return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
+
+
+def pilot(target: Target, seed: int) -> Schedule:
+    """Burn in one ensemble, then measure the autocorrelation time of candidate moves on it until one is good."""
     random = np.random.RandomState(seed)
-    state: Any = emcee.State(_initial(target, fit, random), random_state=random.get_state())
-    sampler = _ensemble(target, state.coords.shape[0], differential_evolution())
-    state = sampler.run_mcmc(state, 2 * PILOT_BURN_IN)
-    sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN, flat=True))
+    state: Any = emcee.State(_initial(target, random), random_state=random.get_state())
+    rough = block_move(target.blocks, target.centre, OVERDISPERSION**2 * target.covariance)
+    sampler = _ensemble(target, state.coords.shape[0], rough)
+    state = sampler.run_mcmc(state, PILOT_BURN_IN)
+    sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN // 2, flat=True))
     measured, moves = {}, candidates(sample, target.blocks)
-    for name, candidate in moves.items():
-        sampler = _ensemble(target, state.coords.shape[0], candidate)
-        state = sampler.run_mcmc(state, PILOT_STEPS)
+    # The most promising one first, briefly; where it is not good, all of them for longer.
+    for name, steps in [(next(iter(moves)), PILOT_STEPS), *((name, LONG_PILOT_STEPS) for name in moves)]:
+        sampler = _ensemble(target, state.coords.shape[0], moves[name])
+        state = sampler.run_mcmc(state, steps)
         measured[name] = float(np.max(ensemble_time(np.asarray(sampler.get_chain())[None])))
+        if measured[name] < GOOD_TAU:
+            break
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
@@ -132,9 +162,8 @@ def _checks(last: int) -> Iterator[int]:
     yield last
 
 
-def _advance(sampler: emcee.EnsembleSampler, goal: int, thin: int) -> Iterator[emcee.State]:
-    """Run until ``goal`` draws are stored; every draw is saved as it is made."""
-    missing = goal - sampler.iteration
+def _advance(sampler: emcee.EnsembleSampler, missing: int, thin: int) -> Iterator[emcee.State]:
+    """Run until ``missing`` more draws are stored; every draw is saved as it is made."""
     if missing > 0:
         for state in sampler.sample(sampler._previous_state, iterations=missing, thin_by=thin, store=True):
             # emcee keeps no state of a run that is iterated over: the next call would start from the same one again.
@@ -142,13 +171,10 @@ def _advance(sampler: emcee.EnsembleSampler, goal: int, thin: int) -> Iterator[e
             yield state
 
 
-def _sampler(
-    target: LogPosterior, fit: PointFit, schedule: Schedule, seed: int, number: int, store: Path | None
-) -> emcee.EnsembleSampler:
-    """One ensemble: burnt in from its own overdispersed start, or taken up where ``store`` left it."""
+def _sampler(target: Target, schedule: Schedule, seed: int, backend: Any) -> emcee.EnsembleSampler:
+    """One ensemble: burnt in from its own overdispersed start, or taken up where ``backend`` left it."""
     random = np.random.RandomState(seed)
-    start = _initial(target, fit, random)
-    backend: Any = None if store is None else emcee.backends.HDFBackend(str(store), name=f"ensemble_{number}")
+    start = _initial(target, random)
     if backend is not None and backend.initialized and backend.iteration > 0:
         sampler = _ensemble(target, len(start), schedule.moves, backend)
         sampler._previous_state = backend.get_last_sample()
@@ -162,21 +188,23 @@ def _sampler(
     return sampler
 
 
-def _ensemble(target: LogPosterior, walkers: int, moves: Moves, backend: Any = None) -> emcee.EnsembleSampler:
-    def log_density(u: np.ndarray) -> np.ndarray:
-        return in_batches(target.batch, u)
+def _ensemble(target: Target, walkers: int, moves: Moves, backend: Any = None) -> emcee.EnsembleSampler:
+    def log_density(v: np.ndarray) -> np.ndarray:
+        """(w, 1 + blocks): emcee keeps what follows the log-density as blobs, and ``BlockMove`` reads them."""
+        parts = target.parts(v)
+        return np.concatenate([np.sum(parts, axis=1, keepdims=True), parts], axis=1)
 
     return emcee.EnsembleSampler(walkers, target.dimension, log_density, vectorize=True, moves=moves, backend=backend)
 
 
-def _initial(target: LogPosterior, fit: PointFit, random: np.random.RandomState) -> np.ndarray:
+def _initial(target: Target, random: np.random.RandomState) -> np.ndarray:
     """(walkers, d) from the widened Laplace approximation, every one where the posterior is not zero."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
-    root = OVERDISPERSION * np.linalg.cholesky(fit.covariance)
-    u = fit.u + random.standard_normal((walkers, target.dimension)) @ root.T
+    root = OVERDISPERSION * np.linalg.cholesky(target.covariance)
+    u = target.centre + random.standard_normal((walkers, target.dimension)) @ root.T
     for _ in range(100):
-        bad = ~np.isfinite(in_batches(target.batch, u))
+        bad = ~np.all(np.isfinite(target.parts(u)), axis=1)
         if not bad.any():
             return u
-        u[bad] = fit.u + random.standard_normal((int(bad.sum()), target.dimension)) @ root.T
+        u[bad] = target.centre + random.standard_normal((int(bad.sum()), target.dimension)) @ root.T
     raise RuntimeError("no finite log-posterior near the point fit: the Laplace approximation does not hold there")

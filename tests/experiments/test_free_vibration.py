@@ -12,8 +12,8 @@ import pytest
 
 from capsule_id.experiments.decay_moments import fold
 from capsule_id.experiments.free_vibration import FreeVibration, autocorrelation
+from capsule_id.inference.compiling import COMPILE_QUICKLY
 from capsule_id.inference.experiment_checks import ljung_box
-from capsule_id.inference.least_squares import QUICK_COMPILE
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_fit import point_fit
 
@@ -61,7 +61,7 @@ def cramer_rao() -> np.ndarray:
     return (np.sqrt(np.diag(np.linalg.inv((j / scale).T @ (j / scale)))) / scale)[:2]
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=QUICK_COMPILE)
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILE_QUICKLY)
 def _newton(first: FreeVibration, values: Any, folded: Any) -> tuple[Any, Any]:
     """Maxima (count, 3) of the package's log-likelihood of each record in ln k1, ln c, ln noise; standard errors."""
 

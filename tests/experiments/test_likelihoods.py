@@ -212,7 +212,7 @@ class TestPointwise:
     def test_chib_identity(self) -> None:
         """log p(y) = log p(y|b) + log p(b) - log p(b|y) for whichever b was drawn."""
         experiment = record(UNIFORM)
-        misfit = experiment.misfit(self.THETA, np)
+        misfit = experiment.misfit(self.THETA)
         y, a = misfit.raw / misfit.sd, misfit.design / misfit.sd[:, None]
         covariance = np.linalg.inv(np.eye(3) + a.T @ a)
         marginal = float(experiment.log_likelihood(self.THETA, np))
@@ -231,7 +231,7 @@ class TestPointwise:
     def test_mean_over_draws(self) -> None:
         """E sum log p(y_i|b) over b|y: the residual sum of squares at the mean, and 3 degrees of freedom less."""
         experiment = record(UNIFORM)
-        misfit = experiment.misfit(self.THETA, np)
+        misfit = experiment.misfit(self.THETA)
         a = misfit.design / misfit.sd[:, None]
         at_mean = np.sum(np.asarray(experiment.residuals(self.THETA, np))[:160] ** 2)
         spread = np.trace(np.linalg.solve(np.eye(3) + a.T @ a, a.T @ a))
@@ -250,7 +250,7 @@ def test_predictive_p_counts_replicates() -> None:
     draws: list[Theta] = [{"k1": 1420.0, "c": 3.89, "noise_sd": s, **MASSES} for s in (1.8e-5, 2e-5, 2.2e-5)]
     exceed = []
     for theta in draws:
-        misfit = experiment.misfit(theta, np)
+        misfit = experiment.misfit(theta)
         b = np.linalg.lstsq(misfit.design, misfit.raw, rcond=None)[0]
         observed = np.sum(((misfit.raw - misfit.design @ b) / misfit.sd) ** 2)
         exceed.append(np.mean(np.sum(rng.standard_normal((4000, 160)) ** 2, axis=1) > observed + 3.0))

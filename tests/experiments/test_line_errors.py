@@ -24,7 +24,7 @@ def slopes(replicates: int, along: bool) -> np.ndarray:
         def objective(slope: float, line: MotorCurrent = line) -> float:
             theta = {"K": slope}
             value = float(line.log_likelihood(theta, np))
-            return -(value if along else value - float(np.sum(line.misfit(theta, np).log_measure)))
+            return -(value if along else value - float(np.sum(line.misfit(theta).log_measure)))
 
         found.append(minimize_scalar(objective, bounds=(1.0, 3.0), method="bounded").x)
     return np.array(found)

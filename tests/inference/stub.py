@@ -3,13 +3,12 @@
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Experiment, Misfit, Start, Theta, no_design
-from capsule_id.inference.result import PointFit
+from capsule_id.experiments.base import Experiment, Start, Theta, no_design
+from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 from capsule_id.views import Comparison
@@ -39,8 +38,8 @@ class Nothing(Experiment):
     def observed(self) -> np.ndarray:
         return np.zeros(0)
 
-    def misfit(self, theta: Theta, xp: ModuleType = jnp) -> Misfit:
-        return Misfit(xp.zeros(0), xp.ones(0), no_design(0, xp))
+    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+        return (Misfit(xp.zeros(0), 1.0, 0.0, no_design(0, xp)),)
 
     def starts(self) -> dict[str, Start]:
         return {}
@@ -50,28 +49,33 @@ class Nothing(Experiment):
 
 
 class Gaussian:
-    """A known normal density in the place of a ``LogPosterior``: what the sampler asks of one, and no more."""
+    """A known normal density in the place of a ``MarginalPosterior``: what the sampler asks of one, and no more.
 
-    def __init__(self, mean: np.ndarray, covariance: np.ndarray) -> None:
-        self.mean, self.covariance = mean, covariance
-        self.precision = np.linalg.inv(covariance)
+    The approximation that it offers to start from is ``OFF`` sds off and ``WIDE`` times too wide.
+    """
+
+    OFF, WIDE = 0.5, 1.3
+
+    def __init__(self, mean: np.ndarray, sigma: np.ndarray, blocks: Sequence[np.ndarray] | None = None) -> None:
+        self.mean, self.sigma = mean, sigma
         self.names = tuple(f"x{i}" for i in range(len(mean)))
         self.dimension = len(mean)
-        self.blocks = [np.arange(len(mean))]
+        self.blocks = [np.arange(len(mean))] if blocks is None else list(blocks)
+        self.precisions = [np.linalg.inv(sigma[np.ix_(block, block)]) for block in self.blocks]
+        self.centre = mean + self.OFF * np.sqrt(np.diag(sigma))
+        self.covariance = self.WIDE**2 * sigma
 
-    def batch(self, u: Any) -> np.ndarray:
-        """(w, d) -> (w,)."""
-        d = np.asarray(u) - self.mean
-        return -0.5 * np.einsum("wi,ij,wj->w", d, self.precision, d)
+    def parts(self, v: np.ndarray) -> np.ndarray:
+        """(w, d) -> (w, blocks)."""
+        d = v - self.mean
+        pairs = zip(self.blocks, self.precisions, strict=True)
+        return np.stack([-0.5 * np.einsum("wi,ij,wj->w", d[:, b], p, d[:, b]) for b, p in pairs], axis=1)
+
+    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Nothing was integrated out."""
+        del seed
+        flat = draws.reshape(-1, self.dimension)
+        return draws, np.sum(self.parts(flat), axis=1).reshape(draws.shape[:-1])
 
     def theta(self, u: np.ndarray) -> np.ndarray:
         return u
-
-    def fit(self, off: float = 0.5, wide: float = 1.3) -> PointFit:
-        """A Laplace approximation that is ``off`` sds off and ``wide`` times too wide."""
-        sd = np.sqrt(np.diag(self.covariance))
-        u = self.mean + off * sd
-        none = np.zeros((1, self.dimension))
-        return PointFit(
-            self.names, u, {}, wide**2 * self.covariance, {}, none, none, np.zeros(1), True, np.zeros(1, dtype=bool)
-        )

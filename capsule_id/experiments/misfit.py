@@ -1,0 +1,136 @@
+"""By how much readings miss a model, and their density as a function of one scatter.
+
+The forward model is evaluated once; a scatter only changes standard deviations, so that the density of the readings at
+many values of it costs little more than at one.
+"""
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.linear import LOG_2PI, conditional_draw, conditional_mean, marginal_log_density
+
+
+@dataclass(frozen=True)
+class ScaledMisfit:
+    """A misfit at one value of its scatter.
+
+    Attributes
+    ----------
+    raw : (n,) measured minus predicted
+    sd : (n,) its standard deviation
+    design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
+    log_measure : (n,) what the measure of an integrated true abscissa adds to the log-density of each reading
+    """
+
+    raw: Any
+    sd: Any
+    design: Any
+    log_measure: Any
+
+    def moments(self) -> tuple[Any, Any, Any]:
+        """y'y, A'y, A'A in units of the noise."""
+        y, a = self.raw / self.sd, self.design / self.sd[:, None]
+        return y @ y, a.T @ y, a.T @ a
+
+    def at_nuisance_mean(self, xp: ModuleType = jnp) -> tuple[Any, Any]:
+        """Residuals (n,) in units of the noise at the conditional mean of the nuisances, and that mean (p,)."""
+        if self.design.shape[1] == 0:
+            return self.raw / self.sd, xp.zeros(0)
+        _, ay, aa = self.moments()
+        b = conditional_mean(ay, aa, xp)
+        return (self.raw - self.design @ b) / self.sd, b
+
+    def at_nuisance_draw(self, rng: np.random.Generator) -> np.ndarray:
+        """Residuals (n,) in units of the noise at one draw of the nuisances given the readings."""
+        raw = self.raw
+        if self.design.shape[1]:
+            _, ay, aa = self.moments()
+            raw = raw - self.design @ conditional_draw(ay, aa, rng)
+        return raw / self.sd
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Readings of one common variance, ``fixed_variance + (scale scatter)^2``: their moments say it all.
+
+    Attributes
+    ----------
+    yy, ay, aa : (), (p,), (p, p) y'y, A'y, A'A, not divided by the noise
+    n : number of readings
+    ordinate : () and (), see ``Misfit``
+    """
+
+    yy: Any
+    ay: Any
+    aa: Any
+    n: int
+    fixed_variance: Any
+    scale: Any = 1.0
+    ordinate: tuple[Any, Any] | None = None
+
+    def log_density(self, scatter: Any, xp: ModuleType = jnp) -> Any:
+        """Natural, normalised log-density of the readings at ``scatter`` (...), nuisances integrated out; (...)."""
+        scatter = xp.asarray(scatter)
+        v = _variance(self.fixed_variance, self.scale, scatter)
+        own = v if self.ordinate is None else _variance(*self.ordinate, scatter)
+        ay, aa = self.ay / v[..., None], self.aa / v[..., None, None]
+        return marginal_log_density(self.yy / v, ay, aa, self.n, xp) - 0.5 * self.n * xp.log(own)
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """By how much the readings of one group miss a model, at any value of their scatter.
+
+    Variance of a reading: fixed_variance + (scale scatter)^2.
+
+    Attributes
+    ----------
+    raw : (n,) measured minus predicted
+    fixed_variance, scale : () or (n,); both () where all readings have one variance
+    design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
+    ordinate : fixed variance and scale of the readings' own error where true abscissas were integrated out along the
+        model (errors in both columns, see ``capsule_id.experiments.line``): it normalises the density
+    """
+
+    raw: Any
+    fixed_variance: Any
+    scale: Any
+    design: Any
+    ordinate: tuple[Any, Any] | None = None
+
+    def at(self, scatter: Any, xp: ModuleType = jnp) -> ScaledMisfit:
+        """At one value of the scatter, ()."""
+        one = xp.ones(self.raw.shape[0])
+        variance = _variance(self.fixed_variance, self.scale, scatter) * one
+        own = variance if self.ordinate is None else _variance(*self.ordinate, scatter) * one
+        return ScaledMisfit(self.raw, xp.sqrt(variance), self.design, 0.5 * xp.log(variance / own))
+
+    def summary(self) -> "Misfit | Moments":
+        """Moments, where all readings have one variance."""
+        numbers = (self.fixed_variance, self.scale, *(self.ordinate or ()))
+        if any(np.ndim(number) for number in numbers):
+            return self
+        y, a = self.raw, self.design
+        return Moments(y @ y, a.T @ y, a.T @ a, y.shape[0], self.fixed_variance, self.scale, self.ordinate)
+
+    def log_density(self, scatter: Any, xp: ModuleType = jnp) -> Any:
+        """Natural, normalised log-density of the readings at ``scatter`` (...), nuisances integrated out; (...)."""
+        scatter = xp.asarray(scatter)[..., None]
+        n, one = self.raw.shape[0], xp.ones(self.raw.shape[0])
+        variance = _variance(self.fixed_variance, self.scale, scatter) * one
+        own = variance if self.ordinate is None else _variance(*self.ordinate, scatter) * one
+        log_scale = -0.5 * xp.sum(xp.log(own), axis=-1)
+        yy = xp.sum(self.raw**2 / variance, axis=-1)
+        if self.design.shape[1] == 0:
+            return log_scale - 0.5 * (n * LOG_2PI + yy)
+        weighted = self.design / variance[..., None]
+        ay, aa = xp.sum(self.raw[:, None] * weighted, axis=-2), xp.swapaxes(weighted, -1, -2) @ self.design
+        return marginal_log_density(yy, ay, aa, n, xp) + log_scale
+
+
+def _variance(fixed: Any, scale: Any, scatter: Any) -> Any:
+    return fixed + (scale * scatter) ** 2

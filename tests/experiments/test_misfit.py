@@ -1,0 +1,51 @@
+"""A misfit's density at many values of its scatter, against SciPy at each of them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from capsule_id.experiments.misfit import Misfit, Moments
+
+RNG = np.random.default_rng(5)
+RAW, DESIGN = RNG.standard_normal(7), RNG.standard_normal((7, 3))
+SCATTERS = np.array([[0.1, 0.7], [2.0, 5.0]])
+ONE_VARIANCE = Misfit(RAW, 0.3, 1.5, DESIGN)
+CASES = {
+    "one variance": ONE_VARIANCE,
+    "no nuisance": Misfit(RAW, 0.0, 1.0, np.zeros((7, 0))),
+    "unequal": Misfit(RAW, np.linspace(0.1, 2.0, 7), np.linspace(1.0, 3.0, 7), DESIGN),
+    "unequal, no nuisance": Misfit(RAW, 0.2, np.linspace(1.0, 3.0, 7), np.zeros((7, 0))),
+}
+
+
+def by_scipy(misfit: Misfit, scatter: float) -> float:
+    variance = (misfit.fixed_variance + (misfit.scale * scatter) ** 2) * np.ones(7)
+    covariance = np.diag(variance) + misfit.design @ misfit.design.T
+    return float(stats.multivariate_normal.logpdf(misfit.raw, np.zeros(7), covariance))
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize("case", CASES)
+def test_density_at_many_scatters(case: str, xp: object) -> None:
+    misfit = CASES[case]
+    expected = [[by_scipy(misfit, s) for s in row] for row in SCATTERS]
+    for part in (misfit, misfit.summary()):
+        found = part.log_density(SCATTERS, xp)  # type: ignore[arg-type]
+        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-12)
+        assert float(part.log_density(0.7, xp)) == pytest.approx(expected[0][1], rel=1e-12)  # type: ignore[arg-type]
+
+
+def test_moments_only_where_one_variance_holds() -> None:
+    kinds = {case: isinstance(misfit.summary(), Moments) for case, misfit in CASES.items()}
+    assert kinds == {"one variance": True, "no nuisance": True, "unequal": False, "unequal, no nuisance": False}
+
+
+def test_the_ordinate_normalises() -> None:
+    """The scaled misfit's ``log_measure`` and the density at many scatters say the same of an integrated abscissa."""
+    misfit = Misfit(RAW, 0.3, 1.5, DESIGN, (0.2, 1.0))
+    measure = misfit.at(0.7, np).log_measure
+    np.testing.assert_allclose(measure, 0.5 * np.log((0.3 + 1.5**2 * 0.49) / (0.2 + 0.49)))
+    for part in (misfit, misfit.summary()):
+        difference = float(part.log_density(0.7, np)) - float(ONE_VARIANCE.log_density(0.7, np))
+        assert difference == pytest.approx(np.sum(measure), rel=1e-12)
