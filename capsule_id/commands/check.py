@@ -6,7 +6,7 @@ from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.lint import lint
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
 
 
@@ -26,10 +26,19 @@ def run(args: argparse.Namespace) -> int:
     rig = read_rig(args.data)
     lines = [f"{rig.name}: {len(rig.tables)} experiments{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
-    findings = lint(rig)
+    findings = [*lint(rig), *_feasibility(rig)]
     lines += [f"lint: {finding}" for finding in findings]
     say("\n".join([*lines, f"{len(findings)} findings" if findings else "no findings"]))
     return 0
+
+
+def _feasibility(rig: Rig) -> list[str]:
+    """What the settings of forced runs cannot do, a line each; the physics is loaded where there are such runs only."""
+    if not any(table.kind == "forced_run" for table in rig.tables):
+        return []
+    from capsule_id.experiments.rough_values import lint_runs
+
+    return [finding.text for finding in lint_runs(rig)]
 
 
 def _summary(table: Table) -> str:
