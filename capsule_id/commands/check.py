@@ -7,7 +7,7 @@ from capsule_id.errors import InputError
 from capsule_id.records.text import describe_run, run_warning
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.lint import lint
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
 
 
@@ -30,10 +30,20 @@ def run(args: argparse.Namespace) -> int:
     runs = [table for table in rig.tables if table.kind == "forced_run"]
     lines += [f"{table.label}: {line}" for table in runs for line in describe_run(table)]
     warnings = {table.label: run_warning(table) for table in runs}
-    findings = lint(rig) + [f"{label}: {text}" for label, text in warnings.items() if text]
+    findings = [*lint(rig), *_feasibility(rig)]
+    findings += [f"{label}: {text}" for label, text in warnings.items() if text]
     lines += [f"lint: {finding}" for finding in findings]
     say("\n".join([*lines, f"{len(findings)} findings" if findings else "no findings"]))
     return 0
+
+
+def _feasibility(rig: Rig) -> list[str]:
+    """What the settings of forced runs cannot do, a line each; the physics is loaded where there are such runs only."""
+    if not any(table.kind == "forced_run" for table in rig.tables):
+        return []
+    from capsule_id.experiments.rough_values import lint_runs
+
+    return [finding.text for finding in lint_runs(rig)]
 
 
 def _summary(table: Table) -> str:

@@ -151,15 +151,8 @@ def least_squares(
     ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
     x, steps = np.stack(ends), np.array(steps, dtype=int)
     residuals, jacobian = linearise(x)
-    message = []
-    for i in range(len(starts)):
-        reason = optx.RESULTS[results[i]]
-        if not _finite(jacobian[i], residuals[i]):
-            reason = "The residuals or their Jacobian are not finite where this start ended: try another start."
-        # A solver that only watches its steps takes heavy damping for convergence.
-        elif not reason and not _stationary(jacobian[i], residuals[i], tolerance * float(unit[i])):
-            reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
-        message.append(reason)
+    rounding = [tolerance * one for one in unit]
+    message = [_reason(*one) for one in zip(results, jacobian, residuals, rounding, strict=True)]
     return LeastSquaresFit(
         x=x,
         cost=0.5 * np.sum(residuals**2, axis=1),
@@ -169,6 +162,17 @@ def least_squares(
         residuals=residuals,
         jacobian=jacobian,
     )
+
+
+def _reason(result: optx.RESULTS, jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> str:
+    """Why an end is none, "" where it is one."""
+    reason = optx.RESULTS[result]
+    if not _finite(jacobian, residuals):
+        return "The residuals or their Jacobian are not finite where this start ended: try another start."
+    # A solver that only watches its steps takes heavy damping for convergence.
+    if not reason and not _stationary(jacobian, residuals, rounding):
+        return "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
+    return reason
 
 
 def covariance(jacobian: np.ndarray, residuals: np.ndarray, residual_sd: float | None = None) -> Covariance:

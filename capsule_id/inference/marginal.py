@@ -19,7 +19,7 @@ from capsule_id.inference import density
 from capsule_id.inference.compiling import COMPILE
 from capsule_id.inference.curvature import BATCH, in_batches
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.quadrature import FEWEST, Grid, add_to_blocks, choose_grid, log_stretch, position
+from capsule_id.inference.quadrature import NODES, Grid, add_to_blocks, choose_grid, log_stretch, position
 from capsule_id.inference.result import PointFit
 
 #: The nodes are chosen by walkers this near to and this far from the point fit, in standard deviations: the tails of
@@ -158,7 +158,7 @@ def _layout(target: LogPosterior) -> Layout:
     for i, block in enumerate(blocks):
         label[block] = i
     scatter, located = (tuple(np.flatnonzero(which).tolist()) for which in (target.scatter, ~target.scatter))
-    return Layout(target.structure, scatter, located, tuple(label.tolist()), FEWEST)
+    return Layout(target.structure, scatter, located, tuple(label.tolist()), NODES[0])
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILE)

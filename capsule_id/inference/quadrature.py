@@ -20,12 +20,12 @@ from scipy.special import wrightomega
 
 #: Densities below e^-DEPTH of their maximum are left out; those below e^-CORE of it are a tail.
 DEPTH, CORE = 21.0, 3.0
-#: Interlaced grids agree when no log-integral differs by more than this.
-TOLERANCE = 3e-9
+#: Interlaced grids agree when no log-integral differs by more than the first, and the second of its size: rounding.
+TOLERANCE, ROUNDING = 3e-9, 1e-13
 #: Where the log-posterior of a block is this far below that of the point fit, integrals need not hold.
 NO_MASS = 20.0
-#: Numbers of nodes to try: few, so that rigs of one structure share compiled code.
-FEWEST, MOST = 64, 1024
+#: Numbers of nodes to try: few, so that rigs of one structure share compiled code. The last is taken as it is.
+NODES = (64, 128, 256, 512, 1024)
 #: The first window about the point fit, in u, and how often it is narrowed at most.
 REACH, ROUNDS = 40.0, 12
 #: A window is found when a round makes no walker's narrower than this part of it.
@@ -84,12 +84,8 @@ def choose_grid(terms: Terms, centre: np.ndarray, block: np.ndarray, probes: np.
     low, high = np.min(np.where(mass, low, np.inf), axis=0), np.max(np.where(mass, high, -np.inf), axis=0)
     # Wright's omega solves t - exp(bend - t) = u: t = u + omega(bend - u).
     start, end = low + wrightomega(bend - low), high + wrightomega(bend - high)
-    nodes = FEWEST
-    while nodes < MOST and not _agree(
-        terms, grid := Grid(start, (end - start) / (nodes - 1), bend, nodes), probes, mass
-    ):
-        nodes *= 2
-    return grid
+    grids = [Grid(start, (end - start) / (nodes - 1), bend, nodes) for nodes in NODES]
+    return next((grid for grid in grids[:-1] if _agree(terms, grid, probes, mass)), grids[-1])
 
 
 def _windows(
@@ -102,7 +98,7 @@ def _windows(
     low = np.broadcast_to(centre - REACH, (len(probes), len(centre)))
     width, straight = np.full(low.shape, 2.0 * REACH), np.full(len(centre), -np.inf)
     for _ in range(ROUNDS):
-        grid = Grid(low, width / (FEWEST - 1), straight, FEWEST)
+        grid = Grid(low, width / (NODES[0] - 1), straight, NODES[0])
         known, density, integral = terms(probes, grid)
         # A walker without density anywhere keeps its window; it has no mass either.
         density = np.where(np.any(np.isfinite(density), axis=-1, keepdims=True), density, 0.0)
@@ -111,7 +107,7 @@ def _windows(
         core = low + np.argmax(density > -CORE, axis=-1) * grid.step
         # The maximum may stand between two nodes: one more on either side.
         first = np.maximum(np.argmax(density > -DEPTH, axis=-1) - 1, 0)
-        last = np.minimum(FEWEST - np.argmax(density[..., ::-1] > -DEPTH, axis=-1), FEWEST - 1)
+        last = np.minimum(NODES[0] - np.argmax(density[..., ::-1] > -DEPTH, axis=-1), NODES[0] - 1)
         settled = np.all((last - first) * grid.step > SETTLED * width)
         low, width = low + first * grid.step, (last - first) * grid.step
         if settled:
@@ -124,5 +120,5 @@ def _windows(
 
 def _agree(terms: Terms, grid: Grid, probes: np.ndarray, mass: np.ndarray) -> bool:
     """No integral where the posterior has mass changes when the nodes are shifted by half their distance."""
-    difference = terms(probes, grid)[2] - terms(probes, grid.shifted(0.5))[2]
-    return bool(np.all(np.abs(difference[mass]) < TOLERANCE))
+    integral, shifted = terms(probes, grid)[2][mass], terms(probes, grid.shifted(0.5))[2][mass]
+    return bool(np.all(np.abs(integral - shifted) < TOLERANCE + ROUNDING * np.abs(integral)))

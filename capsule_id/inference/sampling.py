@@ -15,14 +15,14 @@ from capsule_id.inference.moves import Moves, block_move, candidates
 from capsule_id.inference.result import Posterior
 
 ENSEMBLES = 4
-#: Walkers of an ensemble: at least 64, and at least two for every parameter.
-MIN_WALKERS, WALKERS_PER_PARAMETER = 64, 2
+#: Walkers of an ensemble: one batch of the log-posterior, or more, and at least two for every parameter.
+MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
 #: A sample is long enough when every parameter has more draws than this many autocorrelation times ...
 LENGTH_IN_TAU = 50.0
 #: ... and its ensembles agree when no split R-hat is above this.
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first check, and between the checks that follow.
-FIRST_CHECK, CHECK_EVERY = 120, 60
+FIRST_CHECK, CHECK_EVERY = 120, 30
 #: Autocorrelation times (of the pilot) that every ensemble runs before its first stored draw.
 BURN_IN_IN_TAU = 8.0
 #: Walkers start this much wider than the Laplace approximation.
@@ -102,9 +102,10 @@ def sample(
                         chains.between_draws()
                     report(sum(done), ENSEMBLES * goal, schedule.move)
             located = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
-            draws, lp = target.restore(located, restore_seed)
-            if _converged(draws):
-                break
+            if goal == last or _converged(located):
+                draws, lp = target.restore(located, restore_seed)
+                if _converged(draws):
+                    break
         if chains is not None:
             chains.save()
         acceptance = np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers])

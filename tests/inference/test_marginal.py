@@ -219,3 +219,17 @@ def test_rigs_of_one_structure_share_compiled_code(tmp_path: Path) -> None:
         sizes.append(conditional._cache_size())
     assert sizes[0] == sizes[1]
     assert abs(values[0] - values[1]) > 1.0
+
+
+def test_nothing_to_integrate_out() -> None:
+    """All errors stated: the marginal posterior is the posterior."""
+    current = np.linspace(0.0, 2.0, 7)
+    columns = [bench.column("force", 2.0 * current, 0.05), bench.column("current", current, 0.02)]
+    rig = bench.rig(bench.table("motor_current", columns))
+    target = LogPosterior(rig, make_experiments(rig))
+    marginal = MarginalPosterior(target, approximate(target, {"K": 2.0}))
+    u = np.log(np.array([[1.9], [2.0], [2.1]]))
+    np.testing.assert_allclose(marginal.batch(u), np.asarray(target.batch(jnp.asarray(u))), rtol=1e-13)
+    whole, lp = marginal.restore(u, 3)
+    np.testing.assert_array_equal(whole, u)
+    np.testing.assert_allclose(lp, marginal.batch(u), rtol=1e-13)

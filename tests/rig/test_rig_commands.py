@@ -127,6 +127,16 @@ def test_lint(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert found[-1] == "motor_current and copy: the same data; use each reading in one experiment only"
 
 
+def test_check_says_what_a_forced_run_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The amplitude of the paper's Fig. 11 at its lower end; twice that is enough for contacts."""
+    drive = RIG_TOML.replace("34.56", "73.58")
+    low = findings(write_folder(tmp_path / "low", drive.replace("value = 4.0", "value = 0.6")), capsys)
+    assert [line for line in low if line.startswith("run_01:") and "says nothing of k2" in line]
+    enough = findings(write_folder(tmp_path / "high", drive), capsys)
+    assert not [line for line in enough if "says nothing of" in line]
+    assert [line for line in enough if line.startswith("run_01:") and "record for" in line]
+
+
 def sine(rate: int, samples: int) -> str:
     """A 16 Hz swing sampled at ``rate`` Hz."""
     rows = (f"{i / rate!r},{math.sin(2 * math.pi * 16 * i / rate)!r}\n" for i in range(samples))
