@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from capsule_id.commands.capsule_options import prefer_whole_loops
 from capsule_id.commands.progress import Progress
 from capsule_id.console import say
 from capsule_id.errors import InputError
@@ -42,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
     rig = read_rig(args.data)
     directory = args.out if args.out is not None else Path("results") / rig.name
     check_directory(directory)
+    if args.experiments != "bench" and any(table.kind == "forced_run" for table in rig.tables):
+        prefer_whole_loops()
     # Heavy rooms only now: a wrong folder is answered at once.
     from capsule_id.experiments import make_experiments
     from capsule_id.inference.fit import PACKAGES, fit_rig, package_versions

@@ -18,13 +18,14 @@ import numpy as np
 from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory, simulate
 from capsule_id.capsule.smooth import Smoothing
 from capsule_id.experiments.base import Experiment, Start, Theta
+from capsule_id.experiments.feasibility import feasibility
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, ScaledMisfit
 from capsule_id.experiments.run_start import RunStart, rough_start
 from capsule_id.experiments.run_views import run_comparisons
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Quantity, Rig, Table
-from capsule_id.views import Comparison
+from capsule_id.views import Comparison, Finding
 
 #: Channel of the table -> symbol of its noise; the order of the misfits.
 NOISES = {
@@ -253,6 +254,13 @@ class ForcedRun(Experiment):
     def scaled(self, theta: Theta) -> list[ScaledMisfit]:
         """The misfits at the scatters of ``theta``, NumPy."""
         return self._scaled(theta, np)
+
+    def lint(self, theta: Theta) -> list[Finding]:
+        theta = self.local(theta)
+        drive = theta["K"] * theta["I_d"] if self.driven_by_current else theta.get("P_d", self.drive)
+        gap = theta.get("G", self.gap)
+        settings = {**self.table.settings, "P_d": Quantity(float(drive)), "gap": Quantity(float(gap))}
+        return feasibility(replace(self.table, settings=settings), theta)
 
     def records(self, theta: Theta) -> list[tuple[str, np.ndarray]]:
         scaled = self.scaled(theta)[: len(self.channels)]

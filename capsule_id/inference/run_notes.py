@@ -15,6 +15,7 @@ from capsule_id.inference.density import HeldResiduals
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.records.label import measured_motion
 from capsule_id.views import NoteTable
 
 #: Parameters that bench and runs may share.
@@ -136,7 +137,8 @@ def predicted_motion(
         local = [run.local(draw) for draw in draws]
         stacked = {name: np.array([theta[name] for theta in local]) for name in (local[0] if local else {})}
         sample = run.motion(stacked, np) if local else None
-        row: dict[str, object] = {"contacts, model": int(fit.contacts)}
+        seen = measured_motion(run.table)
+        row: dict[str, object] = {"motion of the record": seen.label, "contacts, model": int(fit.contacts)}
         if sample is not None:
             low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
             row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"

@@ -21,6 +21,8 @@ _KINDS = {
     "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours.",
     "motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K.",
     "support_spring": "The slope of the line is the stiffness of the support spring.",
+    "forced_run": "Forced run: one recorded channel, its residuals at the point fit, and their autocorrelation.",
+    "phase_portrait": "Phase plane as the paper draws it: the record through Savitzky–Golay, the model, the impact line.",
     "free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation.",
 }
 
