@@ -86,14 +86,15 @@ def candidates(
     ----------
     sample : (m, d) of the pilot's burnt-in ensemble: it shapes the proposal of small blocks
     blocks : see ``MarginalPosterior.blocks``
-    centre, covariance : (d,), (d, d) the Laplace approximation: it shapes the proposal of large blocks, whose
-        covariance a short pilot does not know as well
+    centre, covariance : (d,), (d, d) the Laplace approximation: it gives large blocks their correlations, which a short
+        pilot does not know as well; it knows their widths, of parameters with heavy tails too
     """
     shape, middle = np.atleast_2d(np.cov(sample.T)), np.median(sample, axis=0)
     for block in blocks:
         if len(block) >= LARGE:
-            middle[block] = centre[block]
-            shape[np.ix_(block, block)] = covariance[np.ix_(block, block)]
+            own = covariance[np.ix_(block, block)]
+            wider = np.maximum(np.sqrt(np.diag(shape)[block] / np.diag(own)), 1.0)
+            middle[block], shape[np.ix_(block, block)] = centre[block], own * np.outer(wider, wider)
     return {
         "block independence + differential evolution": block_move(blocks, middle, shape),
         # One snooker step in ten (ter Braak & Vrugt 2008).

@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -177,13 +178,18 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing
     return NoteTable("What smoothing would do", caption, frame.rename_axis("parameter"))
 
 
+@eqx.filter_jit
+def _evaluate(residual: HeldResiduals, v: Any) -> Any:
+    return residual(v)
+
+
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing) -> tuple[np.ndarray, np.ndarray]:
     """(d_located,) shift of u between a fit with the smoothed model of ``widths`` and the exact one, and the sd of u."""
     located = np.flatnonzero(~target.scatter)
     smoothed = [e.smoothed(widths) if isinstance(e, ForcedRun) else e for e in target.experiments]
     free, centre = tuple(int(i) for i in located), jnp.asarray(fit.u)
     other = LogPosterior(target.rig, smoothed)
-    misses = jax.jit(HeldResiduals(other.structure, free, other.numbers, centre))(centre[located])
+    misses = _evaluate(HeldResiduals(other.structure, free, other.numbers, centre), centre[located])
     exact, jacobian = linearised(HeldResiduals(target.structure, free, target.numbers, centre), fit.u[located])
     normal = jacobian.T @ jacobian
     step = -np.linalg.solve(normal, jacobian.T @ (np.asarray(misses) - exact))

@@ -6,7 +6,14 @@ from scipy import stats
 
 from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.run_checks import LARGEST_GROWTH, _by_sample, check_agreement, check_runs, disagreement, growth
+from capsule_id.inference.run_checks import (
+    LARGEST_GROWTH,
+    _by_sample,
+    check_agreement,
+    check_runs,
+    disagreement,
+    growth,
+)
 from tests.forced_runs import make, theta
 
 NAMES = ("k1", "c")

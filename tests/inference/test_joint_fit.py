@@ -1,0 +1,90 @@
+"""Bench and runs fitted together, small: against the truth, against SciPy, and what smoothing would have done."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from capsule_id.capsule.smooth import Smoothing
+from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.inference.density import HeldResiduals
+from capsule_id.inference.joint_fit import joint_fit, scatter_modes
+from capsule_id.inference.least_squares import linearised
+from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.point_fit import dispersed_starts
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.run_notes import smoothing_shift
+from capsule_id.rig.model import PriorOverride, Quantity
+from tests.experiments import bench
+from tests.forced_runs import TRUTH, recorded, table
+
+#: What a bench would tell: every shared parameter within 2 %.
+KNOWN = ("k1", "c", "mu", "v_s", "K", "k2[stiff]")
+
+
+@cache
+def fitted() -> tuple[LogPosterior, PointFit]:
+    """Half a second of the second run, beside priors as wide as a bench leaves them, started 1 % off."""
+    own = table(1, samples=500)
+    priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
+    rig = bench.rig(own, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
+    target = LogPosterior(rig, [ForcedRun(own, rig)])
+    rough = {name: 1.01 * TRUTH[name] for name in KNOWN}
+    return target, joint_fit(target, rough, dispersed_starts(target, 0, 2))
+
+
+def test_starts_agree_and_the_truth_lies_within_the_errors() -> None:
+    target, fit = fitted()
+    assert fit.agree
+    assert not fit.stalled.any()
+    truth = recorded()[1].truth
+    known = {name: TRUTH[name] for name in KNOWN} | {"G[run_2]": truth.G, "I_d[run_2]": truth.current_amplitude}
+    sd = np.sqrt(np.diag(fit.covariance))
+    z = {name: (fit.values[name] / value - 1.0) / sd[target.names.index(name)] for name, value in known.items()}
+    assert max(map(abs, z.values())) < 3.5, z
+
+
+def test_scipy_finds_the_same_minimum() -> None:
+    """From two starts: at one of them ours, at the other a dent beside it.
+
+    A contact that moves over a sample gives the likelihood a kink, and so minima side by side whose log-posteriors
+    differ by less than a tenth: to the posterior they are one.
+    """
+    target, fit = fitted()
+    located = np.flatnonzero(~target.scatter)
+    residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, fit.u)
+    sd = np.sqrt(np.diag(fit.covariance))[located]
+    ours = 0.5 * float(np.sum(linearised(residual, fit.u[located])[0] ** 2))
+    distances = []
+    for seed in (0, 1):
+        start = fit.u[located] + 0.5 * sd * np.random.default_rng(seed).standard_normal(len(located))
+        found = optimize.least_squares(
+            lambda v: linearised(residual, v)[0], start, lambda v: linearised(residual, v)[1], x_scale="jac",
+            ftol=1e-15, xtol=1e-12, gtol=1e-15,
+        )  # fmt: skip
+        assert found.cost == pytest.approx(ours, abs=0.1)
+        distances.append(np.max(np.abs(found.x - fit.u[located]) / sd))
+        # The covariance is that of SciPy's Jacobian there.
+        expected = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+        np.testing.assert_allclose(sd, expected, rtol=0.1)
+    assert min(distances) < 1e-3
+    assert max(distances) < 1.0
+
+
+def test_scatters_stand_at_their_conditional_maxima() -> None:
+    target, fit = fitted()
+    for i, mode in scatter_modes(target, fit.u).items():
+        assert fit.u[i] == pytest.approx(mode, abs=1e-3)
+        around = np.repeat(fit.u[None], 3, axis=0)
+        around[:, i] = mode + np.array([-0.1, 0.0, 0.1])
+        low, top, high = np.asarray(target.batch(around))
+        assert top > max(low, high)
+
+
+def test_smoothing_left_wide_is_wrong_by_many_sd_and_the_certified_widths_are_not() -> None:
+    target, fit = fitted()
+    certified, sd = smoothing_shift(target, fit, Smoothing())
+    wide, _ = smoothing_shift(target, fit, Smoothing(velocity=1e-2))
+    assert np.max(np.abs(wide) / sd) > 10.0
+    assert np.max(np.abs(wide) / sd) > 5.0 * np.max(np.abs(certified) / sd)
