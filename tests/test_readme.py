@@ -6,6 +6,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 from capsule_id.commands.init import TEMPLATE
 from capsule_id.parameters import TABLE
 from capsule_id.rig.schema import KINDS
@@ -81,3 +83,10 @@ def test_the_exit_codes_are_those_of_the_command() -> None:
     from capsule_id import cli
 
     assert set(rows("| exit code | meaning |")) == {"0", "3", *map(str, (cli.BAD_INPUT, cli.INTERNAL, cli.INTERRUPTED))}
+
+
+def test_the_example_in_python_gives_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    exec(block, {})
+    (promised,) = re.findall(r"print\(.*\)  # (\S+)", block)
+    assert capsys.readouterr().out.split() == [promised]
