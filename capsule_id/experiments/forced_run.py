@@ -186,7 +186,7 @@ class ForcedRun(Experiment):
     def capsule(self, theta: Theta) -> tuple[CapsuleParameters, Excitation]:
         """Parameters and drive of this run; leaves as in ``theta``."""
         gap = self.gap if self.gap_known else theta["G"]
-        stated = self.drive if self.drive_known else theta.get("P_d")
+        stated: Any = self.drive if self.drive_known else theta.get("P_d")
         force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
         names = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "g")
         return CapsuleParameters(G=gap, **{name: theta[name] for name in names}), Excitation(

@@ -10,6 +10,7 @@ model are exact and forward; the Hessian is Gauss–Newton's, for the residuals 
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -121,7 +122,7 @@ def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
     modes = {}
     for i, terms in _scatter_terms(target, u).items():
         bounds = (u[i] - REACH, u[i] + REACH)
-        found = minimize_scalar(lambda t, terms=terms: -terms(t), bounds=bounds, options={"xatol": 1e-5})
+        found: Any = minimize_scalar(lambda t, terms=terms: -terms(t), bounds=bounds, options={"xatol": 1e-5})
         modes[i] = float(found.x)
     return modes
 
@@ -130,7 +131,7 @@ def _scatter_variances(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """Inverse curvature of every scatter's conditional density at u (d,), in the order of the scatters."""
     h, variances = 0.05, []
     terms = _scatter_terms(target, u)
-    for i in np.flatnonzero(target.scatter):
+    for i in np.flatnonzero(target.scatter).tolist():
         bend = (2.0 * terms[i](u[i]) - terms[i](u[i] + h) - terms[i](u[i] - h)) / h**2
         variances.append(1.0 / max(bend, 0.1))
     return np.array(variances)

@@ -8,6 +8,7 @@ with unknown frequency: D. C. Rife, R. R. Boorstyn, IEEE Trans. Inf. Theory 20, 
 
 import contextlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -103,7 +104,7 @@ def _refine(time: np.ndarray, values: np.ndarray, guess: float) -> tuple[float, 
     best = int(np.argmin([_misfit(time, values, Omega) for Omega in grid]))
     step = grid[1] - grid[0]
     bounds = (grid[best] - step, grid[best] + step)
-    found = minimize_scalar(
+    found: Any = minimize_scalar(
         lambda Omega: _misfit(time, values, Omega), bounds=bounds, method="bounded", options={"xatol": 1e-9 * guess}
     )
     return float(found.x), float(found.fun)
