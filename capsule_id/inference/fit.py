@@ -26,7 +26,7 @@ from capsule_id.inference.run_notes import BenchFit, run_notes
 from capsule_id.inference.sampling import DEFAULT_BUDGET, Progress, sample
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig
-from capsule_id.views import Comparison, NoteTable
+from capsule_id.views import Comparison, Finding, NoteTable
 
 #: Posterior draws behind bands and predictive p-values, and behind the pointwise log-likelihood.
 BAND_DRAWS = 200
@@ -79,8 +79,7 @@ def fit_rig(
     values = {**target.fixed, **point.values}
     setting = Setting(rig, experiments, target, point, posterior, values)
     findings, flagged = run_checks(setting)
-    runs = [e for e in experiments if isinstance(e, ForcedRun)]
-    findings += [*check_agreement(target, point, bench.fit, bench.sample), *check_runs(runs, values)]
+    findings += _check_together(setting, bench)
     rng = np.random.default_rng(seeds[2])
     draws = _draws(target, posterior)
     tables = _tables(rig, target, point, posterior, experiments)
@@ -97,14 +96,15 @@ def fit_rig(
             *make_notes(setting, findings, flagged, seeds[0]),
             *_predictive(experiments, draws, rng),
         ),
-        provenance={
-            "seed": seed,
-            "experiments": which,
-            "versions": package_versions(PACKAGES),
-            "files": dict(rig.files),
-        },
+        provenance=_provenance(rig, seed, which),
         groups=_groups(target, experiments, posterior, rng),
     )
+
+
+def _check_together(s: Setting, bench: BenchFit) -> list[Finding]:
+    """Findings on forced runs, and on runs and bench together; [] without runs."""
+    runs = [e for e in s.experiments if isinstance(e, ForcedRun)]
+    return [*check_agreement(s.target, s.fit, bench.fit, bench.sample), *check_runs(runs, s.values)]
 
 
 def _fit(rig: Rig, target: LogPosterior, seed: int, sampled: bool) -> tuple[PointFit, BenchFit]:
@@ -121,6 +121,10 @@ def _fit(rig: Rig, target: LogPosterior, seed: int, sampled: bool) -> tuple[Poin
     fit = point_fit(alone, seed)
     own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
     return joint_fit(target, fit, starts), BenchFit(fit, own)
+
+
+def _provenance(rig: Rig, seed: int, which: str) -> dict[str, object]:
+    return {"seed": seed, "experiments": which, "versions": package_versions(PACKAGES), "files": dict(rig.files)}
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:

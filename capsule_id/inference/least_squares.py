@@ -130,8 +130,7 @@ def least_squares(
         times as fast where there are thousands of residuals
     linearise : the residuals and Jacobians that scale the starts and judge the ends, by another route; None compiles
         forward-mode differentiation for them
-    heavy : the residuals take milliseconds, so that compiling them well pays; each parameter is then scaled by its
-        effect at the start (Marquardt 1963) instead of by its size, which says nothing of logarithms and phases
+    heavy : the residuals take milliseconds: compiled well, and parameters scaled by their effect (Marquardt 1963)
 
     Raises
     ------
@@ -143,9 +142,8 @@ def least_squares(
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
     linearise = linearise or partial(_forward_mode, residual, heavy)
     scale, unit = zip(*map(_effects if heavy else _scales, linearise(starts)[1], starts), strict=True)
-    solve = partial(
-        _PROGRAMS[heavy][1], residual, tolerance=tolerance, max_steps=max_steps, normal_equations=normal_equations
-    )
+    options = {"tolerance": tolerance, "max_steps": max_steps, "normal_equations": normal_equations}
+    solve = partial(_PROGRAMS[heavy][1], residual, **options)
     # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
     arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
     ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)

@@ -1,6 +1,6 @@
 """Do the runs agree with the bench, and can their motion be predicted at all?"""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -93,7 +93,7 @@ def check_agreement(
     return [Finding("bench and runs agree", "fail", text)]
 
 
-def growth(run: ForcedRun, values: dict[str, float]) -> float:
+def growth(run: ForcedRun, values: Mapping[str, float]) -> float:
     """Largest factor by which a small error of the initial state has grown at the end of the record, 1.
 
     Positions count in units of the motion's length, velocities in that times Omega.
@@ -113,7 +113,7 @@ def growth(run: ForcedRun, values: dict[str, float]) -> float:
     return float(np.linalg.norm(derivative, 2))
 
 
-def check_runs(runs: Sequence[ForcedRun], values: dict[str, float]) -> list[Finding]:
+def check_runs(runs: Sequence[ForcedRun], values: Mapping[str, float]) -> list[Finding]:
     """Expected: every run's motion predictable over its record, and complete."""
     findings = []
     for run in runs:
