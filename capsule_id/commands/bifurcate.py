@@ -1,6 +1,7 @@
 """``capsule-id bifurcate``: which motions the model has over a quantity, or over two, as NetCDF and as a picture."""
 
 import argparse
+import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from capsule_id.commands.capsule_options import (
     DEFAULTS,
     add_capsule_arguments,
     capsule_values,
+    fitted_values,
     number,
     prefer_whole_loops,
 )
@@ -19,6 +21,7 @@ from capsule_id.commands.progress import Progress
 from capsule_id.commands.sweep_output import publish_pair, remove_store, take_store
 from capsule_id.console import say
 from capsule_id.errors import InputError
+from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
 
@@ -114,7 +117,8 @@ def run(args: argparse.Namespace) -> int:
     with Progress(not args.quiet, unit="point") as progress, _client(args.scheduler) as client:
         data = _computed(args, axes, values, {"store": store, "client": client, "progress": progress})
         data.attrs["rig"] = rig.name if rig is not None else ""
-        publish_pair(out, data, draw(data, axes, synthetic=rig is not None and rig.synthetic))
+        measured = _measured(args, rig, axes, values) if rig is not None else ()
+        publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
     remove_store(store)
     say(_sentence(data, axes, out))
     return 0
@@ -177,6 +181,22 @@ def _computed(
         return sweep.diagram(p, e, over, grid, starts=starts, **plain)
     both = ("forward", "backward")
     return sweep.continuation(p, e, over, grid, directions=both if args.method == "both" else (args.method,), **plain)
+
+
+def _measured(
+    args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
+) -> "tuple[MeasuredMotion, ...]":
+    """The rig's forced runs with the settings of a diagram; what was left out is told on standard error."""
+    from capsule_id.commands.measured_runs import Span, overlay
+
+    diagram = len(axes) == 1 and args.posterior is None
+    if not diagram or not any(table.kind == "forced_run" for table in rig.tables):
+        return ()
+    x = axes[0].values()
+    by_name = args.spring if args.k2 is None else None
+    found = overlay(rig, Span(axes[0].name, x[0], x[-1]), values, fitted_values(args.result), by_name)
+    print(found.sentence(), file=sys.stderr, flush=True)
+    return found.motions
 
 
 def _axes(args: argparse.Namespace) -> tuple[Axis, ...]:

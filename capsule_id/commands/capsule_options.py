@@ -88,14 +88,25 @@ def prefer_whole_loops() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {WHOLE_LOOPS}".strip()
 
 
-def _fitted(directory: Path, spring: str | None) -> dict[str, float]:
-    """Fitted values (the most probable set) of DIR/parameters.json by symbol."""
+def fitted_values(directory: Path) -> dict[str, float]:
+    """Fitted values (the most probable set) of DIR/parameters.json by name, SI.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
     file = directory / "parameters.json"
     try:
         table = json.loads(file.read_text(encoding="utf-8"))["parameters"]
-        values = {name: float(row["map"]) for name, row in table.items()}
+        return {name: float(row["map"]) for name, row in table.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError("--result takes a result of fit-params", type(error).__name__, "check DIR", file) from None
+
+
+def _fitted(directory: Path, spring: str | None) -> dict[str, float]:
+    """Fitted values by symbol, k2 that of ``spring``."""
+    values = fitted_values(directory)
     springs = [name[3:-1] for name in values if name.startswith("k2[")]
     if spring is None and len(springs) == 1:
         spring = springs[0]

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from capsule_id.report.style import (
     BLACK,
@@ -154,7 +155,9 @@ def _draw_measured(
         x, y = run.value / factor, _MM * run.mean_velocity
         name = "measured" if i == 0 else None
         ax.plot([x], [y], ls="none", marker="D", ms=6.0, mfc="none", mew=1.6, color="#B00020", label=name)
-        ax.annotate(run.label, (x, y), xytext=(5, 6), textcoords="offset points", fontsize=SMALL - 1.0, color="#B00020")
+        text = ax.annotate(run.label, (x, y), xytext=(0, 8), textcoords="offset points", ha="center", color="#B00020")
+        # white about the letters: they stand among the points of the model
+        text.set(fontsize=SMALL - 1.0, path_effects=[withStroke(linewidth=2.5, foreground="white")], zorder=5)
 
 
 def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:

@@ -1,0 +1,97 @@
+"""Notebooks read, looked at and run, for the tests of them, which stand in two files: a worker takes a whole file."""
+
+import os
+import re
+import shutil
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from nbformat import NotebookNode
+
+from tests.cli_tools import ROOT
+
+FOLDER = ROOT / "notebooks"
+NAMES = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
+ODD = [name for name in NAMES if int(name[:2]) % 2 == 1]
+EVEN = [name for name in NAMES if name not in ODD]
+SECONDS = 600  # of one cell
+#: Instead of the cell with the tag ``parameters``: the same study, smaller. Notebooks without such a cell run as they are.
+SHORT = {
+    "01": "RECORDS = 100",
+    "02": "RECORDS = 60",
+    "03": "STEPS = 1500",
+    "04": "CALIBRATIONS = 1500",
+    "05": "WIDTHS = 3",
+    "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
+    "08": "DRAWS, POINTS = 24, 16",
+}
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+def read(name: str) -> NotebookNode:
+    return nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+
+
+def code(notebook: NotebookNode) -> list[NotebookNode]:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def outputs(notebook: NotebookNode, kind: str) -> list[NotebookNode]:
+    return [out for cell in code(notebook) for out in cell.outputs if out.output_type == kind]
+
+
+def figures(notebook: NotebookNode) -> int:
+    shown = [*outputs(notebook, "display_data"), *outputs(notebook, "execute_result")]
+    return sum("image/png" in out.data for out in shown)
+
+
+def printed(notebook: NotebookNode) -> str:
+    return "".join(out.text for out in outputs(notebook, "stream") if out.name == "stdout")
+
+
+def ends_with_an_assertion(notebook: NotebookNode) -> bool:
+    return bool(re.search(r"(?m)^assert ", code(notebook)[-1].source))
+
+
+def shorten(notebook: NotebookNode, values: str) -> None:
+    """Put ``values`` into the cell of parameters; they must assign the names that stand there."""
+    (cell,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
+    assert values.split("=")[0] == cell.source.split("=")[0]
+    cell.source = values
+
+
+def execute(notebook: NotebookNode, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run a notebook in a copy of ``notebooks/`` beside a copy of ``data/``, as a checkout has them."""
+    for part in ("notebooks", "data"):
+        shutil.copytree(ROOT / part, folder / part)
+    for cell in code(notebook):
+        cell.outputs, cell.execution_count = [], None
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("IPYTHONDIR", str(folder / "ipython"))
+    where = {"metadata": {"path": str(folder / "notebooks")}}
+    NotebookClient(notebook, kernel_name="python3", timeout=SECONDS, resources=where).execute()
+
+
+def run_short(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A notebook with its study made smaller runs to the end, with all its figures and without a complaint."""
+    notebook = read(name)
+    if name[:2] in SHORT:
+        shorten(notebook, SHORT[name[:2]])
+    kept = figures(notebook)
+    execute(notebook, folder, monkeypatch)
+    assert figures(notebook) == kept
+    assert [out.text for out in outputs(notebook, "stream") if out.name != "stdout"] == []
+
+
+def compare_with_kept(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At full size: the same words, and the same numbers but for the last digits of another machine."""
+    notebook = read(name)
+    expected = printed(notebook)
+    execute(notebook, folder, monkeypatch)
+    assert NUMBER.sub("#", printed(notebook)) == NUMBER.sub("#", expected)
+    pairs = zip(NUMBER.findall(printed(notebook)), NUMBER.findall(expected), strict=True)
+    # Differences of rounding (a balance of 1e-11, a disagreement of 1e-7) may be anything of that size.
+    far = [(a, b) for a, b in pairs if abs(float(a) - float(b)) > 0.02 * abs(float(b)) + 1e-5]
+    assert far == []
