@@ -23,6 +23,10 @@ DEFAULTS: Mapping[str, float] = {
     "phase": 0.0,
 }
 
+# Signs that the model asks for; what is in neither set must not be negative.
+POSITIVE = frozenset({"m1", "m2", "v_s"})
+SIGNED = frozenset({"P_d", "phase", "Omega"})
+
 # Compiles the engines' loops as one function each, several times faster for a single run (internal to XLA's CPU part).
 WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 
@@ -47,7 +51,7 @@ def capsule_values(
     Raises
     ------
     InputError
-        One that is missing or no number, a result that cannot be read.
+        One that is missing, no number or not admissible, a result that cannot be read.
     """
     fitted = _fitted(args.result, args.spring) if args.result is not None else {}
     values = {}
@@ -60,8 +64,23 @@ def capsule_values(
             raise InputError(
                 f"{name} ({leaf.meaning}) must be given", "it is missing", f"add --{name} X, in {leaf.unit}"
             )
+        _check_sign(name, value, f"--{name}" if text is not None else "the value")
         values[name] = value
     return values
+
+
+def _check_sign(name: str, value: float, place: str) -> None:
+    """What the model takes for a parameter (``Status.INVALID`` otherwise).
+
+    Raises
+    ------
+    InputError
+        Too small a value; ``place`` says where it stands.
+    """
+    if name in POSITIVE and not value > 0.0:
+        raise InputError(f"{name} must be positive", f"{place} {value:g}", "give a value above 0")
+    if name not in SIGNED and value < 0.0:
+        raise InputError(f"{name} must not be negative", f"{place} {value:g}", "give 0 or more")
 
 
 def number(name: str, text: str) -> float:

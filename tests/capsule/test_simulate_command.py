@@ -84,7 +84,7 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
         ([*DRIVE, "--periods", "-1"], "length must be positive"),
         ([*DRIVE, "--periods", "1", "--duration", "1"], "length is given once"),
         ([*DRIVE, "--Omega", "0"], "without a drive frequency"),
-        ([*DRIVE, "--m1", "-1"], "the run must be complete"),
+        ([*DRIVE, "--m1", "-1"], "m1 must be positive"),
     ],
 )
 def test_errors_are_one_line_and_write_nothing(tmp_path: Path, arguments: list[str], rule: str) -> None:

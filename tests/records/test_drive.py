@@ -81,3 +81,23 @@ def test_uneven_sampling_will_do() -> None:
 def test_too_few_samples_are_refused() -> None:
     with pytest.raises(InputError, match="at least 8 samples"):
         fit_harmonic(TIME[:7], TIME[:7], OMEGA)
+
+
+@pytest.mark.parametrize("samples", [8, 10, 20])
+def test_a_record_of_far_less_than_a_period_does_not_refute_the_stated_frequency(samples: int) -> None:
+    """A tenth of a period at most: the normal equations are singular to rounding for some seeds."""
+    time = np.arange(samples) / 1000.0
+    for seed in range(100):
+        fit = fit_harmonic(time, tone(np.random.default_rng(seed), time), OMEGA)
+        assert fit.Omega > 0.0
+        assert not fit.disagrees
+
+
+def test_an_alias_is_not_taken_for_the_frequency() -> None:
+    """5.5 Hz read at 20/3 Hz looks like 1.17 Hz; the same record refutes 4 Hz."""
+    time = np.arange(30) * 0.15
+    values = tone(np.random.default_rng(0), time)
+    fit = fit_harmonic(time, values, OMEGA)
+    assert fit.Omega == pytest.approx(OMEGA, abs=5.0 * fit.Omega_sd)
+    assert not fit.disagrees
+    assert fit_harmonic(time, values, 8.0 * np.pi).disagrees
