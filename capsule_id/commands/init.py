@@ -94,7 +94,11 @@ name = "@NAME@"
 # spring = "L60"
 # gap = { value = 1.0, sd = 0.02, unit = "mm" }
 # Omega = { value = 34.56, unit = "rad/s" }
-# P_d = { value = 4.0, sd = 0.1, unit = "N" }
+# P_d = { value = 4.0, sd = 0.1, unit = "N" }         # needed where the current is not recorded
+# start = "auto"                                      # or "stuck", "moving", "settled": the first sample
+# noise = "white"                                     # or "ar1": coloured noise, its correlation is estimated
+# x_rel_gain_sd = { value = 0.01, unit = "1" }        # optional, a gain error; also x_capsule_gain_sd,
+#                                                       acceleration_rod_gain_sd, current_gain_sd
 """
 
 

@@ -19,7 +19,7 @@ from capsule_id.experiments.motor_current import MotorCurrent
 from capsule_id.experiments.sliding_friction import SlidingFriction
 from capsule_id.experiments.static_friction import StaticFriction
 from capsule_id.experiments.support_spring import SupportSpring
-from capsule_id.rig.model import Rig
+from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison
 
 KINDS: Mapping[str, type[Experiment]] = {
@@ -51,7 +51,28 @@ def make_experiments(rig: Rig, which: str = "all") -> tuple[Experiment, ...]:
     if not tables:
         rule = "the rig folder must hold an experiment to fit"
         raise InputError(rule, f"none with --experiments {which}", "add one to rig.toml", rig.folder / "rig.toml")
+    for kind in ("static_friction", "dynamic_friction", "sliding_friction"):
+        _check_scatter([table for table in tables if table.kind == kind])
     return tuple(KINDS[table.kind](table, rig) for table in tables)
+
+
+def _check_scatter(tables: Sequence[Table]) -> None:
+    """Readings all the same, without a reading error, let their scatter run to zero: the posterior has no integral.
+
+    Raises
+    ------
+    InputError
+        If they are.
+    """
+    if len({tuple(table.columns) for table in tables}) != 1:
+        return
+    rows = np.concatenate([np.stack([c.values for c in t.columns.values()], axis=1) for t in tables])
+    if len(rows) < 2 or np.any(rows != rows[0]):
+        return
+    if not any(column.reading_sd > 0.0 for table in tables for column in table.columns.values()):
+        name = next(iter(tables[0].columns))
+        rule = f"{tables[0].kind} readings that are all the same need their reading step"
+        raise InputError(rule, f"{len(rows)} rows", f"state {name}_resolution", tables[0].file)
 
 
 def paper_estimates(experiments: Sequence[Experiment]) -> dict[str, float]:

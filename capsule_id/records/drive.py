@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from capsule_id.errors import InputError
@@ -18,7 +19,8 @@ from capsule_id.records.columns import stated_Omega
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.model import Table
 
-#: The stated frequency is wrong where the fitted one is further off than this many standard errors and this share.
+#: The stated frequency is wrong where the fitted one is better by as much as this many standard errors make of a long
+#: record, and off by this share.
 OMEGA_ERRORS, OMEGA_SHARE = 4.0, 1e-3
 FEWEST_SAMPLES = 8  # for five unknowns, the noise among them
 _SCAN = 1.5  # half-width of the search about a first guess, in 1 / duration: a peak of the spectrum is 1 wide
@@ -29,7 +31,8 @@ _SCAN_POINTS = 25
 class Harmonic:
     """A fitted tone, SI: ``amplitude`` cos(``Omega`` t + ``phase``) + ``offset``, t the record's own time.
 
-    ``_sd`` are standard errors; phase in (-pi, pi]; ``noise_sd`` of the residuals; ``stated_Omega`` as in the table.
+    ``_sd`` are standard errors; phase in (-pi, pi]; ``noise_sd`` of the residuals; ``stated_Omega`` as in the table;
+    ``refuted``: the tone of the stated frequency leaves more squares than noise explains.
     """
 
     Omega: float
@@ -41,12 +44,13 @@ class Harmonic:
     offset: float
     noise_sd: float
     stated_Omega: float
+    refuted: bool
 
     @property
     def disagrees(self) -> bool:
         """The stated frequency is not the recorded one: off by 4 standard errors and by one in a thousand."""
         off = abs(self.Omega - self.stated_Omega)
-        return off > OMEGA_ERRORS * self.Omega_sd and off > OMEGA_SHARE * self.stated_Omega
+        return self.refuted and off > OMEGA_SHARE * self.stated_Omega
 
 
 def drive_of(table: Table) -> Harmonic | None:
@@ -77,7 +81,12 @@ def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic
         strongest = 2.0 * np.pi * dominant_frequency(time, values)
         near = abs(strongest - Omega) < _width(time)
         guesses = [strongest] if near else [Omega, strongest]
-    found = min((_refine(time, values, guess) for guess in guesses), key=lambda pair: pair[1])[0]
+    found, left = _refine(time, values, guesses[0])
+    for guess in guesses[1:]:
+        other, less = _refine(time, values, guess)
+        # A coarse record has the stated frequency and its alias in the spectrum alike: then the stated one is meant.
+        if left - less > _threshold(len(time)) * less:
+            found, left = other, less
     return _describe(time, values, found, Omega)
 
 
@@ -88,8 +97,17 @@ def _design(time: np.ndarray, Omega: float) -> np.ndarray:
 def _misfit(time: np.ndarray, values: np.ndarray, Omega: float) -> float:
     """Sum of squares left by the best tone of this frequency."""
     design = _design(time, Omega)
-    unknowns = np.linalg.solve(design.T @ design, design.T @ values)
+    try:
+        unknowns = np.linalg.solve(design.T @ design, design.T @ values)
+    except np.linalg.LinAlgError:  # far less than a period: the cosine is a constant
+        unknowns = np.linalg.lstsq(design, values)[0]
     return float(np.sum((values - design @ unknowns) ** 2))
+
+
+def _threshold(samples: int) -> float:
+    """Gain in squares, as a share of what is left, that noise reaches as seldom as ``OMEGA_ERRORS`` standard errors."""
+    freedom = samples - 4
+    return float(stats.t.isf(stats.norm.sf(OMEGA_ERRORS), freedom) ** 2 / freedom)
 
 
 def _width(time: np.ndarray) -> float:
@@ -103,7 +121,7 @@ def _refine(time: np.ndarray, values: np.ndarray, guess: float) -> tuple[float, 
     grid = np.linspace(max(guess - width, 0.05 * guess), guess + width, _SCAN_POINTS)
     best = int(np.argmin([_misfit(time, values, Omega) for Omega in grid]))
     step = grid[1] - grid[0]
-    bounds = (grid[best] - step, grid[best] + step)
+    bounds = (max(grid[best] - step, 0.5 * grid[0]), grid[best] + step)
     found: Any = minimize_scalar(
         lambda Omega: _misfit(time, values, Omega), bounds=bounds, method="bounded", options={"xatol": 1e-9 * guess}
     )
@@ -119,7 +137,29 @@ def _describe(time: np.ndarray, values: np.ndarray, Omega: float, stated: float)
     slope = -amplitude * np.sin(angle)
     jacobian = np.stack([np.cos(angle), slope, slope * time, np.ones_like(time)], axis=1)
     scale = np.linalg.norm(jacobian, axis=0)
-    noise_sd = float(np.sqrt(np.sum((values - design @ [cosine, sine, offset]) ** 2) / (len(time) - 4)))
-    errors = noise_sd * np.sqrt(np.diag(np.linalg.inv((jacobian / scale).T @ (jacobian / scale)))) / scale
+    left = float(np.sum((values - design @ [cosine, sine, offset]) ** 2))
+    noise_sd = float(np.sqrt(left / (len(time) - 4)))
+    refuted = _misfit(time, values, stated) - left > _threshold(len(time)) * left
+    errors = noise_sd * np.sqrt(_variances(jacobian / scale)) / scale
     sd = [float(error) for error in errors]
-    return Harmonic(Omega, sd[2], amplitude, sd[0], phase, sd[1], float(offset), noise_sd, stated)
+    return Harmonic(
+        Omega,
+        sd[2],
+        amplitude,
+        sd[0],
+        phase,
+        sd[1],
+        float(offset),
+        noise_sd,
+        stated,
+        refuted,
+    )
+
+
+def _variances(jacobian: np.ndarray) -> np.ndarray:
+    """Diagonal of (J'J)^-1; infinite where a record of far less than a period cannot part the unknowns."""
+    try:
+        variances = np.diag(np.linalg.inv(jacobian.T @ jacobian))
+    except np.linalg.LinAlgError:
+        return np.full(jacobian.shape[1], np.inf)
+    return np.where(variances > 0.0, variances, np.inf)

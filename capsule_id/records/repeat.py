@@ -80,6 +80,8 @@ def find_period(time: np.ndarray, x_rel: np.ndarray, T: float, floor: float = 0.
     ratios, seen, repeats = [], [], []
     for n in range(1, min(LONGEST, int(periods - FEWEST_OVERLAP)) + 1):
         early = time[: np.searchsorted(time, time[-1] - n * T - _EDGE * step)]
+        if len(early) == 0:  # a coarse record: the spline's edges are all of what is left
+            break
         difference = spline(early + n * T) - x_rel[: len(early)]
         noise = noise_sd**2 * (1.0 + _noise_gain(n * T / step))
         # of the differences those n T apart share a reading (correlation of squares 1/4 either side), and the spline

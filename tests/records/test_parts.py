@@ -147,3 +147,11 @@ def test_folding_goes_round() -> None:
 )
 def test_stretches_between_two_levels(z: list[float], stretches: list[tuple[int, int]]) -> None:
     assert intervals_above(np.array(z, float), 2.0, 5.0) == stretches
+
+
+def test_a_record_coarser_than_the_drive_is_undecided() -> None:
+    """Fewer than two samples a period: no overlap is left beside the spline's edges."""
+    time = np.arange(14) * 0.15
+    found = find_period(time, np.cos(34.56 * time), 2.0 * np.pi / 34.56)
+    assert found.period is None
+    assert found.reason
