@@ -97,8 +97,7 @@ name = "@NAME@"
 # P_d = { value = 4.0, sd = 0.1, unit = "N" }         # needed where the current is not recorded
 # start = "auto"                                      # or "stuck", "moving", "settled": the first sample
 # noise = "white"                                     # or "ar1": coloured noise, its correlation is estimated
-# x_rel_gain_sd = { value = 0.01, unit = "1" }        # optional, a gain error; also x_capsule_gain_sd,
-#                                                       acceleration_rod_gain_sd, current_gain_sd
+# x_rel_gain_sd = { value = 0.01, unit = "1" } # optional; also x_capsule_gain_sd acceleration_rod_gain_sd current_gain_sd
 """
 
 
