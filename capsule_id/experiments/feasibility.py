@@ -25,6 +25,8 @@ DECAY_TIMES = 4.0
 #: Excitation periods over which the rod on a held capsule is followed, the tolerance of that run, and the largest
 #: number of steps that it is made to take for the sake of its contacts (a drive of years has no contacts to miss).
 HELD_PERIODS, HELD_TOLERANCE, HELD_STEPS = 12, 1e-6, 20_000
+#: ... and no longer than this many times 2 m1/c.
+HELD_DECAYS = 50.0
 
 
 @dataclass(frozen=True)
@@ -102,11 +104,11 @@ def held_rod(theta: Mapping[str, float], drive: Drive) -> tuple[float, bool]:
         return [y, float(drive.P_d * np.cos(drive.Omega * t) - force(x, y)) / m1]
 
     period = 2.0 * np.pi / drive.Omega
-    touch = max(0.25 * contact_time(m1, float("inf"), k2), HELD_PERIODS * period / HELD_STEPS)
+    # The drive begins at its peak: once a slow one's start has died out, nothing larger comes.
+    span = min(HELD_PERIODS * period, HELD_DECAYS * 2.0 * m1 / c)
+    touch = max(0.25 * contact_time(m1, float("inf"), k2), span / HELD_STEPS)
     step = min(period / 40.0, touch)
-    run = solve_ivp(
-        rate, (0.0, HELD_PERIODS * period), [0.0, 0.0], "LSODA", rtol=HELD_TOLERANCE, atol=1e-10, max_step=step
-    )
+    run = solve_ivp(rate, (0.0, span), [0.0, 0.0], "LSODA", rtol=HELD_TOLERANCE, atol=1e-10, max_step=step)
     return float(np.max(np.abs(force(*run.y)))), bool(np.max(run.y[0]) >= drive.G)
 
 
