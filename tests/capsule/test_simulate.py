@@ -70,9 +70,9 @@ def test_a_lane_is_the_same_to_the_last_bit_wherever_it_stands(monkeypatch: pyte
     order = np.random.default_rng(1).permutation(150)
     np.testing.assert_array_equal(part(order), whole[order])
     monkeypatch.setattr(batches.os, "cpu_count", lambda: 1)
-    batches._pool.cache_clear()
+    batches.pool.cache_clear()
     np.testing.assert_array_equal(part(slice(0, 150)), whole)
-    batches._pool.cache_clear()
+    batches.pool.cache_clear()
 
 
 def test_jit_and_vmap_give_the_same_motion(cases: Cases) -> None:

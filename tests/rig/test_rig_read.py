@@ -63,6 +63,8 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "gap": Quantity(0.001, 0.02 / 1000),
         "Omega": 34.56,
         "P_d": Quantity(4.0, 0.1),
+        "start": "auto",
+        "noise": "white",
     }
     np.testing.assert_array_equal(run.rows, np.arange(2, 11))
 
