@@ -11,7 +11,7 @@ import numpy as np
 
 from capsule_id.inference.chain_store import ChainStore
 from capsule_id.inference.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
-from capsule_id.inference.moves import Moves, block_move, candidates
+from capsule_id.inference.moves import LARGE, Moves, block_move, candidates
 from capsule_id.inference.result import Posterior
 
 ENSEMBLES = 4
@@ -135,7 +135,10 @@ def pilot(target: Target, seed: int) -> Schedule:
     """Burn in one ensemble, then measure the autocorrelation time of candidate moves on it until one is good."""
     random = np.random.RandomState(seed)
     state: Any = emcee.State(_initial(target, random), random_state=random.get_state())
-    rough = block_move(target.blocks, target.centre, OVERDISPERSION**2 * target.covariance)
+    # Independence from a density too wide by a fifth in each of thirty directions would hardly ever be accepted.
+    wider = np.ones(target.dimension)
+    wider[[i for block in target.blocks if len(block) < LARGE for i in block]] = OVERDISPERSION
+    rough = block_move(target.blocks, target.centre, target.covariance * np.outer(wider, wider))
     sampler = _ensemble(target, state.coords.shape[0], rough)
     state = sampler.run_mcmc(state, PILOT_BURN_IN)
     sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN // 2, flat=True))
