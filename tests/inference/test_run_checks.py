@@ -58,10 +58,10 @@ def _ordered(one: PointFit, joint: PointFit) -> list[float]:
 def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
     rng = np.random.default_rng(2)
     clean = [check_agreement(Target(), *estimates(rng, 0.0)[::-1], None) for _ in range(1500)]  # type: ignore[arg-type]
-    alarms = np.mean([found[0].level == "fail" for found in clean])
+    alarms = np.mean([found[0].level == "warn" for found in clean])
     assert 0.01 < alarms < 0.03
     planted = [check_agreement(Target(), *estimates(rng, 0.015)[::-1], None) for _ in range(50)]  # type: ignore[arg-type]
-    assert all(found[0].level == "fail" and "largest disagreement in k1" in found[0].text for found in planted)
+    assert all(found[0].level == "warn" and "largest disagreement in k1" in found[0].text for found in planted)
 
 
 def test_tails_follow_the_sample() -> None:
