@@ -72,7 +72,7 @@ def fit_rig(
         if budget is not None:
             # What goes wrong in it comes up again where its result is used.
             pool.submit(compile_ahead, target)
-        point, bench = _fit(rig, target, seeds[0], sampled=budget is not None)
+        point, bench = point_fits(rig, target, seeds[0], sampled=budget is not None)
     posterior = None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)
@@ -107,7 +107,7 @@ def _check_together(s: Setting, bench: BenchFit) -> list[Finding]:
     return [*check_agreement(s.target, s.fit, bench.fit, bench.sample), *check_runs(runs, s.values)]
 
 
-def _fit(rig: Rig, target: LogPosterior, seed: int, sampled: bool) -> tuple[PointFit, BenchFit]:
+def point_fits(rig: Rig, target: LogPosterior, seed: int, sampled: bool) -> tuple[PointFit, BenchFit]:
     """The point fit: of bench experiments directly, of runs starting from what the bench tells; and the bench's own."""
     bench = [e for e in target.experiments if not isinstance(e, ForcedRun)]
     if len(bench) == len(target.experiments):

@@ -28,6 +28,9 @@ AGREEMENT = 0.05
 TOLERANCE, MAX_STEPS = 1e-7, 80
 #: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
 ROUNDS, STILL = 8, 0.01
+#: A start that comes to rest with this many times the sum of squares of the best one has found another motion: its
+#: scatters are then not worth a round.
+ELSEWHERE = 3.0
 #: Starts leave the bench's estimates by this many of its standard deviations.
 DISPERSION = 1.0
 #: Relative sd of the starts about rough values.
@@ -46,7 +49,11 @@ def joint_fit(target: LogPosterior, known: PointFit | Mapping[str, float], start
     """
     starts = _about_known(target, known, starts)
     located = np.flatnonzero(~target.scatter)
-    ends = [_descend(target, start, located) for start in starts]
+    ends = [_descend(target, starts[0], located)]
+    # The others take the first one's scatters to begin with: they start from noise, which any of them knows as well.
+    limit = ELSEWHERE * float(ends[0][1].cost[0])
+    for start in starts[1:]:
+        ends.append(_descend(target, np.where(target.scatter, ends[0][0], start), located, limit))
     u = np.stack([end for end, _, _ in ends])
     value = np.array([float(target.batch(np.repeat(end[None], 2, axis=0))[0]) for end in u])
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
@@ -93,8 +100,10 @@ def _about_known(target: LogPosterior, known: PointFit | Mapping[str, float], st
     return starts
 
 
-def _descend(target: LogPosterior, start: np.ndarray, located: np.ndarray) -> tuple[np.ndarray, LeastSquaresFit, bool]:
-    """From one start: (d,) end, the last least-squares fit, whether everything came to rest."""
+def _descend(
+    target: LogPosterior, start: np.ndarray, located: np.ndarray, limit: float = np.inf
+) -> tuple[np.ndarray, LeastSquaresFit, bool]:
+    """From one start: (d,) end, the last least-squares fit, whether everything came to rest (above ``limit`` too)."""
     u, still, fit = start.copy(), False, None
     for _ in range(ROUNDS):
         residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(u))
@@ -106,6 +115,8 @@ def _descend(target: LogPosterior, start: np.ndarray, located: np.ndarray) -> tu
         sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))
         moved = np.max(np.abs(fit.x[0] - u[located]) / np.where(sd > 0, sd, 1.0))
         u[located] = fit.x[0]
+        if fit.cost[0] > limit:
+            return u, fit, not bool(fit.stalled[0])
         scatters = scatter_modes(target, u)
         shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
         for i, value in scatters.items():

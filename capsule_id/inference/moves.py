@@ -6,12 +6,16 @@ from typing import Any
 import emcee
 import numpy as np
 
-#: Degrees of freedom of the proposal for small and for large blocks, and the mixture of widths that it draws from: close
-#: to the normal density of what is known well, with tails for what is known from four trials only.
-FEW, MANY = 6.0, 40.0
 #: Parameters from which on a block is large: forced runs tie all that they depend on together, and know it well.
 LARGE = 9
-WIDTHS, WEIGHTS = np.array([1.0, 2.0, 4.0]), np.array([0.85, 0.1, 0.05])
+#: Degrees of freedom of the proposal for small and for large blocks, and the widths that it draws from by weight: close
+#: to the normal density of what is known well, with tails for what is known from four trials only. In many dimensions
+#: a little more of either is a proposal that is hardly ever accepted.
+FEW, MANY = 6.0, 200.0
+WIDTHS, WEIGHTS = np.array([[1.0, 2.0, 4.0], [1.0, 1.15, 1.4]]), np.array([0.85, 0.1, 0.05])
+#: A parameter of a large block is proposed wider than the Laplace approximation where a pilot finds it wider by this
+#: factor, which is beyond the noise of a short pilot.
+WIDER = 1.1
 
 Moves = list[tuple[Any, float]]
 
@@ -36,8 +40,9 @@ class BlockMove(emcee.moves.Move):
         self.member = np.stack([np.isin(np.arange(len(centre)), block) for block in blocks], axis=1)
         self.root = np.linalg.cholesky(np.where(self.member @ self.member.T, covariance, 0.0))
         self._inverse = np.linalg.inv(self.root)
-        #: (blocks,) degrees of freedom.
-        self.freedom = np.where(np.sum(self.member, axis=0) < LARGE, FEW, MANY)
+        large = np.sum(self.member, axis=0) >= LARGE
+        #: (blocks,) degrees of freedom, and (3, blocks) widths.
+        self.freedom, self.widths = np.where(large, MANY, FEW), WIDTHS[large.astype(int)].T
 
     def log_density(self, u: np.ndarray) -> np.ndarray:
         """(w, blocks) of the proposals, up to a constant; u (w, d)."""
@@ -46,14 +51,14 @@ class BlockMove(emcee.moves.Move):
         parts = [
             np.log(weight) - d * np.log(width)
             - 0.5 * (self.freedom + d) * np.log1p(square / (width**2 * self.freedom))
-            for width, weight in zip(WIDTHS, WEIGHTS, strict=True)
+            for width, weight in zip(self.widths, WEIGHTS, strict=True)
         ]  # fmt: skip
         return np.logaddexp.reduce(parts, axis=0)
 
     def draw(self, rng: np.random.RandomState, size: int) -> np.ndarray:
         """(size, d)."""
         shape = (size, self.member.shape[1])
-        scale = rng.choice(WIDTHS, p=WEIGHTS, size=shape)
+        scale = self.widths[rng.choice(len(WEIGHTS), p=WEIGHTS, size=shape), np.arange(shape[1])]
         scale = scale * np.sqrt(self.freedom / rng.chisquare(np.broadcast_to(self.freedom, shape)))
         return self.centre + (rng.standard_normal((size, len(self.centre))) * (scale @ self.member.T)) @ self.root.T
 
@@ -93,7 +98,8 @@ def candidates(
     for block in blocks:
         if len(block) >= LARGE:
             own = covariance[np.ix_(block, block)]
-            wider = np.maximum(np.sqrt(np.diag(shape)[block] / np.diag(own)), 1.0)
+            ratio = np.sqrt(np.diag(shape)[block] / np.diag(own))
+            wider = np.where(ratio > WIDER, ratio, 1.0)
             middle[block], shape[np.ix_(block, block)] = centre[block], own * np.outer(wider, wider)
     return {
         "block independence + differential evolution": block_move(blocks, middle, shape),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from capsule_id.capsule.model import Status, simulate
+from capsule_id.capsule.model import CapsuleParameters, Excitation, Status, simulate
 from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit, Posterior
@@ -99,19 +99,22 @@ def growth(run: ForcedRun, values: Mapping[str, float]) -> float:
 
     Positions count in units of the motion's length, velocities in that times Omega.
     """
-    p, e = run.capsule(values)
     size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
-    times = run.time[[0, -1]]
+    motion = run.motion(values, np)
+    start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
+    derivative = np.asarray(_derivative_of_end(*run.capsule(values), run.time[[0, -1]], start))
+    return float(np.linalg.norm(derivative * size / size[:, None], 2))
+
+
+@jax.jit
+def _derivative_of_end(p: CapsuleParameters, e: Excitation, times: jax.Array, start: jax.Array) -> jax.Array:
+    """(3, 3) of (x_rel, its rate, Y2) at the last of ``times`` with respect to the same at the first."""
 
     def end(state: jax.Array) -> jax.Array:
         t = simulate(p, e, times, (state[0], state[1] + state[2], 0.0, state[2]))
-        return jnp.stack([t.X1[-1] - t.X2[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]]) / size
+        return jnp.stack([t.X1[-1] - t.X2[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]])
 
-    motion = run.motion(values, np)
-    rate = np.asarray(motion.Y1 - motion.Y2)
-    start = jnp.array([float(motion.x_rel[0]), float(rate[0]), float(motion.Y2[0])])
-    derivative = np.asarray(jax.jit(jax.jacfwd(end))(start)) * size
-    return float(np.linalg.norm(derivative, 2))
+    return jax.jacfwd(end)(start)
 
 
 def check_runs(runs: Sequence[ForcedRun], values: Mapping[str, float]) -> list[Finding]:

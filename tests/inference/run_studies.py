@@ -1,0 +1,89 @@
+"""Forced runs through the whole fit: rigs with random truths, and rigs with something wrong planted in them."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from calibration import normal_score
+
+from capsule_id.experiments import make_experiments
+from capsule_id.inference.fit import fit_rig, point_fits
+from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.run_checks import check_agreement
+from capsule_id.rig.read import read_rig
+from capsule_id.synthetic import Truth, synthesize
+
+#: Every parameter is off the paper's Table 1 by a factor between these two, or by its inverse.
+NEAREST, FARTHEST = 1.1, 1.5
+VARIED = ("k1", "c", "mu", "v_s", "K", "k2[soft]", "k2[medium]", "k2[stiff]", "k2[hard]")
+#: What is wrong: the static test of a spring reads its force too high by this factor, the tilts are of another surface.
+SPRING_FACTOR, SURFACE = 1.15, 0.1
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """One rig: z = Φ⁻¹(posterior CDF at the truth) of every physical parameter, failed checks, split R-hat and steps."""
+
+    z: dict[str, float]
+    failed: tuple[tuple[str, str], ...]
+    rhat: float
+    ess: float
+
+
+def random_truth(rng: np.random.Generator) -> Truth:
+    """Table 1 with every parameter of ``VARIED`` moved by 10 to 50 %, up or down."""
+    table = Truth().with_runs()
+    size = rng.uniform(np.log(NEAREST), np.log(FARTHEST), len(VARIED))
+    factors = np.exp(size * rng.choice([-1.0, 1.0], len(VARIED)))
+    flat = table.flat()
+    return table.with_values({name: flat[name] * f for name, f in zip(VARIED, factors, strict=True)})
+
+
+def recover(folder: Path, seed: int, budget: int) -> Recovery:
+    """Synthesize the rig of ``seed`` in ``folder`` and fit it, bench and runs."""
+    truth = random_truth(np.random.default_rng([seed, 4]))
+    synthesize(folder, seed, truth, runs=True)
+    result = fit_rig(read_rig(folder), seed, budget=budget)
+    assert result.posterior is not None
+    known = truth.flat()
+    z = {name: normal_score(result.posterior, name, known[name]) for name in result.summary.index if name in known}
+    failed = tuple((f.check, f.text) for f in result.findings if f.level == "fail")
+    return Recovery(z, failed, float(np.max(result.posterior.rhat)), float(np.min(result.posterior.ess)))
+
+
+def plant_spring(folder: Path, spring: str) -> None:
+    """The static test of ``spring`` reads its force too high."""
+    _edit(
+        folder / f"support_spring_{spring}.csv",
+        lambda table: table.assign(**{"force [N]": SPRING_FACTOR * table["force [N]"]}),
+    )
+
+
+def plant_surface(folder: Path) -> None:
+    """The tilts were made on another surface."""
+
+    def other(table: pd.DataFrame) -> pd.DataFrame:
+        mu = np.tan(np.deg2rad(table["angle [deg]"])) + SURFACE
+        return table.assign(**{"angle [deg]": np.rad2deg(np.arctan(mu))})
+
+    _edit(folder / "static_friction.csv", other)
+
+
+def _edit(file: Path, change: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
+    change(pd.read_csv(file)).to_csv(file, index=False)
+
+
+def disagreement_of(folder: Path, seed: int) -> str:
+    """The parameter that the check of bench against runs names on the rig in ``folder``; "" where it passes."""
+    rig = read_rig(folder)
+    target = LogPosterior(rig, make_experiments(rig))
+    joint, bench = point_fits(rig, target, seed, sampled=True)
+    found = check_agreement(target, joint, bench.fit, bench.sample)[0]
+    if found.level == "ok":
+        return ""
+    named = re.search(r"largest disagreement in (\S+)", found.text)
+    assert named is not None
+    return named[1]
