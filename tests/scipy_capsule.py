@@ -11,12 +11,28 @@ def _force(q: Parameters, y: np.ndarray, contact: bool) -> float:
     return q["k1"] * r + q["c"] * (y[1] - y[3]) + (q["k2"] * (r - q["G"]) if contact else 0.0)
 
 
+def _modes(q: Parameters, y: np.ndarray, F_b: float) -> tuple[bool, int]:
+    """In contact?, and the direction in which the capsule slides (0: stuck)."""
+    contact = bool(y[0] - y[2] >= q["G"])
+    f = _force(q, y, contact)
+    return contact, int(np.sign(y[3] if y[3] != 0.0 or abs(f) <= F_b else f))
+
+
 def simulate_scipy(
-    q: Parameters, times: np.ndarray, rtol: float, atol: float, max_step: float = np.inf
+    q: Parameters,
+    times: np.ndarray,
+    rtol: float,
+    atol: float,
+    max_step: float = np.inf,
+    start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, int]:
-    """(states (n, 4) from rest at ``times``, closings of the gap); q holds the parameters, P_d and Omega."""
-    F_b = q["mu"] * (q["m1"] + q["m2"]) * q["g"]
-    y, t, contact, sigma, contacts = np.zeros(4), float(times[0]), False, 0, 0
+    """(states (n, 4) at ``times``, closings of the gap); q holds the parameters, P_d, Omega and possibly a phase.
+
+    start : (4,) at times[0], by default at rest
+    """
+    F_b, phase = q["mu"] * (q["m1"] + q["m2"]) * q["g"], q.get("phase", 0.0)
+    y, t, contacts = np.zeros(4) if start is None else start.copy(), float(times[0]), 0
+    contact, sigma = _modes(q, y, F_b)
     out = np.full((len(times), 4), np.nan)
     out[0] = y
     while t < times[-1]:
@@ -27,7 +43,7 @@ def simulate_scipy(
             f = _force(q, y, contact)
             friction = 0.5 * F_b * (1.0 + np.exp(-sigma * y[3] / q["v_s"])) * sigma
             a2 = (f - friction) / q["m2"] if sigma else 0.0
-            return y[1], (q["P_d"] * np.cos(q["Omega"] * t) - f) / q["m1"], y[3] if sigma else 0.0, a2
+            return y[1], (q["P_d"] * np.cos(q["Omega"] * t + phase) - f) / q["m1"], y[3] if sigma else 0.0, a2
 
         def gap(t: float, y: np.ndarray) -> float:
             return y[0] - y[2] - q["G"]

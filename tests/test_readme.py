@@ -44,7 +44,7 @@ def test_the_installed_command_reads_the_folder_that_readme_names(tmp_path: Path
     (tmp_path / "data").symlink_to(DATA)
     command = set_up_commands()[0][-1].replace(".venv/bin", str(Path(sys.executable).parent))
     done = subprocess.run(
-        [*command.split(), "--no-sample", "--quiet"],
+        [*command.split(), "--experiments", "bench", "--no-sample", "--quiet"],
         cwd=tmp_path,
         env=environment(),
         capture_output=True,

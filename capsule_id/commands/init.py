@@ -98,6 +98,8 @@ name = "@NAME@"
 # start = "auto"                                      # or "stuck", "moving", "settled": the first sample
 # noise = "white"                                     # or "ar1": coloured noise, its correlation is estimated
 # x_rel_gain_sd = { value = 0.01, unit = "1" } # optional; also x_capsule_gain_sd acceleration_rod_gain_sd current_gain_sd
+# x_rel_delay_sd = { value = 0.1, unit = "ms" } # less than a sample; x_capsule_delay_sd acceleration_rod_delay_sd current_delay_sd
+# segment = { value = 0.3, unit = "s" }               # cut into parts, each with its own start, where the motion is chaotic
 """
 
 

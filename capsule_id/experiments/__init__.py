@@ -10,12 +10,14 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Theta
+from capsule_id.experiments.capsule_bench import CapsuleDecay, CapsulePushes
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
 from capsule_id.experiments.line import Line
 from capsule_id.experiments.motor_current import MotorCurrent
+from capsule_id.experiments.run_parts import parts_of
 from capsule_id.experiments.sliding_friction import SlidingFriction
 from capsule_id.experiments.static_friction import StaticFriction
 from capsule_id.experiments.support_spring import SupportSpring
@@ -31,6 +33,8 @@ KINDS: Mapping[str, type[Experiment]] = {
     "support_spring": SupportSpring,
     "forced_run": ForcedRun,
 }
+#: What ``forward = "capsule"`` makes of them.
+CAPSULE_KINDS: Mapping[str, type[Experiment]] = {"free_vibration": CapsuleDecay, "dynamic_friction": CapsulePushes}
 #: Experiments on the bench, as against forced runs.
 BENCH = tuple(kind for kind in KINDS if kind != "forced_run")
 
@@ -53,7 +57,15 @@ def make_experiments(rig: Rig, which: str = "all") -> tuple[Experiment, ...]:
         raise InputError(rule, f"none with --experiments {which}", "add one to rig.toml", rig.folder / "rig.toml")
     for kind in ("static_friction", "dynamic_friction", "sliding_friction"):
         _check_scatter([table for table in tables if table.kind == kind])
-    return tuple(KINDS[table.kind](table, rig) for table in tables)
+    return tuple(e for table in tables for e in _experiments_of(table, rig))
+
+
+def _experiments_of(table: Table, rig: Rig) -> list[Experiment]:
+    """One experiment; of a record that is to be cut, one a part."""
+    kinds = CAPSULE_KINDS if table.settings.get("forward") == "capsule" else KINDS
+    seconds = table.settings.get("segment")
+    parts = parts_of(table, seconds) if isinstance(seconds, float) else [table]
+    return [kinds[table.kind](part, rig) for part in parts]
 
 
 def _check_scatter(tables: Sequence[Table]) -> None:

@@ -46,6 +46,8 @@ class Experiment(ABC):
     scale_known = False
     #: Readings follow each other in time: residuals must be white.
     time_series = False
+    #: The forward model is the event-driven capsule: differentiable in forward mode, and worth milliseconds.
+    event_driven = False
     #: Numeric attributes, and the others, that the likelihood reads: experiments of one class that agree in the shapes
     #: of the former and in the values of the latter are evaluated together, in one batch (see ``signature``).
     ARRAYS: tuple[str, ...] = ()

@@ -3,14 +3,15 @@
     theta -> capsule model from the first sample on -> channels -> misfit of each channel
 
 The channels that are recorded (x_rel, x_capsule, acceleration_rod, current) are independent given the motion; each has
-its own noise, and an offset that enters linearly and is integrated out (a gain too, where its sd is stated). X2 = 0 at
+its own noise, and an offset that enters linearly and is integrated out (a gain and, to first order, a delay too, where
+their sd is stated). X2 = 0 at
 the first sample by convention: X2 and the offset of x_capsule cannot both be free.
 """
 
 from dataclasses import replace
 from functools import cached_property
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +20,11 @@ from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory, 
 from capsule_id.capsule.smooth import Smoothing
 from capsule_id.experiments.base import Experiment, Start, Theta
 from capsule_id.experiments.feasibility import feasibility
+from capsule_id.experiments.forward import Model, forward_model, widths_of
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, ScaledMisfit
-from capsule_id.experiments.run_start import RunStart, rough_start
+from capsule_id.experiments.run_parts import leads, record_of
+from capsule_id.experiments.run_start import SPEED_FOUND, RunStart, rough_start
 from capsule_id.experiments.run_views import run_comparisons
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Quantity, Rig, Table
@@ -43,8 +46,6 @@ PHASE_WIDTH = np.pi
 #: Periods from rest after which a motion counts as settled (start = "settled").
 SETTLING_PERIODS = 40
 
-Model = Literal["exact", "smooth"]
-
 
 class ForcedRun(Experiment):
     """One record of the driven capsule.
@@ -55,15 +56,21 @@ class ForcedRun(Experiment):
 
     The drive is K times the recorded current, whose amplitude and phase are sampled; without a current it is the stated
     P_d. Where both are there, P_d is a second reading of the same amplitude.
+
+    A part of a record (``run_parts``) has a start and offsets of its own; gap, drive, noise and delays are the record's.
     """
 
     time_series = True
+    event_driven = True
+    model: Model
     masses = ("m1", "m2")
     ARRAYS = (
-        "time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "reading_variance", "smoothing",
-        "moves",
+        "time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "delays", "reading_variance",
+        "smoothing", "moves",
     )  # fmt: skip
-    STATIC = ("channels", "settled", "gap_known", "drive_known", "gained", "coloured", "second_reading", "model")
+    STATIC = (
+        "channels", "settled", "gap_known", "drive_known", "gained", "delayed", "coloured", "second_reading", "model",
+    )  # fmt: skip
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)
@@ -82,39 +89,40 @@ class ForcedRun(Experiment):
         self.reading_variance = np.array([table.columns[name].reading_sd ** 2 for name in self.channels])
         self.ranges = np.array([max(float(np.ptp(y)), _floor(table, name)) for name, y in self._by_channel()])
         self.widths = NUISANCE_WIDTH * self.ranges
-        self.gains = np.array([float(table.settings.get(f"{name}_gain_sd", 0.0)) for name in self.channels])  # type: ignore[arg-type]
-        self.gained = tuple(f"{name}_gain_sd" in table.settings for name in self.channels)
+        self.gains, self.gained = self._asked_for("gain")
+        self.delays, self.delayed = self._asked_for("delay")
         self.second_reading = self.driven_by_current and self.drive_sd > 0.0
         self.coloured = table.settings.get("noise") == "ar1"
-        self.model: Model = "exact"
-        self.smoothing = np.zeros(4)
+        self.model, self.smoothing = forward_model(None)
         wanted = str(table.settings.get("start", "auto"))
-        self.start = self.rough.kind if wanted == "auto" else wanted
+        self.start_is_open = wanted == "auto"
+        self.start = self.rough.kind if self.start_is_open else wanted
         self.settled = self.start == "settled"
         #: Factor of ``capsule_start``, so that runs of both kinds are computed together.
         self.moves = float(self.start == "moving")
+
+    def _asked_for(self, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
+        """Stated sd of a gain or delay by channel, and whether there is one."""
+        keys = [f"{name}_{nuisance}_sd" for name in self.channels]
+        sds = np.array([float(self.table.settings.get(key, 0.0)) for key in keys])  # type: ignore[arg-type]
+        return sds, tuple(key in self.table.settings for key in keys)
 
     def _by_channel(self) -> list[tuple[str, np.ndarray]]:
         return list(zip(self.channels, self.values, strict=True))
 
     @cached_property
     def rough(self) -> RunStart:
-        """State and drive at the first sample, read off the record."""
-        return rough_start(self.time, dict(self._by_channel()), self.Omega)
-
-    def with_start(self, start: str) -> "ForcedRun":
-        """The same record with another kind of initial state."""
-        other = ForcedRun(replace(self.table, settings={**self.table.settings, "start": start}), self.rig)
-        other.model, other.smoothing = self.model, self.smoothing
-        return other
+        """State and drive at the first sample, read off the record (the speed by the model, where that found one)."""
+        rough = rough_start(self.time, dict(self._by_channel()), self.Omega)
+        speed = self.table.settings.get(SPEED_FOUND)
+        if not isinstance(speed, float):
+            return rough
+        return replace(rough, capsule_rate=speed, kind="stuck" if speed == 0.0 else "moving")
 
     def smoothed(self, widths: Smoothing | None) -> "ForcedRun":
         """The same record with the smoothed model of these ``widths`` as forward model; None: the exact one."""
         other = ForcedRun(replace(self.table, settings={**self.table.settings, "start": self.start}), self.rig)
-        if widths is not None:
-            other.model = "smooth"
-            numbers = (widths.velocity, widths.penetration, widths.rounding, widths.tolerance)
-            other.smoothing = np.array([float(x) for x in numbers])
+        other.model, other.smoothing = forward_model(widths)
         return other
 
     @property
@@ -131,16 +139,16 @@ class ForcedRun(Experiment):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        of = self.label
+        of, whole = self.label, record_of(self.table)
         rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")] + [parameter("k2", self.spring)]
         if not self.gap_known:
-            rows.append(parameter("G", of, Prior("positive_normal", self.gap, self.gap_sd)))
+            rows.append(parameter("G", whole, Prior("positive_normal", self.gap, self.gap_sd)))
         if self.driven_by_current:
             amplitude = 0.5 * float(np.ptp(self.table["current"]))
-            rows += [parameter("K"), parameter("I_d", of, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
+            rows += [parameter("K"), parameter("I_d", whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
         elif not self.drive_known:
-            rows.append(parameter("P_d", of, Prior("positive_normal", self.drive, self.drive_sd)))
-        rows.append(parameter("phase", of, Prior("normal", 0.0, PHASE_WIDTH)))
+            rows.append(parameter("P_d", whole, Prior("positive_normal", self.drive, self.drive_sd)))
+        rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
         if not self.settled:
             length = NUISANCE_WIDTH * self.rough.length
             rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
@@ -150,9 +158,9 @@ class ForcedRun(Experiment):
                 parameter("capsule_start", of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length))
             )
         for name, scale in zip(self.channels, self.ranges, strict=True):
-            rows.append(parameter(NOISES[name], of, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
+            rows.append(parameter(NOISES[name], whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
         if self.coloured:
-            rows += [parameter(f"ar1_{name}", of) for name in self.channels]
+            rows += [parameter(f"ar1_{name}", whole) for name in self.channels]
         return tuple(rows)
 
     @property
@@ -163,6 +171,16 @@ class ForcedRun(Experiment):
     def starts(self) -> dict[str, Start]:
         """From the record: nuisances alone; what the bench measures has its start there, or at its prior's centre."""
         rough, of = self.rough, self.label
+        starts = self._starts_of_record() if leads(self.table) else {}
+        if not self.settled:
+            starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
+            starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * self.Omega * rough.length)
+        if self.start == "moving":
+            starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * self.Omega * rough.length)
+        return starts
+
+    def _starts_of_record(self) -> dict[str, Start]:
+        rough, of = self.rough, record_of(self.table)
         starts = {f"phase[{of}]": Start(rough.phase, 0.02)}
         if not self.gap_known:
             starts[f"G[{of}]"] = Start(self.gap, 0.5 * self.gap_sd / self.gap)
@@ -170,11 +188,6 @@ class ForcedRun(Experiment):
             starts[f"I_d[{of}]"] = Start(rough.amplitude, 0.005)
         elif not self.drive_known:
             starts[f"P_d[{of}]"] = Start(self.drive, 0.5 * self.drive_sd / self.drive)
-        if not self.settled:
-            starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
-            starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * self.Omega * rough.length)
-        if self.start == "moving":
-            starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * self.Omega * rough.length)
         for name, noise in rough.noise.items():
             starts[f"{NOISES[name]}[{of}]"] = Start(noise, 0.1)
         if self.coloured:
@@ -196,7 +209,7 @@ class ForcedRun(Experiment):
     def motion(self, theta: Theta, xp: ModuleType = jnp) -> Trajectory:
         """The model's motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
-        smoothing = None if self.model == "exact" else Smoothing(*(self.smoothing[i] for i in range(4)))
+        smoothing = widths_of(self.model, self.smoothing)
         if self.settled:
             early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
             run = simulate(p, e, xp.concatenate([early, self.time]), model=self.model, smoothing=smoothing)
@@ -239,6 +252,9 @@ class ForcedRun(Experiment):
             columns = [self.widths[i] * xp.ones(len(self.time))]
             if self.gained[i]:
                 columns.append(self.gains[i] * seen)
+            if self.delayed[i]:
+                # To first order in the delay, which is a part of a sampling step.
+                columns.append(-self.delays[i] * xp.gradient(seen) / xp.gradient(xp.asarray(self.time)))
             raw, design = self.values[i] - seen, xp.stack(columns, axis=1)
             if self.coloured:
                 parts.append(_coloured(raw, self.reading_variance[i], design, xp.tanh(theta[f"ar1_{name}"]), xp))

@@ -64,13 +64,18 @@ class FreeVibration(Experiment):
         return self.values
 
     @property
+    def model_name(self) -> str:
+        """For the legend."""
+        return f"{self.damping} damping"
+
+    @property
     def noise_name(self) -> str:
         return f"noise_sd[{self.label}]"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         scale = float(np.ptp(self.values))
-        noise = parameter("noise_sd", self.label, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR))
+        noise = parameter("noise_sd", self.label, self.noise_prior(scale))
         shared = (parameter("k1"), parameter("c"))
         if self.damping == "dry":
             amplitude = parameter("amplitude", self.label, Prior("lognormal", scale, NUISANCE_WIDTH))
@@ -81,6 +86,11 @@ class FreeVibration(Experiment):
             y_start = parameter("y_start", self.label, Prior("normal", 0.0, self.width * self._rough.Omega_o))
             return *shared, parameter("c_q"), noise, x_start, y_start
         return *shared, noise
+
+    @staticmethod
+    def noise_prior(scale: float) -> Prior:
+        """Of a record whose range is ``scale``, m."""
+        return Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)
 
     def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
         k1, c, m1 = theta["k1"], theta["c"], theta["m1"]
@@ -187,12 +197,17 @@ class FreeVibration(Experiment):
         elif self.damping == "quadratic":
             speed = rough.Omega_o * abs(float(rough.peaks[0]))
             starts["c_q"] = Start(0.5 * rough.c / speed, 0.3)
-            rate = np.polyfit(self.time[:5], self.values[:5], 1)[0]
-            starts[f"x_start[{self.label}]"] = Start(
-                float(self.values[0] - equilibrium(self.values)), 0.02 * abs(float(rough.peaks[0]))
-            )
-            starts[f"y_start[{self.label}]"] = Start(float(rate), 0.05 * speed)
+            starts |= self.starts_of_motion()
         return starts
+
+    def starts_of_motion(self) -> dict[str, Start]:
+        """Of x_rel and its rate at the first sample."""
+        size = abs(float(self._rough.peaks[0]))
+        rate = np.polyfit(self.time[:5], self.values[:5], 1)[0]
+        return {
+            f"x_start[{self.label}]": Start(float(self.values[0] - equilibrium(self.values)), 0.02 * size),
+            f"y_start[{self.label}]": Start(float(rate), 0.05 * self._rough.Omega_o * size),
+        }
 
     # -- what the report and the checks see -------------------------------------------------------------------------
 
@@ -249,7 +264,7 @@ class FreeVibration(Experiment):
             "time [s]",
             axis_label(self.column),
             (Points(self.label, time, self.values * unit),),
-            (Curve(f"this fit, {self.damping} damping", time, curve(theta) * unit, lower, upper),),
+            (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
             time,
             residuals,
             autocorrelation(residuals, min(60, self.n // 4)),

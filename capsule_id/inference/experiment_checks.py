@@ -70,7 +70,7 @@ def check_whiteness(s: Setting) -> list[Finding]:
 
 def _advice(experiment: Experiment) -> str:
     """What a coloured record calls for."""
-    if isinstance(experiment, FreeVibration):
+    if isinstance(experiment, FreeVibration) and not experiment.event_driven:
         drift = experiment.damping_trend()
         remedy = "compare the damping models below, cut the record to free decay with start/stop"
         return f"{'; ' + drift if drift else ''}: {remedy}"
@@ -171,7 +171,8 @@ def check_stated_errors(s: Setting, flagged: Mapping[str, list[int]]) -> list[Fi
 
 def check_stiffness(s: Setting) -> list[Finding]:
     """The paper's "linear near the working point": k1 of single records against release amplitude."""
-    records = [e for e in s.experiments if isinstance(e, FreeVibration)]
+    # The capsule model says by itself what a larger release does.
+    records = [e for e in s.experiments if isinstance(e, FreeVibration) and not e.event_driven]
     if len(records) < 2:
         return []
     k1, sd, _ = stiffness_by_record(records, s.values)
@@ -201,7 +202,8 @@ def stiffness_by_record(
 def check_friction(s: Setting) -> list[Finding]:
     """Expected: tilts and slides tell of one surface."""
     tilts = [e for e in s.experiments if isinstance(e, StaticFriction)]
-    slides = [e for e in s.experiments if isinstance(e, DynamicFriction | SlidingFriction)]
+    # A push with the capsule model tells of k1 and c too: by itself it is no friction test.
+    slides = [e for e in s.experiments if isinstance(e, DynamicFriction | SlidingFriction) and not e.event_driven]
     if not tilts or not slides:
         return []
     found = tension(s.rig, tilts, slides)

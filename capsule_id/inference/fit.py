@@ -2,7 +2,6 @@
 
 import platform
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -10,19 +9,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments import BENCH, compare, make_experiments, paper_estimates
+from capsule_id.experiments import compare, make_experiments, paper_estimates
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.checks import informed, run_checks
 from capsule_id.inference.experiment_checks import Setting
-from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.marginal import MarginalPosterior, compile_ahead
+from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.notes import make_notes
-from capsule_id.inference.point_fit import dispersed_starts, point_fit
+from capsule_id.inference.point_stage import BenchFit, fit_points
 from capsule_id.inference.result import PointFit, Posterior, Result
 from capsule_id.inference.run_checks import check_agreement, check_runs
-from capsule_id.inference.run_notes import BenchFit, run_notes
+from capsule_id.inference.run_notes import run_notes
 from capsule_id.inference.sampling import DEFAULT_BUDGET, Progress, sample
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig
@@ -33,10 +31,6 @@ BAND_DRAWS = 200
 PRIOR_DRAWS = 2000
 #: Pointwise log-likelihoods kept: of every walker's last draw, or of fewer walkers where there are many readings.
 POINTWISE_SIZE = 2_000_000
-#: Starts of the fit of forced runs, each of which costs seconds.
-JOINT_STARTS = 3
-#: emcee steps of the bench's own sample, which shows what the runs add and whether they agree.
-BENCH_BUDGET = 1000
 PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
 
@@ -63,23 +57,19 @@ def fit_rig(
     InputError
         If the rig holds nothing to fit.
     """
-    experiments = make_experiments(rig, which)
-    target = LogPosterior(rig, experiments)
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
     if progress:
         progress(0, 1, "point fit")
-    with ThreadPoolExecutor(1) as pool:
-        if budget is not None:
-            # What goes wrong in it comes up again where its result is used.
-            pool.submit(compile_ahead, target)
-        point, bench = point_fits(rig, target, seeds[0], sampled=budget is not None)
+    stage = fit_points(rig, make_experiments(rig, which), seeds[0], sampled=budget is not None)
+    target, point, bench = stage.target, stage.fit, stage.bench
+    experiments = target.experiments
     posterior = None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)
     values = {**target.fixed, **point.values}
     setting = Setting(rig, experiments, target, point, posterior, values)
     findings, flagged = run_checks(setting)
-    findings += _check_together(setting, bench)
+    findings += [*stage.findings, *_check_together(setting, bench)]
     rng = np.random.default_rng(seeds[2])
     draws = _draws(target, posterior)
     tables = _tables(rig, target, point, posterior, experiments)
@@ -104,23 +94,9 @@ def fit_rig(
 def _check_together(s: Setting, bench: BenchFit) -> list[Finding]:
     """Findings on forced runs, and on runs and bench together; [] without runs."""
     runs = [e for e in s.experiments if isinstance(e, ForcedRun)]
+    if not runs:
+        return []
     return [*check_agreement(s.target, s.fit, bench.fit, bench.sample), *check_runs(runs, s.values)]
-
-
-def point_fits(rig: Rig, target: LogPosterior, seed: int, sampled: bool) -> tuple[PointFit, BenchFit]:
-    """The point fit: of bench experiments directly, of runs starting from what the bench tells; and the bench's own."""
-    bench = [e for e in target.experiments if not isinstance(e, ForcedRun)]
-    if len(bench) == len(target.experiments):
-        return point_fit(target, seed), BenchFit()
-    starts = dispersed_starts(target, seed, JOINT_STARTS)
-    if not bench:
-        measured = [table for table in rig.tables if table.kind in BENCH]
-        rough = paper_estimates(make_experiments(rig, "bench")) if measured else {}
-        return joint_fit(target, rough, starts), BenchFit()
-    alone = LogPosterior(rig, bench)
-    fit = point_fit(alone, seed)
-    own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
-    return joint_fit(target, fit, starts), BenchFit(fit, own)
 
 
 def _provenance(rig: Rig, seed: int, which: str) -> dict[str, object]:

@@ -39,15 +39,25 @@ ROUGH = 0.01
 REACH = 6.0
 
 
-def joint_fit(target: LogPosterior, known: PointFit | Mapping[str, float], starts: np.ndarray) -> PointFit:
+def joint_fit(
+    target: LogPosterior,
+    known: PointFit | Mapping[str, float],
+    starts: np.ndarray,
+    first: Mapping[str, float] | None = None,
+) -> PointFit:
     """Fit ``target``, whose experiments include forced runs.
 
     Parameters
     ----------
     known : the point fit of its bench experiments, or, for runs alone, rough values by name (the paper's estimates)
     starts : (s, d) in u, as ``point_fit.dispersed_starts`` makes them; the entries that are known are replaced
+    first : values by name that the first start has instead, as far as it has them
     """
     starts = _about_known(target, known, starts)
+    if first is not None:
+        theta = target.theta(starts[0])
+        own = [first.get(name, value) for name, value in zip(target.names, theta, strict=True)]
+        starts[0] = target.unconstrain(np.array(own))
     located = np.flatnonzero(~target.scatter)
     ends = [_descend(target, starts[0], located)]
     # The others take the first one's scatters to begin with: they start from noise, which any of them knows as well.

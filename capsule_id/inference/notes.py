@@ -29,7 +29,7 @@ def make_notes(
     setting: Setting, findings: Sequence[Finding], flagged: Mapping[str, list[int]], seed: int
 ) -> list[NoteTable]:
     """The tables that this fit calls for."""
-    records = [e for e in setting.experiments if isinstance(e, FreeVibration)]
+    records = [e for e in setting.experiments if isinstance(e, FreeVibration) and not e.event_driven]
     lines = [e for e in setting.experiments if isinstance(e, Line)]
     notes = []
     if records:

@@ -1,7 +1,6 @@
 """Tables about forced runs: what they buy, scaled groups, what the model predicts of them, what smoothing would do."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -15,20 +14,13 @@ from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.density import HeldResiduals
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.records.label import measured_motion
 from capsule_id.views import NoteTable
 
 #: Parameters that bench and runs may share.
 SHARED = ("m1", "m2", "k1", "c", "mu", "v_s", "K", "k2")
-
-
-@dataclass(frozen=True)
-class BenchFit:
-    """What the bench experiments tell by themselves; None where there are none, or nothing was sampled."""
-
-    fit: PointFit | None = None
-    sample: Posterior | None = None
 
 
 def run_notes(

@@ -25,6 +25,7 @@ def check_experiment(document: TomlDocument, path: KeyPath, table: Table, file: 
     if table.kind == "free_vibration":
         _check_spring_with_gap(document, path, table)
         _check_window(document, path, table, file)
+        _check_forward(document, path, table)
     elif table.kind == "static_friction":
         _check_tilt(document, path, table, file)
     elif table.kind in _LINES:
@@ -38,7 +39,8 @@ def check_masses(document: TomlDocument, tables: Sequence[Table], stated: set[st
     """Masses that an experiment needs must be stated in [rig]."""
     for index, table in enumerate(tables):
         slides = table.kind == "sliding_friction" and "force" in table.columns
-        moves = table.kind == "forced_run" or table.settings.get("capsule") == "free" or slides
+        free = table.settings.get("capsule") == "free" or table.settings.get("forward") == "capsule"
+        moves = table.kind == "forced_run" or free or slides
         needed = {"m1": moves or table.kind == "free_vibration", "m2": moves}
         for mass, is_needed in needed.items():
             if is_needed and mass not in stated:
@@ -63,6 +65,21 @@ def _check_spring_with_gap(document: TomlDocument, path: KeyPath, table: Table) 
             raise document.error(
                 (*path, one), "spring and gap must stand together", f"{one} alone", remedy, of_key=True
             )
+
+
+def _check_forward(document: TomlDocument, path: KeyPath, table: Table) -> None:
+    """The capsule model needs a capsule that is free to move, and has viscous damping only."""
+    if table.settings.get("forward") != "capsule":
+        return
+    place = (*path, "forward")
+    if table.settings.get("capsule", "held") == "held":
+        remedy = 'add capsule = "free", or write forward = "closed" where the capsule was held'
+        raise document.error(place, "forward capsule needs a capsule that is free to move", "held", remedy)
+    if table.settings.get("damping", "viscous") != "viscous":
+        value = str(table.settings["damping"])
+        raise document.error(
+            place, "forward capsule has viscous damping only", value, 'remove damping, or write forward = "closed"'
+        )
 
 
 def _check_window(document: TomlDocument, path: KeyPath, table: Table, file: TableFile) -> None:

@@ -92,7 +92,8 @@ class KindRule:
 
 
 _TIME = ColumnRule("s", increasing=True)
-_FORWARD = ChoiceRule(("closed",))  # "capsule" comes with forced runs
+_FORWARD = ChoiceRule(("closed", "capsule"))
+_CHANNELS = ("x_rel", "x_capsule", "acceleration_rod", "current")
 _GAP = QuantityRule("m", NOT_NEGATIVE, has_sd=True)
 
 KINDS: Mapping[str, KindRule] = {
@@ -152,7 +153,7 @@ KINDS: Mapping[str, KindRule] = {
             "current": ColumnRule("A", varies=True),
         },
         sets=(("time",),),
-        channels=("x_rel", "x_capsule", "acceleration_rod", "current"),
+        channels=_CHANNELS,
         settings={
             "spring": NameRule(),
             "gap": _GAP,
@@ -161,7 +162,9 @@ KINDS: Mapping[str, KindRule] = {
             "P_d": QuantityRule("N", has_sd=True),
             "start": ChoiceRule(("auto", "stuck", "moving", "settled")),
             "noise": ChoiceRule(("white", "ar1")),
-            **{f"{name}_gain_sd": QuantityRule("1") for name in ("x_rel", "x_capsule", "acceleration_rod", "current")},
+            "segment": QuantityRule("s"),
+            **{f"{name}_gain_sd": QuantityRule("1") for name in _CHANNELS},
+            **{f"{name}_delay_sd": QuantityRule("s") for name in _CHANNELS},
         },
         required=("spring", "gap"),
     ),

@@ -10,8 +10,8 @@ import pandas as pd
 from calibration import normal_score
 
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.fit import fit_rig, point_fits
-from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.run_checks import check_agreement
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
@@ -79,9 +79,8 @@ def _edit(file: Path, change: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
 def disagreement_of(folder: Path, seed: int) -> str:
     """The parameter that the check of bench against runs names on the rig in ``folder``; "" where it passes."""
     rig = read_rig(folder)
-    target = LogPosterior(rig, make_experiments(rig))
-    joint, bench = point_fits(rig, target, seed, sampled=True)
-    found = check_agreement(target, joint, bench.fit, bench.sample)[0]
+    stage = fit_points(rig, make_experiments(rig), seed, sampled=True)
+    found = check_agreement(stage.target, stage.fit, stage.bench.fit, stage.bench.sample)[0]
     if found.level == "ok":
         return ""
     named = re.search(r"largest disagreement in (\S+)", found.text)
