@@ -58,17 +58,8 @@ def simulate_scipy(
         motion = speed if sigma else hold
         motion.direction = -float(sigma) if sigma else -1.0
         gap.terminal = motion.terminal = True
-        run = solve_ivp(
-            field,
-            (t, times[-1]),
-            y,
-            "DOP853",
-            dense_output=True,
-            events=(gap, motion),
-            rtol=rtol,
-            atol=atol,
-            max_step=max_step,
-        )
+        options = {"dense_output": True, "rtol": rtol, "atol": atol, "max_step": max_step}
+        run = solve_ivp(field, (t, times[-1]), y, "DOP853", events=(gap, motion), **options)
         inside = (times > t) & (times <= run.t[-1])
         if inside.any():
             out[inside] = run.sol(times[inside]).T

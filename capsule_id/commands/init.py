@@ -46,6 +46,8 @@ name = "@NAME@"
 # capsule = "held"
 #: "viscous" (default), or "dry" or "quadratic" damping beside the viscous one
 # damping = "viscous"
+#: "closed" form (default), or the "capsule" model, where a capsule that is free slips or the rod hits the spring
+# forward = "closed"
 #: window of the filter that the paper's estimator looks through; default: chosen by a rule
 # smoothing_window = { value = 10, unit = "ms" }
 # x_rel_sd = { value = 0.02, unit = "mm" }
@@ -64,6 +66,7 @@ name = "@NAME@"
 # file = "dynamic_friction.csv"
 # speed_sd = { value = 5, unit = "mm/s" }
 # distance_sd = { value = 0.3, unit = "mm" }
+# forward = "closed"                                  # "capsule" where the rod was not locked and rings
 
 #: Steady sliding, a row per point: mu and v_s. Columns: speed [m/s], and force [N] or coefficient [1].
 # [[experiment]]
@@ -98,7 +101,8 @@ name = "@NAME@"
 # start = "auto"                                      # or "stuck", "moving", "settled": the first sample
 # noise = "white"                                     # or "ar1": coloured noise, its correlation is estimated
 # x_rel_gain_sd = { value = 0.01, unit = "1" } # optional; also x_capsule_gain_sd acceleration_rod_gain_sd current_gain_sd
-# x_rel_delay_sd = { value = 0.1, unit = "ms" } # less than a sample; x_capsule_delay_sd acceleration_rod_delay_sd current_delay_sd
+#: of less than a sample; also x_capsule_delay_sd acceleration_rod_delay_sd current_delay_sd
+# x_rel_delay_sd = { value = 0.1, unit = "ms" }
 # segment = { value = 0.3, unit = "s" }               # cut into parts, each with its own start, where the motion is chaotic
 """
 

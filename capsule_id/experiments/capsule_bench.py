@@ -53,7 +53,7 @@ class CapsuleDecay(FreeVibration):
         self.gap_known = self.gap_sd == 0.0
         self.model, self.smoothing = forward_model(None)
 
-    def smoothed(self, widths: Smoothing | None) -> "CapsuleDecay":
+    def with_smoothing(self, widths: Smoothing | None) -> "CapsuleDecay":
         """The same record with the smoothed model of these ``widths``; None: the exact one."""
         other = CapsuleDecay(self.table, self.rig)
         other.model, other.smoothing = forward_model(widths)
@@ -115,7 +115,7 @@ class CapsulePushes(DynamicFriction):
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
         self.model, self.smoothing = forward_model(None)
 
-    def smoothed(self, widths: Smoothing | None) -> "CapsulePushes":
+    def with_smoothing(self, widths: Smoothing | None) -> "CapsulePushes":
         """The same pushes with the smoothed model of these ``widths``; None: the exact one."""
         other = CapsulePushes(self.table, self.rig)
         other.model, other.smoothing = forward_model(widths)

@@ -119,7 +119,7 @@ class ForcedRun(Experiment):
             return rough
         return replace(rough, capsule_rate=speed, kind="stuck" if speed == 0.0 else "moving")
 
-    def smoothed(self, widths: Smoothing | None) -> "ForcedRun":
+    def with_smoothing(self, widths: Smoothing | None) -> "ForcedRun":
         """The same record with the smoothed model of these ``widths`` as forward model; None: the exact one."""
         other = ForcedRun(replace(self.table, settings={**self.table.settings, "start": self.start}), self.rig)
         other.model, other.smoothing = forward_model(widths)

@@ -178,7 +178,7 @@ def _evaluate(residual: HeldResiduals, v: Any) -> Any:
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing) -> tuple[np.ndarray, np.ndarray]:
     """(d_located,) shift of u between a fit with the smoothed model of ``widths`` and the exact one, and the sd of u."""
     located = np.flatnonzero(~target.scatter)
-    smoothed = [e.smoothed(widths) if isinstance(e, ForcedRun) else e for e in target.experiments]
+    smoothed = [e.with_smoothing(widths) if isinstance(e, ForcedRun) else e for e in target.experiments]
     free, centre = tuple(int(i) for i in located), jnp.asarray(fit.u)
     other = LogPosterior(target.rig, smoothed)
     misses = _evaluate(HeldResiduals(other.structure, free, other.numbers, centre), centre[located])

@@ -62,8 +62,7 @@ def test_each_experiment_of_the_template_alone(tmp_path: Path, kind: str) -> Non
 def test_the_template_mentions_everything_that_a_rig_may_say() -> None:
     for rule in KINDS.values():
         assert all(column in init.TEMPLATE for column in rule.columns)
-        # forward has one choice until forced runs are fitted, so there is nothing to choose yet
-        assert all(key in init.TEMPLATE for key in rule.settings if key != "forward")
+        assert all(key in init.TEMPLATE for key in rule.settings)
         for setting in rule.settings.values():
             if isinstance(setting, ChoiceRule) and len(setting.choices) > 1:
                 assert all(f'"{choice}"' in init.TEMPLATE for choice in setting.choices)
