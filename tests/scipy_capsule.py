@@ -8,14 +8,19 @@ Parameters = dict[str, float]
 
 def _force(q: Parameters, y: np.ndarray, contact: bool) -> float:
     r = y[0] - y[2]
-    return q["k1"] * r + q["c"] * (y[1] - y[3]) + (q["k2"] * (r - q["G"]) if contact else 0.0)
+    own = q["k1"] * r + q.get("k1_cubic", 0.0) * r**3
+    return own + q["c"] * (y[1] - y[3]) + (q["k2"] * (r - q["G"]) if contact else 0.0)
 
 
 def _modes(q: Parameters, y: np.ndarray, F_b: float) -> tuple[bool, int]:
     """In contact?, and the direction in which the capsule slides (0: stuck)."""
     contact = bool(y[0] - y[2] >= q["G"])
-    f = _force(q, y, contact)
-    return contact, int(np.sign(y[3] if y[3] != 0.0 or abs(f) <= F_b else f))
+    return contact, int(np.sign(y[3])) or _sets_off(q, _force(q, y, contact), F_b)
+
+
+def _sets_off(q: Parameters, f: float, F_b: float) -> int:
+    """Direction in which a stuck capsule sets off; 0: it stays."""
+    return int(f > F_b) - int(f < -q.get("backward", 1.0) * F_b)
 
 
 def simulate_scipy(
@@ -27,6 +32,9 @@ def simulate_scipy(
     start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, int]:
     """(states (n, 4) at ``times``, closings of the gap); q holds the parameters, P_d, Omega and possibly a phase.
+
+    Two departures from the paper's model may be in q: k1_cubic, N/m^3, and backward, the friction of backward motion
+    over that of forward motion.
 
     start : (4,) at times[0], by default at rest
     """
@@ -41,7 +49,8 @@ def simulate_scipy(
             t: float, y: np.ndarray, contact: bool = contact, sigma: int = sigma
         ) -> tuple[float, float, float, float]:
             f = _force(q, y, contact)
-            friction = 0.5 * F_b * (1.0 + np.exp(-sigma * y[3] / q["v_s"])) * sigma
+            side = q.get("backward", 1.0) if sigma < 0 else 1.0
+            friction = 0.5 * side * F_b * (1.0 + np.exp(-sigma * y[3] / q["v_s"])) * sigma
             a2 = (f - friction) / q["m2"] if sigma else 0.0
             return y[1], (q["P_d"] * np.cos(q["Omega"] * t + phase) - f) / q["m1"], y[3] if sigma else 0.0, a2
 
@@ -49,7 +58,8 @@ def simulate_scipy(
             return y[0] - y[2] - q["G"]
 
         def hold(t: float, y: np.ndarray, contact: bool = contact) -> float:
-            return F_b - abs(_force(q, y, contact))
+            f = _force(q, y, contact)
+            return min(F_b - f, q.get("backward", 1.0) * F_b + f)
 
         def speed(t: float, y: np.ndarray) -> float:
             return y[3]
@@ -74,6 +84,5 @@ def simulate_scipy(
             if sigma == 0:
                 sigma = int(np.sign(f))
             else:
-                y[3] = 0.0
-                sigma = int(np.sign(f)) if abs(f) > F_b else 0
+                y[3], sigma = 0.0, _sets_off(q, f, F_b)
     return out, contacts

@@ -39,7 +39,8 @@ def run_notes(
 
 def bought(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> NoteTable:
     """Posterior sd with bench only, runs only, both; from samples where there are any, else from point fits."""
-    runs = _runs_alone(target, joint)
+    known = {row.name for e in target.experiments if isinstance(e, ForcedRun) for row in e.parameters} | {"m1", "m2"}
+    runs = {name: sd if name in known else np.nan for name, sd in _runs_alone(target, joint).items()}
     rows = {}
     for i, name in enumerate(target.names):
         if target.parameters[i].symbol not in SHARED:
