@@ -33,8 +33,12 @@ DEFAULT_BUDGET = 20_000
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
 #: Steps of the pilot's burn-in, half of which shapes the block proposal, and of the moves that it times.
 PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
+#: Name of the move that the pilot shapes by its own sample, how often it does so at most, and for how many steps.
+ADAPTED, ADAPTATIONS, ADAPTING_STEPS = "adapted block independence + differential evolution", 4, 200
 #: The pilot looks no further once a move has an autocorrelation time, in steps, below this.
 GOOD_TAU = 10.0
+#: Other kinds of moves are tried only where no block proposal comes below this.
+FAIR_TAU = 40.0
 
 Progress = Callable[[int, int, str], None]
 
@@ -142,9 +146,18 @@ def pilot(target: Target, seed: int) -> Schedule:
     sampler = _ensemble(target, state.coords.shape[0], rough)
     state = sampler.run_mcmc(state, PILOT_BURN_IN)
     sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN // 2, flat=True))
-    measured, moves = {}, candidates(sample, target.blocks, target.centre, target.covariance)
-    # The most promising one first, briefly; where it is not good, all of them for longer.
-    for name, steps in [(next(iter(moves)), PILOT_STEPS), *((name, LONG_PILOT_STEPS) for name in moves)]:
+    measured, moves = {}, dict(candidates(sample, target.blocks, target.centre, target.covariance))
+    first, *others = moves
+    # The most promising one first, briefly; where it is not good, for longer; then moves shaped by what was found so far,
+    # again and again: a posterior with kinks is not where and what the curvature at its maximum says. The rest is tried
+    # where none of these will do.
+    plan = [(first, PILOT_STEPS), (first, LONG_PILOT_STEPS), *[(ADAPTED, ADAPTING_STEPS)] * ADAPTATIONS]
+    for name, steps in [*plan, *((name, LONG_PILOT_STEPS) for name in others)]:
+        if name in others and min(measured.values()) < FAIR_TAU:
+            break
+        if name == ADAPTED:
+            found = np.asarray(sampler.get_chain(flat=True))
+            moves[name] = block_move(target.blocks, np.mean(found, axis=0), np.atleast_2d(np.cov(found.T)))
         sampler = _ensemble(target, state.coords.shape[0], moves[name])
         state = sampler.run_mcmc(state, steps)
         measured[name] = float(np.max(ensemble_time(np.asarray(sampler.get_chain())[None])))
