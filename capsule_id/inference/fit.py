@@ -20,7 +20,7 @@ from capsule_id.inference.notes import make_notes
 from capsule_id.inference.point_stage import BenchFit, fit_points
 from capsule_id.inference.result import PointFit, Posterior, Result
 from capsule_id.inference.run_checks import check_agreement, check_runs
-from capsule_id.inference.run_notes import run_notes
+from capsule_id.inference.run_notes import run_notes, run_records
 from capsule_id.inference.sampling import DEFAULT_BUDGET, Progress, sample
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig
@@ -88,6 +88,7 @@ def fit_rig(
         ),
         provenance=_provenance(rig, seed, which),
         groups=_groups(target, experiments, posterior, rng),
+        records=run_records(target, point),
     )
 
 

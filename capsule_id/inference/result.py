@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
+from capsule_id.records.view import RecordView
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison as Comparison
 from capsule_id.views import Curve as Curve
@@ -76,6 +77,15 @@ class Posterior:
 
 
 @dataclass(frozen=True)
+class RunRecord:
+    """A forced run as the paper looks at it, ``force`` (n,) N: the fitted drive at its samples."""
+
+    name: str
+    view: RecordView
+    force: np.ndarray
+
+
+@dataclass(frozen=True)
 class Result:
     """What ``fit`` returns and ``fit-params`` writes.
 
@@ -94,6 +104,7 @@ class Result:
     notes: tuple[NoteTable, ...]
     provenance: Mapping[str, object]
     groups: Mapping[str, object] = field(default_factory=dict)
+    records: tuple[RunRecord, ...] = ()
 
     @property
     def clean(self) -> bool:

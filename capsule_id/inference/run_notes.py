@@ -9,14 +9,16 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.capsule.smooth import Smoothing
+from capsule_id.errors import InputError
 from capsule_id.experiments.base import Theta
 from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.density import HeldResiduals
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_stage import BenchFit
-from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.result import PointFit, Posterior, RunRecord
 from capsule_id.records.label import measured_motion
+from capsule_id.records.view import view_record
 from capsule_id.views import NoteTable
 
 #: Parameters that bench and runs may share.
@@ -35,6 +37,23 @@ def run_notes(
     if draws:
         notes.append(scaled_groups(runs, draws))
     return [*notes, smoothing_certificate(target, fit)]
+
+
+def run_records(target: LogPosterior, fit: PointFit) -> tuple[RunRecord, ...]:
+    """Every run that can be looked at through the filter: those with x_rel, sampled evenly."""
+    values, found = target.mapping(target.theta(fit.u)), []
+    for run in target.experiments:
+        if not isinstance(run, ForcedRun):
+            continue
+        theta = run.local(values)
+        _, e = run.capsule(theta)
+        try:
+            view = view_record(run.table, K=theta["K"] if run.driven_by_current else None)
+        except InputError:
+            continue
+        force = np.asarray(e.P_d * np.cos(run.Omega * run.time + e.phase))
+        found.append(RunRecord(run.label, view, force))
+    return tuple(found)
 
 
 def bought(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> NoteTable:

@@ -7,9 +7,10 @@ from typing import Literal
 
 from matplotlib.figure import Figure
 
-from capsule_id.inference.result import Result
+from capsule_id.inference.result import Result, RunRecord
 from capsule_id.report import figures
 from capsule_id.report.corner import corner
+from capsule_id.report.figures_runs import force_on_rod, run_overview
 from capsule_id.report.style import figure_of, mark, png
 from capsule_id.report.traces import traces
 from capsule_id.views import Comparison
@@ -61,6 +62,9 @@ def pictures(result: Result) -> tuple[Picture, ...]:
         _picture(result, name, "measured", item.title, comparison_caption(item), figures.comparison_figure(item))
         for name, item in zip(names, result.comparisons, strict=True)
     ]
+    labels = _unique(_UNSAFE.sub("_", record.name) for record in result.records)
+    for label, record in zip(labels, result.records, strict=True):
+        drawn += _record_pictures(result, label, record)
     if result.posterior is not None:
         corner_caption = "Posterior of the physical parameters: histograms, and contours of every pair."
         trace_caption = (
@@ -72,6 +76,27 @@ def pictures(result: Result) -> tuple[Picture, ...]:
     starts_caption = "Where each start began and where it ended, in standard deviations of the Laplace approximation."
     drawn.append(_picture(result, "point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts))
     return tuple(drawn)
+
+
+def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Picture]:
+    """The record as the paper draws it (its Figs. 4 and 9); ``label`` is safe and unique."""
+    view, contact = record.view, record.view.at_contact
+    left = f"{view.at_drive.rate:.0%} of a rate at the drive's frequency" + (
+        f" and {contact.rate:.0%} at that of the contacts ({contact.f:.3g} Hz)" if contact else ""
+    )
+    caption = (
+        "The record itself: raw channels, and the phase plane through Savitzky–Golay with the impact line and a point a "
+        f"period. The filter ({view.samples} samples) leaves {left}."
+    )
+    title = f"{record.name}: the record, {view.label}"
+    drawn = [_picture(result, f"record_{label}", "measured", title, caption, run_overview(view))]
+    if view.force is not None:
+        figure = figure_of(force_on_rod(view, model=(view.time, record.force)))
+        text = (
+            "Force on the rod (the paper's Fig. 4d): K times the recorded current, and the drive of the fitted model."
+        )
+        drawn.append(_picture(result, f"force_{label}", "measured", f"{record.name}: force on the rod", text, figure))
+    return drawn
 
 
 def comparison_caption(item: Comparison) -> str:
