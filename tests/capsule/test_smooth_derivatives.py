@@ -105,6 +105,7 @@ def test_batches_and_vmap_have_the_derivatives_of_their_lanes(cases: Cases) -> N
     np.testing.assert_allclose(jax.vmap(advance)(mu), advance(mu), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_failed_lane_has_no_derivative_and_leaves_the_others_theirs(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_20")
 

@@ -1,8 +1,8 @@
 """Forced runs through the whole fit: rigs with random truths, and rigs with something wrong planted in them."""
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from calibration import normal_score
 
 from capsule_id.experiments import make_experiments
 from capsule_id.inference.fit import fit_rig
-from capsule_id.inference.point_stage import fit_points
+from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.inference.run_checks import check_agreement
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
@@ -76,13 +76,19 @@ def _edit(file: Path, change: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
     change(pd.read_csv(file)).to_csv(file, index=False)
 
 
-def disagreement_of(folder: Path, seed: int) -> str:
-    """The parameter that the check of bench against runs names on the rig in ``folder``; "" where it passes."""
-    rig = read_rig(folder)
-    stage = fit_points(rig, make_experiments(rig), seed, sampled=True)
+def named_by(stage: PointStage) -> str:
+    """The parameter that the check of bench against runs names; "" where it passes."""
     found = check_agreement(stage.target, stage.fit, stage.bench.fit, stage.bench.sample)[0]
     if found.level == "ok":
         return ""
     named = re.search(r"largest disagreement in (\S+)", found.text)
     assert named is not None
     return named[1]
+
+
+def disagreement_of(folder: Path, seed: int, runs: Sequence[str] = ()) -> PointStage:
+    """The rig in ``folder`` fitted, bench and runs; of its ``runs`` only these, where named."""
+    rig = read_rig(folder)
+    kept = tuple(t for t in rig.tables if t.kind != "forced_run" or not runs or t.label in runs)
+    rig = replace(rig, tables=kept)
+    return fit_points(rig, make_experiments(rig), seed, sampled=True)
