@@ -31,12 +31,10 @@ def simulate_scipy(
     max_step: float = np.inf,
     start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, int]:
-    """(states (n, 4) at ``times``, closings of the gap); q holds the parameters, P_d, Omega and possibly a phase.
+    """(states (n, 4) at ``times`` from ``start`` (4,), default at rest; closings of the gap).
 
-    Two departures from the paper's model may be in q: k1_cubic, N/m^3, and backward, the friction of backward motion
-    over that of forward motion.
-
-    start : (4,) at times[0], by default at rest
+    q holds the parameters, P_d, Omega, possibly a phase, and departures from the paper's model: k1_cubic, N/m^3, and
+    backward, the friction of backward over that of forward motion.
     """
     F_b, phase = q["mu"] * (q["m1"] + q["m2"]) * q["g"], q.get("phase", 0.0)
     y, t, contacts = np.zeros(4) if start is None else start.copy(), float(times[0]), 0
@@ -81,8 +79,6 @@ def simulate_scipy(
             contacts += contact
         if run.t_events[1].size:
             f = _force(q, y, contact)
-            if sigma == 0:
-                sigma = int(np.sign(f))
-            else:
-                y[3], sigma = 0.0, _sets_off(q, f, F_b)
+            sigma = _sets_off(q, f, F_b) if sigma else int(np.sign(f))
+            y[3] = 0.0
     return out, contacts

@@ -17,6 +17,7 @@ from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior, RunRecord
+from capsule_id.inference.run_checks import runs_alone
 from capsule_id.records.label import measured_motion
 from capsule_id.records.view import view_record
 from capsule_id.views import NoteTable
@@ -59,7 +60,9 @@ def run_records(target: LogPosterior, fit: PointFit) -> tuple[RunRecord, ...]:
 def bought(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> NoteTable:
     """Posterior sd with bench only, runs only, both; from samples where there are any, else from point fits."""
     known = {row.name for e in target.experiments if isinstance(e, ForcedRun) for row in e.parameters} | {"m1", "m2"}
-    runs = {name: sd if name in known else np.nan for name, sd in _runs_alone(target, joint).items()}
+    alone = runs_alone(target, joint)
+    sds = dict(zip(alone.names, np.sqrt(np.diag(alone.covariance)), strict=True))
+    runs = {name: float(sd * abs(joint.values[name])) if name in known else np.nan for name, sd in sds.items()}
     rows = {}
     for i, name in enumerate(target.names):
         if target.parameters[i].symbol not in SHARED:
@@ -72,24 +75,6 @@ def bought(target: LogPosterior, joint: PointFit, sample: Posterior | None, benc
         "point fit; bench and both: from the samples, where they were drawn."
     )
     return NoteTable("What the runs buy", caption, frame.rename_axis("parameter"))
-
-
-def _runs_alone(target: LogPosterior, fit: PointFit) -> dict[str, float]:
-    """sd of every located parameter, SI, from the runs' residuals and the priors."""
-    located = np.flatnonzero(~target.scatter)
-    residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(fit.u))
-    _, jacobian = linearised(residual, fit.u[located])
-    values = target.mapping(target.theta(fit.u))
-    wanted: list[np.ndarray] = []
-    for group in target.structure.groups:
-        own = group.first
-        parts = own.misfits(own.local(values), np)
-        size = sum(part.raw.shape[0] + part.design.shape[1] for part in parts) * len(group.entries[0][1])
-        wanted.append(np.full(size, isinstance(own, ForcedRun)))
-    rows = np.concatenate([*wanted, np.ones(target.dimension, dtype=bool)])
-    kept = jacobian[rows]
-    sd = np.sqrt(np.diag(np.linalg.inv(kept.T @ kept)))
-    return {target.names[i]: float(s * abs(fit.values[target.names[i]])) for i, s in zip(located, sd, strict=True)}
 
 
 def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:

@@ -8,8 +8,9 @@ from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.run_checks import (
     LARGEST_GROWTH,
+    RunsAlone,
     _by_sample,
-    check_agreement,
+    agreement,
     check_runs,
     disagreement,
     growth,
@@ -19,49 +20,40 @@ from tests.forced_runs import make, theta
 NAMES = ("k1", "c")
 
 
-class Target:
-    """Two located parameters, logarithms."""
-
-    names = NAMES
-    scatter = np.array([False, False])
-
-
 def fit(u: np.ndarray, covariance: np.ndarray) -> PointFit:
     values = dict(zip(NAMES, np.exp(u), strict=True))
     none = np.zeros((1, 2))
     return PointFit(NAMES, u, values, covariance, values, none, none, np.zeros(1), True, np.zeros(1, dtype=bool))
 
 
-def estimates(rng: np.random.Generator, shift: float) -> tuple[PointFit, PointFit]:
-    """Bench and joint estimates of two linear experiments; the runs see the first parameter ``shift`` too high."""
+def estimates(rng: np.random.Generator, shift: float) -> tuple[RunsAlone, PointFit]:
+    """Runs and bench, two linear experiments; the runs see the first parameter ``shift`` too high."""
     bench_cov = np.array([[4e-6, 1e-6], [1e-6, 9e-6]])
     runs_cov = np.array([[1e-6, -5e-7], [-5e-7, 2e-6]])
     one = rng.multivariate_normal(np.zeros(2), bench_cov)
     other = rng.multivariate_normal([shift, 0.0], runs_cov)
-    joint_cov = np.linalg.inv(np.linalg.inv(bench_cov) + np.linalg.inv(runs_cov))
-    joint = joint_cov @ (np.linalg.solve(bench_cov, one) + np.linalg.solve(runs_cov, other))
-    return fit(one, bench_cov), fit(joint, joint_cov)
+    return RunsAlone(NAMES, other, runs_cov), fit(one, bench_cov)
 
 
 def test_the_disagreement_is_standard_normal_where_there_is_none() -> None:
     rng = np.random.default_rng(1)
-    z = np.array([list(_ordered(*estimates(rng, 0.0))) for _ in range(3000)])
+    z = np.array([_ordered(*estimates(rng, 0.0)) for _ in range(3000)])
     assert stats.kstest(z[:, 0], "norm").pvalue > 1e-3
     assert stats.kstest(z[:, 1], "norm").pvalue > 1e-3
 
 
-def _ordered(one: PointFit, joint: PointFit) -> list[float]:
-    z = disagreement(Target(), joint, one, None)  # type: ignore[arg-type]
+def _ordered(runs: RunsAlone, bench: PointFit) -> list[float]:
+    z = disagreement(NAMES, runs, bench, None)
     return [z[name] for name in NAMES]
 
 
 def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
     rng = np.random.default_rng(2)
-    clean = [check_agreement(Target(), *estimates(rng, 0.0)[::-1], None) for _ in range(1500)]  # type: ignore[arg-type]
-    alarms = np.mean([found[0].level == "warn" for found in clean])
+    clean = [agreement(disagreement(NAMES, *estimates(rng, 0.0), None), True) for _ in range(1500)]
+    alarms = np.mean([found.level == "fail" for found in clean])
     assert 0.01 < alarms < 0.03
-    planted = [check_agreement(Target(), *estimates(rng, 0.015)[::-1], None) for _ in range(50)]  # type: ignore[arg-type]
-    assert all(found[0].level == "warn" and "largest disagreement in k1" in found[0].text for found in planted)
+    planted = [agreement(disagreement(NAMES, *estimates(rng, 0.015), None), False) for _ in range(50)]
+    assert all(found.level == "warn" and "largest disagreement in k1" in found.text for found in planted)
 
 
 def test_tails_follow_the_sample() -> None:
