@@ -11,11 +11,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, simulate
-from capsule_id.capsule.smooth import Smoothing
+from capsule_id.capsule.model import CapsuleParameters, Excitation
 from capsule_id.experiments.base import Start, Theta, no_design
 from capsule_id.experiments.dynamic_friction import DynamicFriction
-from capsule_id.experiments.forward import Model, forward_model, widths_of
+from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.friction_curve import friction_coefficient, slide_distance
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -32,14 +31,12 @@ SLIDES, REST = 6.0, 0.5
 FAR = 1e3
 
 
-class CapsuleDecay(FreeVibration):
+class CapsuleDecay(CapsuleForward, FreeVibration):
     """x_rel(t) of a rod released at the first sample, drive off, the capsule at rest there and free to slip.
 
     Start of the motion and offset are the record's own; with ``spring`` and ``gap`` the rod may hit the support spring.
     """
 
-    event_driven = True
-    model: Model
     model_name = "capsule model"  # pyright: ignore[reportAssignmentType, reportIncompatibleVariableOverride]
     masses = ("m1", "m2")
     ARRAYS = ("time", "values", "width", "reading_sd", "gap", "smoothing")
@@ -51,13 +48,6 @@ class CapsuleDecay(FreeVibration):
         self.within_reach = isinstance(gap, Quantity)
         self.gap, self.gap_sd = (gap.value, gap.sd) if isinstance(gap, Quantity) else (FAR, 0.0)
         self.gap_known = self.gap_sd == 0.0
-        self.model, self.smoothing = forward_model(None)
-
-    def with_smoothing(self, widths: Smoothing | None) -> "CapsuleDecay":
-        """The same record with the smoothed model of these ``widths``; None: the exact one."""
-        other = CapsuleDecay(self.table, self.rig)
-        other.model, other.smoothing = forward_model(widths)
-        return other
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -75,7 +65,7 @@ class CapsuleDecay(FreeVibration):
         """(n,) x_rel of the model."""
         p = _capsule(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
-        t = simulate(p, OFF, self.time, initial, model=self.model, smoothing=widths_of(self.model, self.smoothing))
+        t = self.simulated(p, OFF, self.time, initial)
         return t.X1 - t.X2
 
     def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
@@ -97,14 +87,12 @@ class CapsuleDecay(FreeVibration):
         return []
 
 
-class CapsulePushes(DynamicFriction):
+class CapsulePushes(CapsuleForward, DynamicFriction):
     """Pushes with the rod free on k1 and c: both masses start at speed v; the distance is the capsule's, once at rest.
 
     Variances are those of the locked rod (first order in reading errors and scatter).
     """
 
-    event_driven = True
-    model: Model
     masses = ("m1", "m2")
     ARRAYS = ("speed", "distance", "speed_sd", "distance_sd", "horizon", "smoothing")
     STATIC = ("model",)
@@ -113,13 +101,6 @@ class CapsulePushes(DynamicFriction):
         super().__init__(table, rig)
         #: (n,) s at which every push has come to rest.
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
-        self.model, self.smoothing = forward_model(None)
-
-    def with_smoothing(self, widths: Smoothing | None) -> "CapsulePushes":
-        """The same pushes with the smoothed model of these ``widths``; None: the exact one."""
-        other = CapsulePushes(self.table, self.rig)
-        other.model, other.smoothing = forward_model(widths)
-        return other
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -128,9 +109,8 @@ class CapsulePushes(DynamicFriction):
     def slide(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """(n,) m that the capsule goes."""
         still, v = xp.zeros(self.n), xp.asarray(self.speed)
-        times = np.stack([np.zeros(self.n), self.horizon], axis=1) if xp is np else _times(self.horizon)
-        widths = widths_of(self.model, self.smoothing)
-        t = simulate(_capsule(theta, 0.0, FAR), OFF, times, (still, v, still, v), model=self.model, smoothing=widths)
+        times = xp.stack([xp.zeros(self.n), xp.asarray(self.horizon)], axis=1)
+        t = self.simulated(_capsule(theta, 0.0, FAR), OFF, times, (still, v, still, v))
         return xp.asarray(t.X2)[:, -1]
 
     def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
@@ -139,10 +119,6 @@ class CapsulePushes(DynamicFriction):
         slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))
         variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
         return (Misfit(self.distance - self.slide(theta, xp), variance, locked, no_design(self.n, xp)),)
-
-
-def _times(horizon: Any) -> Any:
-    return jnp.stack([jnp.zeros_like(horizon), horizon], axis=1)
 
 
 def _capsule(theta: Theta, k2: Any, gap: Any) -> CapsuleParameters:

@@ -4,8 +4,7 @@
 
 The channels that are recorded (x_rel, x_capsule, acceleration_rod, current) are independent given the motion; each has
 its own noise, and an offset that enters linearly and is integrated out (a gain and, to first order, a delay too, where
-their sd is stated). X2 = 0 at
-the first sample by convention: X2 and the offset of x_capsule cannot both be free.
+their sd is stated). X2 = 0 at the first sample by convention: X2 and the offset of x_capsule cannot both be free.
 """
 
 from dataclasses import replace
@@ -16,11 +15,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory, simulate
-from capsule_id.capsule.smooth import Smoothing
+from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.experiments.base import Experiment, Start, Theta
 from capsule_id.experiments.feasibility import feasibility
-from capsule_id.experiments.forward import Model, forward_model, widths_of
+from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, ScaledMisfit
 from capsule_id.experiments.run_parts import leads, record_of
@@ -47,7 +45,7 @@ PHASE_WIDTH = np.pi
 SETTLING_PERIODS = 40
 
 
-class ForcedRun(Experiment):
+class ForcedRun(CapsuleForward, Experiment):
     """One record of the driven capsule.
 
     Initial state, by ``start`` in rig.toml: "stuck" (capsule at rest and held: Y2 = 0), "moving" (Y2 sampled too),
@@ -61,8 +59,6 @@ class ForcedRun(Experiment):
     """
 
     time_series = True
-    event_driven = True
-    model: Model
     masses = ("m1", "m2")
     ARRAYS = (
         "time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "delays", "reading_variance",
@@ -93,7 +89,6 @@ class ForcedRun(Experiment):
         self.delays, self.delayed = self._asked_for("delay")
         self.second_reading = self.driven_by_current and self.drive_sd > 0.0
         self.coloured = table.settings.get("noise") == "ar1"
-        self.model, self.smoothing = forward_model(None)
         wanted = str(table.settings.get("start", "auto"))
         self.start_is_open = wanted == "auto"
         self.start = self.rough.kind if self.start_is_open else wanted
@@ -118,12 +113,6 @@ class ForcedRun(Experiment):
         if not isinstance(speed, float):
             return rough
         return replace(rough, capsule_rate=speed, kind="stuck" if speed == 0.0 else "moving")
-
-    def with_smoothing(self, widths: Smoothing | None) -> "ForcedRun":
-        """The same record with the smoothed model of these ``widths`` as forward model; None: the exact one."""
-        other = ForcedRun(replace(self.table, settings={**self.table.settings, "start": self.start}), self.rig)
-        other.model, other.smoothing = forward_model(widths)
-        return other
 
     @property
     def driven_by_current(self) -> bool:
@@ -209,16 +198,15 @@ class ForcedRun(Experiment):
     def motion(self, theta: Theta, xp: ModuleType = jnp) -> Trajectory:
         """The model's motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
-        smoothing = widths_of(self.model, self.smoothing)
         if self.settled:
             early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
-            run = simulate(p, e, xp.concatenate([early, self.time]), model=self.model, smoothing=smoothing)
+            run = self.simulated(p, e, xp.concatenate([early, self.time]))
             settled = {name: getattr(run, name)[1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
             X2 = settled["X2"][0]
             return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})
         Y2 = self.moves * theta.get("capsule_start", 0.0) + 0.0 * theta["x_start"]
         initial = (theta["x_start"], theta["y_start"] + Y2, 0.0, Y2)
-        return simulate(p, e, self.time, initial, model=self.model, smoothing=smoothing)
+        return self.simulated(p, e, self.time, initial)
 
     def predict(self, theta: Theta, xp: ModuleType = jnp) -> list[Any]:
         """Noise-free channels (n,), offsets and gains left out, in the order of ``channels``.

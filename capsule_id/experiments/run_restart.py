@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from capsule_id.experiments.base import Theta
-from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.experiments.forced_run import NOISES, ForcedRun
 from capsule_id.experiments.run_start import SPEED_FOUND
 
 #: Speeds at the first sample, m/s, that are held against the record; the middle one is rest.
@@ -69,9 +69,8 @@ def _misses(run: ForcedRun, theta: Theta, x: np.ndarray, Y1: np.ndarray, speeds:
     lanes = {name: np.full(len(x), value) for name, value in theta.items() if np.ndim(value) == 0}
     seen = run.predict({**lanes, "x_start": x, "y_start": Y1 - speeds, "capsule_start": speeds}, np)
     parts = []
-    for values, model, name, symbol in zip(run.values, seen, run.channels, run.scatters, strict=False):
+    for values, model, name in zip(run.values, seen, run.channels, strict=True):
         if name != "current":
-            assert symbol is not None, "a channel has a noise"
-            miss = (values - model) / theta[symbol]
+            miss = (values - model) / theta[NOISES[name]]
             parts.append(miss - np.mean(miss, axis=1, keepdims=True))
     return np.concatenate(parts, axis=1)

@@ -74,16 +74,35 @@ def fit_points(rig: Rig, experiments: Sequence[Experiment], seed: int, sampled: 
             own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
             bench, known = BenchFit(fit, own), dict(fit.values)
         experiments, findings = cut_unpredictable(rig, experiments, known)
-        target, first = LogPosterior(rig, experiments), None
-        for _ in range(ROUNDS):
-            _compile(pool, target)
-            starts = dispersed_starts(target, seed, JOINT_STARTS)
-            joint = joint_fit(target, known if bench.fit is None else bench.fit, starts, first)
-            corrected = correct_starts(target, joint)
-            if corrected is None:
-                break
+        target, joint, wavering = _fit_with_right_starts(rig, experiments, known, bench, seed, pool)
+    return PointStage(target, joint, bench, (*findings, *wavering))
+
+
+def _fit_with_right_starts(
+    rig: Rig,
+    experiments: Sequence[Experiment],
+    known: Mapping[str, float],
+    bench: BenchFit,
+    seed: int,
+    pool: Executor | None,
+) -> tuple[LogPosterior, PointFit, list[Finding]]:
+    """The joint fit, again from where it ended as long as it finds a start of a run wrong; and what is left of that."""
+    target, first = LogPosterior(rig, experiments), None
+    for remaining in reversed(range(ROUNDS)):
+        _compile(pool, target)
+        starts = dispersed_starts(target, seed, JOINT_STARTS)
+        joint = joint_fit(target, known if bench.fit is None else bench.fit, starts, first)
+        corrected = correct_starts(target, joint)
+        if corrected is None:
+            return target, joint, []
+        if remaining:
             target, first = LogPosterior(rig, corrected[0]), corrected[1]
-    return PointStage(target, joint, bench, tuple(findings))
+    doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
+    text = (
+        f"{', '.join(doubtful)}: expected one kind of start to fit; after {ROUNDS} fits the record still speaks for "
+        'another: state start = "stuck" or "moving", or cut the record where the capsule is clearly at rest'
+    )
+    return target, joint, [Finding("start of a run", "fail", text, doubtful[0])]
 
 
 def _compile(pool: Executor | None, target: LogPosterior) -> None:

@@ -12,6 +12,7 @@ from capsule_id.capsule.smooth import Smoothing
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Theta
 from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.inference.density import HeldResiduals
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.log_posterior import LogPosterior
@@ -183,7 +184,7 @@ def _evaluate(residual: HeldResiduals, v: Any) -> Any:
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing) -> tuple[np.ndarray, np.ndarray]:
     """(d_located,) shift of u between a fit with the smoothed model of ``widths`` and the exact one, and the sd of u."""
     located = np.flatnonzero(~target.scatter)
-    smoothed = [e.with_smoothing(widths) if isinstance(e, ForcedRun) else e for e in target.experiments]
+    smoothed = [e.with_smoothing(widths) if isinstance(e, CapsuleForward) else e for e in target.experiments]
     free, centre = tuple(int(i) for i in located), jnp.asarray(fit.u)
     other = LogPosterior(target.rig, smoothed)
     misses = _evaluate(HeldResiduals(other.structure, free, other.numbers, centre), centre[located])

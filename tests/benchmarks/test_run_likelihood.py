@@ -15,7 +15,7 @@ import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Theta
-from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.experiments.forced_run import NOISES, ForcedRun
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.rig.read import read_rig
 from tests.cli_tools import DATA
@@ -57,10 +57,9 @@ def density_of_run(run: ForcedRun, theta: Theta) -> float:
         "current": theta["I_d"] * cosine,
     }
     total = 0.0
-    for i, (name, symbol) in enumerate(zip(run.channels, run.scatters, strict=True)):
-        assert symbol is not None
+    for i, name in enumerate(run.channels):
         r, n = run.values[i] - channels[name], len(run.time)
-        variance, offset = theta[symbol] ** 2 + run.reading_variance[i], run.widths[i] ** 2
+        variance, offset = theta[NOISES[name]] ** 2 + run.reading_variance[i], run.widths[i] ** 2
         quadratic = (r @ r - offset * np.sum(r) ** 2 / (variance + n * offset)) / variance
         total -= 0.5 * (quadratic + n * np.log(2.0 * np.pi * variance) + np.log1p(n * offset / variance))
     return float(total)

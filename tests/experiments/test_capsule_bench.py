@@ -11,6 +11,8 @@ from capsule_id.capsule.smooth import Smoothing
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.capsule_bench import CapsuleDecay, CapsulePushes
+from capsule_id.experiments.dynamic_friction import DynamicFriction
+from capsule_id.experiments.free_vibration import FreeVibration
 from capsule_id.experiments.friction_curve import slide_distance
 from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.rig.model import PriorOverride, Quantity, Table
@@ -57,6 +59,12 @@ def estimate(stage: PointStage, name: str) -> tuple[float, float]:
     return stage.fit.values[name], stage.fit.standard_errors[name]
 
 
+def test_forward_chooses_the_room() -> None:
+    for forward, rooms in (("capsule", [CapsuleDecay, CapsulePushes]), ("closed", [FreeVibration, DynamicFriction])):
+        rig = bench.rig(decay(2e-3, forward), pushes(forward))
+        assert [type(e) for e in make_experiments(rig)] == rooms
+
+
 def test_a_small_release_gives_what_the_closed_form_gives() -> None:
     """2 mm is below F_b/k1 = 2.9 mm: the capsule stays where it is."""
     for name in ("k1", "c"):
@@ -78,8 +86,7 @@ def test_a_large_release_biases_the_closed_form_only() -> None:
 def test_a_record_that_hits_the_spring_is_described() -> None:
     """A release of 2.3 mm, spring at 1 mm: no free decay, and no lint either, for the model has the spring."""
     table = decay(2.3e-3, "capsule", gap=Quantity(1e-3), spring="soft", k2=2420.0)
-    e = make_experiments(bench.rig(table))[0]
-    assert isinstance(e, CapsuleDecay)
+    e = CapsuleDecay(table, bench.rig(table))
     theta = TRUTH | {"k2": 2420.0, "x_start": 2.3e-3, "y_start": 0.0, "noise_sd": NOISE}
     rest = np.asarray(e.residuals(theta, np))[: e.n]
     assert np.std(rest) == pytest.approx(1.0, rel=0.1)
@@ -89,8 +96,7 @@ def test_a_record_that_hits_the_spring_is_described() -> None:
 
 def test_a_ringing_rod_shortens_the_slide() -> None:
     """By 11 % at 0.1 m/s and 3 % at 0.2 m/s; a rod that is stiff to its capsule is a locked one."""
-    e = make_experiments(bench.rig(pushes("capsule")))[0]
-    assert isinstance(e, CapsulePushes)
+    e = CapsulePushes(pushes("capsule"), bench.rig())
     np.testing.assert_allclose(np.asarray(e.slide(TRUTH, np)), e.distance, rtol=1e-7)
     locked = np.asarray(slide_distance(SPEEDS, MU, V_S, bench.G, np))
     assert np.round(100.0 * (e.distance / locked - 1.0)[:2]).tolist() == [-11.0, -3.0]
@@ -113,8 +119,7 @@ def test_pushes_read_by_the_closed_form_are_biased() -> None:
 
 
 def test_the_smoothed_model_converges_to_the_exact_one() -> None:
-    e = make_experiments(bench.rig(pushes("capsule")))[0]
-    assert isinstance(e, CapsulePushes)
+    e = CapsulePushes(pushes("capsule"), bench.rig())
     exact = np.asarray(e.slide(TRUTH, np))
     errors = [
         np.max(np.abs(np.asarray(e.with_smoothing(Smoothing(velocity=v)).slide(TRUTH, np)) / exact - 1.0))

@@ -1,7 +1,13 @@
 """Runs that cannot be predicted are cut, and it is said; others are left alone."""
 
+import pytest
+
+from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run import ForcedRun
-from capsule_id.inference.point_stage import cut_unpredictable
+from capsule_id.experiments.run_restart import restarted
+from capsule_id.inference import point_stage
+from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.point_stage import BenchFit, cut_unpredictable
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.synthetic_runs import RunSettings, make_runs
 from tests.experiments import bench
@@ -27,4 +33,28 @@ def test_a_chaotic_record_is_cut_and_a_tame_one_is_not() -> None:
     tame = make(1, samples=1000)
     kept, findings = cut_unpredictable(tame.rig, [tame], TRUTH)
     assert kept == [tame]
+    assert findings == []
+
+
+def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last fit belongs to the experiments that come back with it, whatever would have been tried next."""
+    run, fitted = make(2, samples=120), []
+
+    def joint_fit(target: LogPosterior, *_: object) -> LogPosterior:
+        fitted.append(target)
+        return target
+
+    def other_kind(target: LogPosterior, *_: object) -> tuple[list[Experiment], dict[str, float]]:
+        (own,) = target.experiments
+        assert isinstance(own, ForcedRun)
+        return [restarted(own, 0.0 if own.start == "moving" else 1e-2)], {}
+
+    monkeypatch.setattr(point_stage, "joint_fit", joint_fit)
+    monkeypatch.setattr(point_stage, "correct_starts", other_kind)
+    target, fit, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, BenchFit(), 0, None)
+    assert len(fitted) == point_stage.ROUNDS
+    assert target is fit is fitted[-1]
+    assert [(finding.level, finding.experiment) for finding in findings] == [("fail", "run_3")]
+    monkeypatch.setattr(point_stage, "correct_starts", lambda *_: None)
+    *_, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, BenchFit(), 0, None)
     assert findings == []
