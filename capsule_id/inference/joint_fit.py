@@ -1,11 +1,11 @@
 """Point fit of rigs with forced runs: bench first, then everything together.
 
-    bench experiments -> their own point fit -> starts about it, runs started from their records
+    bench experiments -> their own point fit -> starts about it (``joint_starts``), runs started from their records
     -> (Levenberg–Marquardt on the located parameters <-> scatters at their conditional maxima) until neither moves
+    -> again from wherever moving one parameter alone does better
 
-The likelihood of a run has side maxima far from the truth, so the starts are dispersed as far as the bench leaves the
-parameters open (for runs alone: about the values that the paper's protocol gives). Derivatives of the event-driven
-model are exact and forward; the Hessian is Gauss–Newton's, for the residuals are small and the parameters well known.
+Derivatives of the event-driven model are exact and forward; the Hessian is Gauss–Newton's, for the residuals are small
+and the parameters well known. The likelihood has side maxima (a contact more or less), hence several starts and moves.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,9 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from capsule_id.experiments.forced_run import NOISES, ForcedRun
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.inference import density
 from capsule_id.inference.density import HeldResiduals
+from capsule_id.inference.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.least_squares import LeastSquaresFit, covariance, least_squares
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.result import PointFit
@@ -28,45 +30,45 @@ AGREEMENT = 0.05
 TOLERANCE, MAX_STEPS = 1e-7, 80
 #: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
 ROUNDS, STILL = 8, 0.01
+#: Where a descent ends, every parameter alone is moved by so many standard deviations; what gains more than ``GAIN`` in
+#: log-posterior is a point to descend from again, and again at most.
+MOVES, GAIN, ESCAPES = 2.0 ** np.arange(8), 1.0, 4
+#: Gain in log-posterior, by the Gauss–Newton step from where the descent stopped, that is not worth a complaint: a contact
+#: that moves over a sample gives the likelihood a kink, and at a minimum on a kink no gradient vanishes.
+KINK = 0.02
 #: A start that comes to rest with this many times the sum of squares of the best one has found another motion: its
 #: scatters are then not worth a round.
 ELSEWHERE = 3.0
-#: Starts leave the bench's estimates by this many of its standard deviations.
-DISPERSION = 1.0
-#: Relative sd of the starts about rough values.
-ROUGH = 0.01
+#: Starts go on until two ends leave no run with more than so many times the noise that its record shows.
+NOISY = 1.2
 #: A scatter's conditional maximum is looked for within this factor (logarithm) of where it stands.
 REACH = 6.0
 
 
 def joint_fit(
-    target: LogPosterior,
-    known: PointFit | Mapping[str, float],
-    starts: np.ndarray,
-    first: Mapping[str, float] | None = None,
+    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float] | None = None
 ) -> PointFit:
     """Fit ``target``, whose experiments include forced runs.
 
     Parameters
     ----------
-    known : the point fit of its bench experiments, or, for runs alone, rough values by name (the paper's estimates)
-    starts : (s, d) in u, as ``point_fit.dispersed_starts`` makes them; the entries that are known are replaced
-    first : values by name that the first start has instead, as far as it has them
+    known : values by name of what is known before: a fit of the bench, or the paper's estimates
+    seed : of the candidates
+    first : values by name that stand where the bench's would, as far as it has them
     """
-    starts = _about_known(target, known, starts)
-    if first is not None:
-        theta = target.theta(starts[0])
-        own = [first.get(name, value) for name, value in zip(target.names, theta, strict=True)]
-        starts[0] = target.unconstrain(np.array(own))
+    starts = choose_starts(target, known, seed, first or {})
     located = np.flatnonzero(~target.scatter)
-    ends = [_descend(target, starts[0], located)]
+    ends = [_search(target, starts[0], located)]
     # The others take the first one's scatters to begin with: they start from noise, which any of them knows as well.
     limit = ELSEWHERE * float(ends[0][1].cost[0])
     for start in starts[1:]:
-        ends.append(_descend(target, np.where(target.scatter, ends[0][0], start), located, limit))
+        if len(ends) >= STARTS and sum(not _is_noisy(target, end) for end, _, _ in ends) > 1:
+            break
+        ends.append(_search(target, np.where(target.scatter, ends[0][0], start), located, limit))
+    starts = starts[: len(ends)]
     u = np.stack([end for end, _, _ in ends])
-    value = np.array([float(target.batch(np.repeat(end[None], 2, axis=0))[0]) for end in u])
-    best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
+    value = weigh(target, u)
+    best = int(np.argmax(value))
     fit = ends[best][1]
     matrix = np.zeros((target.dimension, target.dimension))
     located_covariance = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0)
@@ -91,23 +93,35 @@ def joint_fit(
     )
 
 
-def _about_known(target: LogPosterior, known: PointFit | Mapping[str, float], starts: np.ndarray) -> np.ndarray:
-    """``starts`` with the entries that are known drawn about what is known; the first start has them as they are."""
-    starts = starts.copy()
-    if isinstance(known, PointFit):
-        own = np.array([target.names.index(name) for name in known.names])
-        centre, root = known.u, np.linalg.cholesky(known.covariance)
-        root = DISPERSION * np.where(target.scatter[own, None], 0.0, root)
-    else:
-        names = [name for name in target.names if name in known]
-        own = np.array([target.names.index(name) for name in names], dtype=int)
-        theta = target.theta(starts[0])
-        theta[own] = [known[name] for name in names]
-        centre, root = target.unconstrain(theta)[own], ROUGH * np.eye(len(own))
-    for i, start in enumerate(starts):
-        z = np.random.default_rng([i, len(own)]).standard_normal(len(own))
-        start[own] = centre + (root @ z if i else 0.0)
-    return starts
+def _is_noisy(target: LogPosterior, u: np.ndarray) -> bool:
+    """At u (d,) a channel of a run has clearly more noise than its record shows: its motion is not described."""
+    values = target.mapping(target.theta(u))
+    runs = [(e, e.local(values)) for e in target.experiments if isinstance(e, ForcedRun)]
+    return any(theta[NOISES[name]] > NOISY * e.rough.noise[name] for e, theta in runs for name in e.channels)
+
+
+def _search(
+    target: LogPosterior, start: np.ndarray, located: np.ndarray, limit: float = np.inf
+) -> tuple[np.ndarray, LeastSquaresFit, bool]:
+    """``_descend``, and again from wherever moving one parameter alone does better."""
+    end = _descend(target, start, located, limit)
+    for _ in range(ESCAPES):
+        better = _better_point(target, end[0], end[1], located) if end[1].cost[0] <= limit else None
+        if better is None:
+            break
+        end = _descend(target, better, located, limit)
+    return end
+
+
+def _better_point(target: LogPosterior, u: np.ndarray, fit: LeastSquaresFit, located: np.ndarray) -> np.ndarray | None:
+    """(d,) the likeliest of the points that differ from u (d,) in one located parameter; None where none gains."""
+    sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))
+    steps = np.concatenate([MOVES, -MOVES])[:, None, None] * np.diag(sd)
+    points = np.repeat(u[None], steps[..., 0].size + 1, axis=0)
+    points[1:, located] += steps.reshape(-1, len(located))
+    value = weigh(target, points)
+    best = int(np.argmax(value))
+    return points[best] if value[best] > value[0] + GAIN else None
 
 
 def _descend(
@@ -126,7 +140,7 @@ def _descend(
         moved = np.max(np.abs(fit.x[0] - u[located]) / np.where(sd > 0, sd, 1.0))
         u[located] = fit.x[0]
         if fit.cost[0] > limit:
-            return u, fit, not bool(fit.stalled[0])
+            return u, fit, _at_rest(fit)
         scatters = scatter_modes(target, u)
         shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
         for i, value in scatters.items():
@@ -135,7 +149,16 @@ def _descend(
         if still:
             break
     assert fit is not None, "there is at least one round"
-    return u, fit, still and not bool(fit.stalled[0])
+    return u, fit, still and _at_rest(fit)
+
+
+def _at_rest(fit: LeastSquaresFit) -> bool:
+    """One fit, from one start, converged, or stopped where nothing is left to gain."""
+    misses, jacobian = fit.residuals[0], fit.jacobian[0]
+    if not fit.stalled[0] or not (np.isfinite(misses).all() and np.isfinite(jacobian).all()):
+        return not fit.stalled[0]
+    step = np.linalg.lstsq(jacobian, -misses)[0]
+    return bool(0.5 * np.sum((jacobian @ step) ** 2) < KINK)
 
 
 def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:

@@ -18,15 +18,13 @@ from capsule_id.experiments.run_restart import better_start, restarted
 from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.marginal import MarginalPosterior, compile_ahead
-from capsule_id.inference.point_fit import dispersed_starts, point_fit
+from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.run_checks import LARGEST_GROWTH, growth
 from capsule_id.inference.sampling import sample
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 
-#: Starts of the fit of event-driven models, each of which costs seconds.
-JOINT_STARTS = 3
 #: emcee steps of the bench's own sample, which shows what the runs add and whether they agree.
 BENCH_BUDGET = 1000
 #: Fits, each after kinds of start that the one before found wrong have been put right.
@@ -74,7 +72,7 @@ def fit_points(rig: Rig, experiments: Sequence[Experiment], seed: int, sampled: 
             own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
             bench, known = BenchFit(fit, own), dict(fit.values)
         experiments, findings = cut_unpredictable(rig, experiments, known)
-        target, joint, wavering = _fit_with_right_starts(rig, experiments, known, bench, seed, pool)
+        target, joint, wavering = _fit_with_right_starts(rig, experiments, known, seed, pool)
     return PointStage(target, joint, bench, (*findings, *wavering))
 
 
@@ -82,7 +80,6 @@ def _fit_with_right_starts(
     rig: Rig,
     experiments: Sequence[Experiment],
     known: Mapping[str, float],
-    bench: BenchFit,
     seed: int,
     pool: Executor | None,
 ) -> tuple[LogPosterior, PointFit, list[Finding]]:
@@ -90,8 +87,7 @@ def _fit_with_right_starts(
     target, first = LogPosterior(rig, experiments), None
     for remaining in reversed(range(ROUNDS)):
         _compile(pool, target)
-        starts = dispersed_starts(target, seed, JOINT_STARTS)
-        joint = joint_fit(target, known if bench.fit is None else bench.fit, starts, first)
+        joint = joint_fit(target, known, seed, first)
         corrected = correct_starts(target, joint)
         if corrected is None:
             return target, joint, []

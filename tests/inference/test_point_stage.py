@@ -7,7 +7,7 @@ from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.experiments.run_restart import restarted
 from capsule_id.inference import point_stage
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.point_stage import BenchFit, cut_unpredictable
+from capsule_id.inference.point_stage import cut_unpredictable
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.synthetic_runs import RunSettings, make_runs
 from tests.experiments import bench
@@ -51,10 +51,10 @@ def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypat
 
     monkeypatch.setattr(point_stage, "joint_fit", joint_fit)
     monkeypatch.setattr(point_stage, "correct_starts", other_kind)
-    target, fit, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, BenchFit(), 0, None)
+    target, fit, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, 0, None)
     assert len(fitted) == point_stage.ROUNDS
     assert target is fit is fitted[-1]
     assert [(finding.level, finding.experiment) for finding in findings] == [("fail", "run_3")]
     monkeypatch.setattr(point_stage, "correct_starts", lambda *_: None)
-    *_, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, BenchFit(), 0, None)
+    *_, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, 0, None)
     assert findings == []

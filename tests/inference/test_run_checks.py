@@ -8,6 +8,7 @@ from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.run_checks import (
     LARGEST_GROWTH,
+    Distance,
     RunsAlone,
     _by_sample,
     agreement,
@@ -43,8 +44,8 @@ def test_the_disagreement_is_standard_normal_where_there_is_none() -> None:
 
 
 def _ordered(runs: RunsAlone, bench: PointFit) -> list[float]:
-    z = disagreement(NAMES, runs, bench, None)
-    return [z[name] for name in NAMES]
+    found = disagreement(NAMES, runs, bench, None)
+    return [found[name].z for name in NAMES]
 
 
 def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
@@ -54,6 +55,16 @@ def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
     assert 0.01 < alarms < 0.03
     planted = [agreement(disagreement(NAMES, *estimates(rng, 0.015), None), False) for _ in range(50)]
     assert all(found.level == "warn" and "largest disagreement in k1" in found.text for found in planted)
+
+
+def test_named_is_where_the_error_came_from() -> None:
+    """Heavy tails make nothing of what lies between 19 and 7 sd; a parameter that is no surprise is not named at all."""
+    found = {"k1": Distance(30.0, 1.0), "mu": Distance(18.6, 4.0), "v_s": Distance(-6.6, -4.1), "c": Distance(2.0, 2.0)}
+    text = agreement(found, True).text
+    assert "largest disagreement in mu (+18.6 sd" in text
+    assert "then v_s (-6.6 sd" in text
+    assert "k1" not in text
+    assert "c (" not in text
 
 
 def test_tails_follow_the_sample() -> None:
