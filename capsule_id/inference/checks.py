@@ -16,7 +16,6 @@ from capsule_id.inference.experiment_checks import (
     check_whiteness,
 )
 from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.views import Finding
@@ -33,7 +32,7 @@ def run_checks(setting: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
     """All findings, and the rows (indices) flagged as outliers by experiment label."""
     flagged: dict[str, list[int]] = {}
     findings = [
-        *_starts(setting),
+        *check_starts(setting.fit),
         *_chains(setting),
         *check_whiteness(setting),
         *check_outliers(setting, flagged),
@@ -50,14 +49,15 @@ def run_checks(setting: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
     return findings, flagged
 
 
-def _starts(s: Setting) -> list[Finding]:
-    fit, number = s.fit, len(s.fit.starts)
+def check_starts(fit: PointFit) -> list[Finding]:
+    """Expected: every start of the point fit ends at one maximum, or at one that holds no mass."""
+    number = len(fit.starts)
     if fit.agree and not fit.stalled.any():
         return [Finding("starts agree", "ok", f"all {number} starts of the point fit ended at the same maximum")]
     spread = np.sqrt(np.diag(fit.covariance))
     distance = np.abs(fit.ends - fit.u) / spread
     away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
-    elsewhere = away > AGREEMENT
+    elsewhere = fit.elsewhere
     # How much less probable the other ends are: a mode that far down holds no posterior mass.
     below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
     inferior = elsewhere & (below > NEGLIGIBLE_MODE)

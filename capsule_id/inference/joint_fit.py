@@ -33,9 +33,10 @@ ROUNDS, STILL = 8, 0.01
 #: Where a descent ends, every parameter alone is moved by so many standard deviations; what gains more than ``GAIN`` in
 #: log-posterior is a point to descend from again, and again at most.
 MOVES, GAIN, ESCAPES = 2.0 ** np.arange(8), 1.0, 4
-#: Gain in log-posterior, by the Gauss–Newton step from where the descent stopped, that is not worth a complaint: a contact
-#: that moves over a sample gives the likelihood a kink, and at a minimum on a kink no gradient vanishes.
-KINK = 0.02
+#: Difference in log-posterior without a meaning. A contact that moves over a sample gives the likelihood a kink, and so
+#: maxima side by side, less than a standard deviation apart: to the posterior they are one. At a maximum on a kink no
+#: gradient vanishes: the descent has come to rest where its Gauss–Newton step promises no more than this.
+DENT = 0.1
 #: A start that comes to rest with this many times the sum of squares of the best one has found another motion: its
 #: scatters are then not worth a round.
 ELSEWHERE = 3.0
@@ -88,9 +89,17 @@ def joint_fit(
         starts=starts,
         ends=u,
         log_posterior=value,
-        agree=bool(np.all(np.abs(u - u[best]) < AGREEMENT * spread)),
+        elsewhere=_elsewhere(u, value, spread),
         stalled=np.array([not converged for _, _, converged in ends]),
     )
+
+
+def _elsewhere(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(s,) which of the ends u (s, d) are another maximum than the best; log-posterior (s,), posterior sd (d,)."""
+    best = int(np.argmax(value))
+    away = np.max(np.abs(u - u[best]) / spread, axis=1)
+    dent = (away < 1.0) & (value > value[best] - DENT)
+    return (away > AGREEMENT) & ~dent
 
 
 def _is_noisy(target: LogPosterior, u: np.ndarray) -> bool:
@@ -158,7 +167,7 @@ def _at_rest(fit: LeastSquaresFit) -> bool:
     if not fit.stalled[0] or not (np.isfinite(misses).all() and np.isfinite(jacobian).all()):
         return not fit.stalled[0]
     step = np.linalg.lstsq(jacobian, -misses)[0]
-    return bool(0.5 * np.sum((jacobian @ step) ** 2) < KINK)
+    return bool(0.5 * np.sum((jacobian @ step) ** 2) < DENT)
 
 
 def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:

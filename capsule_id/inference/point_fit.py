@@ -77,7 +77,7 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
         starts=starts,
         ends=u,
         log_posterior=value,
-        agree=bool(np.all(np.abs(u - u[best]) < AGREEMENT * spread)),
+        elsewhere=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
         stalled=~converged | ~np.isfinite(value),
     )
 

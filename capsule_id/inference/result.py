@@ -30,7 +30,7 @@ class PointFit:
     standard_errors : by name, SI: from the Jacobian of the standardised residuals
     starts, ends : (s, d) in u
     log_posterior : (s,) at the ends
-    agree : every start ended at the same maximum
+    elsewhere : (s,) bool: this start ended at another maximum than the best one
     stalled : (s,) bool: the solver reported no convergence from this start
     """
 
@@ -42,8 +42,13 @@ class PointFit:
     starts: np.ndarray
     ends: np.ndarray
     log_posterior: np.ndarray
-    agree: bool
+    elsewhere: np.ndarray
     stalled: np.ndarray
+
+    @property
+    def agree(self) -> bool:
+        """Every start ended at the same maximum."""
+        return not self.elsewhere.any()
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from scipy import optimize
 from capsule_id.capsule.smooth import Smoothing
 from capsule_id.experiments.forced_run import ForcedRun
 from capsule_id.inference.density import HeldResiduals
-from capsule_id.inference.joint_fit import _at_rest, _descend, joint_fit, scatter_modes
+from capsule_id.inference.joint_fit import _at_rest, _descend, _elsewhere, joint_fit, scatter_modes
 from capsule_id.inference.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.least_squares import least_squares, linearised
 from capsule_id.inference.log_posterior import LogPosterior
@@ -71,6 +71,13 @@ def test_a_minimum_on_a_kink_is_one_unless_much_is_left_to_gain(pull: float, at_
     assert fit.x[0, 0] == pytest.approx(0.0, abs=1e-3)
     assert fit.stalled[0]
     assert _at_rest(fit) is at_rest
+
+
+def test_ends_are_one_maximum_where_the_posterior_cannot_tell() -> None:
+    """The best, one beside it, a dent, a point on its slope, and one as high, but two sd away."""
+    u = np.array([[0.0, 0.0], [0.04, 0.0], [0.5, 0.0], [0.5, 0.0], [2.0, 0.0]])
+    value = np.array([10.0, 9.9, 9.95, 9.8, 9.99])
+    assert _elsewhere(u, value, np.ones(2)).tolist() == [False, False, False, True, True]
 
 
 def test_scipy_finds_the_same_minimum() -> None:

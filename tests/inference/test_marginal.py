@@ -87,7 +87,7 @@ def approximate(target: LogPosterior, known: dict[str, float]) -> PointFit:
         root = root_of_inverse(-hessian(target.batch, u, scale))
         scale = np.sqrt(np.sum(root**2, axis=1))
     none = np.zeros((1, target.dimension))
-    return PointFit(target.names, u, {}, root @ root.T, {}, none, none, np.zeros(1), True, np.zeros(1, dtype=bool))
+    return PointFit(target.names, u, {}, root @ root.T, {}, none, none, np.zeros(1), *np.zeros((2, 1), dtype=bool))
 
 
 def twin(folder: Path, seed: int) -> tuple[LogPosterior, dict[str, float]]:

@@ -1,11 +1,14 @@
 """The point fit against SciPy on the same readings, its standard errors, and starts that cannot agree."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import optimize
 
 from capsule_id.experiments import make_experiments
+from capsule_id.inference.checks import check_starts
 from capsule_id.inference.log_posterior import LogPosterior
 from capsule_id.inference.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit
@@ -63,6 +66,30 @@ def test_truth_is_within_reach(fit: PointFit) -> None:
     for name, truth in Truth().flat().items():
         if name in fit.values:
             assert abs(fit.values[name] - truth) < 4.0 * fit.standard_errors[name], name
+
+
+@pytest.mark.parametrize(
+    ("log_posterior", "elsewhere", "stalled", "level"),
+    [
+        ([0.0, 0.0, 0.0], [0, 0, 0], [0, 0, 0], "ok"),
+        ([0.0, 0.0, -100.0], [0, 0, 1], [0, 0, 1], "warn"),
+        ([0.0, 0.0, -5.0], [0, 0, 1], [0, 0, 0], "fail"),
+        ([0.0, -100.0, -100.0], [0, 1, 1], [0, 0, 0], "fail"),
+        ([0.0, 0.0, 0.0], [0, 0, 0], [0, 1, 0], "fail"),
+    ],
+)
+def test_other_maxima_are_judged_by_the_mass_they_can_hold(
+    fit: PointFit, log_posterior: list[float], elsewhere: list[int], stalled: list[int], level: str
+) -> None:
+    other = replace(
+        fit,
+        starts=fit.starts[:3],
+        ends=fit.u + 3.0 * np.array(elsewhere)[:, None],
+        log_posterior=np.array(log_posterior),
+        elsewhere=np.array(elsewhere, dtype=bool),
+        stalled=np.array(stalled, dtype=bool),
+    )
+    assert [finding.level for finding in check_starts(other)] == [level]
 
 
 def test_starts_are_away_from_each_other(twin: LogPosterior) -> None:

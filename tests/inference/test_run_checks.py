@@ -24,7 +24,7 @@ NAMES = ("k1", "c")
 def fit(u: np.ndarray, covariance: np.ndarray) -> PointFit:
     values = dict(zip(NAMES, np.exp(u), strict=True))
     none = np.zeros((1, 2))
-    return PointFit(NAMES, u, values, covariance, values, none, none, np.zeros(1), True, np.zeros(1, dtype=bool))
+    return PointFit(NAMES, u, values, covariance, values, none, none, np.zeros(1), *np.zeros((2, 1), dtype=bool))
 
 
 def estimates(rng: np.random.Generator, shift: float) -> tuple[RunsAlone, PointFit]:

@@ -114,7 +114,7 @@ def _point_fit(rng: np.random.Generator) -> PointFit:
     starts = u + rng.normal(size=(6, d))
     return PointFit(
         names, u, {n: r[2] for n, r in SAMPLED.items()}, np.diag(sd**2), {n: 0.97 * r[3] for n, r in SAMPLED.items()},
-        starts, u + 1e-4 * sd * rng.normal(size=(6, d)), 1234.5 - 1e-7 * rng.random(6), True, np.zeros(6, dtype=bool),
+        starts, u + 1e-4 * sd * rng.normal(size=(6, d)), 1234.5 - 1e-7 * rng.random(6), *np.zeros((2, 6), dtype=bool),
     )  # fmt: skip
 
 
