@@ -27,8 +27,8 @@ KNOWN = ("k1", "c", "mu", "v_s", "K", "k2[stiff]")
 
 @cache
 def fitted() -> tuple[LogPosterior, PointFit]:
-    """Half a second of the second run, beside priors as wide as a bench leaves them, started 1 % off."""
-    own = table(1, samples=500)
+    """One second of the second run, beside priors as wide as a bench leaves them, started 1 % off."""
+    own = table(1, samples=1000)
     priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
     rig = bench.rig(own, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
     target = LogPosterior(rig, [ForcedRun(own, rig)])

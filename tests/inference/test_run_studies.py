@@ -11,12 +11,20 @@ import pytest
 from run_studies import disagreement_of, named_by, plant_spring, plant_surface, recover
 from scipy import stats
 
+from capsule_id.inference import point_stage
 from capsule_id.inference.sampling import DEFAULT_BUDGET
 from capsule_id.synthetic import Truth, synthesize
 
 RIGS = 20
 PLANTED = {"k2[medium]": partial(plant_spring, spring="medium"), "mu": plant_surface}
 small = partial(disagreement_of, seed=0, runs=("run_1",))
+
+
+@pytest.fixture(autouse=True)
+def nothing_compiled_ahead(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The small versions draw no sample from runs."""
+    if request.node.get_closest_marker("slow") is None:
+        monkeypatch.setattr(point_stage, "_compile", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
