@@ -7,7 +7,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Theta, axis_label, band
 from capsule_id.experiments.free_vibration import autocorrelation
-from capsule_id.rig.filters import choose_window, savitzky_golay
+from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay, window_samples
 from capsule_id.views import Comparison, Curve, Points
 
 if TYPE_CHECKING:
@@ -64,15 +64,14 @@ def _portrait(run: "ForcedRun", theta: Theta) -> list[Comparison]:
     """Rate of x_rel against x_rel, [] where the record is sampled unevenly: measured through Savitzky–Golay."""
     index = run.channels.index("x_rel")
     values, unit = run.values[index], run.table.columns["x_rel"].to_display
-    try:
-        window = choose_window(run.time, values, PORTRAIT_ORDER)
-        x_rel = savitzky_golay(run.time, values, window, PORTRAIT_ORDER)
-        rate = savitzky_golay(run.time, values, window, PORTRAIT_ORDER, derivative=1)
-    except InputError:
-        return []
     motion = run.motion(theta, np)
     offset = run.scaled(theta)[index].at_nuisance_mean(np)[1][0] * run.widths[index]
     x, y = np.asarray(motion.x_rel) + offset, np.asarray(motion.Y1 - motion.Y2)
+    try:
+        window = choose_window(run.time, values, PORTRAIT_ORDER)
+        recorded, fitted = (_filtered(run.time, column, window) for column in (values, x))
+    except InputError:
+        return []
     p, _ = run.capsule(theta)
     gap = (float(p.G) + offset) * unit  # pyright: ignore[reportArgumentType]
     low, high = float(y.min()), float(y.max())
@@ -83,10 +82,19 @@ def _portrait(run: "ForcedRun", theta: Theta) -> list[Comparison]:
             f"{run.label}: phase portrait",
             axis_label(run.table.columns["x_rel"]),
             "rate of x_rel [m/s]",
-            (Points("record, Savitzky–Golay", x_rel * unit, rate),),
+            (Points("record, Savitzky–Golay", recorded[0] * unit, recorded[1]),),
             (
                 Curve("this fit", x * unit, y),
+                Curve("this fit through the same filter", fitted[0] * unit, fitted[1], role="alternative"),
                 Curve("support spring", np.array([gap, gap]), np.array([low, high]), role="paper"),
             ),
         )
     ]
+
+
+def _filtered(time: np.ndarray, values: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
+    """(value, rate), without the half window at both ends where the derivative is that of a polynomial's edge."""
+    half = window_samples(window, sampling_step(time)) // 2
+    inside = slice(half, len(time) - half)
+    value, rate = (savitzky_golay(time, values, window, PORTRAIT_ORDER, derivative=n) for n in (0, 1))
+    return value[inside], rate[inside]

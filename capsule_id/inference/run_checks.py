@@ -138,7 +138,8 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     p = {name: -np.expm1(len(found) * np.log1p(-2.0 * stats.norm.sf(abs(one.z)))) for name, one in found.items()}
     far = [name for name in found if p[name] < LEVEL]
     worst = far[0] if far else min(p, key=lambda name: p[name])
-    size = f"{found[worst].sd:+.1f} sd, p = {p[worst]:.2g} over {len(found)} shared parameters"
+    judge = " by the bench's sample" if sampled else ""
+    size = f"{found[worst].sd:+.1f} sd of the curvature, p = {p[worst]:.2g}{judge} over {len(found)} shared parameters"
     seen = f"largest disagreement in {worst} ({size})"
     if not far:
         return Finding("bench and runs agree", "ok", seen)

@@ -19,6 +19,7 @@ from capsule_id.report.style import (
     PURPLE,
     VERMILION,
     figure_of,
+    make_room,
     new_figure,
     own_axes,
     set_legend,
@@ -56,6 +57,8 @@ def comparison(item: Comparison, ax: Axes | None = None) -> Axes:
         _draw_points(ax, points)
     set_text(ax, item.x_label, item.y_label, item.title)
     # Finding the best place means testing every point: for a record that takes longer than drawing it.
+    if long:
+        make_room(ax)
     set_legend(ax, place="upper right" if long else "best")
     return ax
 

@@ -10,11 +10,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from capsule_id.capsule.bias import BiasStudy
-from capsule_id.report.style import BLACK, BLUE, GREEN, GREY, VERMILION, new_figure, own_axes, set_legend, set_text
+from capsule_id.report.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    VERMILION,
+    make_room,
+    new_figure,
+    own_axes,
+    set_legend,
+    set_text,
+)
 
 _MM = 1e3
-# Room above the curves for a legend, as a fraction of their height.
-_HEADROOM = 0.25
 
 
 @dataclass(frozen=True)
@@ -37,14 +46,9 @@ def relative_displacement(view: MotionView, ax: Axes | None = None) -> Axes:
     ax.plot(view.times, _MM * view.x_rel, color=BLUE, lw=1.0)
     ax.axhline(_MM * view.G, color=VERMILION, ls="--", lw=1.2, label="support spring")
     set_text(ax, "time, s", "X1 - X2, mm", view.title)
-    _make_room(ax)
+    make_room(ax)
     set_legend(ax, place="upper right")
     return ax
-
-
-def _make_room(ax: Axes) -> None:
-    low, high = ax.get_ylim()
-    ax.set_ylim(low, high + _HEADROOM * (high - low))
 
 
 def capsule_displacement(view: MotionView, ax: Axes | None = None) -> Axes:
@@ -70,7 +74,7 @@ def phase_plane(view: MotionView, ax: Axes | None = None) -> Axes:
         label="once a period",
     )
     set_text(ax, "X1 - X2, mm", "Y1 - Y2, m/s", view.title)
-    _make_room(ax)
+    make_room(ax)
     set_legend(ax, place="upper right")
     return ax
 

@@ -13,8 +13,10 @@ from capsule_id.report.style import (
     BLUE,
     GREEN,
     GREY,
+    HEADROOM,
     PURPLE,
     VERMILION,
+    make_room,
     new_figure,
     own_axes,
     set_legend,
@@ -29,7 +31,6 @@ _CHANNELS = {
     "acceleration_rod": ("acceleration\nof the rod, m/s²", 1.0, GREY),
     "current": ("current, A", 1.0, PURPLE),
 }
-_HEADROOM = 0.3  # of the curves' height, for a legend
 
 
 def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
@@ -38,7 +39,7 @@ def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
     # At the ends of the record the derivative is that of a polynomial's edge, and mostly noise.
     inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
     ax.plot(_MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
-    below_legend = 1.0 / (1.0 + _HEADROOM)
+    below_legend = 1.0 / (1.0 + HEADROOM)
     ax.axvline(_MM * view.gap, ymax=below_legend, color=VERMILION, ls="--", lw=1.2, label="gap as stated")
     if view.gap_seen is not None:
         line = _MM * view.gap_seen
@@ -54,7 +55,7 @@ def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
         label="once a period",
     )
     set_text(ax, "X1 - X2, mm", "rate of X1 - X2, m/s", view.label)
-    _make_room(ax)
+    make_room(ax)
     set_legend(ax, place="upper right")
     return ax
 
@@ -74,7 +75,7 @@ def force_on_rod(view: RecordView, ax: Axes | None = None, model: tuple[np.ndarr
     if model is not None:
         ax.plot(*model, color=BLACK, ls="--", lw=1.2, label="model")
     set_text(ax, "time, s", "force on the rod, N", view.label)
-    _make_room(ax)
+    make_room(ax)
     set_legend(ax, place="upper right")
     return ax
 
@@ -102,8 +103,3 @@ def run_overview(view: RecordView) -> Figure:
             ax.tick_params(labelbottom=False)
     phase_plane_of_run(view, figure.add_subplot(grid[:, 1]))
     return figure
-
-
-def _make_room(ax: Axes) -> None:
-    low, high = ax.get_ylim()
-    ax.set_ylim(low, high + _HEADROOM * (high - low))

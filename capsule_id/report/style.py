@@ -22,6 +22,8 @@ DPI = 150
 _PALETTE, _NEARLY_WHITE = 128, 253
 # Readable at half of the printed size: 11 pt at a width of 6.4 in.
 TEXT, SMALL = 11.0, 9.5
+#: Of the curves' height, for a legend.
+HEADROOM = 0.3
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -68,6 +70,12 @@ def set_legend(ax: Axes, place: Literal["best", "upper right", "lower right", "a
     legend = ax.legend(handles, labels, fontsize=SMALL, frameon=False, handlelength=1.8, **where)
     for text in legend.get_texts():
         text.set_parse_math(False)
+
+
+def make_room(ax: Axes) -> None:
+    """Space over the curves for a legend."""
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + HEADROOM * (high - low))
 
 
 def mark(figure: Figure, text: str) -> None:
