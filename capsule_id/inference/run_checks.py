@@ -139,17 +139,21 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     far = [name for name in found if p[name] < LEVEL]
     worst = far[0] if far else min(p, key=lambda name: p[name])
     judge = " by the bench's sample" if sampled else ""
-    size = f"{found[worst].sd:+.1f} sd of the curvature, p = {p[worst]:.2g}{judge} over {len(found)} shared parameters"
+    size = f"{found[worst].sd:+.1f} sd of the curvature, {_stated(p[worst])}{judge} over {len(found)} shared parameters"
     seen = f"largest disagreement in {worst} ({size})"
     if not far:
         return Finding("bench and runs agree", "ok", seen)
-    others = [f"{name} ({found[name].sd:+.1f} sd, p = {p[name]:.2g})" for name in far[1:]]
+    others = [f"{name} ({found[name].sd:+.1f} sd, {_stated(p[name])})" for name in far[1:]]
     text = (
         f"expected bench and runs to tell of one capsule; {seen}: the bench's {worst} does not fit the recorded motion"
         f"{'; then ' + ', '.join(others) if others else ''}: repeat its bench test, or ask what differs in the runs"
     )
     # The curvature of few trials understates their tails.
     return Finding("bench and runs agree", "fail" if sampled else "warn", text)
+
+
+def _stated(p: float) -> str:
+    return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"
 
 
 def growth(run: ForcedRun, values: Mapping[str, float]) -> float:

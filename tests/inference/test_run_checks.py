@@ -63,8 +63,10 @@ def test_named_is_where_the_error_came_from() -> None:
     text = agreement(found, True).text
     assert "largest disagreement in mu (+18.6 sd" in text
     assert "then v_s (-6.6 sd" in text
+    assert "p = 0.00025 by the bench's sample" in text
     assert "k1" not in text
     assert "c (" not in text
+    assert "p < 1e-300 over" in agreement({"K": Distance(70.0, 70.0)}, False).text
 
 
 def test_tails_follow_the_sample() -> None:
