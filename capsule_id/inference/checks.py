@@ -61,12 +61,16 @@ def check_starts(fit: PointFit) -> list[Finding]:
     # How much less probable the other ends are: a mode that far down holds no posterior mass.
     below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
     inferior = elsewhere & (below > NEGLIGIBLE_MODE)
-    worst = int(np.argmax(away))
+    worst = int(np.argmax(np.where(elsewhere, away, -np.inf)))
     name = fit.names[int(np.argmax(distance[worst]))]
     seen = (
         f"expected {number} starts to end at the same maximum; {int(fit.stalled.sum())} stalled, {int(elsewhere.sum())} "
-        f"ended elsewhere, the furthest {away[worst]:.2g} posterior sd away in {name}"
+        "ended elsewhere"
     )
+    if not elsewhere.any():
+        remedy = "look at the residuals, and at parameters that the data hardly determine"
+        return [Finding("starts agree", "fail", f"{seen}: {remedy}")]
+    seen += f", the furthest {away[worst]:.2g} posterior sd away in {name}"
     if np.all(inferior | ~elsewhere) and np.sum(~elsewhere) >= 2 and not fit.stalled[~elsewhere].any():
         text = f"{seen}; those ends are lower by {np.min(below[inferior]):.0f} in log-posterior, so they hold no mass"
         return [Finding("starts agree", "warn", text)]

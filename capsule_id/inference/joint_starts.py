@@ -24,7 +24,7 @@ LEAVES, NEAR, FAR = 0.5, 3e-3, 0.3
 def choose_starts(
     target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float]
 ) -> np.ndarray:
-    """(MOST_STARTS, d) in u: the ``first`` of ``joint_fit`` and the likeliest candidates about it.
+    """(at most MOST_STARTS, d) in u: the ``first`` of ``joint_fit`` and the likeliest candidates about it.
 
     The likeliest stand on top, but for the ``first``, which is one of the first ``STARTS``.
     """
@@ -37,11 +37,12 @@ def choose_starts(
     has = np.array([name in known for name in target.names])
     open_ = has & target.positive & ~target.scatter & np.array([name in told for name in target.names])
     width = np.exp(rng.uniform(np.log(NEAR), np.log(FAR), candidates.shape)) * open_
-    moved = np.where(has, centre + width * rng.standard_normal(candidates.shape), candidates)
+    moved = np.where(has, width * rng.standard_normal(candidates.shape), candidates - candidates[0]) + centre
     candidates = np.where((rng.random(candidates.shape) < LEAVES) & ~target.scatter, moved, centre)
     candidates[0] = centre
     value = weigh(target, candidates)
     ranked = 1 + np.argsort(-value[1:])[: MOST_STARTS - 1]
+    ranked = ranked[np.isfinite(value[ranked])]
     early = np.append(ranked[: STARTS - 1], 0)
     return candidates[[*early[np.argsort(-value[early], kind="stable")], *ranked[STARTS - 1 :]]]
 

@@ -135,8 +135,15 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
 
     Named is the farthest of the parameters that are too rarely so far off to be chance.
     """
-    p = {name: -np.expm1(len(found) * np.log1p(-2.0 * stats.norm.sf(abs(one.z)))) for name, one in found.items()}
-    far = [name for name in found if p[name] < LEVEL]
+    p = {name: _family_wise(one.z, len(found)) for name, one in found.items()}
+    lost = [name for name, one in found.items() if not (np.isfinite(one.sd) and np.isfinite(one.z))]
+    far = [name for name in found if p[name] < LEVEL and name not in lost]
+    if lost and not far:
+        text = (
+            f"expected finite estimates of all {len(found)} shared parameters from bench and runs; of {', '.join(lost)} "
+            "there is none, so nothing was compared: look at what the records and tests of these determine"
+        )
+        return Finding("bench and runs agree", "warn", text)
     worst = far[0] if far else min(p, key=lambda name: p[name])
     judge = " by the bench's sample" if sampled else ""
     size = f"{found[worst].sd:+.1f} sd of the curvature, {_stated(p[worst])}{judge} over {len(found)} shared parameters"
@@ -150,6 +157,12 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     )
     # The curvature of few trials understates their tails.
     return Finding("bench and runs agree", "fail" if sampled else "warn", text)
+
+
+def _family_wise(z: float, number: int) -> float:
+    """p-value of the largest of ``number`` scores (two-sided, Šidák)."""
+    with np.errstate(divide="ignore"):  # z = 0: log(0), and p = 1
+        return float(-np.expm1(number * np.log1p(-2.0 * stats.norm.sf(abs(z)))))
 
 
 def _stated(p: float) -> str:

@@ -1,5 +1,6 @@
 """Bench and runs fitted together, small: against the truth, against SciPy, and what smoothing would have done."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax.numpy as jnp
@@ -9,9 +10,12 @@ from jax.tree_util import Partial
 from scipy import optimize
 
 from capsule_id.capsule.smooth import Smoothing
+from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run import ForcedRun
+from capsule_id.inference import joint_fit as module
+from capsule_id.inference.checks import check_starts
 from capsule_id.inference.density import HeldResiduals
-from capsule_id.inference.joint_fit import _at_rest, _descend, _elsewhere, joint_fit, scatter_modes
+from capsule_id.inference.joint_fit import GAIN, _at_rest, _better_point, _descend, _elsewhere, joint_fit, scatter_modes
 from capsule_id.inference.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.least_squares import least_squares, linearised
 from capsule_id.inference.log_posterior import LogPosterior
@@ -56,8 +60,7 @@ def test_the_likeliest_candidates_about_a_wrong_bench_lead_to_the_maximum() -> N
     assert starts[STARTS - 1, target.names.index("mu")] == pytest.approx(np.log(0.7 * TRUTH["mu"]))
     assert np.all(np.delete(value, STARTS - 1) > value[STARTS - 1] + 1e4)
     assert value[0] >= value[1]
-    located = np.flatnonzero(~target.scatter)
-    ends = np.stack([_descend(target, start, located)[0] for start in starts[:2]])
+    ends = np.stack([_descend(target, start).u for start in starts[:2]])
     np.testing.assert_allclose(weigh(target, ends), np.max(fit.log_posterior), atol=0.1)
 
 
@@ -78,6 +81,38 @@ def test_ends_are_one_maximum_where_the_posterior_cannot_tell() -> None:
     u = np.array([[0.0, 0.0], [0.04, 0.0], [0.5, 0.0], [0.5, 0.0], [2.0, 0.0]])
     value = np.array([10.0, 9.9, 9.95, 9.8, 9.99])
     assert _elsewhere(u, value, np.ones(2)).tolist() == [False, False, False, True, True]
+
+
+def test_starts_go_on_until_two_ends_describe_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive that is 2.5 rad late cannot be fitted: two such starts of the first three prove nothing."""
+    target, fit = fitted()
+    good = np.where(target.scatter, fit.starts[0], fit.u)
+    late = good + 2.5 * (np.array(target.names) == "phase[run_2]")
+    starts = np.stack([good, late, late, good, good, good])
+    monkeypatch.setattr(module, "choose_starts", lambda *_: starts)
+    again = joint_fit(target, {}, 0)
+    assert again.elsewhere.tolist() == [False, True, True, False]
+    assert check_starts(again)[0].level == "warn"
+
+
+def test_a_move_of_one_parameter_leads_out_of_a_side_maximum_and_not_out_of_the_maximum() -> None:
+    target, fit = fitted()
+    end = _descend(target, fit.u)
+    assert _better_point(target, end) is None
+    off = end.u + 40.0 * np.sqrt(np.diag(fit.covariance)) * (np.array(target.names) == "mu")
+    better = _better_point(target, replace(end, u=off))
+    assert better is not None
+    assert np.flatnonzero(better != off).tolist() == [target.names.index("mu")]
+    assert weigh(target, better[None])[0] > weigh(target, off[None])[0] + GAIN
+
+
+def test_a_start_that_is_not_finite_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    target, fit = fitted()
+    nowhere = np.where(np.array(target.names) == "c", 300.0, fit.u)
+    assert not np.isfinite(_descend(target, nowhere).value)
+    monkeypatch.setattr(module, "choose_starts", lambda *_: nowhere[None])
+    with pytest.raises(InputError, match="every motion is finite"):
+        joint_fit(target, {}, 0)
 
 
 def test_scipy_finds_the_same_minimum() -> None:

@@ -69,6 +69,14 @@ def test_named_is_where_the_error_came_from() -> None:
     assert "p < 1e-300 over" in agreement({"K": Distance(70.0, 70.0)}, False).text
 
 
+def test_what_is_not_finite_is_not_taken_for_agreement() -> None:
+    nothing = Distance(float("nan"), float("nan"))
+    found = agreement({"k1": nothing, "c": Distance(0.0, 0.0)}, True)
+    assert found.level == "warn"
+    assert "k1" in found.text
+    assert agreement({"k1": nothing, "c": Distance(9.0, 9.0)}, True).level == "fail"
+
+
 def test_tails_follow_the_sample() -> None:
     draws = stats.t(5).rvs(100_000, random_state=3)
     for value in (0.5, 2.0, 6.0, 12.0):
