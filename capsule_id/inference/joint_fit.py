@@ -25,10 +25,9 @@ from capsule_id.inference.density import HeldResiduals
 from capsule_id.inference.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.least_squares import LeastSquaresFit, covariance, least_squares
 from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.inference.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit
 
-#: Ends count as the same where they differ by less than this many posterior standard deviations.
-AGREEMENT = 0.05
 TOLERANCE, MAX_STEPS = 1e-7, 80
 #: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
 ROUNDS, STILL = 8, 0.01

@@ -147,9 +147,8 @@ def basis(time: np.ndarray, k1: float, c: float) -> np.ndarray:
 def record(time: np.ndarray, damping: str = "viscous", sd: float | None = None) -> FreeVibration:
     noise = 2e-5 * np.random.default_rng(5).standard_normal(len(time))
     columns = [bench.column("time", time), bench.column("x_rel", bench.released(time, 2e-3) + 1e-4 + noise, sd)]
-    built = make(bench.table("free_vibration", columns, damping=damping))
-    assert isinstance(built, FreeVibration)
-    return built
+    table = bench.table("free_vibration", columns, damping=damping)
+    return FreeVibration(table, bench.rig(table))
 
 
 @pytest.mark.parametrize("time", [UNIFORM, UNEVEN], ids=["fast path", "uneven"])
