@@ -68,11 +68,7 @@ class Distance:
 def disagreement(
     shared: Sequence[str], runs: RunsAlone, bench: PointFit, sample: Posterior | None
 ) -> dict[str, Distance]:
-    """Of every ``shared`` parameter by name, the farthest first; bench and runs know nothing of each other.
-
-    The order is that of ``sd``, by how much the error of one parameter alone would explain: an error in one draws along
-    what the bench measures together with it (v_s after mu), and heavy tails hide which came first.
-    """
+    """Of every ``shared`` parameter by name; bench and runs know nothing of each other."""
     found = {}
     for name in shared:
         i, j = runs.names.index(name), bench.names.index(name)
@@ -84,7 +80,7 @@ def disagreement(
             blurred = draws + np.sqrt(own) * np.random.default_rng(j).standard_normal(draws.size)
             z = _by_sample(blurred, float(runs.u[i]), sd)
         found[name] = Distance(sd, z)
-    return dict(sorted(found.items(), key=lambda item: -abs(item[1].sd)))
+    return found
 
 
 def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
@@ -133,11 +129,14 @@ def check_agreement(
 def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     """The finding on what ``disagreement`` found; without a bench sample the worst is a suspicion.
 
-    Named is the farthest of the parameters that are too rarely so far off to be chance.
+    Named is the farthest, in sd, of the parameters that are too rarely so far off to be chance: sd say how much the
+    error of one parameter alone would explain. An error in one draws along what the bench measures together with it
+    (v_s after mu), and heavy tails hide which came first.
     """
     p = {name: _family_wise(one.z, len(found)) for name, one in found.items()}
     lost = [name for name, one in found.items() if not (np.isfinite(one.sd) and np.isfinite(one.z))]
     far = [name for name in found if p[name] < LEVEL and name not in lost]
+    far.sort(key=lambda name: -abs(found[name].sd))
     if lost and not far:
         text = (
             f"expected finite estimates of all {len(found)} shared parameters from bench and runs; of {', '.join(lost)} "

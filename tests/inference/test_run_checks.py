@@ -59,7 +59,7 @@ def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
 
 def test_named_is_where_the_error_came_from() -> None:
     """Heavy tails make nothing of what lies between 19 and 7 sd; a parameter that is no surprise is not named at all."""
-    found = {"k1": Distance(30.0, 1.0), "mu": Distance(18.6, 4.0), "v_s": Distance(-6.6, -4.1), "c": Distance(2.0, 2.0)}
+    found = {"k1": Distance(30.0, 1.0), "v_s": Distance(-6.6, -4.1), "mu": Distance(18.6, 4.0), "c": Distance(2.0, 2.0)}
     text = agreement(found, True).text
     assert "largest disagreement in mu (+18.6 sd" in text
     assert "then v_s (-6.6 sd" in text
