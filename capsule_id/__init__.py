@@ -15,42 +15,42 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from capsule_id.api import Fit as Fit
     from capsule_id.api import fit as fit
-    from capsule_id.capsule.model import CapsuleParameters as CapsuleParameters
-    from capsule_id.capsule.model import Excitation as Excitation
-    from capsule_id.capsule.model import Status as Status
-    from capsule_id.capsule.model import Trajectory as Trajectory
-    from capsule_id.capsule.model import simulate as simulate
-    from capsule_id.capsule.model import status_message as status_message
-    from capsule_id.capsule.response import Response as Response
-    from capsule_id.capsule.response import Settling as Settling
-    from capsule_id.capsule.response import response as response
-    from capsule_id.capsule.smooth import Smoothing as Smoothing
-    from capsule_id.capsule.sweep import continuation as continuation
-    from capsule_id.capsule.sweep import diagram as diagram
-    from capsule_id.capsule.sweep import motion_map as motion_map
     from capsule_id.errors import InputError as InputError
+    from capsule_id.motions.response import Response as Response
+    from capsule_id.motions.response import Settling as Settling
+    from capsule_id.motions.response import response as response
+    from capsule_id.motions.sweep import continuation as continuation
+    from capsule_id.motions.sweep import diagram as diagram
+    from capsule_id.motions.sweep import motion_map as motion_map
+    from capsule_id.physics.model import CapsuleParameters as CapsuleParameters
+    from capsule_id.physics.model import Excitation as Excitation
+    from capsule_id.physics.model import Status as Status
+    from capsule_id.physics.model import Trajectory as Trajectory
+    from capsule_id.physics.model import simulate as simulate
+    from capsule_id.physics.model import status_message as status_message
+    from capsule_id.physics.smooth.engine import Smoothing as Smoothing
     from capsule_id.rig.read import read_rig as read_rig
     from capsule_id.synthetic import synthesize as synthesize
 
 _HOME = {
-    "CapsuleParameters": "capsule_id.capsule.model",
-    "continuation": "capsule_id.capsule.sweep",
-    "diagram": "capsule_id.capsule.sweep",
-    "Excitation": "capsule_id.capsule.model",
+    "CapsuleParameters": "capsule_id.physics.model",
+    "continuation": "capsule_id.motions.sweep",
+    "diagram": "capsule_id.motions.sweep",
+    "Excitation": "capsule_id.physics.model",
     "Fit": "capsule_id.api",
     "fit": "capsule_id.api",
     "InputError": "capsule_id.errors",
-    "motion_map": "capsule_id.capsule.sweep",
+    "motion_map": "capsule_id.motions.sweep",
     "read_rig": "capsule_id.rig.read",
-    "Response": "capsule_id.capsule.response",
-    "response": "capsule_id.capsule.response",
-    "Settling": "capsule_id.capsule.response",
-    "simulate": "capsule_id.capsule.model",
-    "Smoothing": "capsule_id.capsule.smooth",
-    "Status": "capsule_id.capsule.model",
-    "status_message": "capsule_id.capsule.model",
+    "Response": "capsule_id.motions.response",
+    "response": "capsule_id.motions.response",
+    "Settling": "capsule_id.motions.response",
+    "simulate": "capsule_id.physics.model",
+    "Smoothing": "capsule_id.physics.smooth.engine",
+    "Status": "capsule_id.physics.model",
+    "status_message": "capsule_id.physics.model",
     "synthesize": "capsule_id.synthetic",
-    "Trajectory": "capsule_id.capsule.model",
+    "Trajectory": "capsule_id.physics.model",
 }
 
 

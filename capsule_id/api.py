@@ -3,9 +3,9 @@
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
-from capsule_id.inference.sampling import DEFAULT_BUDGET
+from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.report.write import write_result
 from capsule_id.rig.model import Rig

@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments import (
-    dynamic_friction,
-    free_vibration,
-    motor_current,
-    static_friction,
-    support_spring,
-)
+from capsule_id.experiments.dynamic_friction import experiment as dynamic_friction
+from capsule_id.experiments.free_vibration import experiment as free_vibration
+from capsule_id.experiments.motor_current import experiment as motor_current
+from capsule_id.experiments.static_friction import experiment as static_friction
+from capsule_id.experiments.support_spring import experiment as support_spring
 from capsule_id.rig.schema import NAME_PATTERN
 from capsule_id.synthetic_runs import RUN_SPRINGS, make_runs, spring_priors, truths
 

@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, Status, simulate, status_message
 from capsule_id.errors import InputError
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, status_message
 
 
 @dataclass(frozen=True)

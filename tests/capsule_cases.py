@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory
+from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 
 PARAMETERS = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")
 
@@ -35,7 +35,7 @@ class Cases:
 
 def read_cases() -> Cases:
     """The cases of exact_cases.json."""
-    raw = json.loads((Path(__file__).parent / "capsule" / "exact_cases.json").read_text())["cases"]
+    raw = json.loads((Path(__file__).parent / "physics" / "exact_cases.json").read_text())["cases"]
     column = {key: np.array([case[key] for case in raw]) for key in (*PARAMETERS, "P_d", "Omega")}
     return Cases(
         raw,

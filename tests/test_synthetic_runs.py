@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, simulate
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
+from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize

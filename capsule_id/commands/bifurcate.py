@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from capsule_id.capsule.leaves import LEAVES, SWEPT
 from capsule_id.commands.capsule_options import (
     DEFAULTS,
     add_capsule_arguments,
@@ -21,6 +20,7 @@ from capsule_id.commands.progress import Progress
 from capsule_id.commands.sweep_output import publish_pair, remove_store, take_store
 from capsule_id.console import say
 from capsule_id.errors import InputError
+from capsule_id.physics.leaves import LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-    from capsule_id.report.figures_sweep import MeasuredMotion
+    from capsule_id.report.figures.sweeps import MeasuredMotion
 
 # The setting of the paper's Fig. 6, unless the options say otherwise.
 DRIVEN = {**DEFAULTS, "G": 1e-3, "P_d": 4.0, "Omega": 34.56}
@@ -128,8 +128,10 @@ def draw(
     data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredMotion]" = (), synthetic: bool = False
 ) -> "Figure":
     """The picture of what ``run`` has computed; measured runs are laid over a diagram, each with its own label."""
-    from capsule_id.report import figures_bands, figures_map, figures_sweep
-    from capsule_id.report.style import mark
+    from capsule_id.report.figures import bands as figures_bands
+    from capsule_id.report.figures import maps as figures_map
+    from capsule_id.report.figures import sweeps as figures_sweep
+    from capsule_id.report.figures.style import mark
 
     units = {axis.name: figures_sweep.AxisUnit(axis.unit, axis.factor) for axis in axes}
     title = str(data.attrs["rig"])
@@ -148,9 +150,9 @@ def _computed(
     args: argparse.Namespace, axes: Sequence[Axis], values: dict[str, float], work: dict[str, Any]
 ) -> "xr.Dataset":
     """The Dataset that the options ask for."""
-    from capsule_id.capsule import operating, sweep
-    from capsule_id.capsule.model import CapsuleParameters, Excitation
-    from capsule_id.capsule.response import Settling
+    from capsule_id.motions import operating, sweep
+    from capsule_id.motions.response import Settling
+    from capsule_id.physics.model import CapsuleParameters, Excitation
     from capsule_id.report.posterior_file import read_draws
 
     settling = Settling(

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from capsule_id.capsule.leaves import LEAVES
 from capsule_id.errors import InputError
+from capsule_id.physics.leaves import LEAVES
 
 # From the paper's Table 1; what is not here must be given.
 DEFAULTS: Mapping[str, float] = {

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         prefer_whole_loops()
     # Heavy rooms only now: a wrong folder is answered at once.
     from capsule_id.experiments import make_experiments
-    from capsule_id.inference.fit import PACKAGES, fit_rig, package_versions
+    from capsule_id.inference.pipeline import PACKAGES, fit_rig, package_versions
     from capsule_id.report.text import table_text
     from capsule_id.report.write import write_result
 

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capsule_id.capsule.leaves import SWEPT
 from capsule_id.experiments.rough_values import rough_values
+from capsule_id.physics.leaves import SWEPT
 from capsule_id.records.columns import stated_gap, stated_Omega
 from capsule_id.records.drive import drive_of
 from capsule_id.records.label import measured_motion
-from capsule_id.report.figures_sweep import MeasuredMotion
+from capsule_id.report.figures.sweeps import MeasuredMotion
 from capsule_id.rig.model import Quantity, Rig, Table
 
 #: A setting is the diagram's where it differs by no more than this share of it, or by this many of its own sds.

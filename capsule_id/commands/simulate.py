@@ -6,14 +6,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsule_id.capsule.leaves import LEAVES
 from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_values, number, prefer_whole_loops
 from capsule_id.errors import InputError
+from capsule_id.physics.leaves import LEAVES
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from capsule_id.capsule.model import Trajectory
+    from capsule_id.physics.model import Trajectory
 
 WIDTHS = {"velocity": "m/s", "penetration": "m", "rounding": "fraction of the break-away force", "tolerance": "1"}
 PICTURE_SAMPLES = 20_000
@@ -59,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
     prefer_whole_loops()
     import numpy as np
 
-    from capsule_id.capsule.model import CapsuleParameters, Excitation, Status, simulate, status_message
-    from capsule_id.capsule.smooth import Smoothing
+    from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, status_message
+    from capsule_id.physics.smooth.engine import Smoothing
     from capsule_id.report.motion_files import write_motion
 
     p = CapsuleParameters(**{name: values[name] for name, leaf in LEAVES.items() if not leaf.drive})
@@ -122,8 +122,8 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     """Time histories and phase plane; section: which samples stand at the drive's phase."""
     import numpy as np
 
-    from capsule_id.report.figures_capsule import MotionView, motion
-    from capsule_id.report.style import png
+    from capsule_id.report.figures.capsule import MotionView, motion
+    from capsule_id.report.figures.style import png
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
     view = MotionView(np.asarray(t.times), x_rel, np.asarray(t.X2), rate, x_rel[section], rate[section], G)

@@ -49,7 +49,7 @@ def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
     InputError
         If they cannot be written.
     """
-    from capsule_id.report.style import png
+    from capsule_id.report.figures.style import png
 
     picture = out.with_suffix(".png")
     new = [path.with_name(f".{path.name}.new") for path in (out, picture)]

@@ -11,16 +11,16 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, Theta
 from capsule_id.experiments.capsule_bench import CapsuleDecay, CapsulePushes
-from capsule_id.experiments.dynamic_friction import DynamicFriction
-from capsule_id.experiments.forced_run import ForcedRun
-from capsule_id.experiments.free_vibration import FreeVibration
+from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.parts import parts_of
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
 from capsule_id.experiments.line import Line
-from capsule_id.experiments.motor_current import MotorCurrent
-from capsule_id.experiments.run_parts import parts_of
-from capsule_id.experiments.sliding_friction import SlidingFriction
-from capsule_id.experiments.static_friction import StaticFriction
-from capsule_id.experiments.support_spring import SupportSpring
+from capsule_id.experiments.motor_current.experiment import MotorCurrent
+from capsule_id.experiments.sliding_friction.experiment import SlidingFriction
+from capsule_id.experiments.static_friction.experiment import StaticFriction
+from capsule_id.experiments.support_spring.experiment import SupportSpring
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison
 

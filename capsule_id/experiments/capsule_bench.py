@@ -11,14 +11,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation
 from capsule_id.experiments.base import Start, Theta, no_design
-from capsule_id.experiments.dynamic_friction import DynamicFriction
+from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.forward import CapsuleForward
-from capsule_id.experiments.free_vibration import FreeVibration
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import friction_coefficient, slide_distance
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Finding
 

@@ -6,8 +6,8 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory, simulate
-from capsule_id.capsule.smooth import Smoothing
+from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory, simulate
+from capsule_id.physics.smooth.engine import Smoothing
 
 
 class CapsuleForward:

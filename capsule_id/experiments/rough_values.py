@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from capsule_id.experiments import make_experiments, paper_estimates
-from capsule_id.experiments.feasibility import feasibility
-from capsule_id.experiments.free_vibration import FreeVibration
+from capsule_id.experiments.forced_run.feasibility import feasibility
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.parameters import parameter, symbol_of
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding

@@ -8,11 +8,11 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from capsule_id.inference.result import Result, RunRecord
-from capsule_id.report import figures
-from capsule_id.report.corner import corner
-from capsule_id.report.figures_runs import force_on_rod, run_overview
-from capsule_id.report.style import figure_of, mark, png
-from capsule_id.report.traces import traces
+from capsule_id.report.figures import comparisons as figures
+from capsule_id.report.figures.corner import corner
+from capsule_id.report.figures.runs import force_on_rod, run_overview
+from capsule_id.report.figures.style import figure_of, mark, png
+from capsule_id.report.figures.traces import traces
 from capsule_id.views import Comparison
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, simulate
+from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from tests.scipy_capsule import simulate_scipy
 
 pytestmark = pytest.mark.benchmark

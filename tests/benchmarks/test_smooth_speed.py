@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from capsule_id.capsule.model import CapsuleParameters, Excitation, Trajectory, simulate
-from capsule_id.capsule.smooth import Smoothing
+from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory, simulate
+from capsule_id.physics.smooth.engine import Smoothing
 
 E = Excitation(4.0, 34.56)
 TIMES = np.linspace(0.0, 20.0 * np.pi / 34.56, 1000)

@@ -7,14 +7,14 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
-from capsule_id.capsule.smooth import Smoothing
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.capsule_bench import CapsuleDecay, CapsulePushes
-from capsule_id.experiments.dynamic_friction import DynamicFriction
-from capsule_id.experiments.free_vibration import FreeVibration
+from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import slide_distance
-from capsule_id.inference.point_stage import PointStage, fit_points
+from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity, Table
 from tests.experiments import bench
 from tests.scipy_capsule import simulate_scipy

@@ -8,8 +8,8 @@ import pytest
 from bench import K1, M1, C, released
 from scipy.integrate import solve_ivp
 
-from capsule_id.experiments.decay_models import dry_decay, quadratic_decay, rates, viscous_basis
-from capsule_id.experiments.decay_moments import decay_moments, fold, uniform_step
+from capsule_id.experiments.free_vibration.decay_models import dry_decay, quadratic_decay, rates, viscous_basis
+from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
 
 TIME = np.arange(900) / 2000.0
 GAMMA, OMEGA = C / (2 * M1), np.sqrt(K1 / M1 - (C / (2 * M1)) ** 2)

@@ -4,10 +4,10 @@ import bench
 import numpy as np
 import pytest
 
-from capsule_id.capsule.grazing import grazing_load
-from capsule_id.capsule.model import CapsuleParameters, Excitation, simulate
-from capsule_id.experiments.feasibility import Drive, contact_time, feasibility, held_rod
+from capsule_id.experiments.forced_run.feasibility import Drive, contact_time, feasibility, held_rod
 from capsule_id.experiments.rough_values import lint_runs, rough_values
+from capsule_id.physics.grazing import grazing_load
+from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 
 TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.66, "v_s": 0.3, "g": 9.81}

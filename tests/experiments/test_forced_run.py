@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.capsule.model import simulate
-from capsule_id.experiments.forced_run import NOISES, SETTLING_PERIODS, ForcedRun
-from capsule_id.experiments.run_start import rough_start
-from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.experiments.forced_run.experiment import NOISES, SETTLING_PERIODS, ForcedRun
+from capsule_id.experiments.forced_run.start import rough_start
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.model import simulate
 from capsule_id.rig.model import Quantity
 from tests.experiments import bench
 from tests.forced_runs import NOISE, SAMPLES, channels, make, recorded, table, theta

@@ -10,8 +10,8 @@ from scipy import integrate, stats
 
 from capsule_id.experiments import KINDS
 from capsule_id.experiments.base import Experiment, Theta
-from capsule_id.experiments.decay_models import dry_decay, quadratic_decay
-from capsule_id.experiments.free_vibration import FreeVibration
+from capsule_id.experiments.free_vibration.decay_models import dry_decay, quadratic_decay
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.rig.model import Table
 
 MASSES = {"m1": bench.M1, "m2": bench.M2, "g": bench.G}

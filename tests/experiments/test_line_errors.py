@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from capsule_id.experiments.motor_current import MotorCurrent
+from capsule_id.experiments.motor_current.experiment import MotorCurrent
 
 K, CURRENT_SD, FORCE_SD = 2.0, 0.15, 0.1
 CURRENTS = np.linspace(0.0, 2.0, 40)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capsule_id.capsule.model import simulate
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.forced_run import ForcedRun
-from capsule_id.experiments.run_parts import leads, parts_of, record_of
-from capsule_id.experiments.run_restart import better_start, restarted
-from capsule_id.inference.log_posterior import LogPosterior
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.parts import leads, parts_of, record_of
+from capsule_id.experiments.forced_run.restart import better_start, restarted
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.model import simulate
 from capsule_id.rig.model import Quantity, Table
 from tests.experiments import bench
 from tests.forced_runs import make, recorded, table, theta

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Posterior, Result
-from capsule_id.inference.sampling import DEFAULT_BUDGET
+from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from calibration import normal_score
 
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.fit import fit_rig
-from capsule_id.inference.point_stage import PointStage, fit_points
-from capsule_id.inference.run_checks import check_agreement
+from capsule_id.inference.checks.run_checks import check_agreement
+from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
+from tests.inference.calibration import normal_score
 
 #: Every parameter is off the paper's Table 1 by a factor between these two, or by its inverse.
 NEAREST, FARTHEST = 1.1, 1.5

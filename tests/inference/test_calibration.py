@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration import Outcome, study, summarise
 from scipy import stats
 
-from capsule_id.inference import sampling
+from capsule_id.inference.sampling import ensembles as sampling
+from tests.inference.calibration import Outcome, study, summarise
 
 
 def test_ten_rigs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

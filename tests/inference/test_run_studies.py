@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_studies import disagreement_of, named_by, plant_spring, plant_surface, recover
 from scipy import stats
 
-from capsule_id.inference import point_stage
-from capsule_id.inference.sampling import DEFAULT_BUDGET
+from capsule_id.inference.fit import point_stage
+from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.synthetic import Truth, synthesize
+from tests.inference.run_studies import disagreement_of, named_by, plant_spring, plant_surface, recover
 
 RIGS = 20
 PLANTED = {"k2[medium]": partial(plant_spring, spring="medium"), "mu": plant_surface}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import coil_spring

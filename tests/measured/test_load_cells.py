@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
 from tests.measured.folders import Entry, make_rig, note
 from tests.measured.sources import load_cells

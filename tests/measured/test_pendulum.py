@@ -13,12 +13,12 @@ import pytest
 from scipy.signal import find_peaks
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.free_vibration import FreeVibration
-from capsule_id.inference.fit import fit_rig
-from capsule_id.inference.log_posterior import LogPosterior
-from capsule_id.inference.notes import DAMPING_MODELS, bic
-from capsule_id.inference.point_fit import point_fit
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
+from capsule_id.inference.tables.notes import DAMPING_MODELS, bic
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import pendulum

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
-from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import ship_roll, ship_roll_stiffness

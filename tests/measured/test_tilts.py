@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.inference.fit import fit_rig
+from capsule_id.inference.pipeline import fit_rig
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, quantity
 from tests.measured.sources import tilt_notes

@@ -9,8 +9,8 @@ import pytest
 from capsule_id.errors import InputError
 from capsule_id.records.text import describe_run, run_warning
 from capsule_id.records.view import PASSED, RecordView, view_record
-from capsule_id.report.figures_runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
-from capsule_id.report.style import new_figure, png
+from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
+from capsule_id.report.figures.style import new_figure, png
 from capsule_id.rig.filters import gain
 from tests.records.runs import Known, noisier, reference, table_of
 
@@ -116,4 +116,4 @@ def test_check_says_why_it_cannot_tell(case: Known) -> None:
 
 def test_records_know_no_model() -> None:
     for file in (Path(__file__).parents[2] / "capsule_id" / "records").glob("*.py"):
-        assert "capsule_id.capsule" not in file.read_text(encoding="utf-8"), file.name
+        assert "capsule_id.physics" not in file.read_text(encoding="utf-8"), file.name

@@ -12,11 +12,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from capsule_id.inference.result import Result
-from capsule_id.report import figures
-from capsule_id.report.corner import _ticks, corner
+from capsule_id.report.figures import comparisons as figures
+from capsule_id.report.figures.corner import _ticks, corner
+from capsule_id.report.figures.style import figure_of, png
+from capsule_id.report.figures.traces import traces
 from capsule_id.report.gallery import Picture, pictures
-from capsule_id.report.style import figure_of, png
-from capsule_id.report.traces import traces
 from capsule_id.views import Comparison
 
 UNIT = re.compile(r"\[[^\]]+\]$")

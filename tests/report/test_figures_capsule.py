@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from capsule_id.capsule.bias import BiasStudy
-from capsule_id.report.figures_capsule import MotionView, motion, phase_plane, smoothing_bias
-from capsule_id.report.style import new_figure, png
+from capsule_id.motions.bias import BiasStudy
+from capsule_id.report.figures.capsule import MotionView, motion, phase_plane, smoothing_bias
+from capsule_id.report.figures.style import new_figure, png
 
 
 def _study() -> BiasStudy:

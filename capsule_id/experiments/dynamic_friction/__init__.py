@@ -1,0 +1,1 @@
+"""Pushes, speed and distance slid: mu and v_s."""

@@ -1,0 +1,1 @@
+"""The capsule driven by the motor, recorded in full motion."""

@@ -1,0 +1,142 @@
+"""Whether a forced run can tell what it is made for: contact, a moving capsule, samples and length enough.
+
+It judges settings, not readings, of a run that starts from rest: before a fit with rough values out of the same folder
+(``rough_values.py``), and just as well at fitted ones.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from capsule_id.physics.grazing import grazing_load
+from capsule_id.rig.model import Quantity, Table
+from capsule_id.views import Finding
+
+#: The name that every finding of this module carries.
+CHECK = "feasible"
+#: Fewer samples than this in one touch of the support spring draw no impact.
+SAMPLES_PER_CONTACT = 10
+#: A run shows the settled motion in this many excitation periods ...
+SETTLED_PERIODS = 8
+#: ... after the start has died out: this many times 2 m1/c leave exp(-4) = 2 % of it.
+DECAY_TIMES = 4.0
+#: Excitation periods over which the rod on a held capsule is followed, the tolerance of that run, and the largest
+#: number of steps that it is made to take for the sake of its contacts (a drive of years has no contacts to miss).
+HELD_PERIODS, HELD_TOLERANCE, HELD_STEPS = 12, 1e-6, 20_000
+#: ... and no longer than this many times 2 m1/c.
+HELD_DECAYS = 50.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What rig.toml and the current say of one run, SI: angular frequency, amplitude, gap."""
+
+    Omega: float
+    P_d: float
+    G: float
+
+
+def drive_of(table: Table, K: float) -> Drive:
+    """The drive of a forced run: P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
+    stated, gap = table.settings.get("P_d"), table.settings["gap"]
+    assert isinstance(gap, Quantity), "the schema asks for the gap of a forced run"
+    Omega = table.settings.get("Omega")
+    if Omega is None:
+        Omega = 2.0 * np.pi * float(table.settings["f"])  # type: ignore[arg-type]
+    Omega = float(Omega)  # type: ignore[arg-type]
+    P_d = stated.value if isinstance(stated, Quantity) else K * _amplitude(table["time"], table["current"], Omega)
+    return Drive(Omega, P_d, gap.value)
+
+
+def _amplitude(time: np.ndarray, values: np.ndarray, Omega: float) -> float:
+    """Amplitude of ``values`` (n,) at Omega by least squares, an offset beside it."""
+    design = np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones(len(time))], axis=1)
+    coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
+    return float(np.hypot(coefficients[0], coefficients[1]))
+
+
+def feasibility(table: Table, theta: Mapping[str, float], note: str = "") -> list[Finding]:
+    """Findings, level ``warn``, on one forced run; none where its settings can do what they are for.
+
+    Parameters
+    ----------
+    table : a ``forced_run``
+    theta : values by symbol, SI: m1, m2, k1, c, mu, k2 (of this run's spring), g, and K where P_d is not stated
+    note : where the values come from, added to every finding that rests on them
+    """
+    drive = drive_of(table, theta.get("K", np.nan))
+    reached, touches = held_rod(theta, drive)
+    F_b = theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"]
+    without_contact = drive.P_d / float(grazing_load(theta["m1"], theta["k1"], theta["c"], 1.0, drive.Omega))
+    grazing = float(grazing_load(theta["m1"], theta["k1"], theta["c"], drive.G, drive.Omega))
+    linear_force = without_contact * float(np.hypot(theta["k1"], theta["c"] * drive.Omega))
+    texts = []
+    if drive.P_d < grazing and linear_force <= F_b:
+        texts.append(
+            f"at Omega = {drive.Omega:.4g} rad/s the rod reaches the gap of {1e3 * drive.G:.3g} mm from P_d = "
+            f"{grazing:.3g} N on, the run has {drive.P_d:.3g} N: no lasting contact from rest, so it says nothing of k2; "
+            "check P_d, gap and Omega, drive harder, or narrow the gap"
+        )
+    if reached <= F_b:
+        texts.append(
+            f"the rod pushes a capsule at rest with {reached:.3g} N at most, F_b = mu (m1 + m2) g = {F_b:.3g} N: the "
+            "capsule cannot set off, so the run says nothing of v_s; drive harder, or nearer to resonance"
+        )
+    texts += _sampling(table, theta, touches and drive.P_d >= grazing)
+    texts += _length(table, theta, drive)
+    return [Finding(CHECK, "warn", f"{table.label}: {text}{note}", table.label) for text in texts]
+
+
+def held_rod(theta: Mapping[str, float], drive: Drive) -> tuple[float, bool]:
+    """Largest |f|, N, that the rod puts on a capsule held at rest, starting from rest, and whether it ever touches.
+
+    A capsule at rest stays there while |f| <= F_b, so this is exact for the question whether it sets off.
+    """
+    m1, k1, c, k2 = (float(theta[name]) for name in ("m1", "k1", "c", "k2"))
+
+    def force(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return k1 * x + c * y + k2 * np.maximum(x - drive.G, 0.0)
+
+    def rate(t: float, state: np.ndarray) -> list[float]:
+        x, y = state
+        return [y, float(drive.P_d * np.cos(drive.Omega * t) - force(x, y)) / m1]
+
+    period = 2.0 * np.pi / drive.Omega
+    # The drive begins at its peak: once a slow one's start has died out, nothing larger comes.
+    span = min(HELD_PERIODS * period, HELD_DECAYS * 2.0 * m1 / c)
+    touch = max(0.25 * contact_time(m1, float("inf"), k2), span / HELD_STEPS)
+    step = min(period / 40.0, touch)
+    run = solve_ivp(rate, (0.0, span), [0.0, 0.0], "LSODA", rtol=HELD_TOLERANCE, atol=1e-10, max_step=step)
+    return float(np.max(np.abs(force(*run.y)))), bool(np.max(run.y[0]) >= drive.G)
+
+
+def contact_time(m1: float, m2: float, k2: float) -> float:
+    """Half a period of the rod on the support spring, pi sqrt(m*/k2), s; m* the reduced mass, m1 where m2 is infinite."""
+    return float(np.pi * np.sqrt(1.0 / ((1.0 / m1 + 1.0 / m2) * k2)))
+
+
+def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[str]:
+    """Samples within a touch, where there are touches; the shortest is that of a capsule which gives way."""
+    step = float(np.median(np.diff(table["time"])))
+    touch = contact_time(theta["m1"], theta["m2"], theta["k2"])
+    if not touches or touch / step >= SAMPLES_PER_CONTACT:
+        return []
+    return [
+        f"a contact lasts about pi sqrt(m*/k2) = {1e3 * touch:.2g} ms, {touch / step:.2g} samples, and "
+        f"{SAMPLES_PER_CONTACT} or more are wanted; sample at {SAMPLES_PER_CONTACT / touch:.2g} Hz or more"
+    ]
+
+
+def _length(table: Table, theta: Mapping[str, float], drive: Drive) -> list[str]:
+    """Excitation periods left once the start has died out."""
+    time, start = table["time"], DECAY_TIMES * 2.0 * theta["m1"] / theta["c"]
+    period = 2.0 * np.pi / drive.Omega
+    settled = (float(time[-1] - time[0]) - start) / period
+    if settled >= SETTLED_PERIODS:
+        return []
+    return [
+        f"{max(settled, 0.0):.2g} excitation periods are left after the start has died out ({start:.2g} s), "
+        f"{SETTLED_PERIODS} or more are wanted; record for {start + SETTLED_PERIODS * period:.2g} s or more"
+    ]

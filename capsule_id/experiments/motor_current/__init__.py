@@ -1,0 +1,1 @@
+"""Force of the motor against its current: K."""

@@ -1,0 +1,1 @@
+"""Steady sliding: friction against speed, mu and v_s."""

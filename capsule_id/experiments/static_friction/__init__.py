@@ -1,0 +1,1 @@
+"""Tilt of the board until the capsule slips: mu."""

@@ -1,0 +1,1 @@
+"""Force of a support spring against its deflection: k2."""

@@ -1,0 +1,213 @@
+"""Do the runs agree with the bench, and can their motion be predicted at all?"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.inference.fit.least_squares import linearised
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.target.density import HeldResiduals
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.views import Finding
+
+#: Family-wise false-alarm rate of the comparison of bench and runs.
+LEVEL = 0.02
+#: An error in the initial state that grows by this factor within the record makes an open-loop fit meaningless.
+LARGEST_GROWTH = 1e3
+
+
+@dataclass(frozen=True)
+class RunsAlone:
+    """What runs and priors tell without the bench: ``names`` of the located parameters, u (p,), covariance (p, p)."""
+
+    names: tuple[str, ...]
+    u: np.ndarray
+    covariance: np.ndarray
+
+
+def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
+    """One Gauss–Newton step from the joint ``fit`` with the bench's residuals left out."""
+    located = np.flatnonzero(~target.scatter)
+    residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(fit.u))
+    misses, jacobian = linearised(residual, fit.u[located])
+    values = target.mapping(target.theta(fit.u))
+    wanted: list[np.ndarray] = []
+    for group in target.structure.groups:
+        own = group.first
+        parts = own.misfits(own.local(values), np)
+        size = sum(part.raw.shape[0] + part.design.shape[1] for part in parts) * len(group.entries[0][1])
+        wanted.append(np.full(size, isinstance(own, ForcedRun)))
+    rows = np.concatenate([*wanted, np.ones(target.dimension, dtype=bool)])
+    kept = jacobian[rows]
+    covariance = np.linalg.inv(kept.T @ kept)
+    u = fit.u[located] - covariance @ (kept.T @ misses[rows])
+    return RunsAlone(tuple(target.names[i] for i in located), u, covariance)
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Bench less runs in one parameter.
+
+    Attributes
+    ----------
+    sd : over the sd of the difference as the curvature has it
+    z : standard normal quantile of how rare that is: the tails of what few trials tell are those of the bench's sample,
+        where there is one
+    """
+
+    sd: float
+    z: float
+
+
+def disagreement(
+    shared: Sequence[str], runs: RunsAlone, bench: PointFit, sample: Posterior | None
+) -> dict[str, Distance]:
+    """Of every ``shared`` parameter by name; bench and runs know nothing of each other."""
+    found = {}
+    for name in shared:
+        i, j = runs.names.index(name), bench.names.index(name)
+        own = runs.covariance[i, i]
+        z = sd = float((bench.u[j] - runs.u[i]) / np.sqrt(bench.covariance[j, j] + own))
+        if sample is not None:
+            # Every parameter that bench and runs share is positive: u is its logarithm.
+            draws = np.log(sample.draws[..., j].ravel())
+            blurred = draws + np.sqrt(own) * np.random.default_rng(j).standard_normal(draws.size)
+            z = _by_sample(blurred, float(runs.u[i]), sd)
+        found[name] = Distance(sd, z)
+    return found
+
+
+def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
+    """Standard normal quantile of where ``value`` lies among ``draws``, sign as ``laplace``.
+
+    Beyond the outermost hundredth the tail is continued as that of a Student t with the sample's own reach.
+    """
+    below = np.mean(draws < value)
+    if 0.005 < below < 0.995:
+        return float(-stats.norm.ppf(below))
+    # The outer quantiles at two levels give the number of degrees of freedom of the tail.
+    levels = np.array([0.005, 0.05]) if below < 0.5 else np.array([0.995, 0.95])
+    centre = float(np.median(draws))
+    outer, inner = np.abs(np.quantile(draws, levels) - centre)
+    freedom = _freedom(outer / inner)
+    scale = outer / stats.t.isf(0.005, freedom)
+    tail = stats.t.logsf(abs(value - centre) / scale, freedom)
+    return float(np.copysign(_quantile_of_log_tail(float(tail)), laplace))
+
+
+def _freedom(ratio: float) -> float:
+    """Degrees of freedom of a Student t whose 0.5 % and 5 % points stand in ``ratio``."""
+    grid = np.geomspace(1.0, 1e3, 200)
+    return float(grid[np.argmin(np.abs(stats.t.isf(0.005, grid) / stats.t.isf(0.05, grid) - ratio))])
+
+
+def _quantile_of_log_tail(log_tail: float) -> float:
+    """z with log(1 - Phi(z)) = ``log_tail``, also where the tail itself underflows."""
+    z = np.linspace(0.0, 40.0, 8001)
+    return float(np.interp(-log_tail, -stats.norm.logsf(z), z))
+
+
+def check_agreement(
+    target: LogPosterior, joint: PointFit, bench: PointFit | None, sample: Posterior | None
+) -> list[Finding]:
+    """Expected: bench and runs tell of one capsule (two-sided, Šidák over the shared parameters).
+
+    Masses are left out: their weighings stand on both sides.
+    """
+    told = {row.name for e in target.experiments if isinstance(e, ForcedRun) for row in e.parameters}
+    shared = [] if bench is None else [name for name in bench.names if name in told]
+    found = disagreement(shared, runs_alone(target, joint), bench, sample) if bench is not None and shared else {}
+    return [agreement(found, sample is not None)] if found else []
+
+
+def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
+    """The finding on what ``disagreement`` found; without a bench sample the worst is a suspicion.
+
+    Named is the farthest, in sd, of the parameters that are too rarely so far off to be chance: sd say how much the
+    error of one parameter alone would explain. An error in one draws along what the bench measures together with it
+    (v_s after mu), and heavy tails hide which came first.
+    """
+    p = {name: _family_wise(one.z, len(found)) for name, one in found.items()}
+    lost = [name for name, one in found.items() if not (np.isfinite(one.sd) and np.isfinite(one.z))]
+    far = [name for name in found if p[name] < LEVEL and name not in lost]
+    far.sort(key=lambda name: -abs(found[name].sd))
+    if lost and not far:
+        text = (
+            f"expected finite estimates of all {len(found)} shared parameters from bench and runs; of {', '.join(lost)} "
+            "there is none, so nothing was compared: look at what the records and tests of these determine"
+        )
+        return Finding("bench and runs agree", "warn", text)
+    worst = far[0] if far else min(p, key=lambda name: p[name])
+    judge = " by the bench's sample" if sampled else ""
+    size = f"{found[worst].sd:+.1f} sd of the curvature, {_stated(p[worst])}{judge} over {len(found)} shared parameters"
+    seen = f"largest disagreement in {worst} ({size})"
+    if not far:
+        return Finding("bench and runs agree", "ok", seen)
+    others = [f"{name} ({found[name].sd:+.1f} sd, {_stated(p[name])})" for name in far[1:]]
+    text = (
+        f"expected bench and runs to tell of one capsule; {seen}: the bench's {worst} does not fit the recorded motion"
+        f"{'; then ' + ', '.join(others) if others else ''}: repeat its bench test, or ask what differs in the runs"
+    )
+    # The curvature of few trials understates their tails.
+    return Finding("bench and runs agree", "fail" if sampled else "warn", text)
+
+
+def _family_wise(z: float, number: int) -> float:
+    """p-value of the largest of ``number`` scores (two-sided, Šidák)."""
+    with np.errstate(divide="ignore"):  # z = 0: log(0), and p = 1
+        return float(-np.expm1(number * np.log1p(-2.0 * stats.norm.sf(abs(z)))))
+
+
+def _stated(p: float) -> str:
+    return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"
+
+
+def growth(run: ForcedRun, values: Mapping[str, float]) -> float:
+    """Largest factor by which a small error of the initial state has grown at the end of the record, 1.
+
+    Positions count in units of the motion's length, velocities in that times Omega.
+    """
+    size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
+    motion = run.motion(values, np)
+    start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
+    derivative = np.asarray(_derivative_of_end(*run.capsule(values), run.time[[0, -1]], start))
+    return float(np.linalg.norm(derivative * size / size[:, None], 2))
+
+
+@jax.jit
+def _derivative_of_end(p: CapsuleParameters, e: Excitation, times: jax.Array, start: jax.Array) -> jax.Array:
+    """(3, 3) of (x_rel, its rate, Y2) at the last of ``times`` with respect to the same at the first."""
+
+    def end(state: jax.Array) -> jax.Array:
+        t = simulate(p, e, times, (state[0], state[1] + state[2], 0.0, state[2]))
+        return jnp.stack([t.X1[-1] - t.X2[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]])
+
+    return jax.jacfwd(end)(start)
+
+
+def check_runs(runs: Sequence[ForcedRun], values: Mapping[str, float]) -> list[Finding]:
+    """Expected: every run's motion predictable over its record, and complete."""
+    findings = []
+    for run in runs:
+        local = run.local(values)
+        status = Status(int(run.motion(local, np).status))
+        if status is Status.GRAZING:
+            text = (
+                f"{run.label}: {status.sentence} Its covariance at the point fit may be off; the sample does not use it"
+            )
+            findings.append(Finding("runs predictable", "warn", text, run.label))
+        factor = growth(run, local)
+        if not factor < LARGEST_GROWTH:
+            text = (
+                f"{run.label}: expected a motion that forgets its start; an error of the initial state grows {factor:.2g} "
+                f"times over the record, so one initial state cannot predict it: state segments, or record less of it"
+            )
+            findings.append(Finding("runs predictable", "fail", text, run.label))
+    seen = f"none of {len(runs)} runs amplifies an error of its start {LARGEST_GROWTH:g} times"
+    return findings or ([Finding("runs predictable", "ok", seen)] if runs else [])

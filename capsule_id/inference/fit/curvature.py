@@ -1,0 +1,76 @@
+"""Second derivatives of the log-posterior from its batched values, and what follows from them.
+
+The log-posterior is compiled once, for the sampler; its Hessian by automatic differentiation would cost another, far
+longer compilation. Central differences with steps of a fraction of a posterior standard deviation, extrapolated
+(Richardson), agree with it to 1e-6 relative (tested).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from capsule_id.physics.batches import pool
+
+#: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
+STEP, RATIO = 0.05, 2.0
+#: Step of the gradient's central differences, in standard deviations: an error of 1e-7 where curvature changes by half
+#: over one of them.
+GRADIENT_STEP = 1e-3
+#: A batch has this many rows always, so that it is compiled for one shape.
+BATCH = 32
+
+
+def in_batches(function: Callable[[np.ndarray], np.ndarray], points: np.ndarray) -> np.ndarray:
+    """``function`` of (m, d) points, called with exactly ``BATCH`` rows at a time, on all cores; (m,)."""
+    padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % BATCH, axis=0)])
+    chunks = [padded[i : i + BATCH] for i in range(0, len(padded), BATCH)]
+    parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
+    return np.concatenate(parts)[: len(points)]
+
+
+def hessian(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(d, d) Hessian of ``function`` ((m, d) -> (m,)) at u (d,); ``scale`` (d,) a rough sd of each parameter."""
+    d = len(u)
+    rows, columns = np.triu_indices(d)
+    unit = np.diag(scale)
+    pair, single = unit[rows] + unit[columns], unit[rows] - unit[columns]
+    estimates = []
+    for step in (STEP, RATIO * STEP):
+        offsets = step * np.concatenate([pair, -pair, single, -single])
+        values = in_batches(function, np.concatenate([u + offsets, u[None]]))
+        plus, minus, cross, cross_minus = np.split(values[:-1], 4)
+        second = (plus + minus - cross - cross_minus) / (4.0 * step**2)
+        estimates.append(second)
+    best = (RATIO**2 * estimates[0] - estimates[1]) / (RATIO**2 - 1.0)
+    matrix = np.zeros((d, d))
+    matrix[rows, columns] = best / (scale[rows] * scale[columns])
+    return matrix + np.triu(matrix, 1).T
+
+
+def gradient(function: Callable[[np.ndarray], np.ndarray], v: np.ndarray) -> np.ndarray:
+    """(d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates of which a standard deviation is 1."""
+    offsets = GRADIENT_STEP * np.eye(len(v))
+    plus, minus = np.split(function(np.concatenate([v + offsets, v - offsets])), 2)
+    return (plus - minus) / (2.0 * GRADIENT_STEP)
+
+
+def root_of_inverse(hessian: np.ndarray) -> np.ndarray:
+    """R (d, d) with R R' = H^-1; directions without positive curvature get the weakest positive one instead.
+
+    Away from the maximum H may be indefinite; it only serves as a metric there.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), 1e-12))
+    eigenvalues, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    positive = eigenvalues > 1e-8 * eigenvalues[-1]
+    eigenvalues = np.where(positive, eigenvalues, np.min(eigenvalues[positive]))
+    return scale[:, None] * vectors / np.sqrt(eigenvalues)
+
+
+def jacobian(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """(n, d) Jacobian of ``function`` ((d,) -> (n,)) at u by central differences with ``step`` (d,)."""
+    columns = []
+    for j, h in enumerate(step):
+        offset = np.zeros_like(u)
+        offset[j] = h
+        columns.append((function(u + offset) - function(u - offset)) / (2.0 * h))
+    return np.stack(columns, axis=1)

@@ -1,0 +1,237 @@
+"""Point fit of rigs with forced runs: bench first, then everything together.
+
+    bench experiments -> their own point fit -> starts about it (``joint_starts``), runs started from their records
+    -> (Levenberg–Marquardt on the located parameters <-> scatters at their conditional maxima) until neither moves
+    -> again from wherever moving one parameter alone does better
+
+Derivatives of the event-driven model are exact and forward; the Hessian is Gauss–Newton's, for the residuals are small
+and the parameters well known. The likelihood has side maxima (a contact more or less), hence several starts and moves.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.forced_run.experiment import NOISES, ForcedRun
+from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
+from capsule_id.inference.fit.least_squares import LeastSquaresFit, covariance, least_squares
+from capsule_id.inference.fit.point_fit import AGREEMENT
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.target import density
+from capsule_id.inference.target.density import HeldResiduals
+from capsule_id.inference.target.log_posterior import LogPosterior
+
+TOLERANCE, MAX_STEPS = 1e-7, 80
+#: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
+ROUNDS, STILL = 8, 0.01
+#: Where a descent ends, every parameter alone is moved by so many standard deviations; what gains more than ``GAIN`` in
+#: log-posterior is a point to descend from again, and again at most.
+MOVES, GAIN, ESCAPES = 2.0 ** np.arange(8), 1.0, 4
+#: No such move changes a positive parameter by more than this, natural logarithm.
+FARTHEST = 2.0
+#: Difference in log-posterior without a meaning. A contact that moves over a sample gives the likelihood a kink, and so
+#: maxima side by side, less than a standard deviation apart: to the posterior they are one. At a maximum on a kink no
+#: gradient vanishes: the descent has come to rest where its Gauss–Newton step promises no more than this.
+DENT = 0.1
+#: A start that comes to rest with this many times the sum of squares of the best end before it has found another motion: its
+#: scatters are then not worth a round.
+ELSEWHERE = 3.0
+#: Starts go on until two ends leave no run with more than so many times the noise that its record shows.
+NOISY = 1.2
+#: A scatter's conditional maximum is looked for within this factor (logarithm) of where it stands.
+REACH = 6.0
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where a descent ended: u (d,), the last least-squares fit, whether everything came to rest, log-posterior."""
+
+    u: np.ndarray
+    fit: LeastSquaresFit
+    at_rest: bool
+    value: float
+
+
+def joint_fit(
+    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float] | None = None
+) -> PointFit:
+    """Fit ``target``, whose experiments include forced runs.
+
+    Parameters
+    ----------
+    known : values by name of what is known before: a fit of the bench, or the paper's estimates
+    seed : of the candidates
+    first : values by name that stand where the bench's would, as far as it has them
+    """
+    starts = choose_starts(target, known, seed, first or {})
+    ends: list[_End] = []
+    for start in starts:
+        if len(ends) >= STARTS and sum(not _is_noisy(target, end.u) for end in ends) > 1:
+            break
+        before = max(ends, key=lambda end: end.value, default=None)
+        if before is None or not np.isfinite(before.value):
+            ends.append(_search(target, start, np.inf))
+        else:
+            # A start knows the scatters no better than the best end does: its own stand for the noise of its record.
+            start = np.where(target.scatter, before.u, start)
+            ends.append(_search(target, start, ELSEWHERE * float(before.fit.cost[0])))
+    u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
+    best = int(np.argmax(value))
+    if not np.isfinite(value[best]):
+        raise InputError(
+            "bench and runs are fitted from a start at which every motion is finite",
+            f"none of {len(starts)} starts leads to one",
+            "look at masses, gaps and settings of the runs, and at what the bench tests tell (--experiments bench)",
+        )
+    fit, located = ends[best].fit, np.flatnonzero(~target.scatter)
+    matrix = np.zeros((target.dimension, target.dimension))
+    located_covariance = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0)
+    matrix[np.ix_(located, located)] = located_covariance.matrix
+    scatters = np.flatnonzero(target.scatter)
+    matrix[scatters, scatters] = _scatter_variances(target, u[best])
+    spread = np.sqrt(np.diag(matrix))
+    theta = target.theta(u[best])
+    errors = np.full(target.dimension, np.nan)
+    errors[located] = located_covariance.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    return PointFit(
+        names=target.names,
+        u=u[best],
+        values=dict(zip(target.names, (float(v) for v in theta), strict=True)),
+        covariance=matrix,
+        standard_errors=dict(zip(target.names, (float(e) for e in errors), strict=True)),
+        starts=starts[: len(ends)],
+        ends=u,
+        log_posterior=value,
+        elsewhere=_elsewhere(u, value, spread),
+        stalled=np.array([not end.at_rest for end in ends]),
+    )
+
+
+def _elsewhere(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(s,) which of the ends u (s, d) are another maximum than the best; log-posterior (s,), posterior sd (d,)."""
+    best = int(np.argmax(value))
+    away = np.max(np.abs(u - u[best]) / spread, axis=1)
+    dent = (away < 1.0) & (value > value[best] - DENT)
+    return ~((away <= AGREEMENT) | dent) | ~np.isfinite(value)
+
+
+def _is_noisy(target: LogPosterior, u: np.ndarray) -> bool:
+    """At u (d,) a channel of a run has clearly more noise than its record shows: its motion is not described.
+
+    Coloured noise does not show in a record by itself: such a run is not asked.
+    """
+    values = target.mapping(target.theta(u))
+    runs = [(e, e.local(values)) for e in target.experiments if isinstance(e, ForcedRun) and not e.coloured]
+    return any(theta[NOISES[name]] > NOISY * _shown(e, name) for e, theta in runs for name in e.channels)
+
+
+def _shown(run: ForcedRun, name: str) -> float:
+    """sd of the noise that the record itself shows in a channel."""
+    return max(run.rough.noise[name], run.table.columns[name].reading_sd)
+
+
+def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
+    """``_descend``, and again from wherever moving one parameter alone does better."""
+    end = _descend(target, start, limit)
+    for _ in range(ESCAPES):
+        if not np.isfinite(end.value) or end.fit.cost[0] > limit:
+            break
+        better = _better_point(target, end)
+        if better is None:
+            break
+        other = _descend(target, better, limit)
+        if other.value <= end.value:
+            break
+        end = other
+    return end
+
+
+def _better_point(target: LogPosterior, end: _End) -> np.ndarray | None:
+    """(d,) the likeliest of the points that differ from ``end`` in one located parameter; None where none gains."""
+    located = np.flatnonzero(~target.scatter)
+    sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(end.fit.jacobian[0].T @ end.fit.jacobian[0])), 0.0))
+    farthest = np.where(target.positive[located], FARTHEST, np.inf)
+    sizes = np.minimum(MOVES[:, None] * sd, farthest)[:, None, :] * np.eye(len(located))
+    steps = np.concatenate([sizes, -sizes]).reshape(-1, len(located))
+    points = np.repeat(end.u[None], len(steps) + 1, axis=0)
+    points[1:, located] += steps
+    value = weigh(target, points)
+    best = int(np.argmax(value))
+    return points[best] if value[best] > value[0] + GAIN else None
+
+
+def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> _End:
+    """From one start (d,); above ``limit`` of the cost it goes no further, and neither where numbers are not finite."""
+    located = np.flatnonzero(~target.scatter)
+    u, still, fit = start.copy(), False, None
+    for _ in range(ROUNDS):
+        residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(u))
+        fit = least_squares(
+            residual, u[located][None], tolerance=TOLERANCE, max_steps=MAX_STEPS, normal_equations=True, heavy=True
+        )
+        if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
+            return _End(u, fit, False, -np.inf)
+        sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))
+        moved = np.max(np.abs(fit.x[0] - u[located]) / np.where(sd > 0, sd, 1.0))
+        u[located] = fit.x[0]
+        scatters = scatter_modes(target, u)
+        shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
+        for i, value in scatters.items():
+            u[i] = value
+        still = bool(moved < STILL and shift < STILL)
+        if still or fit.cost[0] > limit:
+            break
+    assert fit is not None, "there is at least one round"
+    at_rest = (still or bool(fit.cost[0] > limit)) and _at_rest(fit)
+    return _End(u, fit, at_rest, float(weigh(target, u[None])[0]))
+
+
+def _at_rest(fit: LeastSquaresFit) -> bool:
+    """One fit, from one start, converged, or stopped where nothing is left to gain."""
+    step = np.linalg.lstsq(fit.jacobian[0], -fit.residuals[0])[0]
+    return not fit.stalled[0] or bool(0.5 * np.sum((fit.jacobian[0] @ step) ** 2) < DENT)
+
+
+def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
+    """Conditional maximum, in u, of every scatter given the located entries of u (d,), by index."""
+    modes = {}
+    for i, terms in _scatter_terms(target, u).items():
+        bounds = (u[i] - REACH, u[i] + REACH)
+        found: Any = minimize_scalar(lambda t, terms=terms: -terms(t), bounds=bounds, options={"xatol": 1e-5})
+        modes[i] = float(found.x)
+    return modes
+
+
+def _scatter_variances(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """Inverse curvature of every scatter's conditional density at u (d,), in the order of the scatters."""
+    h, variances = 0.05, []
+    terms = _scatter_terms(target, u)
+    for i in np.flatnonzero(target.scatter).tolist():
+        bend = (2.0 * terms[i](u[i]) - terms[i](u[i] + h) - terms[i](u[i] - h)) / h**2
+        variances.append(1.0 / max(bend, 0.1))
+    return np.array(variances)
+
+
+def _scatter_terms(target: LogPosterior, u: np.ndarray) -> dict[int, Callable[[float], float]]:
+    """log-density of every scatter's u given the located entries of u (d,), up to a constant, by index."""
+    values = target.mapping(target.theta(u))
+    parts: dict[int, list[Misfit | Moments]] = {int(i): [] for i in np.flatnonzero(target.scatter)}
+    for experiment in target.experiments:
+        names = {row.symbol: row.name for row in experiment.parameters}
+        for part, symbol in zip(experiment.summaries(experiment.local(values), np), experiment.scatters, strict=True):
+            if symbol is not None:
+                parts[target.names.index(names[symbol])].append(part)
+
+    def terms(i: int, t: float) -> float:
+        prior = {name: array[i] for name, array in target.priors.items()}
+        own = sum(part.log_density(np.exp(t), np) for part in parts[i])
+        return float(own + density.prior_terms(prior, np.float64(t), np.exp(t), np))
+
+    return {i: partial(terms, i) for i in parts}

@@ -1,0 +1,335 @@
+"""Nonlinear least squares from several starts, with the covariance that the solver does not give.
+
+Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the minimum the covariance of the parameters is
+σ² (JᵀJ)⁻¹ with σ² = Σ r² / (n − d) unless it is known (Seber & Wild, *Nonlinear Regression*, 1989, ch. 2).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+
+from capsule_id.errors import InputError
+from capsule_id.inference.target.compiling import COMPILE, COMPILE_QUICKLY
+from capsule_id.precision import require_float64
+
+require_float64()
+
+Residual = Callable[[jax.Array], jax.Array]
+#: Points (s, d) -> residuals (s, n) and their Jacobians (s, n, d).
+Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+FIRST_DAMPING = 1e-6
+"""Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
+strongly correlated, and a start near the minimum must not look converged for heavy damping."""
+
+SMALLEST_EFFECT = 0.01
+"""Dimensionless. Where changing a parameter by 100 % of its start moves the residuals by less than this share of what
+the strongest parameter does, the parameter's scale is the step that moves them by this share: zero has no size."""
+
+LARGEST_OFFSET = 1e-3
+"""Dimensionless, in radii of the joint confidence region: how far from a stationary point an end counts as converged
+(Bates & Watts, *Technometrics* 23, 1981, 179, the relative offset)."""
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of the parameters at a minimum, and whether the data determine them at all.
+
+    Attributes
+    ----------
+    matrix : (d, d), units of the parameters; every entry is inf where the Jacobian is rank deficient
+    rank : numerical rank of the Jacobian, its columns scaled to unit length; 0 where it is not finite
+    residual_sd : σ that the matrix was multiplied with, units of the residuals
+    """
+
+    matrix: np.ndarray
+    rank: int
+    residual_sd: float
+
+    @property
+    def rank_deficient(self) -> bool:
+        """Some combination of the parameters leaves the residuals unchanged: no standard error exists."""
+        return self.rank < self.matrix.shape[0]
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """(d,) square roots of the diagonal, units of the parameters; inf where rank deficient."""
+        return np.sqrt(np.diag(self.matrix))
+
+
+@dataclass(frozen=True)
+class LeastSquaresFit:
+    """Where each start ended, and whether it converged there.
+
+    Attributes
+    ----------
+    x : (s, d) end points, units of the parameters
+    cost : (s,) ½ Σ r², units of the residuals squared
+    stalled : (s,) bool, no convergence: out of steps, numbers that are not finite, or steps that became tiny short of
+        a stationary point
+    steps : (s,) solver steps, rejected ones included
+    message : (s,) the reason, "" where it converged
+    residuals : (s, n) at the end points
+    jacobian : (s, n, d) of the residuals at the end points
+    """
+
+    x: np.ndarray
+    cost: np.ndarray
+    stalled: np.ndarray
+    steps: np.ndarray
+    message: tuple[str, ...]
+    residuals: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def best(self) -> int:
+        """The start with the smallest finite cost among those that converged, or among all where none did."""
+        candidates = self.stalled if self.stalled.all() else ~self.stalled
+        return int(np.argmin(np.where(candidates & np.isfinite(self.cost), self.cost, np.inf)))
+
+    def covariance(self, residual_sd: float | None = None, start: int | None = None) -> Covariance:
+        """Covariance at the end point of ``start`` (default: the best one); see the function ``covariance``."""
+        index = self.best if start is None else start
+        return covariance(self.jacobian[index], self.residuals[index], residual_sd)
+
+
+def least_squares(
+    residual: Residual,
+    starts: np.ndarray,
+    *,
+    tolerance: float = 1e-9,
+    max_steps: int = 1024,
+    normal_equations: bool = False,
+    linearise: Linearise | None = None,
+    heavy: bool = False,
+) -> LeastSquaresFit:
+    """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
+
+    The damping of Levenberg-Marquardt, and its tolerance, mean something only when the parameters are of comparable
+    size, so each start is solved in v_j = x_j / scale_j with scale_j = |start_j| (``SMALLEST_EFFECT`` says what happens
+    at zero), and the residuals are divided by the largest column norm of the Jacobian in v at the start. The result
+    therefore depends on neither the units of the parameters nor those of the residuals.
+
+    Parameters
+    ----------
+    residual : (d,) -> (n,), a JAX function; it may close over arrays. A ``jax.tree_util.Partial`` or ``equinox.Module``
+        carries its arrays as arguments instead: other numbers of the same shapes then need no new compilation
+    starts : (s, d), units of the parameters
+    tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
+        tolerance (1 + its size)
+    max_steps : solver steps, rejected ones included, after which a start counts as stalled
+    normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
+        times as fast where there are thousands of residuals
+    linearise : the residuals and Jacobians that scale the starts and judge the ends, by another route; None compiles
+        forward-mode differentiation for them
+    heavy : the residuals take milliseconds: compiled well, and parameters scaled by their effect (Marquardt 1963)
+
+    Raises
+    ------
+    ValueError
+        ``starts`` is not (s, d) with s ≥ 1, or not finite.
+    """
+    starts = np.asarray(starts, dtype=float)
+    if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
+        raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
+    linearise = linearise or partial(_forward_mode, residual, heavy)
+    scale, unit = zip(*map(_effects if heavy else _scales, linearise(starts)[1], starts), strict=True)
+    options = {"tolerance": tolerance, "max_steps": max_steps, "normal_equations": normal_equations}
+    solve = partial(_PROGRAMS[heavy][1], residual, **options)
+    # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
+    arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
+    ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
+    x, steps = np.stack(ends), np.array(steps, dtype=int)
+    residuals, jacobian = linearise(x)
+    rounding = [tolerance * one for one in unit]
+    message = [_reason(*one) for one in zip(results, jacobian, residuals, rounding, strict=True)]
+    return LeastSquaresFit(
+        x=x,
+        cost=0.5 * np.sum(residuals**2, axis=1),
+        stalled=np.array([reason != "" for reason in message]),
+        steps=steps,
+        message=tuple(message),
+        residuals=residuals,
+        jacobian=jacobian,
+    )
+
+
+def _reason(result: optx.RESULTS, jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> str:
+    """Why an end is none, "" where it is one."""
+    reason = optx.RESULTS[result]
+    if not _finite(jacobian, residuals):
+        return "The residuals or their Jacobian are not finite where this start ended: try another start."
+    # A solver that only watches its steps takes heavy damping for convergence.
+    if not reason and not _stationary(jacobian, residuals, rounding):
+        return "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
+    return reason
+
+
+def covariance(jacobian: np.ndarray, residuals: np.ndarray, residual_sd: float | None = None) -> Covariance:
+    """σ² (JᵀJ)⁻¹ from the singular values of J, never by a pseudo-inverse: a direction without data has no variance.
+
+    The columns are scaled to unit length first, so that the rank does not depend on the units of the parameters.
+
+    Parameters
+    ----------
+    jacobian : (n, d) of the residuals at the minimum
+    residuals : (n,) at the minimum
+    residual_sd : σ where it is known, 1 for residuals in units of their own sd; None estimates it from the residuals
+
+    Raises
+    ------
+    InputError
+        σ is to be estimated and there are not more residuals than parameters.
+    """
+    count, parameters = jacobian.shape
+    if residual_sd is None:
+        if count <= parameters:
+            raise InputError(
+                "the residual sd can be estimated only from more residuals than parameters",
+                f"{count} residuals for {parameters} parameters",
+                "give the sd of the measurements or more measurements",
+            )
+        residual_sd = float(np.sqrt(residuals @ residuals / (count - parameters)))
+    no_answer = np.full((parameters, parameters), np.inf)
+    if not _finite(jacobian, residuals):
+        return Covariance(no_answer, 0, residual_sd)
+    _, singular, right, column_norm = _range(jacobian)
+    if len(singular) < parameters:
+        return Covariance(no_answer, len(singular), residual_sd)
+    root = residual_sd * right.T / singular / column_norm[:, None]
+    return Covariance(root @ root.T, parameters, residual_sd)
+
+
+def _finite(jacobian: np.ndarray, residuals: np.ndarray) -> bool:
+    return bool(np.isfinite(jacobian).all() and np.isfinite(residuals).all())
+
+
+def _range(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Singular vectors and values of J with unit columns, as far as they are above rounding, and the column norms.
+
+    (n, rank), (rank,), (rank, d), (d,).
+    """
+    column_norm = np.linalg.norm(jacobian, axis=0)
+    left, singular, right = np.linalg.svd(jacobian / np.where(column_norm > 0, column_norm, 1.0), full_matrices=False)
+    rank = int(np.sum(singular > singular[0] * max(jacobian.shape) * np.finfo(float).eps))
+    return left[:, :rank], singular[:rank], right[:rank], column_norm
+
+
+def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> bool:
+    """The part of the residuals (n,) in the range of J (n, d) is small against the rest, or below ``rounding``."""
+    left = _range(jacobian)[0]
+    tangential = float(np.linalg.norm(left.T @ residuals))
+    normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))
+    freedom = max(len(residuals) - left.shape[1], 1)
+    # Bates & Watts: both parts per degree of freedom.
+    radius = normal * np.sqrt(max(left.shape[1], 1) / freedom)
+    return tangential <= max(LARGEST_OFFSET * radius, rounding)
+
+
+def _forward_mode(residual: Residual, heavy: bool, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (s, n) and Jacobians (s, n, d) at points (s, d)."""
+    parts = [_PROGRAMS[heavy][0](residual, point) for point in jnp.asarray(points)]
+    residuals, jacobians = (np.stack(part) for part in zip(*parts, strict=True))
+    return residuals, jacobians
+
+
+def linearised(residual: Residual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n,) and Jacobian (n, d) of heavy residuals at x (d,)."""
+    residuals, jacobians = _forward_mode(residual, True, x[None])
+    return residuals[0], jacobians[0]
+
+
+def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Residuals (n,) and Jacobian (n, d) at x (d,), in one pass."""
+
+    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value = residual(x)
+        return value, value
+
+    jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
+    return value, jacobian
+
+
+def _solve(
+    residual: Residual,
+    start: jax.Array,
+    scale: jax.Array,
+    unit: jax.Array,
+    *,
+    tolerance: float,
+    max_steps: int,
+    normal_equations: bool,
+) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
+    """From one start (d,): x (d,), steps, result code."""
+    function = _with_jacobian(lambda v: residual(v * scale) / unit)
+    solution = optx.least_squares(
+        lambda v, _: function(v),
+        optx.LevenbergMarquardt(
+            rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR()
+        ),
+        start / scale,
+        max_steps=max_steps,
+        throw=False,
+    )
+    return solution.value * scale, solution.stats["num_steps"], solution.result
+
+
+def _with_jacobian(function: Residual) -> Residual:
+    """``function`` whose tangents come from its whole Jacobian, found in one pass with its value.
+
+    The solver linearises and then asks for every column: this compiles a third faster than transposing its way there,
+    and an event-driven run, a loop of unknown length, cannot be transposed.
+    """
+    wrapped = jax.custom_jvp(function)
+
+    @wrapped.defjvp
+    def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+        value, jacobian = _linearise(function, *primals)
+        return value, jacobian @ tangents[0]
+
+    return wrapped
+
+
+def _compiled(function: Callable[..., Any], options: Mapping[str, object]) -> Callable[..., Any]:
+    # Equinox hands the options of jax.jit on; its annotations leave them out.
+    return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+
+
+#: (linearise, solve) by whether the residuals are heavy.
+_PROGRAMS = {
+    heavy: tuple(_compiled(function, COMPILE if heavy else COMPILE_QUICKLY) for function in (_linearise, _solve))
+    for heavy in (False, True)
+}
+
+
+def _effects(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """As ``_scales``: every column of the Jacobian gets the same norm, which is then the unit of the residuals."""
+    column_norm = np.linalg.norm(jacobian, axis=0)
+    column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
+    unit = float(np.max(column_norm)) or 1.0
+    scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), np.ones_like(start))
+    # The solver begins with a damping of 1: beside residuals in larger units it is weaker by their square.
+    return scale, float(np.sqrt(FIRST_DAMPING)) * unit
+
+
+def _scales(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
+    column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
+    # Not finite: the solver will say so.
+    column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
+    strongest = np.max(column_norm * size)
+    # All starts at zero: there is no size to compare with, so every parameter counts as equally strong.
+    step = SMALLEST_EFFECT * strongest if strongest > 0 else 1.0
+    scale = np.maximum(size, np.divide(step, column_norm, out=np.zeros_like(size), where=column_norm > 0))
+    # Neither a start nor an effect: any scale does, the parameter will not move.
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = float(np.max(column_norm * scale))
+    return scale, unit if unit > 0 else 1.0

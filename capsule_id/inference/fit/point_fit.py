@@ -1,0 +1,156 @@
+"""Maximum of the joint log-posterior from several starts.
+
+Least squares first (it finds the basin, with the scatters held at their starting values), then quasi-Newton on the
+joint log-posterior, scatters included, in coordinates whitened by the curvature at the best least-squares end. The
+second step has its gradients from batches of log-posteriors: compiled for the Hessian anyhow, where a gradient by
+reverse mode would take seconds to compile, and milliseconds to run.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import optimize
+
+from capsule_id.inference.fit.curvature import BATCH, gradient, hessian, in_batches, jacobian, root_of_inverse
+from capsule_id.inference.fit.least_squares import covariance, least_squares
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.target.density import HeldResiduals
+from capsule_id.inference.target.log_posterior import LogPosterior
+
+STARTS = 5
+#: Ends count as the same where they differ by less than this many posterior standard deviations.
+AGREEMENT = 0.05
+#: Quasi-Newton stops where the gradient, per posterior standard deviation, is below the first; its end counts as a
+#: maximum below the second (rounding of the log-posterior may stop it earlier).
+TOLERANCE, MAXIMUM = 1e-5, 1e-3
+MAX_STEPS = 400
+#: Stands for the log-posterior where there is none: line searches need a number.
+NOWHERE = -1e12
+LEAST_SQUARES_TOLERANCE = 1e-6
+#: Least squares only has to find the basin. A damping term that is not there runs to zero, which its logarithm never
+#: reaches: the prior stops it, and quasi-Newton finds that in fewer steps.
+LEAST_SQUARES_STEPS = 50
+#: Relative step of the difference quotients of residuals: their error is then about 1e-10 relative.
+DIFFERENCE = 1e-5
+
+
+def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -> PointFit:
+    """Fit from ``number_of_starts`` dispersed starts, none of them the truth or on a bound (there are no bounds).
+
+    Parameters
+    ----------
+    seed : of the dispersal
+    """
+    starts = dispersed_starts(target, seed, number_of_starts)
+    located = np.flatnonzero(~target.scatter)
+    # The log-posterior compiles while least squares does.
+    with ThreadPoolExecutor(1) as pool:
+        compiled = pool.submit(target.batch, np.repeat(starts[:1], BATCH, axis=0))
+        rough = least_squares(
+            HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(starts[0])),
+            starts[:, located],
+            tolerance=LEAST_SQUARES_TOLERANCE,
+            max_steps=LEAST_SQUARES_STEPS,
+            normal_equations=True,
+            linearise=partial(_linearise, target, starts[0]),
+        )
+        compiled.result()
+    ends = starts.copy()
+    ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
+    scale = _information(target, ends[rough.best]) ** -0.5
+    whitening = root_of_inverse(-hessian(target.batch, ends[rough.best], scale))
+    polished = [_polish(target, end, whitening) for end in ends]
+    u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
+    best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
+    scale = _information(target, u[best]) ** -0.5
+    root = root_of_inverse(-hessian(target.batch, u[best], scale))
+    spread = np.sqrt(np.sum(root**2, axis=1))
+    theta = target.theta(u[best])
+    return PointFit(
+        names=target.names,
+        u=u[best],
+        values=dict(zip(target.names, (float(v) for v in theta), strict=True)),
+        covariance=root @ root.T,
+        standard_errors=_standard_errors(target, u[best], theta),
+        starts=starts,
+        ends=u,
+        log_posterior=value,
+        elsewhere=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
+        stalled=~converged | ~np.isfinite(value),
+    )
+
+
+def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray:
+    """(number, d) in u: the proposed centre, then normal draws about it with each parameter's own spread."""
+    proposed = [target.starts()[name] for name in target.names]
+    centre = target.unconstrain(np.array([start.centre for start in proposed]))
+    spread = np.array([start.spread for start in proposed])
+    z = np.random.default_rng(seed).standard_normal((number, target.dimension))
+    # The first start is the paper's estimate itself; the others leave it by at least a third of their spread.
+    z = np.where(np.abs(z) < 1.0 / 3.0, np.copysign(1.0 / 3.0, z), z)
+    z[0] = 0.0
+    return centre + spread * z
+
+
+def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged."""
+
+    def negative(v: np.ndarray) -> np.ndarray:
+        """(m,) of whitened v (m, d)."""
+        value = in_batches(target.batch, end + v @ whitening.T)
+        return -np.where(np.isfinite(value), value, NOWHERE)
+
+    solution = optimize.minimize(
+        lambda v: float(negative(v[None])[0]),
+        np.zeros(len(end)),
+        jac=lambda v: gradient(negative, v),
+        method="BFGS",
+        options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
+    )
+    value = -float(solution.fun)
+    return end + whitening @ solution.x, value, value > NOWHERE and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
+
+
+def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (s, n) and Jacobians (s, n, d) at located u (s, d), the scatters those of ``start``; not compiled."""
+    located = np.flatnonzero(~target.scatter)
+
+    def residuals(v: np.ndarray) -> np.ndarray:
+        u = start.copy()
+        u[located] = v
+        with np.errstate(all="ignore"):
+            return target.plain_residuals(u)
+
+    step = np.full(len(located), DIFFERENCE)
+    return np.stack([residuals(v) for v in points]), np.stack([jacobian(residuals, v, step) for v in points])
+
+
+def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(d,) rough diagonal information: squared residual Jacobian, and 2n for the scatter of n readings."""
+    jacobian = _residual_jacobian(target, u)
+    count = np.zeros(target.dimension)
+    for experiment in target.experiments:
+        for row in experiment.parameters:
+            if row.scatter:
+                count[target.names.index(row.name)] += 2.0 * experiment.n
+    return np.maximum(np.where(target.scatter, count, np.sum(jacobian**2, axis=0)), 1e-2)
+
+
+def _residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(n, d) Jacobian of the standardised residuals, scatters in the denominator included."""
+    return jacobian(target.plain_residuals, u, np.full(len(u), DIFFERENCE))
+
+
+def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> dict[str, float]:
+    """From the Jacobian of the standardised residuals, scatters held at the fit; NaN for the scatters; SI.
+
+    The error of a parameter sampled through its logarithm is its relative error times its value.
+    """
+    located = ~target.scatter
+    at_fit = _residual_jacobian(target, u)[:, located]
+    errors = np.full(len(u), np.nan)
+    matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
+    errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    return dict(zip(target.names, (float(e) for e in errors), strict=True))

@@ -1,0 +1,1 @@
+"""Small tables of a fit for the report."""

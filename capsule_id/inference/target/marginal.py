@@ -1,0 +1,228 @@
+"""The log-posterior with every scatter integrated out: what the sampler explores.
+
+Given all other parameters the scatters are independent, for each belongs to the readings of one kind or one record, so
+that each is a one-dimensional integral: a sum over equidistant nodes in u = log(scatter), which converges faster than
+any power of their distance. What is left has light tails and few dimensions. The scatters come back as exact draws from
+their conditional distributions: one of the nodes, drawn by weight, of a grid that was shifted at random.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.inference.fit.curvature import BATCH, in_batches
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.target import density
+from capsule_id.inference.target.compiling import COMPILE
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.quadrature import NODES, Grid, add_to_blocks, choose_grid, log_stretch, position
+
+#: The nodes are chosen by walkers this near to and this far from the point fit, in standard deviations: the tails of
+#: what few trials tell are those of Student's t.
+NEAREST, FARTHEST = 0.5, 500.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What is static in the integrated log-posterior.
+
+    Attributes
+    ----------
+    structure : of the joint one
+    scatter, located : which entries of u are integrated out, and which are not
+    block : of every entry of u, see ``LogPosterior.blocks``
+    nodes : number of nodes of every integral
+    """
+
+    structure: density.Structure
+    scatter: tuple[int, ...]
+    located: tuple[int, ...]
+    block: tuple[int, ...]
+    nodes: int
+
+    @property
+    def blocks(self) -> int:
+        return max(self.block) + 1
+
+
+class MarginalPosterior:
+    """The located parameters of ``target``, its scatters integrated out.
+
+    Attributes
+    ----------
+    names : (d,) of all parameters, as in ``target``
+    dimension : number of located parameters
+    blocks : indices, among the located parameters, of those that the posterior ties together
+    centre, covariance : (dimension,), (dimension, dimension) the Laplace approximation of u
+    """
+
+    def __init__(self, target: LogPosterior, fit: PointFit) -> None:
+        self.target, self.names, self._layout = target, target.names, _layout(target)
+        self._located, self._scatter = np.array(self._layout.located), np.array(self._layout.scatter, dtype=int)
+        self._label = np.array(self._layout.block)
+        self.dimension = len(self._located)
+        self.centre, self.covariance = fit.u[self._located], fit.covariance[np.ix_(self._located, self._located)]
+        own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
+        self.blocks = [block for block in own if len(block)]
+        self.grid = choose_grid(self._terms, fit.u[self._scatter], self._label[self._scatter], self._probes())
+
+    def parts(self, v: np.ndarray) -> np.ndarray:
+        """(w, blocks) log-posterior of the located u (w, dimension), block by block; up to the evidence."""
+
+        def one(v: np.ndarray) -> np.ndarray:
+            known, _, integrals = self._terms(v, self.grid)
+            return add_to_blocks(known, self._label[self._scatter], integrals)
+
+        values = in_batches(one, v)
+        # Scatters that nothing depends on add a constant.
+        return np.where(np.isfinite(values), values, -np.inf)[:, : len(self.blocks)]
+
+    def batch(self, v: np.ndarray) -> np.ndarray:
+        """(w,) log-posterior of the located u (w, dimension), up to the evidence; -inf where it is not finite."""
+        return np.sum(self.parts(v), axis=1)
+
+    def theta(self, u: np.ndarray) -> np.ndarray:
+        """(..., d) constrained values from the whole u (..., d)."""
+        return self.target.theta(u)
+
+    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """The whole u (..., d) of located ``draws`` (..., dimension), scatters drawn given them, and its log-posterior.
+
+        A random shift of the grid and a node drawn by weight is a draw from the density as exactly as the sum over
+        the nodes is its integral: that does not depend on the shift.
+        """
+        flat, scatters = draws.reshape(-1, self.dimension), len(self._scatter)
+        random = np.random.default_rng(seed).uniform(size=(len(flat), 2 * scatters))
+        grid = self.grid
+
+        def one(rows: np.ndarray) -> np.ndarray:
+            """(BATCH, scatters + 1), scatters and log-posterior, of rows: located u and 2 random numbers a scatter."""
+            v, shift, chance = np.split(rows, [self.dimension, self.dimension + scatters], axis=1)
+            shifted = grid.shifted(shift - 0.5)
+            known, terms, _ = self._terms(v, shifted)
+            sums = np.cumsum(np.exp(terms - np.max(terms, axis=-1, keepdims=True)), axis=-1)
+            node = np.sum(sums < chance[..., None] * sums[..., -1:], axis=-1)
+            t = shifted.start + node * grid.step
+            chosen = np.take_along_axis(terms, node[..., None], axis=-1)[..., 0] - log_stretch(t, grid.bend, np)
+            total = np.sum(known, axis=1) + np.sum(chosen, axis=1)
+            return np.concatenate([position(t, grid.bend, np), total[:, None]], axis=1)
+
+        restored = in_batches(one, np.concatenate([flat, random], axis=1))
+        u = np.empty((len(flat), len(self.names)))
+        u[:, self._located], u[:, self._scatter] = flat, restored[:, :-1]
+        return u.reshape(*draws.shape[:-1], -1), restored[:, -1].reshape(draws.shape[:-1])
+
+    def _terms(self, v: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """``conditional`` of (w, dimension), in batches."""
+        layout = replace(self._layout, nodes=grid.nodes)
+        size = (len(v), len(self._scatter))
+        start, step = np.broadcast_to(grid.start, size), np.broadcast_to(grid.step, size)
+        parts = [
+            conditional(
+                layout, self.target.numbers, v[i : i + BATCH], start[i : i + BATCH], step[i : i + BATCH], grid.bend
+            )
+            for i in range(0, len(v), BATCH)
+        ]
+        known, terms, integrals = zip(*parts, strict=True)
+        return np.concatenate(known), np.concatenate(terms), np.concatenate(integrals)
+
+    def _probes(self) -> np.ndarray:
+        """(2 BATCH, dimension) located u: the point fit, and walkers at growing distances from it, twice.
+
+        Every block goes out by itself, measured by the Laplace approximation.
+        """
+        direction = np.random.default_rng(0).standard_normal((2 * BATCH, self.dimension))
+        for block in self.blocks:
+            direction[:, block] /= np.linalg.norm(direction[:, block], axis=1, keepdims=True)
+        radius = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, BATCH - 1)])
+        return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
+
+
+def compile_ahead(target: LogPosterior) -> None:
+    """Compile what a ``MarginalPosterior`` of ``target`` needs: in another thread, while the point fit is at work."""
+    layout = _layout(target)
+    v, nodes = np.zeros((BATCH, len(layout.located))), np.ones((BATCH, len(layout.scatter)))
+    conditional(layout, target.numbers, v, nodes, nodes, nodes[0])
+
+
+def _layout(target: LogPosterior) -> Layout:
+    """With as many nodes as will do for most rigs."""
+    # A block of scatters alone, whose readings nothing predicts, has no place among the located ones.
+    blocks = sorted(target.blocks, key=lambda block: bool(np.all(target.scatter[block])))
+    label = np.zeros(target.dimension, dtype=int)
+    for i, block in enumerate(blocks):
+        label[block] = i
+    scatter, located = (tuple(np.flatnonzero(which).tolist()) for which in (target.scatter, ~target.scatter))
+    return Layout(target.structure, scatter, located, tuple(label.tolist()), NODES[0])
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILE)
+def conditional(layout: Layout, numbers: density.Numbers, v: Any, start: Any, step: Any, bend: Any) -> tuple[Any, ...]:
+    """The log-posterior of the located v (w, dimension), scatters at their nodes: the forward models run once a walker.
+
+    Returns
+    -------
+    what does not depend on scatters (w, blocks); densities of t at the nodes (w, scatters, nodes), see
+    ``capsule_id.inference.target.quadrature``; their integrals (w, scatters): logarithms all
+
+    Parameters
+    ----------
+    start, step : (w, scatters) first node and distance of the nodes, in t
+    bend : (scatters,)
+    """
+    return jax.vmap(partial(_conditional, layout, numbers, bend))(v, start, step)
+
+
+def _conditional(
+    layout: Layout, numbers: density.Numbers, bend: Any, v: Any, start: Any, step: Any
+) -> tuple[Any, Any, Any]:
+    scatter, located = np.array(layout.scatter, dtype=int), np.array(layout.located)
+    # Forward models do not read scatters: the zeros left for them reach nothing.
+    u = jnp.zeros(len(layout.block)).at[located].set(v)
+    values = density.constrain(layout.structure, u)
+    prior = numbers["prior"]
+    t = start[:, None] + step[:, None] * jnp.arange(layout.nodes)
+    nodes = position(t, bend[:, None])
+    sizes = jnp.exp(nodes)
+    own_prior = {name: array[scatter][:, None] for name, array in prior.items()}
+    terms = density.prior_terms(own_prior, nodes, sizes) + log_stretch(t, bend[:, None])
+    known = [density.prior_terms(prior, u, values)[located]]
+    known_block = [layout.block[i] for i in layout.located]
+    rows, row_scatter = [], []
+    for group, arrays in zip(layout.structure.groups, numbers["arrays"], strict=True):
+        symbols, entries = group.first.scatters, dict(group.entries)
+        places = [None if s is None else [layout.scatter.index(i) for i in entries[s]] for s in symbols]
+        theta = {s: density.pick(values, i) for s, i in entries.items() if s not in symbols}
+        constants = {name: numbers["fixed"][name] for name in group.constants}
+        members = len(group.entries[0][1])
+        own = tuple(jnp.zeros(members) if p is None else sizes[jnp.array(p)] for p in places)
+
+        def one(arrays: Any, theta: Any, own: Any, constants: Any = constants, first: Any = group.first) -> Any:
+            summaries = first.with_arrays(arrays).summaries({**theta, **constants})
+            return tuple(part.log_density(s) for part, s in zip(summaries, own, strict=True))
+
+        for place, value in zip(places, jax.vmap(one)(arrays, theta, own), strict=True):
+            if place is None:
+                known.append(value)
+                known_block += [layout.block[entry[0]] for entry in zip(*entries.values(), strict=True)]
+            else:
+                rows.append(value)
+                row_scatter += place
+    parts = _sum_by(jnp.concatenate(known), known_block, layout.blocks)
+    if rows:
+        terms = terms + _sum_by(jnp.concatenate(rows), row_scatter, len(scatter))
+    return parts, terms, jnp.log(step) + jax.nn.logsumexp(terms, axis=-1)
+
+
+def _sum_by(values: Any, label: Sequence[int], number: int) -> Any:
+    """Sums of the rows of ``values`` (m, ...) that share a label: (number, ...), by gathering."""
+    members = [[i for i, own in enumerate(label) if own == j] for j in range(number)]
+    width = max(map(len, members))
+    index = np.array([row + [len(label)] * (width - len(row)) for row in members])
+    padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
+    return jnp.sum(padded[index], axis=1)

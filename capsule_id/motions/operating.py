@@ -1,0 +1,135 @@
+"""Diagrams for draws of the parameters: how probable each motion is, how fast, and where to operate best.
+
+    draws over values -> settled motions (value, draw) -> bands: probabilities, quantiles, best operating point
+
+Where the draws come from is no matter of the physics: they are arrays of leaves.
+"""
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from capsule_id.errors import InputError
+from capsule_id.motions.blocks import Progress, compute
+from capsule_id.motions.datasets import grid_of
+from capsule_id.motions.points import SEEN, SUMMARY, points_of
+from capsule_id.motions.response import SETTLING, Settling
+from capsule_id.physics.batches import lanes_of
+from capsule_id.physics.leaves import SWEPT
+from capsule_id.physics.model import CapsuleParameters, Excitation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from distributed import Client
+
+QUANTILES = (0.025, 0.5, 0.975)
+
+
+def draws_diagram(
+    p: CapsuleParameters,
+    e: Excitation,
+    over: str,
+    values: ArrayLike,
+    *,
+    settling: Settling = SETTLING,
+    progress: Progress | None = None,
+    store: "Path | None" = None,
+    client: "Client | None" = None,
+) -> xr.Dataset:
+    """Settled motions from rest at every value for every draw: a Dataset over (<over>, draw).
+
+    Parameters
+    ----------
+    p, e : leaves () or (draws,), at least one with draws
+    over, values : the quantity that is varied, (n,), SI (f in Hz)
+    store, client : see ``blocks.compute``
+
+    Raises
+    ------
+    InputError
+        A quantity that does not exist, no leaf with draws, values that are no list of finite numbers.
+    """
+    grid = grid_of({over: values})
+    if not any(np.ndim(leaf) for leaf in jax.tree.leaves((p, e))):
+        raise InputError("a posterior band needs draws", "every leaf is one number", "use diagram, or give arrays")
+    (drawn, _), _ = lanes_of((p, e), np.zeros(1))
+    n, draws = len(grid[over]), len(drawn[0].m1)
+    p, e = jax.tree.map(lambda leaf: np.tile(leaf, n), drawn)
+    points = points_of(p, e, {over: np.repeat(grid[over], draws)})
+    seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client)
+    variables = {
+        name: ((over, "draw"), seen[name].reshape(n, draws), {"units": SEEN[name][0], "long_name": SEEN[name][1]})
+        for name in SUMMARY
+    }
+    axis = (over, grid[over], {"units": SWEPT[over].unit, "long_name": SWEPT[over].meaning})
+    about = {**asdict(settling), "method": "rest", "model": "exact", "semantics": "stick-slip"}
+    return xr.Dataset(variables, {over: axis, "draw": np.arange(draws)}, about)
+
+
+def bands(seen: xr.Dataset, objective: str = "mean_velocity") -> xr.Dataset:
+    """What the draws say: of each value, and of the best operating point.
+
+    Parameters
+    ----------
+    seen : from ``draws_diagram``
+    objective : what is best: the largest "mean_velocity" (forward), or "efficiency"
+
+    Returns a Dataset with
+
+    probability (label, <over>) : share of the draws with this label, "failed" among them: over labels it sums to 1
+    <objective>_quantiles (quantile, <over>) : 2.5 %, 50 % and 97.5 % over the draws that have not failed
+    best (draw), best_<objective> (draw) : for each draw the value with the largest objective, and that objective
+    best_quantiles, best_<objective>_quantiles (quantile) : the same over the draws
+    chosen () : the value whose *mean* over the draws is largest, that is, what to set when the parameters are not
+        known better; chosen_<objective>_quantiles (quantile) : what it gives
+
+    Raises
+    ------
+    InputError
+        An objective that does not exist, draws of which every one failed at some value or at all of them.
+    """
+    if objective not in ("mean_velocity", "efficiency"):
+        raise InputError("the objective is mean_velocity or efficiency", objective, "choose one of them")
+    over = str(next(name for name in seen.dims if name != "draw"))
+    axis, label, goal = seen[over].to_numpy(), seen["label"].to_numpy(), seen[objective].to_numpy()
+    failed = label == "failed"
+    if failed.all(axis=0).any() or failed.all(axis=1).any():
+        raise InputError("every value and every draw needs a run that is complete", "all failed", "look at status")
+    names = _by_share(label)
+    probability = np.stack([(label == name).mean(axis=1) for name in names])
+    goal = np.where(failed, np.nan, goal)
+    at = np.nanargmax(goal, axis=0)
+    best, best_goal = axis[at], goal[at, np.arange(goal.shape[1])]
+    chosen = int(np.argmax(np.nanmean(goal, axis=1)))
+    value, unit = dict(seen[over].attrs), seen[objective].attrs["units"]
+    about = {"units": unit, "long_name": seen[objective].attrs["long_name"]}
+    per_draw = "with the largest objective, of each draw"
+    return xr.Dataset(
+        {
+            "probability": (
+                ("label", over),
+                probability,
+                {"units": "1", "long_name": "posterior probability of the motion"},
+            ),
+            f"{objective}_quantiles": (("quantile", over), np.nanquantile(goal, QUANTILES, axis=1), about),
+            "best": ("draw", best, value | {"long_name": f"{value['long_name']} {per_draw}"}),
+            f"best_{objective}": ("draw", best_goal, about),
+            "best_quantiles": ("quantile", np.quantile(best, QUANTILES), value),
+            f"best_{objective}_quantiles": ("quantile", np.quantile(best_goal, QUANTILES), about),
+            "chosen": ((), axis[chosen], value | {"long_name": "value whose objective is largest in the mean"}),
+            f"chosen_{objective}_quantiles": ("quantile", np.nanquantile(goal[chosen], QUANTILES), about),
+        },
+        {over: (over, axis, value), "label": names, "quantile": list(QUANTILES)},
+        {**seen.attrs, "objective": objective, "draws": goal.shape[1]},
+    )
+
+
+def _by_share(label: np.ndarray) -> list[str]:
+    """The labels that occur, the most frequent first."""
+    names, counts = np.unique(label, return_counts=True)
+    return [str(name) for name in names[np.argsort(-counts, kind="stable")]]

@@ -1,0 +1,93 @@
+"""What a sweep is made of: points, and what is seen of each of them.
+
+A *point* is one set of leaves with one initial state. A lane of the engine is the same to the last bit whatever batch
+it stands in, so how points are cut into blocks, and who computes these, cannot be seen in the result.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.motions.response import Settled, Settling, settle
+from capsule_id.physics.batches import lanes_of
+from capsule_id.physics.leaves import SWEPT
+from capsule_id.physics.model import CapsuleParameters, Excitation, Initial
+
+Columns = dict[str, np.ndarray]  # name -> (points, ...)
+
+# What is seen of a motion: unit and meaning.
+SEEN = {
+    "x_rel": ("m", "X1 - X2 at the drive's phase at the start of a period"),
+    "rate": ("m/s", "Y1 - Y2 at the drive's phase at the start of a period"),
+    "Y2": ("m/s", "velocity of the capsule at the drive's phase at the start of a period"),
+    "label": ("1", "P-<period>-<direction>-<contacts per excitation period>, aperiodic, or failed (see status)"),
+    "period": ("1", "period of the motion in excitation periods, 0 if aperiodic or failed"),
+    "direction": ("1", "F forward, B backward, S standing, empty if failed"),
+    "contacts_per_period": ("1", "closings of the gap per excitation period"),
+    "mean_velocity": ("m/s", "mean velocity of the capsule"),
+    "work_per_period": ("J", "work of the drive per excitation period"),
+    "efficiency": ("m/J", "advance of the capsule per work of the drive"),
+    "lyapunov": ("1/s", "largest Lyapunov exponent of an aperiodic motion, undefined for all others"),
+    "status": ("1", "how the run ended: 0 complete, 1 complete with grazing, 2 and more given up"),
+}
+SECTION = ("x_rel", "rate", "Y2")  # one value a period, all others one value a point
+SUMMARY = tuple(name for name in SEEN if name not in SECTION)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Lanes of points: every leaf and every component of the initial state is (points,)."""
+
+    p: CapsuleParameters
+    e: Excitation
+    initial: Initial
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return len(np.asarray(self.p.m1))
+
+    def part(self, begin: int, end: int) -> "Points":
+        """The points begin .. end - 1."""
+        return Points(*jax.tree.map(lambda leaf: leaf[begin:end], (self.p, self.e, self.initial)))
+
+
+def points_of(
+    p: CapsuleParameters, e: Excitation, over: Mapping[str, np.ndarray], initial: Initial | None = None
+) -> Points:
+    """The lanes in which the quantities of ``over`` (symbol -> (points,), SI; ``f`` in Hz) replace those of p and e.
+
+    Raises
+    ------
+    InputError
+        A quantity that does not exist, one given twice (f and Omega), shapes that do not agree.
+    """
+    leaves = {name: np.asarray(values, float) for name, values in over.items()}
+    for name in leaves:
+        if name not in SWEPT:
+            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(SWEPT)}")
+    if {"f", "Omega"} <= set(leaves):
+        raise InputError("f and Omega are the same quantity", "both are swept", "leave one out")
+    if "f" in leaves:
+        leaves["Omega"] = 2.0 * np.pi * leaves.pop("f")
+    p = CapsuleParameters(**{**vars(p), **{name: x for name, x in leaves.items() if not SWEPT[name].drive}})
+    e = Excitation(**{**vars(e), **{name: x for name, x in leaves.items() if SWEPT[name].drive}})
+    (lanes, _), _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
+    return Points(*lanes)
+
+
+def columns_of(points: Points, settling: Settling) -> Columns:
+    """Everything seen of the settled motions, by the names of ``SEEN``."""
+    return columns(settle(points.p, points.e, points.initial, settling), points)
+
+
+def columns(seen: Settled, points: Points) -> Columns:
+    """The fields of ``seen`` and the efficiency of each motion, 0 for one that stands."""
+    found: Columns = {name: np.asarray(getattr(seen, name)) for name in SEEN if name != "efficiency"}
+    advance = found["mean_velocity"] * 2.0 * np.pi / np.asarray(points.e.Omega)
+    # Without a drive there is neither work nor advance.
+    work = np.where(found["work_per_period"] == 0.0, np.inf, found["work_per_period"])
+    return found | {"efficiency": np.where(found["direction"] == "S", 0.0, advance / work)}

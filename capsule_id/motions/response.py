@@ -1,0 +1,224 @@
+"""The settled motion in one line: period, direction, contacts, mean velocity, and the paper's label P-<n>-<F|B|S>-<m>.
+
+march over the dropped and the observed periods -> Poincaré section -> period -> what each period holds -> Settled
+
+``response`` is the question about single motions; sweeps and maps ask ``settle`` for everything that was seen.
+"""
+
+from dataclasses import dataclass, fields
+from fractions import Fraction
+
+import jax
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.motions.lyapunov import largest_exponent
+from capsule_id.motions.periods import observe
+from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
+from capsule_id.physics.exact.engine import kernel
+from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Excitation, Initial, Status
+
+# Excitation periods left out, and looked at.
+DROPPED, OBSERVED = 300, 48
+# The longest period that is looked for, in excitation periods, where at least REPEATS times as many are observed.
+LONGEST, REPEATS = 16, 3
+# Two points of the Poincaré section are the same within these (m, m/s), and within this part of the motion's size.
+SAME_POSITION, SAME_VELOCITY, SAME_RELATIVE = 1e-7, 1e-4, 1e-3
+# A capsule that advances less than this per excitation period (m) stands still.
+STANDING = 1e-7
+# Periods over which the Lyapunov exponent of an aperiodic motion is a mean.
+EXPONENT_PERIODS = 100
+
+
+@dataclass(frozen=True)
+class Settling:
+    """How motions are settled and looked at.
+
+    dropped, observed : excitation periods left out, and looked at; the longest period looked for is the least of 16
+        and a third of ``observed``
+    merge_contacts : s; contacts parted by less than this count as one (0, the default: every closing counts)
+    exponent_periods : periods over which the Lyapunov exponent of an aperiodic motion is a mean, 0 to leave it out
+    max_steps : bound on the steps of a lane, see ``simulate``
+
+    Raises
+    ------
+    InputError
+        A number that is negative, or fewer than 3 periods observed.
+    """
+
+    dropped: int = DROPPED
+    observed: int = OBSERVED
+    merge_contacts: float = 0.0
+    exponent_periods: int = EXPONENT_PERIODS
+    max_steps: int = MAX_STEPS
+
+    def __post_init__(self) -> None:
+        for name in ("dropped", "exponent_periods", "merge_contacts"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name} must not be negative", str(getattr(self, name)), "give 0 or more")
+        if self.observed < REPEATS:
+            raise InputError(f"observed must be at least {REPEATS}", str(self.observed), "observe more periods")
+        if self.max_steps < 1:
+            raise InputError("max_steps must be positive", str(self.max_steps), "give 1 or more")
+
+
+SETTLING = Settling()
+
+
+@dataclass(frozen=True)
+class Response:
+    """The settled motion; with a batch every field is an array (batch,).
+
+    label : "P-<period>-<direction>-<contacts>", "aperiodic", or "failed" where the run was given up (see status)
+    period : in excitation periods, 1..16; 0 where the motion is aperiodic or the run failed
+    direction : "F" forward, "B" backward, "S" standing (|advance| < 1e-7 m per excitation period), "" where failed
+    contacts_per_period : closings of the gap per excitation period
+    mean_velocity : of the capsule over the observed periods, m/s
+    status : a ``Status`` code
+    work_per_period : work of the drive per excitation period, J
+    lyapunov : largest Lyapunov exponent of an aperiodic motion, 1/s; NaN for all others, see ``largest_exponent``
+    """
+
+    label: str | np.ndarray
+    period: int | np.ndarray
+    direction: str | np.ndarray
+    contacts_per_period: float | np.ndarray
+    mean_velocity: float | np.ndarray
+    status: int | np.ndarray
+    work_per_period: float | np.ndarray
+    lyapunov: float | np.ndarray
+
+
+@dataclass(frozen=True)
+class Settled(Response):
+    """Settled motions with their Poincaré sections, every field an array (lanes, ...).
+
+    x_rel, rate, Y2 : (lanes, observed + 1), m and m/s: X1 - X2, Y1 - Y2 and Y2 at the drive's phase at the start
+    """
+
+    x_rel: np.ndarray
+    rate: np.ndarray
+    Y2: np.ndarray
+
+    @property
+    def end(self) -> Initial:
+        """(X1, Y1, X2, Y2) at the end with the capsule put back to X2 = 0: where a neighbouring motion may start."""
+        x_rel, rate, Y2 = (np.nan_to_num(x[:, -1]) for x in (self.x_rel, self.rate, self.Y2))
+        return x_rel, rate + Y2, np.zeros_like(x_rel), Y2
+
+
+def response(
+    p: CapsuleParameters, e: Excitation, *, settling: Settling = SETTLING, max_steps: int | None = None
+) -> Response:
+    """Settled motion from rest: 300 excitation periods dropped, 48 observed.
+
+    Parameters
+    ----------
+    p, e : parameters and drive; any leaf may carry a batch axis (batch,). Omega must be positive.
+    settling : other numbers of periods, the rule for micro-contacts
+    max_steps : bound on the steps of a lane, in the place of that of ``settling``
+
+    Raises
+    ------
+    InputError
+        Traced values (a label is a string), Omega not positive, shapes that do not agree.
+    """
+    if is_traced((p, e)):
+        raise InputError("response needs concrete values", "a traced value", "call it outside of jit, vmap and jvp")
+    _, batched = lanes_of((p, e), np.zeros(1))
+    if max_steps is not None:
+        settling = Settling(**{**vars(settling), "max_steps": max_steps})
+    seen = settle(p, e, settling=settling)
+    columns = (getattr(seen, field.name) for field in fields(Response))
+    return Response(*(column if batched else column[0].item() for column in columns))
+
+
+def settle(
+    p: CapsuleParameters,
+    e: Excitation,
+    initial: Initial | None = None,
+    settling: Settling = SETTLING,
+    width: int = CHUNK,
+) -> Settled:
+    """Settled motions of a batch (a single motion is a batch of one), from ``initial`` or from rest.
+
+    Parameters
+    ----------
+    p, e : as in ``response``, concrete
+    initial : (X1, Y1, X2, Y2), each () or (batch,); default at rest at the origin
+    width : lanes of one call of the engine, see ``run_lanes``
+
+    Raises
+    ------
+    InputError
+        Omega not positive, a merging time that would take in whole periods, shapes that do not agree.
+    """
+    lanes, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
+    (p, e, initial), _ = lanes
+    if not np.all(np.asarray(e.Omega) > 0.0):
+        wrong = np.asarray(e.Omega)[~(np.asarray(e.Omega) > 0.0)][0]
+        raise InputError("Omega must be positive", str(wrong), "a response needs a period: use simulate")
+    T = 2.0 * np.pi / np.asarray(e.Omega)
+    if not settling.merge_contacts < 0.5 * T.min():
+        rule = "merge_contacts must be less than half a period of the drive"
+        raise InputError(rule, f"{settling.merge_contacts} s", f"give less than {0.5 * T.min():.3g} s")
+    # One period before the observed ones: its last contact may take in the first of those.
+    before = min(settling.dropped, 1)
+    section = T[:, None] * np.arange(settling.dropped - before, settling.dropped + settling.observed + 1)
+    # The start comes first, which the section begins with where (almost) nothing is dropped.
+    times = np.concatenate([np.zeros((len(T), 1)), section], axis=1) if settling.dropped > 1 else section
+    run = run_lanes(kernel(settling.max_steps), ((p, e, initial), times), batched=True, width=width)
+    states = np.stack([np.asarray(x)[:, -section.shape[1] :] for x in (run.X1, run.Y1, run.X2, run.Y2)])
+    seen = observe(p, e, section, states, settling.merge_contacts, settling.max_steps, width)
+    states, closings = states[:, :, before:], seen.closings[:, before:]
+    status = np.maximum(np.asarray(run.status), seen.status)
+    found = [_describe(states[:, i], 2.0 * np.pi / T[i], closings[i], int(status[i])) for i in range(len(T))]
+    label, period, direction, per_period = (np.array(column) for column in zip(*found, strict=True))
+    X1, Y1, X2, Y2 = states
+    velocity = (X2[:, -1] - X2[:, 0]) / (settling.observed * T)
+    work = np.where(np.isfinite(velocity), seen.work[:, before:].mean(axis=1), np.nan)
+    exponent = exponents(p, e, tuple(states[:, :, -1]), label == "aperiodic", settling)
+    columns = (label, period, direction, per_period, velocity, status, work, exponent)
+    return Settled(*columns, x_rel=X1 - X2, rate=Y1 - Y2, Y2=Y2)
+
+
+def exponents(
+    p: CapsuleParameters, e: Excitation, ends: tuple[np.ndarray, ...], chosen: np.ndarray, settling: Settling
+) -> np.ndarray:
+    """(lanes,) 1/s: Lyapunov exponents of lanes from the states ``ends`` where ``chosen`` (lanes,), NaN elsewhere."""
+    found = np.full(len(chosen), np.nan)
+    if settling.exponent_periods and chosen.any():
+        p, e, (X1, Y1, X2, Y2) = jax.tree.map(lambda leaf: leaf[chosen], (p, e, ends))
+        rates = largest_exponent(p, e, (X1, Y1, X2, Y2), settling.exponent_periods, settling.max_steps)
+        found[chosen] = rates.exponent
+    return found
+
+
+def _describe(state: np.ndarray, Omega: float, contacts: np.ndarray, status: int) -> tuple[str, int, str, float]:
+    """(label, period, direction, contacts per period) of one lane: state (4, n + 1), contacts (n,) of n periods."""
+    if not Status(status).usable:
+        return "failed", 0, "", float("nan")
+    X1, Y1, X2, Y2 = state
+    observed = len(contacts)
+    advance = (X2[-1] - X2[0]) / observed
+    direction = "S" if abs(advance) < STANDING else "F" if advance > 0.0 else "B"
+    period = period_of(X1 - X2, Y1 - Y2, Omega)
+    if period == 0:
+        return "aperiodic", 0, direction, float(contacts.mean())
+    whole = observed // period * period
+    per_period = Fraction(int(contacts[-whole:].sum()), whole)
+    return f"P-{period}-{direction}-{per_period}", period, direction, float(per_period)
+
+
+def period_of(x_rel: np.ndarray, rate: np.ndarray, Omega: float) -> int:
+    """Period in excitation periods of points (n,) of the Poincaré section (m, m/s); 0 if they do not repeat.
+
+    The tolerance is absolute, and for small motions relative to the largest distance from the origin. Looked for are
+    periods up to 16 which are observed three times.
+    """
+    scale = SAME_RELATIVE * float(np.max(np.hypot(x_rel, rate / Omega)))
+    for n in range(1, min(LONGEST, (len(x_rel) - 1) // REPEATS) + 1):
+        dx, dw = np.abs(x_rel[n:] - x_rel[:-n]), np.abs(rate[n:] - rate[:-n])
+        if dx.max() <= min(SAME_POSITION, scale) and dw.max() <= min(SAME_VELOCITY, scale * Omega):
+            return n
+    return 0

@@ -1,0 +1,97 @@
+"""One lane axis for everything: broadcasting, chunks of lanes, threads.
+
+An engine works on lanes: every leaf (L,), times (L, n). Whatever the user gives is broadcast to that form; a concrete
+batch is then split into chunks of CHUNK lanes which run from as many threads as there are cores. Every chunk is
+padded to full width, so that a lane is always computed by the same program, and its result is the same to the last bit
+wherever in whichever batch it stands. Traced values are never split.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from capsule_id.errors import InputError
+
+Tree = TypeVar("Tree")
+Lanes = tuple[Any, jax.Array | np.ndarray]  # (pytree of (L,) leaves, times (L, n))
+
+# Lanes of one call: enough to fill the vector units, few enough for the second-level cache.
+CHUNK = 64
+
+
+def is_traced(tree: object) -> bool:
+    """Whether a leaf is a JAX tracer, so that its value cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def lanes_of(tree: object, times: ArrayLike) -> tuple[Lanes, bool]:
+    """Broadcast leaves () or (batch,) and times (n,) or (batch, n) to one lane axis; also says whether there was one.
+
+    Raises
+    ------
+    InputError
+        A leaf or ``times`` of another shape, batch axes of different lengths, concrete times that do not increase or
+        are not finite, values traced in single precision.
+    """
+    xp = jnp if is_traced((tree, times)) else np
+    leaves, structure = jax.tree.flatten(tree)
+    if any(isinstance(leaf, jax.core.Tracer) and leaf.dtype == jnp.float32 for leaf in (*leaves, times)):
+        raise InputError(
+            "traced values must be float64",
+            "float32",
+            "import capsule_id.physics.model, or set jax_enable_x64, before the first jax.jit",
+        )
+    leaves = [xp.asarray(leaf, float) for leaf in leaves]
+    grid = xp.asarray(times, float)
+    if grid.ndim not in (1, 2) or grid.shape[-1] == 0:
+        raise InputError("times must have shape (n,) or (batch, n)", str(grid.shape), "give at least one time")
+    if xp is np and not bool(np.isfinite(grid).all()):
+        raise InputError("times must be finite", "an infinite or undefined time", "leave it out")
+    if xp is np and not bool(np.all(np.diff(grid, axis=-1) > 0.0)):
+        raise InputError("times must increase", "found a step that is not positive", "sort them, drop repeated ones")
+    if any(leaf.ndim > 1 for leaf in leaves):
+        shape = next(leaf.shape for leaf in leaves if leaf.ndim > 1)
+        raise InputError("a leaf must have shape () or (batch,)", str(shape), "use one batch axis, or jax.vmap")
+    sizes = {leaf.shape[0] for leaf in leaves if leaf.ndim == 1} | ({grid.shape[0]} if grid.ndim == 2 else set())
+    if len(sizes) > 1:
+        raise InputError("all batch axes must have one length", f"lengths {sorted(sizes)}", "make them agree")
+    lanes = sizes.pop() if sizes else 1
+    batched = grid.ndim == 2 or any(leaf.ndim == 1 for leaf in leaves)
+    if lanes == 0:
+        raise InputError("a batch must hold at least one lane", "length 0", "leave the call out")
+    spread = [xp.broadcast_to(leaf, (lanes,)) for leaf in leaves]
+    return (jax.tree.unflatten(structure, spread), xp.broadcast_to(grid, (lanes, grid.shape[-1]))), batched
+
+
+def run_lanes(kernel: Callable[..., Tree], lanes: Lanes, batched: bool, width: int = CHUNK) -> Tree:
+    """Run ``kernel(p, e, times, initial)`` on lanes from ``lanes_of``; drops the lane axis where none was given.
+
+    width : lanes of one call; another width is another program, whose results may differ in the last bit
+    """
+    (p, e, initial), times = lanes
+    if not batched:
+        return jax.tree.map(lambda leaf: leaf[0], kernel(p, e, times, initial))
+    size = times.shape[0]
+    if is_traced(lanes):
+        return kernel(p, e, times, initial)
+    chunks = [np.minimum(np.arange(start, start + width), size - 1) for start in range(0, size, width)]
+
+    def run(index: np.ndarray) -> Tree:
+        return jax.block_until_ready(kernel(*jax.tree.map(lambda leaf: leaf[index], (p, e, times, initial))))
+
+    results = [run(chunks[0])] if len(chunks) == 1 else list(pool().map(run, chunks))
+    return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate([np.asarray(x) for x in parts])[:size]), *results)
+
+
+@lru_cache(maxsize=1)
+def pool() -> ThreadPoolExecutor:
+    """Threads, as many as cores, that compiled functions are called from."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="capsule-lanes")

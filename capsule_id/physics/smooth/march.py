@@ -1,0 +1,260 @@
+"""Adaptive march of lanes through a smooth field, with samples at any times; differentiated in ``march_tangents``.
+
+    segment = a bounded number of steps, whose states are kept -> samples inside it by interpolation -> next segment
+
+Every lane has its own time, state and step; lanes are coupled only through "is anybody still running", so a lane's
+numbers do not depend on its neighbours. The memory does not grow with the length of the run.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from capsule_id.physics.model import Status
+from capsule_id.physics.smooth.rosenbrock import Field, State, step, step_factor
+
+# Steps between two interpolations of samples: one or two segments hold ten periods; 64 lanes of them fill 5 MB.
+SEGMENT = 2048
+# A lane whose step is rejected as not finite below this fraction of its time cannot be saved by a smaller step.
+_LEAST_STEP = 1e-13
+
+
+class Problem(NamedTuple):
+    """What a run is made of besides its inputs; every array is (L,) or ()."""
+
+    field: Field
+    gap: jax.Array  # m: a closing is r - gap turning from negative to not negative
+    first: jax.Array  # s: length of the first step tried
+    longest: jax.Array  # s: no step is longer (infinity: no bound)
+    floors: tuple[jax.Array, jax.Array]  # m/s and m: scales below which velocity and r need no accuracy
+    tolerance: jax.Array  # 1: error of a step over the scale reached so far
+    valid: jax.Array  # bool: whether the lane may start
+
+
+Build = Callable[[Any], Problem]  # from theta, the pytree in which a run is differentiated
+
+
+class Lanes(NamedTuple):
+    """Where every lane stands: y is (4, L), the others (L,)."""
+
+    t: jax.Array
+    y: State
+    h: jax.Array
+    speed: jax.Array  # largest |velocity| so far: the scale of the error in velocity
+    stretch: jax.Array  # largest |r| so far: the scale of the error in r
+    steps: jax.Array
+    closings: jax.Array
+    status: jax.Array
+
+
+class Record(NamedTuple):
+    """Samples (X1, Y1, X2, Y2) of shape (4, L, n); per lane the closings of the gap, the steps tried, the status."""
+
+    samples: jax.Array
+    closings: jax.Array
+    steps: jax.Array
+    status: jax.Array
+
+
+def _grown(speed: jax.Array, stretch: jax.Array, y: State) -> tuple[jax.Array, jax.Array]:
+    largest = jnp.maximum(jnp.abs(y[1]), jnp.abs(y[3]))
+    return jnp.maximum(speed, largest), jnp.maximum(stretch, jnp.abs(y[0] - y[2]))
+
+
+def start(problem: Problem, times: jax.Array, y: State) -> Lanes:
+    """Lanes at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
+    t = times[:, 0]
+    floors = [jnp.broadcast_to(floor, t.shape) for floor in problem.floors]
+    speed, stretch = _grown(floors[0], floors[1], y)
+    finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(y), axis=0)
+    status = jnp.where(finite & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
+    zero = jnp.zeros(t.shape, jnp.int32)
+    return Lanes(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, zero, status)
+
+
+def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> Lanes:
+    """Try one step in every lane that is still running."""
+    t, y = lanes.t, lanes.y
+    active = (t < end) & (lanes.status == Status.OK)
+    h = jnp.minimum(lanes.h, problem.longest)
+    # A rest shorter than a hundredth of a step is taken along, so that no sliver of a step is left at the end.
+    last = h * 1.01 >= end - t
+    h = jnp.where(active, jnp.where(last, end - t, h), 1.0)
+    y_new, defect = step(problem.field, t, y, h)
+    speed, stretch = _grown(lanes.speed, lanes.stretch, y_new)
+    velocity_error = jnp.maximum(jnp.abs(defect[1]), jnp.abs(defect[3]))
+    # max(velocity_error / speed, r_error / stretch) / tolerance, in one division.
+    worse = jnp.maximum(velocity_error * stretch, jnp.abs(defect[0] - defect[2]) * speed)
+    error = worse / (speed * stretch * problem.tolerance)
+    h_next = h * step_factor(error)
+    accepted = active & (error <= 1.0)
+    closing = accepted & (y[0] - y[2] < problem.gap) & (y_new[0] - y_new[2] >= problem.gap)
+    steps = lanes.steps + active
+    t_new = jnp.where(accepted, jnp.where(last, end, t + h), t)
+    hopeless = active & ~jnp.isfinite(error) & (h < _LEAST_STEP * (jnp.abs(t) + jnp.abs(end)))
+    status = jnp.where(hopeless, Status.NOT_FINITE, lanes.status)
+    status = jnp.where(active & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
+    return Lanes(
+        t=t_new,
+        y=jnp.where(accepted, y_new, y),
+        h=jnp.where(active, h_next, lanes.h),
+        speed=jnp.where(accepted, speed, lanes.speed),
+        stretch=jnp.where(accepted, stretch, lanes.stretch),
+        steps=steps,
+        closings=lanes.closings + closing,
+        status=status.astype(jnp.int32),
+    )
+
+
+def running(end: jax.Array, lanes: Lanes) -> jax.Array:
+    """Whether any lane has to go on."""
+    return jnp.any((lanes.t < end) & (lanes.status == Status.OK))
+
+
+def segment(
+    build: Build,
+    theta: Any,
+    end: jax.Array,
+    lanes: Lanes,
+    max_steps: int,
+    length: int,
+) -> tuple[jax.Array, Lanes]:
+    """Try up to ``length`` steps; the rows (t, X1, Y1, X2, Y2) on the way, and where the lanes then stand.
+
+    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of theta is (L,). Under ``jax.vmap`` the
+    new axis joins the lanes: batching the loop itself would copy all rows in every step.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def march(theta: Any, end: jax.Array, lanes: Lanes) -> tuple[jax.Array, Lanes]:
+        return _segment(build(theta), end, lanes, max_steps, length)
+
+    @march.def_vmap
+    def _(size: int, batched: Any, *inputs: Any) -> tuple[Any, Any]:
+        def join(leaf: jax.Array, has_axis: bool) -> jax.Array:
+            leaf = leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
+            leaf = jnp.moveaxis(leaf, 0, -2)
+            return leaf.reshape(*leaf.shape[:-2], -1)
+
+        def split(leaf: jax.Array) -> jax.Array:
+            return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], size, -1), -2, 0)
+
+        theta, end, lanes = jax.tree.map(join, inputs, tuple(batched))
+        result = jax.tree.map(split, segment(build, theta, end, lanes, max_steps, length))
+        return result, jax.tree.map(lambda _: True, result)
+
+    return march(theta, end, lanes)
+
+
+def _segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, length: int) -> tuple[jax.Array, Lanes]:
+    def put(rows: jax.Array, i: jax.Array, lanes: Lanes) -> jax.Array:
+        row = jnp.concatenate([lanes.t[None], lanes.y])
+        return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
+
+    def body(carry: tuple[jax.Array, jax.Array, Lanes]) -> tuple[jax.Array, jax.Array, Lanes]:
+        i, rows, lanes = carry
+        lanes = _advance(problem, end, lanes, max_steps)
+        return i + 1, put(rows, i + 1, lanes), lanes
+
+    def more(carry: tuple[jax.Array, jax.Array, Lanes]) -> jax.Array:
+        return (carry[0] < length) & running(end, carry[2])
+
+    rows = put(jnp.full((length + 1, 5, *end.shape), jnp.inf), jnp.int32(0), lanes)
+    _, rows, lanes = jax.lax.while_loop(more, body, (jnp.int32(0), rows, lanes))
+    return rows, lanes
+
+
+def _interpolate(t: jax.Array, y: jax.Array, V2: jax.Array, times: jax.Array) -> jax.Array:
+    """States (4, n) of one lane at ``times`` (n,), from rows t (N,), y (N, 4) and X2' (N,), inside the finite rows.
+
+    Positions: the cubic through both ends with their rates; velocities: its derivative. That needs no acceleration,
+    which in the stiff phases of rest would be far larger than what the step has used. Where X2' is not Y2 (the gate
+    of eq. (2)), their difference is interpolated linearly.
+    """
+    right = jnp.clip(jnp.searchsorted(t, times, side="left"), 1, t.shape[0] - 1)
+    left = right - 1
+    h = t[right] - t[left]
+    h = jnp.where((h > 0.0) & jnp.isfinite(h), h, 1.0)
+    s = (times - t[left]) / h
+    w, v0, v1 = s * s * (3.0 - 2.0 * s), s * (1.0 - s) ** 2, s * s * (s - 1.0)
+    d, e0, e1 = 6.0 * s * (1.0 - s) / h, (1.0 - s) * (1.0 - 3.0 * s), s * (3.0 * s - 2.0)
+
+    def pair(X: jax.Array, V: jax.Array) -> tuple[jax.Array, jax.Array]:
+        X0, V0, V1, rise = X[left], V[left], V[right], X[right] - X[left]
+        return X0 + w * rise + h * (v0 * V0 + v1 * V1), d * rise + e0 * V0 + e1 * V1
+
+    idle = y[:, 3] - V2
+    X2, moving = pair(y[:, 2], V2)
+    return jnp.stack([*pair(y[:, 0], y[:, 1]), X2, moving + (1.0 - s) * idle[left] + s * idle[right]])
+
+
+def interpolate(field: Field, t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
+    """States (4, L, n) at ``times`` (L, n), from rows t (N, L) and y (N, 4, L) of a march through ``field``."""
+    V2 = field(t, y[:, 0] - y[:, 2], y[:, 1], y[:, 3])[1]
+    # Lanes stand last in rows, first in times: rows are written by lane, times are searched by lane.
+    return jax.vmap(_interpolate, in_axes=(1, 2, 1, 0), out_axes=1)(t, y, V2, times)
+
+
+def inside(rows: jax.Array, lanes: Lanes, times: jax.Array) -> jax.Array:
+    """Which samples (L, n) fall into the segment that led to ``lanes``."""
+    return (times > rows[0, 0][:, None]) & (times <= lanes.t[:, None])
+
+
+def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:
+    """March all lanes from times[:, 0] to times[:, -1]; samples after a lane's failure are NaN. No derivatives."""
+    end = times[:, -1]
+    problem = build(theta)
+    lanes = start(problem, times, y)
+
+    def body(carry: tuple[Lanes, jax.Array]) -> tuple[Lanes, jax.Array]:
+        rows, lanes = segment(build, theta, end, carry[0], max_steps, SEGMENT)
+        return lanes, jnp.where(
+            inside(rows, lanes, times), interpolate(problem.field, rows[:, 0], rows[:, 1:], times), carry[1]
+        )
+
+    nothing = jnp.full((4, *times.shape), jnp.nan)
+    samples = nothing.at[:, :, 0].set(jnp.where(lanes.status == Status.OK, y, jnp.nan))
+    lanes, samples = jax.lax.while_loop(lambda carry: running(end, carry[0]), body, (lanes, samples))
+    return Record(samples, lanes.closings, lanes.steps, lanes.status)
+
+
+def checkpoints(
+    build: Build,
+    theta: Any,
+    times: jax.Array,
+    y: State,
+    max_steps: int,
+    length: int,
+) -> tuple[jax.Array, Lanes]:
+    """The number of segments of a run, and the lanes at the start of each, (segments, L) each. No derivatives."""
+    end = times[:, -1]
+    lanes = start(build(theta), times, y)
+    store = jax.tree.map(lambda leaf: jnp.zeros((-(-max_steps // length), *leaf.shape), leaf.dtype), lanes)
+
+    def body(carry: tuple[jax.Array, Lanes, Lanes]) -> tuple[jax.Array, Lanes, Lanes]:
+        k, lanes, store = carry
+        store = jax.tree.map(lambda rows, leaf: rows.at[k].set(leaf), store, lanes)
+        return k + 1, segment(build, theta, end, lanes, max_steps, length)[1], store
+
+    count, _, store = jax.lax.while_loop(lambda c: running(end, c[1]), body, (jnp.int32(0), lanes, store))
+    return count, store
+
+
+def replay(problem: Problem, y: State, t: jax.Array, times: jax.Array) -> tuple[State, jax.Array]:
+    """One segment on its known grid: state at its end and samples (4, L, n); differentiable in the problem and y.
+
+    t : (steps + 1, L), the times of the tried steps; no step where the time did not grow.
+    """
+
+    @jax.checkpoint
+    def one(y: State, span: tuple[jax.Array, jax.Array]) -> tuple[State, State]:
+        t, h = span
+        taken = jnp.isfinite(h) & (h > 0.0)
+        y = jnp.where(taken, step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)
+        return y, y
+
+    spans = (jnp.where(jnp.isfinite(t[:-1]), t[:-1], 0.0), jnp.diff(t, axis=0))
+    y_end, ends = jax.lax.scan(one, y, spans)
+    return y_end, interpolate(problem.field, t, jnp.concatenate([y[None], ends]), times)

@@ -1,0 +1,1 @@
+"""Figures, a function ``(data, ax) -> ax`` each."""

@@ -1,0 +1,230 @@
+"""The same seed gives the same numbers, however often the run was interrupted or killed on the way."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import emcee
+import numpy as np
+import pytest
+import xarray as xr
+
+from capsule_id.cli import fit_params
+from capsule_id.commands.fit import Progress
+from tests.cli_tools import CODE, environment, listing, small_rig
+
+WORDS = ("rig", "--quiet", "--max-steps", "60")
+#: A short run that is checked often and never converges, so that every ensemble goes on after several checks; and
+#: chains saved after every draw.
+SHORT = {"sampling.FIRST_CHECK": 15, "sampling.CHECK_EVERY": 15, "sampling.PILOT_STEPS": 60, "sampling.MAX_RHAT": 0.0}
+SHORT |= {"chain_store.SAVE_EVERY": 0.0}
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing catches it."""
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``rig`` and the result of a run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    small_rig(folder / "rig")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        shorten(patch)
+        assert fit_params([*WORDS, "--out", "whole"]) == 3
+    return folder
+
+
+@pytest.fixture
+def here(uninterrupted: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same folder as the current directory."""
+    monkeypatch.chdir(uninterrupted)
+    shorten(monkeypatch)
+    return uninterrupted
+
+
+def shorten(patch: pytest.MonkeyPatch) -> None:
+    for name, value in SHORT.items():
+        patch.setattr(f"capsule_id.inference.{name}", value)
+
+
+def die_in_progress(patch: pytest.MonkeyPatch, stage: str, draws: int, death: Callable[[], object]) -> None:
+    """``death()`` when the run reports that many draws in ``stage`` ("" for any)."""
+
+    def call(self: Progress, done: int, total: int, text: str) -> None:
+        if stage in text and done >= draws:
+            death()
+
+    patch.setattr(Progress, "__call__", call)
+
+
+def same_as_uninterrupted(folder: Path, out: str) -> None:
+    assert not (folder / f"{out}.partial").exists()
+    assert (folder / out / "parameters.json").read_bytes() == (folder / "whole" / "parameters.json").read_bytes()
+    assert (folder / out / "parameters.csv").read_bytes() == (folder / "whole" / "parameters.csv").read_bytes()
+    trees = [xr.open_datatree(folder / name / "posterior.nc", engine="h5netcdf") for name in (out, "whole")]
+    assert trees[0].identical(trees[1])
+    for tree in trees:
+        tree.close()
+
+
+def test_two_runs_agree_to_the_byte(here: Path) -> None:
+    assert fit_params([*WORDS, "--out", "again"]) == 3
+    same_as_uninterrupted(here, "again")
+
+
+def test_another_seed_gives_other_numbers(here: Path) -> None:
+    fit_params([*WORDS, "--out", "other", "--seed", "1"])
+    whole, other = (json.loads((here / name / "parameters.json").read_text()) for name in ("whole", "other"))
+    mean, sd = (whole["parameters"]["mu"][key] for key in ("mean", "sd"))
+    assert other["provenance"]["seed"] == 1
+    assert 0.0 < abs(other["parameters"]["mu"]["mean"] - mean) < 0.2 * sd
+
+
+def test_an_ensemble_never_repeats_itself(here: Path) -> None:
+    """emcee restarts from the state it is given; what follows a check of convergence must go on from the last draw."""
+    with xr.open_datatree(here / "whole" / "posterior.nc", engine="h5netcdf") as tree:
+        mu = tree["posterior"]["mu"].to_numpy()
+    assert mu.shape[1] > 2 * SHORT["sampling.CHECK_EVERY"]
+    states = np.unique(np.round(mu, 15), axis=1)
+    assert states.shape == mu.shape
+
+
+@pytest.mark.parametrize(
+    ("stage", "draws"), [("point fit", 0), ("pilot", 0), ("e", 1), ("e", 35), ("e", 100), ("report", 0)]
+)
+def test_interrupted_and_resumed(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stage: str, draws: int
+) -> None:
+    def interrupt() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        die_in_progress(patch, stage, draws, interrupt)
+        assert fit_params([*WORDS, "--out", "out"]) == 130
+    assert capsys.readouterr().err == "fit-params: interrupted; --resume goes on from the saved state\n"
+    assert not (here / "out").exists()
+    assert fit_params([*WORDS, "--out", "out", "--resume"]) == 3
+    same_as_uninterrupted(here, "out")
+    _remove(here / "out")
+
+
+def test_killed_inside_emcee_and_spoilt_afterwards(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kill between coordinates and counter leaves a file that opens and is wrong: it is not believed."""
+    real = emcee.backends.HDFBackend.save_step
+
+    def dying(self: emcee.backends.HDFBackend, state: emcee.State, accepted: np.ndarray) -> None:
+        if self.iteration == 25:
+            with self.open("a") as file:
+                file[self.name].attrs["iteration"] = 28
+            raise Killed
+        real(self, state, accepted)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(emcee.backends.HDFBackend, "save_step", dying)
+        with pytest.raises(Killed):
+            fit_params([*WORDS, "--out", "out"])
+    assert fit_params([*WORDS, "--out", "out", "--resume"]) == 3
+    same_as_uninterrupted(here, "out")
+    _remove(here / "out")
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "missing"])
+def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPatch, damage: str) -> None:
+    with monkeypatch.context() as patch:
+        die_in_progress(patch, "e", 80, lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert fit_params([*WORDS, "--out", "out"]) == 130
+    for name in ("chains.h5", "chains.saved"):
+        file = here / "out.partial" / name
+        content = file.read_bytes()
+        middle = len(content) // 2
+        spoilt = {
+            "truncated": content[:middle],
+            "flipped": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+            "empty": b"",
+            "missing": b"",
+        }[damage]
+        file.unlink() if damage == "missing" else file.write_bytes(spoilt)
+    assert fit_params([*WORDS, "--out", "out", "--resume"]) == 3
+    same_as_uninterrupted(here, "out")
+    _remove(here / "out")
+
+
+def test_killed_from_outside_and_resumed(here: Path) -> None:
+    """SIGKILL at a real process: nothing of Python runs after it."""
+    kill = "import os, signal\nfrom capsule_id.commands.fit import Progress\n"
+    kill += "from capsule_id.inference.sampling import chain_store, ensembles as sampling\n"
+    kill += "".join(f"{name} = {value}\n" for name, value in SHORT.items())
+    kill += "call = lambda self, done, total, text: done > 100 and os.kill(os.getpid(), signal.SIGKILL)\n"
+    kill += "Progress.__call__ = call\n"
+    code = kill + CODE.format(name="fit_params")
+    done = subprocess.run(
+        [sys.executable, "-c", code, *WORDS, "--out", "out"], env=environment(), check=False, cwd=here
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert (here / "out.partial" / "chains.saved").exists()
+    assert fit_params([*WORDS, "--out", "out", "--resume"]) == 3
+    same_as_uninterrupted(here, "out")
+    _remove(here / "out")
+
+
+def test_resume_refuses_what_has_changed(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with monkeypatch.context() as patch:
+        die_in_progress(patch, "point fit", 0, lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert fit_params([*WORDS, "--out", "out"]) == 130
+    capsys.readouterr()
+    small_rig(here / "changed")
+    (here / "changed" / "static_friction.csv").write_text("angle [deg]\n30\n31\n32\n")
+    for words, named in (
+        ((*WORDS, "--seed", "1"), "seed"),
+        (("changed", *WORDS[1:]), "data"),
+        ((*WORDS, "--experiments", "bench"), "experiments"),
+    ):
+        before = listing(here)
+        assert fit_params([*words, "--out", "out", "--resume"]) == 2
+        assert f"the same {named}" in capsys.readouterr().err
+        assert listing(here) == before
+    with monkeypatch.context() as patch:
+        versions = {"python": "0"}
+        patch.setattr("capsule_id.inference.pipeline.package_versions", lambda packages: versions)
+        assert fit_params([*WORDS, "--out", "out", "--resume"]) == 2
+        assert "the same versions" in capsys.readouterr().err
+    _remove(here / "out.partial")
+    _remove(here / "changed")
+
+
+def test_progress_in_a_file_is_sparse_and_on_a_terminal_has_rate_and_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = iter(np.arange(0.0, 1000.0, 0.5))
+    monkeypatch.setattr("time.monotonic", lambda: next(now))
+    with Progress(enabled=True) as progress:
+        for done in range(1, 201):  # 100 s
+            progress(done, 400, "move")
+    lines = capsys.readouterr().err.splitlines()
+    assert 9 <= len(lines) <= 11
+    assert all("move" in line and "\r" not in line for line in lines)
+    assert "2.00draw/s" in lines[-1]
+    assert "<01:4" in lines[-1]
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with Progress(enabled=True) as progress:
+        for done in range(1, 4):
+            progress(done, 400, "move")
+    text = capsys.readouterr().err
+    assert (text.count("\r"), text.count("\n")) == (3, 1)
+    with Progress(enabled=False) as progress:
+        progress(1, 400, "move")
+    assert capsys.readouterr().err == ""
+
+
+def _remove(folder: Path) -> None:
+    for path in sorted(folder.rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    folder.rmdir()

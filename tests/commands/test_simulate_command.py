@@ -1,0 +1,114 @@
+"""``capsule-id simulate``: tables, picture, errors."""
+
+import argparse
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+
+from capsule_id.commands import capsule_options as options
+from capsule_id.commands import simulate as command
+from capsule_id.errors import InputError
+from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+
+DRIVE = ["--k2", "18960", "--G", "1e-3", "--P_d", "4", "--Omega", "34.56"]
+
+
+def _run(*arguments: str) -> int:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return command.run(parser.parse_args(arguments))
+
+
+def _table(path: Path) -> tuple[list[str], np.ndarray]:
+    with path.open(encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    return header, np.array(rows, float)
+
+
+def test_table_is_the_simulated_motion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, figure = tmp_path / "run.csv", tmp_path / "run.png"
+    assert _run(*DRIVE, "--periods", "2", "--samples", "50", "--out", str(out), "--figure", str(figure)) == 0
+    assert "50 samples" in capsys.readouterr().out
+    header, rows = _table(out)
+    assert header == ["time [s]", "X1 [m]", "Y1 [m/s]", "X2 [m]", "Y2 [m/s]", "x_rel [m]"]
+    p = CapsuleParameters(0.11, 0.53, 1420.0, 18960.0, 3.89, 0.66, 0.3, 1e-3)
+    t = simulate(p, Excitation(4.0, 34.56), np.linspace(0.0, 4.0 * np.pi / 34.56, 50))
+    expected = np.stack([t.times, t.X1, t.Y1, t.X2, t.Y2, t.x_rel], axis=1)
+    np.testing.assert_allclose(rows, expected, rtol=0.0, atol=1e-12)
+    with Image.open(figure) as picture:
+        assert picture.size == (1500, 720)
+
+
+def test_netcdf_carries_units_and_parameters(tmp_path: Path) -> None:
+    out = tmp_path / "run.nc"
+    start = ["--initial", "1e-3", "0", "0.5", "0.1"]
+    assert _run(*DRIVE, *start, "--duration", "0.05", "--samples", "20", "--model", "smooth", "--out", str(out)) == 0
+    with xr.open_dataset(out, engine="h5netcdf") as data:
+        assert data.sizes == {"time": 20}
+        assert data.X2.attrs["units"] == "m"
+        assert data.attrs["k2"] == 18960.0
+        assert data.attrs["model"] == "smooth"
+        assert float(data.X2[0]) == 0.5
+        assert float(data.Y2[0]) == 0.1
+
+
+def test_parameters_of_a_result(tmp_path: Path) -> None:
+    rows = {"k1": {"map": 1500.0, "median": None}, "k2[L60]": {"map": 2e4}, "K": {"map": 20.0}}
+    (tmp_path / "parameters.json").write_text(json.dumps({"parameters": rows}), encoding="utf-8")
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    drive = ["--G", "1e-3", "--P_d", "4", "--Omega", "30", "--out", "x.csv", "--result", str(tmp_path)]
+    values = options.capsule_values(parser.parse_args([*drive, "--c", "5"]))
+    assert (values["k1"], values["k2"], values["c"], values["m1"]) == (1500.0, 2e4, 5.0, 0.11)
+    with pytest.raises(InputError, match="choose from L60"):
+        options.capsule_values(parser.parse_args([*drive, "--spring", "L70"]))
+    (tmp_path / "parameters.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(InputError, match="takes a result"):
+        options.capsule_values(parser.parse_args(drive))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rule"),
+    [
+        (["--k2", "18960"], "must be given"),
+        ([*DRIVE, "--k1", "stiff"], "--k1 takes a number"),
+        ([*DRIVE, "--k1", "nan"], "--k1 must be finite"),
+        ([*DRIVE, "--velocity", "1e-3"], "exact model has no widths"),
+        ([*DRIVE, "--semantics", "eq2"], "stick-slip semantics only"),
+        ([*DRIVE, "--samples", "1"], "at least 2"),
+        ([*DRIVE, "--periods", "-1"], "length must be positive"),
+        ([*DRIVE, "--periods", "1", "--duration", "1"], "length is given once"),
+        ([*DRIVE, "--Omega", "0"], "without a drive frequency"),
+        ([*DRIVE, "--m1", "-1"], "m1 must be positive"),
+    ],
+)
+def test_errors_are_one_line_and_write_nothing(tmp_path: Path, arguments: list[str], rule: str) -> None:
+    out = tmp_path / "run.csv"
+    with pytest.raises(InputError, match=rule) as caught:
+        _run(*arguments, "--out", str(out))
+    assert "\n" not in str(caught.value)
+    assert not out.exists()
+
+
+def test_outputs_must_have_a_known_suffix_and_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"must end in \.csv or \.nc"):
+        _run(*DRIVE, "--out", str(tmp_path / "run.txt"))
+    with pytest.raises(InputError, match="folder of the output must exist"):
+        _run(*DRIVE, "--out", str(tmp_path / "missing" / "run.csv"))
+
+
+def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(options.sys, "modules", {})
+    for before, after in (
+        ("", options.WHOLE_LOOPS),
+        ("--xla_a=1", f"--xla_a=1 {options.WHOLE_LOOPS}"),
+        ("--xla_backend_extra_options=other", "--xla_backend_extra_options=other"),
+    ):
+        monkeypatch.setenv("XLA_FLAGS", before)
+        options.prefer_whole_loops()
+        assert options.os.environ["XLA_FLAGS"] == after

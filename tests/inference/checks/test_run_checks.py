@@ -1,0 +1,103 @@
+"""Bench against runs, and what an error of the start becomes: against closed forms, each with a negative control."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.inference.checks.run_checks import (
+    LARGEST_GROWTH,
+    Distance,
+    RunsAlone,
+    _by_sample,
+    agreement,
+    check_runs,
+    disagreement,
+    growth,
+)
+from capsule_id.inference.result import PointFit
+from tests.forced_runs import make, theta
+
+NAMES = ("k1", "c")
+
+
+def fit(u: np.ndarray, covariance: np.ndarray) -> PointFit:
+    values = dict(zip(NAMES, np.exp(u), strict=True))
+    none = np.zeros((1, 2))
+    return PointFit(NAMES, u, values, covariance, values, none, none, np.zeros(1), *np.zeros((2, 1), dtype=bool))
+
+
+def estimates(rng: np.random.Generator, shift: float) -> tuple[RunsAlone, PointFit]:
+    """Runs and bench, two linear experiments; the runs see the first parameter ``shift`` too high."""
+    bench_cov = np.array([[4e-6, 1e-6], [1e-6, 9e-6]])
+    runs_cov = np.array([[1e-6, -5e-7], [-5e-7, 2e-6]])
+    one = rng.multivariate_normal(np.zeros(2), bench_cov)
+    other = rng.multivariate_normal([shift, 0.0], runs_cov)
+    return RunsAlone(NAMES, other, runs_cov), fit(one, bench_cov)
+
+
+def test_the_disagreement_is_standard_normal_where_there_is_none() -> None:
+    rng = np.random.default_rng(1)
+    z = np.array([_ordered(*estimates(rng, 0.0)) for _ in range(3000)])
+    assert stats.kstest(z[:, 0], "norm").pvalue > 1e-3
+    assert stats.kstest(z[:, 1], "norm").pvalue > 1e-3
+
+
+def _ordered(runs: RunsAlone, bench: PointFit) -> list[float]:
+    found = disagreement(NAMES, runs, bench, None)
+    return [found[name].z for name in NAMES]
+
+
+def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
+    rng = np.random.default_rng(2)
+    clean = [agreement(disagreement(NAMES, *estimates(rng, 0.0), None), True) for _ in range(1500)]
+    alarms = np.mean([found.level == "fail" for found in clean])
+    assert 0.01 < alarms < 0.03
+    planted = [agreement(disagreement(NAMES, *estimates(rng, 0.015), None), False) for _ in range(50)]
+    assert all(found.level == "warn" and "largest disagreement in k1" in found.text for found in planted)
+
+
+def test_named_is_where_the_error_came_from() -> None:
+    """Heavy tails make nothing of what lies between 19 and 7 sd; a parameter that is no surprise is not named at all."""
+    found = {"k1": Distance(30.0, 1.0), "v_s": Distance(-6.6, -4.1), "mu": Distance(18.6, 4.0), "c": Distance(2.0, 2.0)}
+    text = agreement(found, True).text
+    assert "largest disagreement in mu (+18.6 sd" in text
+    assert "then v_s (-6.6 sd" in text
+    assert "p = 0.00025 by the bench's sample" in text
+    assert "k1" not in text
+    assert "c (" not in text
+    assert "p < 1e-300 over" in agreement({"K": Distance(70.0, 70.0)}, False).text
+
+
+def test_what_is_not_finite_is_not_taken_for_agreement() -> None:
+    nothing = Distance(float("nan"), float("nan"))
+    found = agreement({"k1": nothing, "c": Distance(0.0, 0.0)}, True)
+    assert found.level == "warn"
+    assert "k1" in found.text
+    assert agreement({"k1": nothing, "c": Distance(9.0, 9.0)}, True).level == "fail"
+
+
+def test_tails_follow_the_sample() -> None:
+    draws = stats.t(5).rvs(100_000, random_state=3)
+    for value in (0.5, 2.0, 6.0, 12.0):
+        expected = -stats.norm.isf(stats.t(5).sf(value))
+        assert _by_sample(draws, value, -1.0) == pytest.approx(expected, abs=0.35)
+    # The normal density would call the farthest of these twelve sd.
+    assert abs(_by_sample(draws, 12.0, -1.0)) < 5.0
+
+
+def test_a_motion_that_forgets_its_start_is_predictable_and_a_chaotic_one_is_not() -> None:
+    run = make(0, samples=2000)
+    assert growth(run, theta(0)) < 1.0
+    assert check_runs([run], _named(run, theta(0)))[0].level == "ok"
+    # The chaotic motion of tests/capsule/test_lyapunov.py.
+    wild = theta(0) | {"m2": 0.3, "k2": 56410.0, "c": 0.5, "mu": 0.2, "G": 0.5e-3, "I_d": 4.0}
+    assert growth(run, wild) > LARGEST_GROWTH
+    found = check_runs([run], _named(run, wild))
+    assert found[0].level == "fail"
+    assert "run_1" in found[0].text
+
+
+def _named(run: ForcedRun, values: dict[str, float]) -> dict[str, float]:
+    by_symbol = {row.symbol: row.name for row in run.parameters}
+    return {by_symbol.get(symbol, symbol): value for symbol, value in values.items()}

@@ -1,0 +1,61 @@
+"""Hessian and Jacobian by differences against automatic differentiation; roots of inverses; fixed batches."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.inference.fit.curvature import BATCH, hessian, in_batches, jacobian, root_of_inverse
+from capsule_id.precision import require_float64
+
+require_float64()
+SCALE = np.array([1e-4, 2e-2, 1.0, 0.1])
+AT = np.array([3.0, -1.0, 0.5, 2.0])
+
+
+def smooth(u: jax.Array) -> jax.Array:
+    """A log-density with mixed scales, strong correlation and a third derivative."""
+    v = (u - jnp.asarray(AT)) / jnp.asarray(SCALE) + 0.3
+    return -0.5 * (v @ v) - 0.8 * v[0] * v[1] - jnp.log1p(jnp.exp(v[2])) - 0.05 * v[3] ** 4
+
+
+def test_hessian_against_automatic_differentiation() -> None:
+    found = hessian(jax.vmap(smooth), AT, SCALE)
+    scale = np.outer(SCALE, SCALE)
+    np.testing.assert_allclose(found * scale, jax.hessian(smooth)(AT) * scale, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(found, found.T)
+
+
+def test_jacobian_against_automatic_differentiation() -> None:
+    def function(u: np.ndarray) -> np.ndarray:
+        return np.array([np.sin(u[0] * u[1]), np.exp(u[2]), u[3] ** 3 * u[0]])
+
+    expected = jax.jacobian(lambda u: jnp.array([jnp.sin(u[0] * u[1]), jnp.exp(u[2]), u[3] ** 3 * u[0]]))(AT)
+    np.testing.assert_allclose(jacobian(function, AT, np.full(4, 1e-5)), expected, rtol=1e-8, atol=1e-9)
+
+
+def test_root_of_inverse() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.standard_normal((5, 5))
+    h = np.diag(10.0 ** np.arange(-4, 6, 2.0)) @ (a @ a.T + np.eye(5)) @ np.diag(10.0 ** np.arange(-4, 6, 2.0))
+    root = root_of_inverse(h)
+    np.testing.assert_allclose(root @ root.T @ h, np.eye(5), atol=1e-9 * np.linalg.cond(a @ a.T + np.eye(5)) * 1e4)
+
+
+def test_root_of_an_indefinite_matrix_is_a_metric() -> None:
+    """Directions of negative curvature get the weakest positive one: positive definite all the same."""
+    q, _ = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))
+    root = root_of_inverse(q @ np.diag([-2.0, 1.0, 4.0]) @ q.T)
+    assert np.all(np.isfinite(root))
+    assert np.all(np.linalg.eigvalsh(root @ root.T) > 0.0)
+
+
+def test_batches_have_one_shape() -> None:
+    shapes: list[int] = []
+
+    def function(points: np.ndarray) -> np.ndarray:
+        shapes.append(len(points))
+        return np.sum(points, axis=1)
+
+    points = np.arange(3.0 * 70).reshape(70, 3)
+    np.testing.assert_array_equal(in_batches(function, points), np.sum(points, axis=1))
+    assert shapes == [BATCH] * 3

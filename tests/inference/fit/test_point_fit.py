@@ -1,0 +1,109 @@
+"""The point fit against SciPy on the same readings, its standard errors, and starts that cannot agree."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import optimize
+
+from capsule_id.experiments import make_experiments
+from capsule_id.inference.checks.verdict import check_starts
+from capsule_id.inference.fit.point_fit import dispersed_starts, point_fit
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.rig.read import read_rig
+from capsule_id.synthetic import Truth, synthesize
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> LogPosterior:
+    folder = tmp_path_factory.mktemp("twin") / "rig"
+    synthesize(folder, 21)
+    rig = read_rig(folder)
+    return LogPosterior(rig, make_experiments(rig))
+
+
+@pytest.fixture(scope="module")
+def fit(twin: LogPosterior) -> PointFit:
+    return point_fit(twin, seed=5)
+
+
+def test_all_starts_agree(fit: PointFit) -> None:
+    assert fit.agree
+    assert not fit.stalled.any()
+    assert np.ptp(fit.log_posterior) < 1e-3
+
+
+def test_it_is_a_maximum(twin: LogPosterior, fit: PointFit) -> None:
+    """SciPy's simplex in whitened coordinates cannot climb: the gain stays below 1e-4, the step below 0.02 sd."""
+    root = np.linalg.cholesky(fit.covariance)
+
+    def objective(v: np.ndarray) -> float:
+        return -float(twin.batch(jnp.asarray(fit.u + root @ v)[None])[0])
+
+    step = 1e-3
+    gradient = optimize.approx_fprime(np.zeros(twin.dimension), objective, step)
+    backward = -optimize.approx_fprime(np.zeros(twin.dimension), lambda v: objective(-v), step)
+    assert np.max(np.abs(0.5 * (gradient + backward))) < 0.02
+    # The curvature of whitened coordinates is 1: forward less backward difference is the step.
+    np.testing.assert_allclose((gradient - backward) / step, 1.0, atol=0.02)
+
+
+def test_springs_against_scipy(twin: LogPosterior, fit: PointFit) -> None:
+    """A line with one scatter: k2 is the ordinary slope, its standard error that of least squares with this scatter."""
+    for experiment in twin.experiments:
+        if experiment.kind == "support_spring":
+            x, y = experiment.table["deflection"], experiment.table["force"]
+            (slope, _), scaled = np.polyfit(x, y, 1, cov="unscaled")
+            scatter = fit.values[f"scatter[{experiment.label}]"]
+            name = next(row.name for row in experiment.parameters if row.symbol == "k2")
+            assert fit.values[name] == pytest.approx(slope, rel=1e-4)
+            assert fit.standard_errors[name] == pytest.approx(scatter * np.sqrt(scaled[0, 0]), rel=2e-3)
+
+
+def test_truth_is_within_reach(fit: PointFit) -> None:
+    for name, truth in Truth().flat().items():
+        if name in fit.values:
+            assert abs(fit.values[name] - truth) < 4.0 * fit.standard_errors[name], name
+
+
+@pytest.mark.parametrize(
+    ("log_posterior", "elsewhere", "stalled", "level"),
+    [
+        ([0.0, 0.0, 0.0], [0, 0, 0], [0, 0, 0], "ok"),
+        ([0.0, 0.0, -100.0], [0, 0, 1], [0, 0, 1], "warn"),
+        ([0.0, 0.0, -5.0], [0, 0, 1], [0, 0, 0], "fail"),
+        ([0.0, -100.0, -100.0], [0, 1, 1], [0, 0, 0], "fail"),
+        ([0.0, 0.0, 0.0], [0, 0, 0], [0, 1, 0], "fail"),
+    ],
+)
+def test_other_maxima_are_judged_by_the_mass_they_can_hold(
+    fit: PointFit, log_posterior: list[float], elsewhere: list[int], stalled: list[int], level: str
+) -> None:
+    other = replace(
+        fit,
+        starts=fit.starts[:3],
+        ends=fit.u + 3.0 * np.array(elsewhere)[:, None],
+        log_posterior=np.array(log_posterior),
+        elsewhere=np.array(elsewhere, dtype=bool),
+        stalled=np.array(stalled, dtype=bool),
+    )
+    assert [finding.level for finding in check_starts(other)] == [level]
+
+
+def test_starts_are_away_from_each_other(twin: LogPosterior) -> None:
+    """The first is the proposed centre; every other leaves it in every parameter by at least a third of its spread."""
+    starts = dispersed_starts(twin, 3, 6)
+    spread = np.array([twin.starts()[name].spread for name in twin.names])
+    distance = np.abs(starts[1:] - starts[0]) / spread
+    assert distance.min() >= 1.0 / 3.0 - 1e-12
+    assert np.array_equal(dispersed_starts(twin, 3, 6), starts)
+    assert not np.array_equal(dispersed_starts(twin, 4, 6)[1:], starts[1:])
+
+
+def test_seeds_do_not_move_the_maximum(twin: LogPosterior, fit: PointFit) -> None:
+    other = point_fit(twin, seed=77)
+    sd = np.sqrt(np.diag(fit.covariance))
+    np.testing.assert_allclose((other.u - fit.u) / sd, 0.0, atol=0.05)
+    np.testing.assert_allclose(other.covariance / np.outer(sd, sd), fit.covariance / np.outer(sd, sd), atol=0.02)

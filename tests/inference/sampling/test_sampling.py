@@ -1,0 +1,127 @@
+"""The sampler on a Gaussian whose moments are known: z-tests in Monte Carlo standard errors, and what fails them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.inference.result import Posterior
+from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time
+from capsule_id.inference.sampling.ensembles import ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
+from tests.inference.stub import Gaussian
+
+#: Largest |z| of the 16 numbers tested at once: false alarm in 1 of 1000.
+LIMIT = 4.0
+SD = np.array([1e-3, 0.05, 1.0, 20.0])
+CORRELATION = np.array([[1.0, 0.95, 0.0, 0.3], [0.95, 1.0, 0.0, 0.3], [0.0, 0.0, 1.0, -0.5], [0.3, 0.3, -0.5, 1.0]])
+KNOWN = Gaussian(np.array([5.0, -1.0, 0.0, 100.0]), CORRELATION * np.outer(SD, SD))
+
+
+def draw(seed: int, budget: int = 20_000, store: Path | None = None, target: Gaussian = KNOWN) -> Posterior:
+    return sample(target, seed, budget, store)
+
+
+def scores(draws: np.ndarray, known: Gaussian) -> np.ndarray:
+    """z of every mean, variance and correlation: the average of a function of the draws over its own MCSE.
+
+    Each function has a known mean of 0 under ``known``; its effective sample size comes from its own autocorrelation.
+    """
+    sd = np.sqrt(np.diag(known.sigma))
+    y = (draws - known.mean) / sd
+    rows, columns = np.triu_indices(known.dimension, 1)
+    products = y[..., rows] * y[..., columns] - (known.sigma / np.outer(sd, sd))[rows, columns]
+    functions = np.concatenate([y, y**2 - 1.0, products], axis=-1)
+    ess = effective_sample_size(functions, ensemble_time(functions))
+    flat = functions.reshape(-1, functions.shape[-1])
+    return np.mean(flat, axis=0) / (np.std(flat, axis=0) / np.sqrt(ess))
+
+
+@pytest.fixture(scope="module")
+def posterior() -> Posterior:
+    return draw(1)
+
+
+def test_known_gaussian(posterior: Posterior) -> None:
+    """Means, sds and correlations within ``LIMIT`` Monte Carlo standard errors."""
+    assert posterior.converged
+    assert np.max(np.abs(scores(posterior.draws, KNOWN))) < LIMIT
+    assert np.all(posterior.rhat <= MAX_RHAT)
+    assert np.all(posterior.draws.shape[1] > LENGTH_IN_TAU * posterior.tau)
+    assert np.all(posterior.ess > 400.0)
+
+
+def test_blocks_are_accepted_one_by_one() -> None:
+    """Two independent pairs: right moments, and no longer correlated in time than either pair alone would be.
+
+    Negative control: declared as blocks although they are tied together, the pairs come out independent.
+    """
+    tied = np.kron(np.eye(2), [[1.0, 0.9], [0.9, 1.0]])
+    blocks = [np.array([0, 1]), np.array([2, 3])]
+    target = Gaussian(np.arange(4.0), tied, blocks)
+    found = draw(6, target=target)
+    assert found.converged
+    assert np.max(found.tau) < 3.0
+    assert np.max(np.abs(scores(found.draws, target))) < LIMIT
+    tied = tied + 0.05 * (tied == 0.0)
+    found = draw(6, target=Gaussian(np.arange(4.0), tied, blocks))
+    assert np.max(np.abs(scores(found.draws, Gaussian(np.arange(4.0), tied)))) > LIMIT
+
+
+@pytest.mark.parametrize("fault", ["mean", "sd", "correlation"])
+def test_a_wrong_gaussian_fails(posterior: Posterior, fault: str) -> None:
+    """Negative controls: the same draws against moments that are off by ten standard errors of the mean."""
+    error = 10.0 / np.sqrt(np.min(posterior.ess))
+    mean, covariance = KNOWN.mean.copy(), KNOWN.sigma.copy()
+    if fault == "mean":
+        mean[1] += error * SD[1]
+    elif fault == "sd":
+        covariance[2] *= 1.0 + error
+        covariance[:, 2] *= 1.0 + error
+    else:
+        covariance[2, 3] = covariance[3, 2] = (error - 0.5) * SD[2] * SD[3]
+    assert np.max(np.abs(scores(posterior.draws, Gaussian(mean, covariance)))) > LIMIT
+
+
+def test_scores_are_standard_normal() -> None:
+    """The z-test is calibrated: 4 seeds give 56 scores with sd 1 (ensembles share nothing)."""
+    z = np.concatenate([scores(draw(seed).draws, KNOWN) for seed in range(10, 14)])
+    assert 0.7 < np.std(z) < 1.35
+    assert np.max(np.abs(z)) < LIMIT
+
+
+def test_seeds() -> None:
+    """The same seed gives the same draws whatever NumPy's global state is, another seed others."""
+    first = draw(3, budget=400)
+    np.random.seed(99)  # noqa: NPY002
+    np.testing.assert_array_equal(draw(3, budget=400).draws, first.draws)
+    assert not np.array_equal(draw(4, budget=400).draws, first.draws)
+
+
+def test_a_spent_budget_is_not_convergence() -> None:
+    posterior = draw(1, budget=60)
+    assert not posterior.converged
+    assert posterior.draws.shape[0] == ENSEMBLES
+
+
+def test_log_density_belongs_to_the_draws(posterior: Posterior) -> None:
+    flat = posterior.draws.reshape(-1, 4)
+    np.testing.assert_allclose(posterior.lp.ravel(), KNOWN.parts(flat)[:, 0], rtol=1e-9, atol=1e-9)
+
+
+def test_interrupted_chains_go_on(tmp_path: Path) -> None:
+    """Stopped after half the budget and taken up again: the draws stored before are kept, the whole still passes."""
+    half = draw(5, budget=60, store=tmp_path / "chains.h5")
+    whole = draw(5, store=tmp_path / "chains.h5")
+    stored = half.draws.shape[1]
+    np.testing.assert_array_equal(whole.draws[:, :stored], half.draws)
+    assert whole.draws.shape[1] > stored
+    assert whole.converged
+    assert np.max(np.abs(scores(whole.draws, KNOWN))) < LIMIT
+
+
+def test_progress_is_reported() -> None:
+    seen: list[tuple[int, int, str]] = []
+    sample(KNOWN, 1, 300, None, lambda *args: seen.append(args))
+    assert seen[0] == (0, 1, "pilot")
+    assert all(0 <= done <= goal for done, goal, _ in seen)
+    assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)

@@ -1,0 +1,186 @@
+"""Priors against SciPy, their integrals and samples; the joint density is the sum of its parts."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.base import Experiment
+from capsule_id.inference.target import density
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.parameters import TABLE, Prior, parameter
+from capsule_id.rig.model import PriorOverride
+from capsule_id.rig.read import read_rig
+from capsule_id.synthetic import Truth, synthesize
+from tests.inference.stub import Nothing, rig_without_tables
+
+PRIORS = {
+    "lognormal": (Prior("lognormal", 0.3, 10.0), stats.lognorm(s=np.log(10.0) / stats.norm.ppf(0.975), scale=0.3)),
+    "halfnormal": (Prior("halfnormal", 0.0, 0.05), stats.halfnorm(scale=0.05)),
+    "weighing": (Prior("positive_normal", 0.11, 2e-4), stats.truncnorm(-550.0, np.inf, 0.11, 2e-4)),
+    "poor weighing": (Prior("positive_normal", 0.1, 0.08), stats.truncnorm(-1.25, np.inf, 0.1, 0.08)),
+    "normal": (Prior("normal", -0.2, 0.5), stats.norm(-0.2, 0.5)),
+}
+CASES = pytest.mark.parametrize(("prior", "reference"), PRIORS.values(), ids=PRIORS.keys())
+
+
+def target_of(*priors: Prior) -> LogPosterior:
+    """A posterior without data: x1, x2, ... with these priors."""
+    return LogPosterior(rig_without_tables(), [Nothing([parameter("F_dry", f"x{i}", p) for i, p in enumerate(priors)])])
+
+
+@CASES
+def test_log_prior_against_scipy(prior: Prior, reference: Any) -> None:
+    target, step = target_of(prior), 1e-4
+    for theta in reference.ppf([0.001, 0.2, 0.5, 0.9, 0.999]):
+        u = target.unconstrain(np.array([theta]))
+        # d theta/du numerically, extrapolated (Richardson).
+        slopes = [(target.theta(u + h) - target.theta(u - h)) / (2.0 * h) for h in (step, 2.0 * step)]
+        slope = (4.0 * slopes[0] - slopes[1]) / 3.0
+        expected = reference.logpdf(theta) + np.log(slope[0])
+        assert float(target.log_prior(jnp.asarray(u))) == pytest.approx(expected, rel=1e-10, abs=1e-10)
+
+
+@CASES
+def test_prior_integrates_to_one(prior: Prior, reference: Any) -> None:
+    target = target_of(prior)
+    ends = target.unconstrain(reference.ppf([[1e-13], [0.5], [1.0 - 1e-13]]))[:, 0]
+    if prior.kind in ("halfnormal", "positive_normal"):  # a density of theta at 0: in u its tail falls like exp(u)
+        ends[0] = min(ends[0], ends[1] - 35.0)
+    mass = sum(
+        integrate.quad(lambda u: float(np.exp(target.log_prior(jnp.array([u])))), a, b, limit=400, epsabs=1e-11)[0]
+        for a, b in np.stack([np.linspace(ends[0], ends[2], 9)[:-1], np.linspace(ends[0], ends[2], 9)[1:]], axis=1)
+    )
+    assert mass == pytest.approx(1.0, abs=1e-8)
+
+
+@CASES
+def test_samples_follow_the_density(prior: Prior, reference: Any) -> None:
+    """Kolmogorov–Smirnov at n = 20000; a prior of 1.1 times the width is told apart (negative control)."""
+    x = target_of(prior).sample_prior(np.random.default_rng(12), 20000)["F_dry[x0]"]
+    assert stats.kstest(x, reference.cdf).pvalue > 0.01
+    centre = reference.median() if prior.kind != "halfnormal" else 0.0
+    wider = centre * (x / centre) ** 1.1 if prior.kind == "lognormal" else centre + 1.1 * (x - centre)
+    assert stats.kstest(wider, reference.cdf).pvalue < 1e-4
+
+
+def test_joint_prior_is_the_sum() -> None:
+    priors = [prior for prior, _ in PRIORS.values()]
+    joint, singles = target_of(*priors), [target_of(prior) for prior in priors]
+    u = joint.unconstrain(np.array([0.4, 0.03, 0.1101, 0.2, 0.3]))
+    expected = sum(float(t.log_prior(jnp.asarray(u[i : i + 1]))) for i, t in enumerate(singles))
+    assert float(joint.log_prior(jnp.asarray(u))) == pytest.approx(expected, rel=1e-13)
+    residuals = joint.prior_residuals(u)
+    moved = u + np.array([0.1, 0.0, 0.0, 0.0, 0.2])
+    gain = 0.5 * np.sum(residuals**2) - 0.5 * np.sum(joint.prior_residuals(moved) ** 2)
+    assert float(joint.log_prior(jnp.asarray(moved)) - joint.log_prior(jnp.asarray(u))) == pytest.approx(
+        gain, rel=1e-10
+    )
+
+
+def test_default_priors_are_as_documented() -> None:
+    """95 % of a log-normal within median/factor .. median*factor; scatters half-normal."""
+    for row in TABLE.values():
+        if row.prior is not None and row.prior.kind == "lognormal":
+            x = row.prior.sample(np.random.default_rng(1), 40000)
+            inside = np.abs(np.log(x / row.prior.location)) < np.log(row.prior.spread)
+            assert np.mean(inside) == pytest.approx(0.95, abs=4.0 * np.sqrt(0.95 * 0.05 / 40000))
+    assert TABLE["v_s"].prior == Prior("lognormal", 0.3, 10.0)
+    assert TABLE["mu"].prior == Prior("lognormal", 0.4, 5.0)
+    assert TABLE["tilt_sd"].prior == Prior("halfnormal", 0.0, np.deg2rad(1.0))
+    assert TABLE["push_scatter"].prior == Prior("halfnormal", 0.0, 0.05)
+    assert min(TABLE[s].prior.spread for s in ("k1", "c", "k2", "K")) >= 100.0  # type: ignore[union-attr]
+
+
+def test_a_parameter_without_a_prior_is_refused() -> None:
+    target = LogPosterior(rig_without_tables(), [Nothing([parameter("noise_sd", "x")])])
+    with pytest.raises(ValueError, match=r"noise_sd\[x\] has no prior"):
+        target.log_prior(jnp.zeros(1))
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> tuple[LogPosterior, tuple[Experiment, ...]]:
+    folder = tmp_path_factory.mktemp("twin") / "rig"
+    synthesize(folder, 4)
+    rig = read_rig(folder)
+    experiments = make_experiments(rig)
+    return LogPosterior(rig, experiments), experiments
+
+
+def at_truth(target: LogPosterior, factor: float = 1.0) -> np.ndarray:
+    """u at the truth of the twin, noise at plausible values that differ from record to record."""
+    known = Truth().flat() | {"tilt_sd": 0.009, "push_scatter": 0.02}
+    known |= {f"noise_sd[free_vibration_{i}]": s for i, s in ((1, 1.5e-5), (2, 2.1e-5), (3, 2.4e-5))}
+    known |= {f"scatter[support_spring_{s}]": v for s, v in (("soft", 0.005), ("medium", 0.04), ("stiff", 0.1))}
+    return target.unconstrain(np.array([known[name] * factor for name in target.names]))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.03])
+def test_log_posterior_is_the_sum_of_its_experiments(
+    twin: tuple[LogPosterior, tuple[Experiment, ...]], factor: float
+) -> None:
+    """Records and springs evaluated together in batches, against each alone in NumPy; nine tables, unequal noise."""
+    target, experiments = twin
+    u = at_truth(target, factor)
+    values = target.mapping(target.theta(u))
+    assert len(experiments) == 9
+    expected = sum(float(e.log_likelihood(e.local(values), np)) for e in experiments)
+    batched = np.asarray(target.batch(jnp.asarray(u[None])))[0]
+    assert float(batched - target.log_prior(jnp.asarray(u))) == pytest.approx(expected, rel=1e-11)
+
+
+def test_residuals_by_both_routes(twin: tuple[LogPosterior, tuple[Experiment, ...]]) -> None:
+    """Batched and plain residuals are the same numbers in another order."""
+    target, _ = twin
+    u = at_truth(target)
+    batched = np.sort(np.asarray(target.residuals(jnp.asarray(u))))
+    np.testing.assert_allclose(batched, np.sort(target.plain_residuals(u)), rtol=1e-8, atol=1e-9)
+
+
+def test_overdamped_decays_have_no_density(twin: tuple[LogPosterior, tuple[Experiment, ...]]) -> None:
+    target, _ = twin
+    u = at_truth(target)
+    u[target.names.index("c")] = np.log(30.0)  # critical damping is 2 sqrt(k1 m1) = 25 N s/m
+    assert float(target.batch(jnp.asarray(u[None]))[0]) == -np.inf
+
+
+def test_rigs_of_one_structure_do_not_share_numbers(tmp_path: Path) -> None:
+    """Compiled code is shared between rigs; readings, priors and weighings must not be."""
+    values: list[float] = []
+    for seed in (1, 2):
+        synthesize(tmp_path / f"rig{seed}", seed, Truth().with_values({"k1": 1300.0 + 50.0 * seed}))
+        rig = read_rig(tmp_path / f"rig{seed}")
+        target = LogPosterior(rig, make_experiments(rig))
+        u = at_truth(target)
+        local = target.mapping(target.theta(u))
+        expected = sum(float(e.log_likelihood(e.local(local), np)) for e in target.experiments)
+        found = float(target.batch(jnp.asarray(u[None]))[0] - target.log_prior(jnp.asarray(u)))
+        assert found == pytest.approx(expected, rel=1e-11)
+        values.append(found)
+    assert values[0] != pytest.approx(values[1], rel=1e-3)
+
+
+def test_overrides_replace_priors() -> None:
+    override = {"mu": PriorOverride(median=0.5, factor=2.0), "tilt_sd": PriorOverride(scale=0.01)}
+    target = LogPosterior(rig_without_tables(override), [Nothing([parameter("mu"), parameter("tilt_sd")])])
+    assert [row.prior for row in target.parameters] == [Prior("lognormal", 0.5, 2.0), Prior("halfnormal", 0.0, 0.01)]
+
+
+def test_prior_sd_is_that_of_u() -> None:
+    """What "informed" is measured against, by sampling; a weighing to first order."""
+    for name in ("lognormal", "halfnormal", "weighing", "normal"):
+        target = target_of(PRIORS[name][0])
+        x = target.sample_prior(np.random.default_rng(3), 200000)["F_dry[x0]"]
+        assert target.prior_sd[0] == pytest.approx(np.std(target.unconstrain(x[:, None])), rel=0.02)
+
+
+def test_numpy_and_jax_agree_on_constraints() -> None:
+    target = target_of(*(prior for prior, _ in PRIORS.values()))
+    u = np.array([-1.0, -3.0, -2.2, -2.0, 0.1])
+    np.testing.assert_allclose(target.unconstrain(target.theta(u)), u, rtol=1e-14)
+    np.testing.assert_allclose(density.constrain(target.structure, jnp.asarray(u)), target.theta(u), rtol=1e-14)
+    assert list(target.positive) == [True, True, True, True, False]

@@ -1,0 +1,235 @@
+"""Scatters integrated out: against adaptive quadrature in NumPy, and drawn back from their conditional densities."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, optimize, stats
+
+import tests.experiments.bench as bench
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.base import Experiment
+from capsule_id.inference.fit.curvature import hessian, root_of_inverse
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.marginal import MarginalPosterior, conditional
+from capsule_id.parameters import Parameter
+from capsule_id.rig.model import Rig
+from capsule_id.rig.read import read_rig
+from capsule_id.synthetic import Truth, synthesize
+
+WALKERS, OVERDISPERSION = 6, 2.0
+#: Largest error of a log-integral.
+LIMIT = 1e-8
+ROUGH = {"tilt_sd": 0.009, "push_scatter": 0.02, "sliding_scatter": 0.02}
+
+
+def log_prior(row: Parameter, u: float) -> float:
+    """Log-density of u = log(value), by SciPy."""
+    assert row.prior is not None
+    location, spread = row.prior.location, row.prior.spread
+    if row.prior.kind == "lognormal":
+        return float(stats.norm.logpdf(u, np.log(location), np.log(spread) / stats.norm.ppf(0.975)))
+    if row.prior.kind == "halfnormal":
+        return float(stats.halfnorm.logpdf(np.exp(u), scale=spread) + u)
+    return float(stats.truncnorm.logpdf(np.exp(u), -location / spread, np.inf, location, spread) + u)
+
+
+def log_integral(density: Callable[[float], float], near: float) -> float:
+    """log of the integral of exp(density(u)) over the real line, piece by piece about its maximum."""
+    coarse = near + np.linspace(-12.0, 12.0, 97)
+    start = coarse[np.argmax([density(u) for u in coarse])]
+    found = optimize.minimize_scalar(lambda u: -density(u), bracket=(start - 0.3, start, start + 0.3), tol=1e-6)
+    top, at = -found.fun, found.x
+    width = 1e-3
+    while density(at + width) > top - 0.5:
+        width *= 1.5
+    ends = at + width * np.array([-2000.0, -200.0, -50.0, -12.0, -4.0, -1.0, 0.0, 1.0, 3.0, 6.0, 12.0, 50.0, 200.0])
+    ends = np.concatenate([[at - 45.0], ends[np.abs(ends - at) < 45.0], [at + 45.0]])
+    pieces = [
+        integrate.quad(lambda u: np.exp(density(u) - top), a, b, epsabs=1e-13, epsrel=1e-11, limit=200)[0]
+        for a, b in pairwise(ends)
+    ]
+    return top + float(np.log(np.sum(pieces)))
+
+
+def by_quadrature(target: LogPosterior, u: np.ndarray) -> float:
+    """The integrated log-posterior at u, its scatters near which to integrate; every likelihood in NumPy."""
+    total = sum(log_prior(row, x) for row, x, s in zip(target.parameters, u, target.scatter, strict=True) if not s)
+    values = target.mapping(target.theta(u))
+    readers: dict[str, list[Experiment]] = {}
+    for experiment in target.experiments:
+        own = [row.name for row in experiment.parameters if row.scatter]
+        if own:
+            readers.setdefault(own[0], []).append(experiment)
+        else:
+            total += float(experiment.log_likelihood(experiment.local(values), np))
+    for name, experiments in readers.items():
+        row = target.parameters[target.names.index(name)]
+
+        def density(x: float, row: Parameter = row, experiments: list[Experiment] = experiments) -> float:
+            moved = values | {row.name: np.exp(x)}
+            return log_prior(row, x) + sum(float(e.log_likelihood(e.local(moved), np)) for e in experiments)
+
+        total += log_integral(density, u[target.names.index(name)])
+    return total
+
+
+def approximate(target: LogPosterior, known: dict[str, float]) -> PointFit:
+    """The Laplace approximation at ``known``, which need not be a maximum."""
+    u = target.unconstrain(np.array([known[name] for name in target.names]))
+    scale = np.full(target.dimension, 1e-3)
+    for _ in range(3):
+        root = root_of_inverse(-hessian(target.batch, u, scale))
+        scale = np.sqrt(np.sum(root**2, axis=1))
+    none = np.zeros((1, target.dimension))
+    return PointFit(target.names, u, {}, root @ root.T, {}, none, none, np.zeros(1), *np.zeros((2, 1), dtype=bool))
+
+
+def twin(folder: Path, seed: int) -> tuple[LogPosterior, dict[str, float]]:
+    synthesize(folder, seed)
+    rig = read_rig(folder)
+    target = LogPosterior(rig, make_experiments(rig))
+    known = Truth().flat() | ROUGH
+    known |= {f"noise_sd[free_vibration_{i}]": s for i, s in ((1, 2e-5), (2, 3e-5), (3, 1e-5))}
+    known |= {f"scatter[support_spring_{s}]": v for s, v in (("soft", 0.005), ("medium", 0.04), ("stiff", 0.1))}
+    return target, known
+
+
+def coarse() -> tuple[LogPosterior, dict[str, float]]:
+    """Readings whose stated errors leave hardly any scatter, two tables that share one, and three pushes."""
+    rng, mu, v_s = np.random.default_rng(4), 0.66, 0.3
+    time = np.arange(400) / 1000.0
+    step = 2e-4
+    record = step * np.round(bench.released(time, 2e-3) / step)
+    current = np.linspace(0.0, 2.0, 7)
+    speed = np.linspace(0.2, 1.0, 4)
+    coefficient = 0.5 * mu * (1.0 + np.exp(-speed / v_s))
+    tables = [
+        bench.table(
+            "free_vibration", [bench.column("time", time), bench.column("x_rel", record, resolution=step)]
+        ),
+        bench.table("static_friction", [bench.column("angle", np.arctan(mu) + 0.01 * rng.standard_normal(2))], "a"),
+        bench.table("static_friction", [bench.column("angle", np.arctan(mu) + 0.01 * rng.standard_normal(3), 0.02)], "b"),
+        bench.table(
+            "sliding_friction",
+            [
+                bench.column("speed", speed, 0.05),
+                bench.column("coefficient", coefficient * (1.0 + 0.03 * rng.standard_normal(4))),
+            ],
+        ),
+        bench.table(
+            "motor_current",
+            [
+                bench.column("force", 2.0 * current + 0.05 * rng.standard_normal(7), resolution=0.05),
+                bench.column("current", current + 0.02 * rng.standard_normal(7), resolution=0.02),
+            ],
+            sd_ratio=2.0,
+        ),
+    ]  # fmt: skip
+    rig: Rig = bench.rig(*tables)
+    known = {"k1": bench.K1, "c": bench.C, "mu": mu, "v_s": v_s, "K": 2.0} | ROUGH
+    known |= {"noise_sd[free_vibration]": 2e-5, "scatter[motor_current]": 0.05}
+    return LogPosterior(rig, make_experiments(rig)), known
+
+
+@pytest.fixture(scope="module", params=["twin", "coarse"])
+def marginal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> MarginalPosterior:
+    target, known = coarse() if request.param == "coarse" else twin(tmp_path_factory.mktemp("rig") / "rig", 4)
+    return MarginalPosterior(target, approximate(target, known))
+
+
+def walkers(marginal: MarginalPosterior, number: int) -> np.ndarray:
+    """Overdispersed draws from the Laplace approximation where there is a posterior."""
+    z = np.random.default_rng(1).standard_normal((10 * number, marginal.dimension))
+    v = marginal.centre + OVERDISPERSION * z @ np.linalg.cholesky(marginal.covariance).T
+    return v[np.isfinite(marginal.batch(v))][:number]
+
+
+def test_integrals_against_adaptive_quadrature(marginal: MarginalPosterior) -> None:
+    v = walkers(marginal, WALKERS)
+    whole, _ = marginal.restore(v, 0)
+    expected = [by_quadrature(marginal.target, u) for u in whole]
+    np.testing.assert_allclose(marginal.batch(v), expected, rtol=0.0, atol=LIMIT)
+
+
+def test_too_few_nodes_fail(marginal: MarginalPosterior) -> None:
+    """Negative control: a quarter of the nodes over the same window."""
+    v, grid = walkers(marginal, 64), marginal.grid
+    good = marginal.batch(v)
+    try:
+        marginal.grid = replace(grid, step=4.0 * grid.step, nodes=grid.nodes // 4)
+        assert np.max(np.abs(marginal.batch(v) - good)) > 100.0 * LIMIT
+    finally:
+        marginal.grid = grid
+
+
+def test_restored_scatters_follow_their_conditional_density(marginal: MarginalPosterior) -> None:
+    """4000 draws at one walker against the distribution function summed on a fine grid of the joint posterior."""
+    target = marginal.target
+    v = walkers(marginal, 1)[0]
+    u, lp = marginal.restore(np.tile(v, (4000, 1)), 7)
+    np.testing.assert_array_equal(u[:, ~target.scatter], np.tile(v, (4000, 1)))
+    np.testing.assert_allclose(lp[:64], np.asarray(target.batch(jnp.asarray(u[:64]))), rtol=0.0, atol=1e-7)
+    for j in np.flatnonzero(target.scatter):
+        low, high = np.min(u[:, j]) - 1.0, np.max(u[:, j]) + 1.0
+        fine = np.linspace(low, high, 4096)
+        moved = np.tile(u[0], (4096, 1))
+        moved[:, j] = fine
+        log_density = np.asarray(target.batch(jnp.asarray(moved)))
+        cumulated = integrate.cumulative_simpson(np.exp(log_density - np.max(log_density)), x=fine, initial=0.0)
+        rank = np.interp(u[:, j], fine, cumulated / cumulated[-1])
+        assert stats.kstest(rank, "uniform").pvalue > 1e-3, target.names[j]
+        # Negative control: one twentieth of an sd off.
+        off = np.interp(u[:, j] + 0.1 * np.std(u[:, j]), fine, cumulated / cumulated[-1])
+        assert stats.kstest(off, "uniform").pvalue < 1e-3, target.names[j]
+
+
+def test_blocks_add_up(marginal: MarginalPosterior) -> None:
+    """A step in one block changes its part and no other."""
+    v = walkers(marginal, 2)
+    before, after = marginal.parts(v[:1])[0], v[:1].copy()
+    for i, block in enumerate(marginal.blocks):
+        after[:, block] = v[1:, block]
+        now = marginal.parts(after)[0]
+        assert now[i] != before[i]
+        np.testing.assert_allclose(np.delete(now, i), np.delete(before, i), rtol=1e-14)
+        after[:, block] = v[:1, block]
+    assert sorted(np.concatenate(marginal.blocks).tolist()) == list(range(marginal.dimension))
+
+
+def test_no_density_where_decays_are_overdamped(marginal: MarginalPosterior) -> None:
+    v = marginal.centre.copy()
+    v[[name for name, s in zip(marginal.names, marginal.target.scatter, strict=True) if not s].index("c")] = np.log(
+        30.0
+    )
+    assert marginal.batch(v[None])[0] == -np.inf
+
+
+def test_rigs_of_one_structure_share_compiled_code(tmp_path: Path) -> None:
+    sizes, values = [], []
+    for seed in (1, 2):
+        target, known = twin(tmp_path / f"rig{seed}", seed)
+        marginal = MarginalPosterior(target, approximate(target, known))
+        values.append(marginal.batch(marginal.centre[None])[0])
+        sizes.append(conditional._cache_size())
+    assert sizes[0] == sizes[1]
+    assert abs(values[0] - values[1]) > 1.0
+
+
+def test_nothing_to_integrate_out() -> None:
+    """All errors stated: the marginal posterior is the posterior."""
+    current = np.linspace(0.0, 2.0, 7)
+    columns = [bench.column("force", 2.0 * current, 0.05), bench.column("current", current, 0.02)]
+    rig = bench.rig(bench.table("motor_current", columns))
+    target = LogPosterior(rig, make_experiments(rig))
+    marginal = MarginalPosterior(target, approximate(target, {"K": 2.0}))
+    u = np.log(np.array([[1.9], [2.0], [2.1]]))
+    np.testing.assert_allclose(marginal.batch(u), np.asarray(target.batch(jnp.asarray(u))), rtol=1e-13)
+    whole, lp = marginal.restore(u, 3)
+    np.testing.assert_array_equal(whole, u)
+    np.testing.assert_allclose(lp, marginal.batch(u), rtol=1e-13)
