@@ -1,27 +1,19 @@
-"""THE parameter table: symbol, unit, meaning, LaTeX label, default prior. Priors, axes, report and README read it.
+"""THE parameter table: symbol, unit, meaning, LaTeX label, default prior, sign, and which leaf of the model it is.
 
-A parameter's *name* is its symbol, with a bracket where there is one per spring or per record: ``k2[soft]``,
-``noise_sd[free_vibration_1]``. Positive parameters are sampled through their logarithm, the others as they are.
+Priors, engines, command options, sweeps, axes, report and README read it. A parameter's *name* is its symbol, with a
+bracket where there is one per spring or per record: ``k2[soft]``, ``noise_sd[free_vibration_1]``. Positive parameters
+are sampled through their logarithm, the others as they are.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
-from scipy import stats
 
 #: A log-normal prior holds 95 % of its mass within median/factor .. median*factor.
-QUANTILE_975 = float(stats.norm.ppf(0.975))
-
-
-#: Symbols of standard deviations.
-SCATTERS = frozenset(
-    {
-        "noise_sd", "tilt_sd", "push_scatter", "sliding_scatter", "scatter",
-        "noise_x_rel", "noise_x_capsule", "noise_acceleration", "noise_current",
-    }
-)  # fmt: skip
+QUANTILE_975 = NormalDist().inv_cdf(0.975)
 
 
 @dataclass(frozen=True)
@@ -43,6 +35,8 @@ class Prior:
         if self.kind == "halfnormal":
             return np.abs(self.spread * rng.standard_normal(size))
         if self.kind == "positive_normal":
+            from scipy import stats
+
             low = -self.location / self.spread
             return self.location + self.spread * stats.truncnorm(low, np.inf).rvs(size, random_state=rng)
         return self.location + self.spread * rng.standard_normal(size)
@@ -60,15 +54,32 @@ class Prior:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One row of the table; ``of`` is the spring's or the record's name, "" where there is none."""
+    """One row of the table.
+
+    Attributes
+    ----------
+    prior : the default; None: the experiment or the weighing supplies it
+    physical : a property of the rig; else a nuisance of one record or table
+    of : the spring's or the record's name, "" where there is none
+    leaf : whether it is a field of ``CapsuleParameters`` ("capsule") or of a drive ("drive")
+    sign : what the model admits
+    scatter : a standard deviation, absolute or relative: it scales residuals, it moves no prediction
+    sampled : False for constants, which a fit never samples
+    table_1 : the paper's value (Table 1), SI
+    """
 
     symbol: str
     unit: str
     meaning: str
     latex: str
-    prior: Prior | None
+    prior: Prior | None = None
     physical: bool = True
     of: str = ""
+    leaf: Literal["capsule", "drive"] | None = None
+    sign: Literal["positive", "not negative", "any"] = "positive"
+    scatter: bool = False
+    sampled: bool = True
+    table_1: float | None = None
 
     @property
     def name(self) -> str:
@@ -80,14 +91,26 @@ class Parameter:
         return f"${self.latex}$ [{self.of}]" if self.of else f"${self.latex}$"
 
     @property
-    def scatter(self) -> bool:
-        """A standard deviation, absolute or relative: it scales residuals, it moves no prediction."""
-        return self.symbol in SCATTERS
-
-    @property
     def positive(self) -> bool:
         """Sampled through its logarithm."""
         return self.prior is None or self.prior.kind != "normal"
+
+    @property
+    def prior_can_be_stated(self) -> bool:
+        """Whether ``[prior]`` in rig.toml may override the default: it needs one, and not that of an experiment."""
+        return self.prior is not None and self.prior.kind in ("lognormal", "halfnormal")
+
+    def describe_prior(self) -> str:
+        """The default prior in one phrase, SI; "constant" where nothing is sampled."""
+        if not self.sampled:
+            return "constant"
+        return "by the experiment" if self.prior is None else self.prior.describe()
+
+    def admits(self, value: float | np.ndarray) -> np.ndarray:
+        """Elementwise: finite, and of the sign that the model admits."""
+        value = np.asarray(value)
+        bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": True}[self.sign]
+        return np.isfinite(value) & bound
 
 
 def _lognormal(median: float, factor: float) -> Prior:
@@ -98,62 +121,89 @@ def _halfnormal(scale: float) -> Prior:
     return Prior("halfnormal", 0.0, scale)
 
 
-#: Prior ``None``: there is no default, the experiment or the weighing supplies it.
+def _capsule(symbol: str, unit: str, meaning: str, latex: str, **others: object) -> Parameter:
+    return Parameter(symbol, unit, meaning, latex, leaf="capsule", **others)  # type: ignore[arg-type]
+
+
+def _drive(symbol: str, unit: str, meaning: str, latex: str, **others: object) -> Parameter:
+    return Parameter(symbol, unit, meaning, latex, leaf="drive", sign="any", **others)  # type: ignore[arg-type]
+
+
+def _nuisance(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | None = None) -> Parameter:
+    return Parameter(symbol, unit, meaning, latex, prior, physical=False, sign="any")
+
+
+def _scatter(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | None = None) -> Parameter:
+    return Parameter(symbol, unit, meaning, latex, prior, physical=False, scatter=True)
+
+
+#: Recorded channels of a forced run: name, unit, LaTeX subscript.
+_CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
+
 TABLE: Mapping[str, Parameter] = {
     row.symbol: row
     for row in (
-        Parameter("m1", "kg", "mass of the rod", "m_1", None),
-        Parameter("m2", "kg", "mass of the capsule", "m_2", None),
-        Parameter("k1", "N/m", "stiffness between rod and capsule", "k_1", _lognormal(1500.0, 1000.0)),
-        Parameter("c", "N s/m", "viscous damping between rod and capsule", "c", _lognormal(4.0, 1000.0)),
-        Parameter("mu", "1", "static friction coefficient, eq. (1)", r"\mu", _lognormal(0.4, 5.0)),
-        Parameter("v_s", "m/s", "Stribeck velocity, eq. (1)", "v_s", _lognormal(0.3, 10.0)),
-        Parameter("k2", "N/m", "stiffness of the support spring", "k_2", _lognormal(20e3, 1000.0)),
-        Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0)),
+        _capsule("m1", "kg", "mass of the rod", "m_1", table_1=0.110),
+        _capsule("m2", "kg", "mass of the capsule", "m_2", table_1=0.530),
+        _capsule(
+            "k1", "N/m", "stiffness between rod and capsule", "k_1", prior=_lognormal(1500.0, 1000.0),
+            sign="not negative", table_1=1420.0,
+        ),
+        _capsule(
+            "k2", "N/m", "stiffness of the support spring", "k_2", prior=_lognormal(20e3, 1000.0), sign="not negative"
+        ),
+        _capsule(
+            "c", "N s/m", "viscous damping between rod and capsule", "c", prior=_lognormal(4.0, 1000.0),
+            sign="not negative", table_1=3.89,
+        ),
+        _capsule(
+            "mu", "1", "static friction coefficient, eq. (1)", r"\mu", prior=_lognormal(0.4, 5.0),
+            sign="not negative", table_1=0.66,
+        ),
+        _capsule("v_s", "m/s", "Stribeck velocity, eq. (1)", "v_s", prior=_lognormal(0.3, 10.0), table_1=0.30),
+        _capsule("G", "m", "gap between rod and support spring", "G", sign="not negative"),
+        _capsule("g", "m/s^2", "acceleration of gravity", "g", sign="not negative", sampled=False, table_1=9.81),
+        _drive("P_d", "N", "amplitude of the drive", "P_d"),
+        _drive("Omega", "rad/s", "angular frequency of the drive", r"\Omega", sampled=False),
+        _drive("phase", "rad", "phase of the drive", r"\varphi", physical=False),
+        Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
-        Parameter("G", "m", "gap between rod and support spring in a run", "G", None),
-        Parameter("P_d", "N", "amplitude of the drive in a run", "P_d", None),
-        Parameter("I_d", "A", "amplitude of the current in a run", "I_d", None, physical=False),
-        Parameter("phase", "rad", "phase of the drive in a run", r"\varphi", None, physical=False),
-        Parameter("noise_sd", "m", "noise of a record", r"\sigma", None, physical=False),
-        Parameter("noise_x_rel", "m", "noise of x_rel in a run", r"\sigma_{x}", None, physical=False),
-        Parameter("noise_x_capsule", "m", "noise of x_capsule in a run", r"\sigma_{X2}", None, physical=False),
-        Parameter("noise_acceleration", "m/s^2", "noise of the acceleration in a run", r"\sigma_{a}", None, False),
-        Parameter("noise_current", "A", "noise of the current in a run", r"\sigma_{I}", None, physical=False),
-        Parameter("amplitude", "m", "first turning point of a decay", "a_0", None, physical=False),
-        Parameter("turning_time", "s", "time of the first turning point of a decay", "t_0", None, physical=False),
-        Parameter("x_start", "m", "x_rel at the start of a record", "x_0", None, physical=False),
-        Parameter("y_start", "m/s", "rate of x_rel at the start of a record", "y_0", None, physical=False),
+        _nuisance("I_d", "A", "amplitude of the current in a run", "I_d"),
+        _scatter("noise_sd", "m", "noise of a record", r"\sigma"),
         *(
-            Parameter(
-                f"ar1_{name}",
-                "1",
-                f"atanh of the noise's lag-1 correlation, {name} of a run",
-                r"\alpha",
+            _scatter(f"noise_{name}", unit, f"noise of {name} in a run", rf"\sigma_{{{index}}}")
+            for name, unit, index in _CHANNELS
+        ),
+        _nuisance("amplitude", "m", "first turning point of a decay", "a_0"),
+        _nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0"),
+        _nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
+        _nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
+        *(
+            _nuisance(
+                f"ar1_{name}", "1", f"atanh of the noise's lag-1 correlation, {name} of a run", r"\alpha",
                 Prior("normal", 0.0, 1.0),
-                False,
             )
-            for name in ("x_rel", "x_capsule", "acceleration_rod", "current")
+            for name, _, _ in _CHANNELS
         ),
-        Parameter("capsule_start", "m/s", "speed of the capsule at the start of a run", "v_0", None, physical=False),
-        Parameter(
-            "tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", _halfnormal(np.deg2rad(1.0)), False
+        _nuisance("capsule_start", "m/s", "speed of the capsule at the start of a run", "v_0"),
+        _scatter("tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", _halfnormal(np.deg2rad(1.0))),
+        _scatter(
+            "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", _halfnormal(0.05)
         ),
-        Parameter(
-            "push_scatter",
-            "1",
-            "relative scatter of mu from push to push",
-            r"s_\mathrm{push}",
-            _halfnormal(0.05),
-            False,
-        ),
-        Parameter(
-            "sliding_scatter", "1", "relative scatter of mu, steady sliding", r"s_\mathrm{sl}", _halfnormal(0.05), False
-        ),
-        Parameter("scatter", "N", "scatter about a calibration line", "s", None, physical=False),
+        _scatter("sliding_scatter", "1", "relative scatter of mu, steady sliding", r"s_\mathrm{sl}", _halfnormal(0.05)),
+        _scatter("scatter", "N", "scatter about a calibration line", "s"),
     )
-}
+}  # fmt: skip
+
+#: Fields of ``CapsuleParameters``, of ``Excitation``, and both: the leaves of the model.
+CAPSULE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "capsule"}
+DRIVE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "drive"}
+LEAVES: Mapping[str, Parameter] = {**CAPSULE_LEAVES, **DRIVE_LEAVES}
+#: What may be swept: every leaf, and the drive's frequency in Hz.
+SWEPT: Mapping[str, Parameter] = {**LEAVES, "f": _drive("f", "Hz", "frequency of the drive", "f", sampled=False)}
+#: The paper's Table 1, SI: what it states.
+TABLE_1: Mapping[str, float] = {s: row.table_1 for s, row in TABLE.items() if row.table_1 is not None}
 
 
 def parameter(symbol: str, of: str = "", prior: Prior | None = None) -> Parameter:

@@ -14,6 +14,7 @@ from capsule_id.experiments.free_vibration import experiment as free_vibration
 from capsule_id.experiments.motor_current import experiment as motor_current
 from capsule_id.experiments.static_friction import experiment as static_friction
 from capsule_id.experiments.support_spring import experiment as support_spring
+from capsule_id.parameters import TABLE_1
 from capsule_id.rig.schema import NAME_PATTERN
 from capsule_id.synthetic_runs import RUN_SPRINGS, make_runs, spring_priors, truths
 
@@ -22,14 +23,14 @@ from capsule_id.synthetic_runs import RUN_SPRINGS, make_runs, spring_priors, tru
 class Truth:
     """The parameters behind a synthetic rig, SI; the defaults are the paper's Table 1 and three of its springs."""
 
-    m1: float = 0.110
-    m2: float = 0.530
-    k1: float = 1420.0
-    c: float = 3.89
-    mu: float = 0.66
-    v_s: float = 0.30
-    K: float = 2.0
-    g: float = 9.81
+    m1: float = TABLE_1["m1"]
+    m2: float = TABLE_1["m2"]
+    k1: float = TABLE_1["k1"]
+    c: float = TABLE_1["c"]
+    mu: float = TABLE_1["mu"]
+    v_s: float = TABLE_1["v_s"]
+    K: float = TABLE_1["K"]
+    g: float = TABLE_1["g"]
     k2: Mapping[str, float] = field(default_factory=lambda: {"soft": 2420.0, "medium": 18960.0, "stiff": 56410.0})
 
     def with_values(self, values: Mapping[str, float]) -> "Truth":

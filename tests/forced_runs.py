@@ -12,7 +12,7 @@ from capsule_id.synthetic_runs import SyntheticRun, make_runs
 from tests.experiments import bench
 
 SAMPLES = 120
-NOISE = {"noise_x_rel": 1.1e-5, "noise_x_capsule": 5.2e-6, "noise_acceleration": 0.9, "noise_current": 4.8e-3}
+NOISE = {"noise_x_rel": 1.1e-5, "noise_x_capsule": 5.2e-6, "noise_acceleration_rod": 0.9, "noise_current": 4.8e-3}
 TRUTH = Truth().with_runs().flat()
 
 

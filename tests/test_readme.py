@@ -57,10 +57,7 @@ def test_the_installed_command_reads_the_folder_that_readme_names(tmp_path: Path
 
 
 def test_the_parameter_table_is_the_packages() -> None:
-    expected = {
-        symbol: [row.unit, row.meaning, row.prior.describe() if row.prior else "by the experiment"]
-        for symbol, row in TABLE.items()
-    }
+    expected = {symbol: [row.unit, row.meaning, row.describe_prior()] for symbol, row in TABLE.items()}
     assert rows("| symbol | unit | meaning | default prior |") == expected
 
 

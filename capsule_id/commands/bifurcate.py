@@ -20,7 +20,7 @@ from capsule_id.commands.progress import Progress
 from capsule_id.commands.sweep_output import publish_pair, remove_store, take_store
 from capsule_id.console import say
 from capsule_id.errors import InputError
-from capsule_id.physics.leaves import LEAVES, SWEPT
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVE_LEAVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
@@ -168,8 +168,8 @@ def _computed(
             raise InputError("k2 must be given", "the posterior has several springs or none", "add --spring or --k2")
         given = {name for name in LEAVES if getattr(args, name) is not None}
         leaves |= {name: column for name, column in draws.items() if name not in given}
-    p = CapsuleParameters(**{name: leaves[name] for name, leaf in LEAVES.items() if not leaf.drive})
-    e = Excitation(**{name: leaves[name] for name, leaf in LEAVES.items() if leaf.drive})
+    p = CapsuleParameters(**{name: leaves[name] for name in CAPSULE_LEAVES})
+    e = Excitation(**{name: leaves[name] for name in DRIVE_LEAVES})
     x = {axis.name: axis.values() for axis in axes}
     (over, grid), *_ = x.items()
     if args.posterior is not None:

@@ -9,23 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from capsule_id.errors import InputError
-from capsule_id.physics.leaves import LEAVES
+from capsule_id.parameters import LEAVES, TABLE_1
 
 # From the paper's Table 1; what is not here must be given.
-DEFAULTS: Mapping[str, float] = {
-    "m1": 0.11,
-    "m2": 0.53,
-    "k1": 1420.0,
-    "c": 3.89,
-    "mu": 0.66,
-    "v_s": 0.3,
-    "g": 9.81,
-    "phase": 0.0,
-}
-
-# Signs that the model asks for; what is in neither set must not be negative.
-POSITIVE = frozenset({"m1", "m2", "v_s"})
-SIGNED = frozenset({"P_d", "phase", "Omega"})
+DEFAULTS: Mapping[str, float] = {name: TABLE_1[name] for name in LEAVES if name in TABLE_1} | {"phase": 0.0}
 
 # Compiles the engines' loops as one function each, several times faster for a single run (internal to XLA's CPU part).
 WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
@@ -77,10 +64,11 @@ def _check_sign(name: str, value: float, place: str) -> None:
     InputError
         Too small a value; ``place`` says where it stands.
     """
-    if name in POSITIVE and not value > 0.0:
-        raise InputError(f"{name} must be positive", f"{place} {value:g}", "give a value above 0")
-    if name not in SIGNED and value < 0.0:
-        raise InputError(f"{name} must not be negative", f"{place} {value:g}", "give 0 or more")
+    row = LEAVES[name]
+    if not row.admits(value):
+        remedy = {"positive": "give a value above 0", "not negative": "give 0 or more", "any": "give a finite value"}
+        rule = f"must be {row.sign}" if row.sign == "positive" else "must not be negative"
+        raise InputError(f"{name} {rule}", f"{place} {value:g}", remedy[row.sign])
 
 
 def number(name: str, text: str) -> float:

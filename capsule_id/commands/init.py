@@ -29,7 +29,7 @@ name = "@NAME@"
 # g = { value = 9.81, unit = "m/s^2" }
 
 #: What was known before the measurement. Default priors are broad. Log-normal, 95 % within median/factor to
-#: median*factor: k1 c mu v_s K "k2[<spring>]". Half-normal by scale: tilt_sd push_scatter sliding_scatter.
+#: median*factor: k1 c mu v_s K F_dry c_q "k2[<spring>]". Half-normal by scale: tilt_sd push_scatter sliding_scatter.
 # [prior]
 # k1 = { median = 1500, factor = 3, unit = "N/m" }
 # tilt_sd = { scale = 1, unit = "deg" }

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from capsule_id.experiments.rough_values import rough_values
-from capsule_id.physics.leaves import SWEPT
+from capsule_id.parameters import SWEPT
 from capsule_id.records.columns import stated_gap, stated_Omega
 from capsule_id.records.drive import drive_of
 from capsule_id.records.label import measured_motion

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_values, number, prefer_whole_loops
 from capsule_id.errors import InputError
-from capsule_id.physics.leaves import LEAVES
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVE_LEAVES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.physics.smooth.engine import Smoothing
     from capsule_id.report.motion_files import write_motion
 
-    p = CapsuleParameters(**{name: values[name] for name, leaf in LEAVES.items() if not leaf.drive})
-    e = Excitation(**{name: values[name] for name, leaf in LEAVES.items() if leaf.drive})
+    p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES})
+    e = Excitation(**{name: values[name] for name in DRIVE_LEAVES})
     grid = np.linspace(0.0, end, samples)
     section = _section(values["Omega"], end)
     # Impacts are short: a picture needs more samples than a table may want.

@@ -13,7 +13,7 @@ from capsule_id.errors import InputError
 from capsule_id.motions.attractors import attractors_of
 from capsule_id.motions.points import SECTION, SEEN, SUMMARY, Columns
 from capsule_id.motions.response import Settling
-from capsule_id.physics.leaves import SWEPT
+from capsule_id.parameters import SWEPT
 from capsule_id.physics.model import CapsuleParameters, Excitation
 
 ATTRACTOR = {"units": "1", "long_name": "number of the attractor among those found here, -1 if the run failed"}

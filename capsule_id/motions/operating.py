@@ -18,8 +18,8 @@ from capsule_id.motions.blocks import Progress, compute
 from capsule_id.motions.datasets import grid_of
 from capsule_id.motions.points import SEEN, SUMMARY, points_of
 from capsule_id.motions.response import SETTLING, Settling
+from capsule_id.parameters import SWEPT
 from capsule_id.physics.batches import lanes_of
-from capsule_id.physics.leaves import SWEPT
 from capsule_id.physics.model import CapsuleParameters, Excitation
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.motions.response import Settled, Settling, settle
+from capsule_id.parameters import SWEPT
 from capsule_id.physics.batches import lanes_of
-from capsule_id.physics.leaves import SWEPT
 from capsule_id.physics.model import CapsuleParameters, Excitation, Initial
 
 Columns = dict[str, np.ndarray]  # name -> (points, ...)
@@ -73,8 +73,8 @@ def points_of(
         raise InputError("f and Omega are the same quantity", "both are swept", "leave one out")
     if "f" in leaves:
         leaves["Omega"] = 2.0 * np.pi * leaves.pop("f")
-    p = CapsuleParameters(**{**vars(p), **{name: x for name, x in leaves.items() if not SWEPT[name].drive}})
-    e = Excitation(**{**vars(e), **{name: x for name, x in leaves.items() if SWEPT[name].drive}})
+    p = CapsuleParameters(**{**vars(p), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "capsule"}})
+    e = Excitation(**{**vars(e), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "drive"}})
     (lanes, _), _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
     return Points(*lanes)
 

@@ -29,7 +29,7 @@ def write_posterior(result: Result, path: Path) -> None:
     if result.posterior is None:
         raise ValueError("nothing was sampled (point fit only): there is no posterior to write")
     # Exact masses and g need no row in the tables of the result.
-    units = {symbol: row.unit for symbol, row in TABLE.items()} | {"g": "m/s^2"}
+    units = {symbol: row.unit for symbol, row in TABLE.items()}
     for frame in (result.summary, result.nuisances):
         units |= {str(name): str(unit) for name, unit in frame["unit"].items()}
     groups = {

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from capsule_id.errors import InputError
-from capsule_id.physics.leaves import LEAVES
+from capsule_id.parameters import LEAVES
 
 
 def read_draws(path: Path, count: int, seed: int, spring: str | None = None) -> dict[str, np.ndarray]:

@@ -10,6 +10,8 @@ from math import inf, pi
 
 import numpy as np
 
+from capsule_id.parameters import TABLE
+
 NAME_PATTERN = r"[A-Za-z0-9._-]+"
 SHORTEST_RECORD = 8  # samples: six unknowns of a free decay (k1, c, amplitude, phase, offset, noise) and two to spare
 
@@ -178,5 +180,6 @@ RIG_QUANTITIES: Mapping[str, QuantityRule] = {
 }
 
 # [prior]: SI unit by key; "k2[<spring>]" has the unit of "k2"
-LOG_NORMAL_PRIORS: Mapping[str, str] = {"k1": "N/m", "c": "N*s/m", "mu": "1", "v_s": "m/s", "K": "N/A", "k2": "N/m"}
-HALF_NORMAL_PRIORS: Mapping[str, str] = {"tilt_sd": "rad", "push_scatter": "1", "sliding_scatter": "1"}
+_STATED = [row for row in TABLE.values() if row.prior_can_be_stated]
+LOG_NORMAL_PRIORS: Mapping[str, str] = {row.symbol: row.unit for row in _STATED if not row.scatter}
+HALF_NORMAL_PRIORS: Mapping[str, str] = {row.symbol: row.unit for row in _STATED if row.scatter}

@@ -10,7 +10,7 @@ from capsule_id.errors import InputError
 from capsule_id.motions.points import SEEN, SUMMARY
 from capsule_id.motions.response import Settling, response
 from capsule_id.motions.sweep import basins, continuation, diagram, motion_map, spread_starts
-from capsule_id.physics.leaves import SWEPT
+from capsule_id.parameters import SWEPT
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)

@@ -32,7 +32,7 @@ from capsule_id.views import Comparison, Finding
 NOISES = {
     "x_rel": "noise_x_rel",
     "x_capsule": "noise_x_capsule",
-    "acceleration_rod": "noise_acceleration",
+    "acceleration_rod": "noise_acceleration_rod",
     "current": "noise_current",
 }
 #: Default prior of a channel's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
