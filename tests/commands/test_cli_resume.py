@@ -20,7 +20,7 @@ from tests.cli_tools import CODE, environment, listing, small_rig
 WORDS = ("rig", "--quiet", "--max-steps", "60")
 #: A short run that is checked often and never converges, so that every ensemble goes on after several checks; and
 #: chains saved after every draw.
-SHORT = {"sampling.FIRST_CHECK": 15, "sampling.CHECK_EVERY": 15, "sampling.PILOT_STEPS": 60, "sampling.MAX_RHAT": 0.0}
+SHORT = {"ensembles.FIRST_CHECK": 15, "ensembles.CHECK_EVERY": 15, "ensembles.PILOT_STEPS": 60, "ensembles.MAX_RHAT": 0.0}
 SHORT |= {"chain_store.SAVE_EVERY": 0.0}
 
 
@@ -50,7 +50,7 @@ def here(uninterrupted: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def shorten(patch: pytest.MonkeyPatch) -> None:
     for name, value in SHORT.items():
-        patch.setattr(f"capsule_id.inference.{name}", value)
+        patch.setattr(f"capsule_id.inference.sampling.{name}", value)
 
 
 def die_in_progress(patch: pytest.MonkeyPatch, stage: str, draws: int, death: Callable[[], object]) -> None:
@@ -90,7 +90,7 @@ def test_an_ensemble_never_repeats_itself(here: Path) -> None:
     """emcee restarts from the state it is given; what follows a check of convergence must go on from the last draw."""
     with xr.open_datatree(here / "whole" / "posterior.nc", engine="h5netcdf") as tree:
         mu = tree["posterior"]["mu"].to_numpy()
-    assert mu.shape[1] > 2 * SHORT["sampling.CHECK_EVERY"]
+    assert mu.shape[1] > 2 * SHORT["ensembles.CHECK_EVERY"]
     states = np.unique(np.round(mu, 15), axis=1)
     assert states.shape == mu.shape
 
@@ -158,7 +158,7 @@ def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPa
 def test_killed_from_outside_and_resumed(here: Path) -> None:
     """SIGKILL at a real process: nothing of Python runs after it."""
     kill = "import os, signal\nfrom capsule_id.commands.fit import Progress\n"
-    kill += "from capsule_id.inference.sampling import chain_store, ensembles as sampling\n"
+    kill += "from capsule_id.inference.sampling import chain_store, ensembles\n"
     kill += "".join(f"{name} = {value}\n" for name, value in SHORT.items())
     kill += "call = lambda self, done, total, text: done > 100 and os.kill(os.getpid(), signal.SIGKILL)\n"
     kill += "Progress.__call__ = call\n"
