@@ -20,7 +20,12 @@ from tests.cli_tools import CODE, environment, listing, small_rig
 WORDS = ("rig", "--quiet", "--max-steps", "60")
 #: A short run that is checked often and never converges, so that every ensemble goes on after several checks; and
 #: chains saved after every draw.
-SHORT = {"ensembles.FIRST_CHECK": 15, "ensembles.CHECK_EVERY": 15, "ensembles.PILOT_STEPS": 60, "ensembles.MAX_RHAT": 0.0}
+SHORT = {
+    "ensembles.FIRST_CHECK": 15,
+    "ensembles.CHECK_EVERY": 15,
+    "ensembles.PILOT_STEPS": 60,
+    "ensembles.MAX_RHAT": 0.0,
+}
 SHORT |= {"chain_store.SAVE_EVERY": 0.0}
 
 
