@@ -140,6 +140,9 @@ def _scatter(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | No
 #: Recorded channels of a forced run: name, unit, LaTeX subscript.
 _CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
 
+#: Recorded channels of a forced run by name.
+CHANNELS = tuple(name for name, _, _ in _CHANNELS)
+
 TABLE: Mapping[str, Parameter] = {
     row.symbol: row
     for row in (

@@ -9,11 +9,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment, Theta
+from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.capsule_bench import CapsuleDecay, CapsulePushes
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.parts import parts_of
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
 from capsule_id.experiments.line import Line
@@ -60,12 +59,10 @@ def make_experiments(rig: Rig, which: str = "all") -> tuple[Experiment, ...]:
     return tuple(e for table in tables for e in _experiments_of(table, rig))
 
 
-def _experiments_of(table: Table, rig: Rig) -> list[Experiment]:
+def _experiments_of(table: Table, rig: Rig) -> tuple[Experiment, ...]:
     """One experiment; of a record that is to be cut, one a part."""
-    kinds = CAPSULE_KINDS if table.settings.get("forward") == "capsule" else KINDS
-    seconds = table.settings.get("segment")
-    parts = parts_of(table, seconds) if isinstance(seconds, float) else [table]
-    return [kinds[table.kind](part, rig) for part in parts]
+    kinds = CAPSULE_KINDS if table.settings.forward == "capsule" else KINDS
+    return kinds[table.kind].make(table, rig)
 
 
 def _check_scatter(tables: Sequence[Table]) -> None:
@@ -118,7 +115,7 @@ def compare(
     panels = []
     if friction:
         # Their local values differ in scatters only; together they know both mu and v_s where one of them does.
-        everything: list[Theta] = [
+        everything: list[ValuesBySymbol] = [
             {k: v for e in friction for k, v in e.local(point).items()} for point in (values, *draws)
         ]
         panels.append(friction_comparison(friction, everything[0], everything[1:]))

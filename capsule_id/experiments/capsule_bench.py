@@ -8,19 +8,19 @@ form is biased and the capsule model, the one of the forced runs with the drive 
 from types import ModuleType
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Start, Theta, no_design
+from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import friction_coefficient, slide_distance
 from capsule_id.experiments.misfit import Misfit, Moments
-from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.parameters import Prior, parameter
 from capsule_id.physics.model import CapsuleParameters, Excitation
-from capsule_id.rig.model import Quantity, Rig, Table
-from capsule_id.views import Finding
+from capsule_id.rig.model import Rig, Table
 
 #: No drive: its frequency means nothing then.
 OFF = Excitation(0.0, 1.0)
@@ -37,54 +37,52 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     Start of the motion and offset are the record's own; with ``spring`` and ``gap`` the rod may hit the support spring.
     """
 
-    model_name = "capsule model"  # pyright: ignore[reportAssignmentType, reportIncompatibleVariableOverride]
-    masses = ("m1", "m2")
-    ARRAYS = ("time", "values", "width", "reading_sd", "gap", "smoothing")
-    STATIC = ("model", "within_reach", "gap_known")
+    gap: float
+    within_reach: bool = eqx.field(static=True)
+    gap_known: bool = eqx.field(static=True)
+
+    checks = ()
+    tables = ()
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig)
-        gap = table.settings.get("gap")
-        self.within_reach = isinstance(gap, Quantity)
-        self.gap, self.gap_sd = (gap.value, gap.sd) if isinstance(gap, Quantity) else (FAR, 0.0)
-        self.gap_known = self.gap_sd == 0.0
+        FreeVibration.__init__(self, table, rig)
+        self.smoothing = None
+        gap = table.settings.gap
+        self.within_reach = gap is not None
+        self.gap = FAR if gap is None else gap.value
+        self.gap_known = gap is None or gap.sd == 0.0
+        rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")]
+        if gap is not None:
+            rows.append(parameter("k2", table.settings.spring))
+            if gap.sd > 0.0:
+                rows.append(parameter("G", table.label, Prior("positive_normal", gap.value, gap.sd)))
+        rows += self.motion_parameters(self.rough_decrement())
+        rows.append(parameter("noise_sd", table.label, self.noise_prior()))
+        self.about = About(table, rig, tuple(rows))
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        of, scale = self.label, float(np.ptp(self.values))
-        rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")]
-        if self.within_reach:
-            rows.append(parameter("k2", str(self.table.settings["spring"])))
-        if not self.gap_known:
-            rows.append(parameter("G", of, Prior("positive_normal", self.gap, self.gap_sd)))
-        rows.append(parameter("x_start", of, Prior("normal", 0.0, self.width)))
-        rows.append(parameter("y_start", of, Prior("normal", 0.0, self.width * self._rough.Omega_o)))
-        return (*rows, parameter("noise_sd", of, self.noise_prior(scale)))
+    def model_name(self) -> str:
+        return "capsule model"
 
-    def motion_of(self, theta: Theta) -> Any:
+    def motion_of(self, theta: ValuesBySymbol) -> Any:
         """(n,) x_rel of the model."""
         p = _capsule(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
         t = self.simulated(p, OFF, self.time, initial)
         return t.X1 - t.X2
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         raw = self.values - xp.asarray(self.motion_of(theta))
         return (Misfit(raw, self.reading_sd**2, 1.0, self.width * xp.ones((len(self.time), 1))),)
 
-    def summaries(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
-        return tuple(misfit.summary() for misfit in self.misfits(theta, xp))
+    def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
+        return Experiment.summaries(self, theta, xp)
 
     def starts(self) -> dict[str, Start]:
-        starts = super().starts() | self.starts_of_motion()
+        starts = super().starts() | self.starts_of_motion(self.rough_decrement())
         if not self.gap_known:
-            starts[f"G[{self.label}]"] = Start(self.gap, 0.5 * self.gap_sd / self.gap)
+            starts[f"G[{self.label}]"] = Start(self.gap, 0.5 * self.table.settings.gap.sd / self.gap)
         return starts
-
-    def lint(self, theta: Theta) -> list[Finding]:
-        """A slip and a hit are in the model."""
-        del theta
-        return []
 
 
 class CapsulePushes(CapsuleForward, DynamicFriction):
@@ -93,27 +91,27 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
     Variances are those of the locked rod (first order in reading errors and scatter).
     """
 
-    masses = ("m1", "m2")
-    ARRAYS = ("speed", "distance", "speed_sd", "distance_sd", "horizon", "smoothing")
-    STATIC = ("model",)
+    #: (n,) s at which every push has come to rest.
+    horizon: np.ndarray
+
+    # A push with the capsule model depends on k1 and c too: by itself it is no friction test.
+    checks = ()
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig)
-        #: (n,) s at which every push has come to rest.
+        DynamicFriction.__init__(self, table, rig)
+        self.smoothing = None
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
+        rows = tuple(parameter(symbol) for symbol in ("k1", "c", "mu", "v_s", "push_scatter"))
+        self.about = About(table, rig, rows)
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (*(parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")), parameter("push_scatter"))
-
-    def slide(self, theta: Theta, xp: ModuleType = jnp) -> Any:
+    def slide(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
         """(n,) m that the capsule goes."""
         still, v = xp.zeros(self.n), xp.asarray(self.speed)
         times = xp.stack([xp.zeros(self.n), xp.asarray(self.horizon)], axis=1)
         t = self.simulated(_capsule(theta, 0.0, FAR), OFF, times, (still, v, still, v))
         return xp.asarray(t.X2)[:, -1]
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         mu, v_s, g = theta["mu"], theta["v_s"], theta["g"]
         locked = slide_distance(self.speed, mu, v_s, g, xp)
         slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))
@@ -121,5 +119,5 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         return (Misfit(self.distance - self.slide(theta, xp), variance, locked, no_design(self.n, xp)),)
 
 
-def _capsule(theta: Theta, k2: Any, gap: Any) -> CapsuleParameters:
+def _capsule(theta: ValuesBySymbol, k2: Any, gap: Any) -> CapsuleParameters:
     return CapsuleParameters(G=gap, k2=k2, **{name: theta[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")})

@@ -1,32 +1,40 @@
-"""The capsule as a forward model: the exact one, or the smoothed one of some widths. Mixed into the experiments it predicts."""
+"""The capsule as a forward model: the exact one, or the smoothed one. Mixed into the experiments that it predicts."""
 
-from copy import copy
-from typing import Any, Literal, Self
+from typing import Any, Self
 
-import numpy as np
+import equinox as eqx
 from numpy.typing import ArrayLike
 
+from capsule_id.experiments.base import Experiment
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
 
 
-class CapsuleForward:
-    """An experiment that the capsule model predicts; ``smoothing`` (4,) are the smoothed model's widths, else zeros."""
+class CapsuleForward(Experiment):
+    """An experiment that the capsule model predicts.
+
+    Attributes
+    ----------
+    smoothing : widths of the smoothed model; None: the exact model
+    """
+
+    smoothing: Smoothing | None
 
     event_driven = True
-    model: Literal["exact", "smooth"] = "exact"
-    smoothing: Any = np.zeros(4)
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        return ("m1", "m2")
 
     def with_smoothing(self, widths: Smoothing | None) -> Self:
         """The same readings with the smoothed model of these ``widths`` as forward model; None: the exact one."""
-        other = copy(self)
-        other.model, other.smoothing = "exact", np.zeros(4)
-        if widths is not None:
-            numbers = (widths.velocity, widths.penetration, widths.rounding, widths.tolerance)
-            other.model, other.smoothing = "smooth", np.array([float(x) for x in numbers])
-        return other
+        return eqx.tree_at(lambda e: e.smoothing, self, widths, is_leaf=lambda x: x is None)
 
     def simulated(self, p: CapsuleParameters, e: Excitation, times: ArrayLike, initial: Any = None) -> Trajectory:
         """``simulate`` by this experiment's model."""
-        widths = None if self.model == "exact" else Smoothing(*(self.smoothing[i] for i in range(4)))
-        return simulate(p, e, times, initial, model=self.model, smoothing=widths)
+        model = "exact" if self.smoothing is None else "smooth"
+        return simulate(p, e, times, initial, model=model, smoothing=self.smoothing)
+
+    def advice_on_coloured_noise(self) -> str:
+        remedy = 'check spring, gap and friction law, or state noise = "ar1" where the sensor filters'
+        return f": look at its residuals and phase portrait, {remedy}"

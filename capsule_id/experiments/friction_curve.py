@@ -2,13 +2,14 @@
 
 from abc import abstractmethod
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import curve_fit
 
-from capsule_id.experiments.base import Experiment, Theta, band
+from capsule_id.experiments.base import Experiment, ValuesBySymbol, band
+from capsule_id.experiments.checks.friction import check_one_surface
 from capsule_id.views import Comparison, Curve, Points
 
 #: Gauss–Legendre nodes on (0, 1). 48 give 1e-12 relative up to v = 50 v_s (tests compare with the dilogarithm).
@@ -54,23 +55,26 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
 class FrictionExperiment(Experiment):
     """An experiment on the surface: it shares eq. (1), the paper's protocol and one panel with the others."""
 
-    role: Literal["static", "dynamic", "sliding"]
+    role: ClassVar[Literal["static", "dynamic", "sliding"]]
+    checks = (check_one_surface,)
 
     @abstractmethod
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Speed, m/s, and coefficient, as the paper reads them, (n,) each."""
 
-    def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return friction_comparison([self], theta, draws)
 
 
-def friction_comparison(experiments: list[FrictionExperiment], theta: Theta, draws: list[Theta]) -> Comparison:
+def friction_comparison(
+    experiments: list[FrictionExperiment], theta: ValuesBySymbol, draws: list[ValuesBySymbol]
+) -> Comparison:
     """Friction coefficient against velocity: readings, the paper's curve, ours with its band (paper, Fig. 2)."""
     points = [Points(e.label, *e.paper_points(), role=e.role) for e in experiments]
     top = max(float(np.max(p.x)) for p in points)
     speed = np.linspace(0.0, 1.15 * top if top > 0 else 1.0, 161)
 
-    def curve(values: Theta) -> np.ndarray:
+    def curve(values: ValuesBySymbol) -> np.ndarray:
         if "v_s" not in values:
             return np.full(speed.size, float(values["mu"]))
         return friction_coefficient(speed, values["mu"], values["v_s"], np)

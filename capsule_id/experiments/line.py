@@ -10,14 +10,16 @@ intercept is integrated out under a wide normal prior.
 
 from types import ModuleType
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Experiment, Start, Theta, axis_label, band
+from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, band
+from capsule_id.experiments.checks.lines import check_linearity, line_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Points
 
 #: Default prior of a scatter: log-normal, median 1 % of the range of y, factor 100.
@@ -25,51 +27,91 @@ SCATTER_MEDIAN, SCATTER_FACTOR = 0.01, 100.0
 
 
 class Line(Experiment):
-    """y against x; subclasses name the columns and the slope."""
+    """y against x; subclasses name the columns and the slope.
 
-    ARRAYS = ("x", "y", "x_sd", "y_sd", "width")
-    STATIC = ("scale_known", "sd_ratio")
+    Attributes
+    ----------
+    x, y : (n,) the readings, SI
+    x_sd, y_sd : stated reading errors, SI
+    width : sd of the intercept's prior
+    sd_ratio : stated ratio of both errors; None: not stated
+    symbol : of the slope
+    errors_known : both reading errors are stated
+    """
 
-    def __init__(self, table: Table, rig: Rig, x: str, y: str, slope: Parameter) -> None:
-        super().__init__(table, rig)
-        self.x_column, self.y_column, self.slope = table.columns[x], table.columns[y], slope
-        self.x, self.y = self.x_column.values, self.y_column.values
-        self.x_sd, self.y_sd = self.x_column.reading_sd, self.y_column.reading_sd
-        self.width = NUISANCE_WIDTH * float(np.ptp(self.y))
-        ratio = table.settings.get("sd_ratio")
-        self.sd_ratio = None if ratio is None else float(ratio)  # type: ignore[arg-type]
-        self.scale_known = self.x_column.sd is not None and self.y_column.sd is not None
-        self.scatters = (None,) if self.scale_known else ("scatter",)
+    x: np.ndarray
+    y: np.ndarray
+    x_sd: float
+    y_sd: float
+    width: float
+    sd_ratio: float | None
+    symbol: str = eqx.field(static=True)
+    x_name: str = eqx.field(static=True)
+    y_name: str = eqx.field(static=True)
+    errors_known: bool = eqx.field(static=True)
+
+    estimates_may_be_negative = True
+    checks = (check_linearity,)
+    tables = (line_table,)
+
+    def __init__(self, table: Table, rig: Rig, x: str, y: str, slope: Parameter, sd_ratio: float | None) -> None:
+        self.x_name, self.y_name, self.symbol = x, y, slope.symbol
+        x_column, y_column = table.columns[x], table.columns[y]
+        self.x, self.y = x_column.values, y_column.values
+        self.x_sd, self.y_sd = x_column.reading_sd, y_column.reading_sd
+        size = float(np.ptp(self.y))
+        self.width = NUISANCE_WIDTH * size
+        self.sd_ratio = sd_ratio
+        self.errors_known = x_column.sd is not None and y_column.sd is not None
+        scatter = parameter("scatter", table.label, Prior("lognormal", SCATTER_MEDIAN * size, SCATTER_FACTOR))
+        self.about = About(table, rig, (slope,) if self.errors_known else (slope, scatter))
+
+    @property
+    def slope(self) -> Parameter:
+        return self.parameters[0]
+
+    @property
+    def scale_known(self) -> bool:
+        return self.errors_known
+
+    @property
+    def scatters(self) -> tuple[str | None, ...]:
+        return (None,) if self.errors_known else ("scatter",)
+
+    @property
+    def x_column(self) -> Column:
+        return self.table.columns[self.x_name]
+
+    @property
+    def y_column(self) -> Column:
+        return self.table.columns[self.y_name]
 
     @property
     def errors(self) -> str:
         """How the errors are modelled, in words for the report."""
-        if self.scale_known:
+        if self.errors_known:
             return "errors in both columns, as stated"
         if self.sd_ratio is not None:
             return "errors in both columns, their ratio as stated, their size estimated"
         return "one total scatter about the line (the reading errors of both columns are not stated)"
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        if self.scale_known:
-            return (self.slope,)
-        prior = Prior("lognormal", SCATTER_MEDIAN * float(np.ptp(self.y)), SCATTER_FACTOR)
-        return self.slope, parameter("scatter", self.label, prior)
+    def table_extras(self) -> dict[str, float]:
+        """Further columns of the table of calibration lines, name with unit -> number."""
+        return {}
 
     @property
     def observed(self) -> np.ndarray:
         return self.y
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
-        slope, design = theta[self.slope.symbol], self.width * xp.ones((self.n, 1))
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        slope, design = theta[self.symbol], self.width * xp.ones((self.n, 1))
         # Readings scatter in y, and in x where the ratio of both errors is stated.
         across = 0.0 if self.sd_ratio is None else (slope / self.sd_ratio) ** 2
-        estimated = 0.0 if self.scale_known else 1.0
+        estimated = 0.0 if self.errors_known else 1.0
         fixed, scale = self.y_sd**2 + slope**2 * self.x_sd**2, estimated * xp.sqrt(1.0 + across)
         return (Misfit(self.y - slope * self.x, fixed, scale, design, (self.y_sd**2, estimated)),)
 
-    def intercept(self, theta: Theta) -> float:
+    def intercept(self, theta: ValuesBySymbol) -> float:
         """Conditional mean of y0, SI."""
         return float(self.nuisance_mean(theta)[0] * self.width)
 
@@ -82,17 +124,17 @@ class Line(Experiment):
     def starts(self) -> dict[str, Start]:
         slope, _, sd = self.ordinary_line()
         starts = {self.slope.name: Start(abs(slope), 0.4)}
-        if not self.scale_known:
+        if not self.errors_known:
             starts[f"scatter[{self.label}]"] = Start(max(sd, 1e-6 * float(np.ptp(self.y))), 0.3)
         return starts
 
-    def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         x_unit, y_unit = self.x_column.to_display, self.y_column.to_display
         low, high = np.min(self.x), np.max(self.x)
         x = np.linspace(low - 0.04 * (high - low), high + 0.04 * (high - low), 60)
 
-        def line(values: Theta) -> np.ndarray:
-            return (self.intercept(values) + values[self.slope.symbol] * x) * y_unit
+        def line(values: ValuesBySymbol) -> np.ndarray:
+            return (self.intercept(values) + values[self.symbol] * x) * y_unit
 
         lower, upper = band(np.array([line(draw) for draw in draws]))
         slope, intercept, _ = self.ordinary_line()

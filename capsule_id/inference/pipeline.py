@@ -1,7 +1,7 @@
 """The whole path from a rig to a result: experiments, log-posterior, point fit, sample, checks."""
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -10,21 +10,18 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments import compare, make_experiments, paper_estimates
-from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.inference.checks.experiment_checks import Setting
-from capsule_id.inference.checks.run_checks import check_agreement, check_runs
+from capsule_id.inference.checks.agreement import check_agreement
+from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import informed, run_checks
-from capsule_id.inference.fit.point_stage import BenchFit, fit_points
-from capsule_id.inference.result import PointFit, Posterior, Result
+from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.inference.result import PointFit, Posterior, Result, RunRecord
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, Progress, sample
 from capsule_id.inference.tables.notes import make_notes
-from capsule_id.inference.tables.run_notes import run_notes, run_records
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig
-from capsule_id.views import Comparison, Finding, NoteTable
+from capsule_id.views import Comparison, NoteTable
 
 #: Posterior draws behind bands and predictive p-values, and behind the pointwise log-likelihood.
 BAND_DRAWS = 200
@@ -37,7 +34,7 @@ PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "panda
 def fit_rig(
     rig: Rig,
     seed: int = 0,
-    which: str = "all",
+    experiments: str = "all",
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
     progress: Progress | None = None,
@@ -47,7 +44,7 @@ def fit_rig(
     Parameters
     ----------
     seed : every random number follows from it
-    which : "bench", "runs" or "all" experiments
+    experiments : "bench", "runs" or "all"
     budget : emcee steps of an ensemble; None draws no sample
     store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
     progress : see ``capsule_id.inference.sampling.ensembles.sample``
@@ -60,48 +57,43 @@ def fit_rig(
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
     if progress:
         progress(0, 1, "point fit")
-    stage = fit_points(rig, make_experiments(rig, which), seeds[0], sampled=budget is not None)
-    target, point, bench = stage.target, stage.fit, stage.bench
-    experiments = target.experiments
+    stage = fit_points(rig, make_experiments(rig, experiments), seeds[0], sampled=budget is not None)
+    target, point = stage.target, stage.fit
     posterior = None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point), seeds[1], budget, store, progress)
-    values = {**target.fixed, **point.values}
-    setting = Setting(rig, experiments, target, point, posterior, values)
-    findings, flagged = run_checks(setting)
-    findings += [*stage.findings, *_check_together(setting, bench)]
     rng = np.random.default_rng(seeds[2])
-    draws = _draws(target, posterior)
-    tables = _tables(rig, target, point, posterior, experiments)
+    values, draws = {**target.fixed, **point.values}, _draws(target, posterior)
+    setting = run_checks(Setting(target, point, posterior, values, draws, seeds[0]))
+    findings = (
+        *setting.findings,
+        *stage.findings,
+        *check_agreement(target, point, stage.bench.fit, stage.bench.sample),
+    )
+    tables = _tables(rig, target, point, posterior)
     return Result(
         rig=rig,
         summary=tables["physical"],
         nuisances=tables["nuisance"],
         point_fit=point,
         posterior=posterior,
-        findings=tuple(findings),
-        comparisons=_comparisons(experiments, values, draws, flagged, rng),
-        notes=(
-            *run_notes(target, point, posterior, bench, draws),
-            *make_notes(setting, findings, flagged, seeds[0]),
-            *_predictive(experiments, draws, rng),
-        ),
-        provenance=_provenance(rig, seed, which),
-        groups=_groups(target, experiments, posterior, rng),
-        records=run_records(target, point),
+        findings=findings,
+        comparisons=_comparisons(setting, rng),
+        notes=(*make_notes(setting, stage.bench), *_predictive(setting, rng)),
+        provenance=_provenance(rig, seed, experiments),
+        groups=_groups(target, posterior, rng),
+        records=_records(setting),
     )
 
 
-def _check_together(s: Setting, bench: BenchFit) -> list[Finding]:
-    """Findings on forced runs, and on runs and bench together; [] without runs."""
-    runs = [e for e in s.experiments if isinstance(e, ForcedRun)]
-    if not runs:
-        return []
-    return [*check_agreement(s.target, s.fit, bench.fit, bench.sample), *check_runs(runs, s.values)]
+def _records(s: Setting) -> tuple[RunRecord, ...]:
+    """Every record that can be looked at through the filter."""
+    views = (e.record_view(e.local(s.values)) for e in s.experiments)
+    return tuple(view for view in views if view is not None)
 
 
-def _provenance(rig: Rig, seed: int, which: str) -> dict[str, object]:
-    return {"seed": seed, "experiments": which, "versions": package_versions(PACKAGES), "files": dict(rig.files)}
+def _provenance(rig: Rig, seed: int, experiments: str) -> dict[str, object]:
+    return {"seed": seed, "experiments": experiments, "versions": package_versions(PACKAGES), "files": dict(rig.files)}
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:
@@ -117,35 +109,27 @@ def _draws(target: LogPosterior, posterior: Posterior | None) -> list[dict[str, 
     return [target.mapping(flat[i]) for i in np.linspace(0, len(flat) - 1, BAND_DRAWS).astype(int)]
 
 
-def _comparisons(
-    experiments: Sequence[Experiment],
-    values: Mapping[str, float],
-    draws: list[dict[str, float]],
-    flagged: Mapping[str, list[int]],
-    rng: np.random.Generator,
-) -> tuple[Comparison, ...]:
+def _comparisons(s: Setting, rng: np.random.Generator) -> tuple[Comparison, ...]:
     """Panels with flagged rows marked and predictive p-values filled in."""
-    by_label = {e.label: e for e in experiments}
+    by_label = {e.label: e for e in s.experiments}
     panels = []
-    for panel in compare(experiments, values, draws):
+    for panel in compare(s.experiments, s.values, s.draws):
         points = []
         for part in panel.points:
             mask = np.zeros(len(part.x), dtype=bool)
-            mask[flagged.get(part.label, [])] = True
+            mask[s.flagged.get(part.label, [])] = True
             points.append(replace(part, flagged=mask))
         own = by_label.get(panel.label)
-        p = None if own is None else own.predictive_p([own.local(d) for d in draws], rng)
+        p = None if own is None else own.predictive_p([own.local(d) for d in s.draws], rng)
         panels.append(replace(panel, points=tuple(points), predictive_p=p))
     return tuple(panels)
 
 
-def _predictive(
-    experiments: Sequence[Experiment], draws: list[dict[str, float]], rng: np.random.Generator
-) -> list[NoteTable]:
+def _predictive(s: Setting, rng: np.random.Generator) -> list[NoteTable]:
     """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
-    if not draws:
+    if not s.draws:
         return []
-    rows = {e.label: (e.kind, e.n, e.predictive_p([e.local(d) for d in draws], rng)) for e in experiments}
+    rows = {e.label: (e.kind, e.n, e.predictive_p([e.local(d) for d in s.draws], rng)) for e in s.experiments}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"]).rename_axis("experiment")
     caption = (
         "Chance that a replicate would miss the model by more than the readings do (chi-square discrepancy). Near 0: the "
@@ -154,11 +138,9 @@ def _predictive(
     return [NoteTable("Posterior predictive checks", caption, frame)]
 
 
-def _tables(
-    rig: Rig, target: LogPosterior, point: PointFit, posterior: Posterior | None, experiments: Sequence[Experiment]
-) -> dict[str, pd.DataFrame]:
+def _tables(rig: Rig, target: LogPosterior, point: PointFit, posterior: Posterior | None) -> dict[str, pd.DataFrame]:
     """The parameter table and the nuisance table; see ``Result``."""
-    paper = paper_estimates(experiments)
+    paper = paper_estimates(target.experiments)
     paper |= {name: mass.value for name, mass in (("m1", rig.m1), ("m2", rig.m2)) if mass is not None}
     known = informed(target, posterior, point)
     rows: list[tuple[Parameter, dict[str, object]]] = []
@@ -207,10 +189,9 @@ def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
     }
 
 
-def _groups(
-    target: LogPosterior, experiments: Sequence[Experiment], posterior: Posterior | None, rng: np.random.Generator
-) -> dict[str, object]:
+def _groups(target: LogPosterior, posterior: Posterior | None, rng: np.random.Generator) -> dict[str, object]:
     """What goes into posterior.nc beside the draws. The pointwise densities are those of every walker's last draw."""
+    experiments = target.experiments
     fixed = {name: value for name, value in target.fixed.items() if name != "g"}
     groups: dict[str, object] = {"fixed": fixed, "observed": {e.label: e.observed for e in experiments}}
     groups["prior"] = target.sample_prior(rng, PRIOR_DRAWS)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from capsule_id.records.view import RecordView
+from capsule_id.experiments.checks.context import RunRecord as RunRecord
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison as Comparison
 from capsule_id.views import Curve as Curve
@@ -79,15 +79,6 @@ class Posterior:
     moves: Mapping[str, float]
     steps: int
     thin: int
-
-
-@dataclass(frozen=True)
-class RunRecord:
-    """A forced run as the paper looks at it, ``force`` (n,) N: the fitted drive at its samples."""
-
-    name: str
-    view: RecordView
-    force: np.ndarray
 
 
 @dataclass(frozen=True)

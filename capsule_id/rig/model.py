@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,7 @@ class Table:
     label: str
     file: str
     columns: Mapping[str, Column]
-    settings: Mapping[str, object]
+    settings: Any
     rows: np.ndarray
 
     def __getitem__(self, name: str) -> np.ndarray:

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from capsule_id.errors import InputError
+from capsule_id.rig.loose_settings import loose
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Table
 from capsule_id.rig.rules import check_experiment, check_masses, check_prior_springs
 from capsule_id.rig.schema import (
@@ -164,7 +165,7 @@ def _read_experiment(document: TomlDocument, path: KeyPath, entry: dict[str, Any
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
     columns = {key: _with_reading_error(document, path, entry, column, rule) for key, column in file.columns.items()}
     _refuse_idle_reading_errors(document, path, entry, errors, file)
-    table = Table(kind, label, name, MappingProxyType(columns), MappingProxyType(settings), file.raw.rows)
+    table = Table(kind, label, name, MappingProxyType(columns), loose(kind, settings), file.raw.rows)
     check_experiment(document, path, table, file)
     return table, file.sha256
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.base import Theta
-from capsule_id.experiments.forced_run.experiment import NOISES, ForcedRun
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.read import read_rig
 from tests.cli_tools import DATA
@@ -39,7 +39,7 @@ def truth_of(target: LogPosterior) -> np.ndarray:
     return target.unconstrain(np.array([values[name] for name in target.names]))
 
 
-def density_of_run(run: ForcedRun, theta: Theta) -> float:
+def density_of_run(run: ForcedRun, theta: ValuesBySymbol) -> float:
     """log-density of one record: DOP853, Newton's second law, normal noise with a normal offset a channel."""
     drive = theta["K"] * theta["I_d"]
     names = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "g", "G", "phase")
@@ -59,7 +59,7 @@ def density_of_run(run: ForcedRun, theta: Theta) -> float:
     total = 0.0
     for i, name in enumerate(run.channels):
         r, n = run.values[i] - channels[name], len(run.time)
-        variance, offset = theta[NOISES[name]] ** 2 + run.reading_variance[i], run.widths[i] ** 2
+        variance, offset = theta[f"noise_{name}"] ** 2 + run.reading_variance[i], run.widths[i] ** 2
         quadratic = (r @ r - offset * np.sum(r) ** 2 / (variance + n * offset)) / variance
         total -= 0.5 * (quadratic + n * np.log(2.0 * np.pi * variance) + np.log1p(n * offset / variance))
     return float(total)

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments, paper_estimates
+from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import slide_distance
-from capsule_id.inference.checks.regression import refit
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.experiments.forced_run.experiment import NOISES, SETTLING_PERIODS, ForcedRun
+from capsule_id.experiments.forced_run.experiment import SETTLING_PERIODS, ForcedRun
 from capsule_id.experiments.forced_run.start import rough_start
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.model import simulate
@@ -27,7 +27,7 @@ def test_channels_are_independent_normal_densities_with_offsets_integrated_out(n
     run = make(number)
     observed = [recorded()[number].channels[name][:SAMPLES] for name in run.channels]
     expected = sum(
-        density(y, seen, NOISE[NOISES[name]] ** 2 * np.eye(SAMPLES))
+        density(y, seen, NOISE[f"noise_{name}"] ** 2 * np.eye(SAMPLES))
         for name, y, seen in zip(run.channels, observed, channels(number), strict=True)
     )
     assert float(run.log_likelihood(theta(number), np)) == pytest.approx(expected, rel=1e-9)
@@ -80,9 +80,9 @@ def test_runs_of_both_kinds_of_start_are_one_group_and_add_up() -> None:
     tables = [table(0), table(1)]
     rig = bench.rig(*tables)
     runs = [ForcedRun(own, rig) for own in tables]
-    assert [run.start for run in runs] == ["moving", "stuck"]
+    assert [run.about.start for run in runs] == ["moving", "stuck"]
     target = LogPosterior(rig, runs)
-    assert len(target.structure.groups) == 1
+    assert len(target.groups) == 1
     rng = np.random.default_rng(0)
     centre = {name: start.centre for name, start in target.starts().items()}
     u = target.unconstrain(np.array([centre[name] for name in target.names]))

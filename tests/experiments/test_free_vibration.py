@@ -5,14 +5,15 @@ from functools import partial
 from typing import Any
 
 import bench
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from capsule_id.experiments.checks.series import autocorrelation, ljung_box
 from capsule_id.experiments.free_vibration.decay_moments import fold
-from capsule_id.experiments.free_vibration.experiment import FreeVibration, autocorrelation
-from capsule_id.inference.checks.experiment_checks import ljung_box
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.compiling import COMPILE_QUICKLY
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -61,12 +62,12 @@ def cramer_rao() -> np.ndarray:
     return (np.sqrt(np.diag(np.linalg.inv((j / scale).T @ (j / scale)))) / scale)[:2]
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=COMPILE_QUICKLY)
+@partial(jax.jit, compiler_options=COMPILE_QUICKLY)
 def _newton(first: FreeVibration, values: Any, folded: Any) -> tuple[Any, Any]:
     """Maxima (count, 3) of the package's log-likelihood of each record in ln k1, ln c, ln noise; standard errors."""
 
     def one(record: tuple[Any, Any]) -> tuple[Any, Any]:
-        own = first.with_arrays({"values": record[0], "folded": record[1], "width": 10.0 * jnp.ptp(record[0])})
+        own = eqx.tree_at(lambda e: (e.values, e.folded, e.width), first, (*record, 10.0 * jnp.ptp(record[0])))
 
         def log_likelihood(v: Any) -> Any:
             k1, c, noise = jnp.exp(v)

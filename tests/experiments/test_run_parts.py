@@ -7,10 +7,11 @@ import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.parts import leads, parts_of, record_of
-from capsule_id.experiments.forced_run.restart import better_start, restarted
+from capsule_id.experiments.forced_run.parts import parts_of
+from capsule_id.experiments.forced_run.restart import better_start
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.model import simulate
+from capsule_id.rig.loose_settings import loose
 from capsule_id.rig.model import Quantity, Table
 from tests.experiments import bench
 from tests.forced_runs import make, recorded, table, theta
@@ -18,7 +19,7 @@ from tests.forced_runs import make, recorded, table, theta
 
 def test_parts_are_the_record_and_share_what_is_the_records() -> None:
     whole = table(0, samples=600, segment=0.2, P_d=Quantity(4.0, 0.1))
-    runs = make_experiments(bench.rig(whole))
+    runs = [e for e in make_experiments(bench.rig(whole)) if isinstance(e, ForcedRun)]
     assert [e.label for e in runs] == ["run_1~1", "run_1~2", "run_1~3"]
     np.testing.assert_array_equal(np.concatenate([e.table["x_rel"] for e in runs]), whole["x_rel"])
     np.testing.assert_array_equal(np.concatenate([e.table.rows for e in runs]), whole.rows)
@@ -26,13 +27,25 @@ def test_parts_are_the_record_and_share_what_is_the_records() -> None:
     shared = set.intersection(*names)
     assert {"k1", "K", "G[run_1]", "I_d[run_1]", "phase[run_1]", "noise_x_rel[run_1]"} <= shared
     assert {"x_start[run_1~2]", "y_start[run_1~2]"} <= names[1] - shared
-    assert [leads(e.table) for e in runs] == [True, False, False]
-    assert {record_of(e.table) for e in runs} == {"run_1"}
+    assert [e.about.leads for e in runs] == [True, False, False]
+    assert {e.about.record for e in runs} == {"run_1"}
     # The second reading of the drive's amplitude is counted once.
-    assert [isinstance(e, ForcedRun) and e.second_reading for e in runs] == [True, False, False]
+    assert [e.second_reading for e in runs] == [True, False, False]
     # Only the first part proposes where what they share may start: phases must not be averaged.
     assert "phase[run_1]" not in runs[1].starts()
     assert set(LogPosterior(bench.rig(whole), runs).starts()) == set.union(*names)
+
+
+def test_parts_of_a_part_belong_to_the_record() -> None:
+    """A part that is cut again shares gap, drive and noise with the whole record; one initial state each."""
+    (whole,) = ForcedRun.make(table(0, samples=600, P_d=Quantity(4.0, 0.1)), bench.rig())
+    parts = [again for part in whole.parts(0.3) for again in part.parts(0.15)]
+    assert len(parts) == 4
+    assert {e.about.record for e in parts} == {"run_1"}
+    assert [e.about.leads for e in parts] == [e.second_reading for e in parts] == [True, False, False, False]
+    names = [{row.name for row in e.parameters} for e in parts]
+    assert {"G[run_1]", "noise_x_rel[run_1]"} <= set.intersection(*names)
+    assert len({name for own in names for name in own if name.startswith("x_start[")}) == 4
 
 
 def test_a_record_shorter_than_a_part_stays_whole() -> None:
@@ -57,25 +70,25 @@ def delayed(seconds: float, **settings: object) -> ForcedRun:
     t = simulate(p, e, late, (run.truth.x_rel, run.truth.Y1, 0.0, run.truth.Y2))
     x = np.asarray(t.x_rel)
     columns = {**own.columns, "x_rel": replace(own.columns["x_rel"], values=x)}
-    changed: Table = replace(own, columns=columns, settings={**own.settings, "start": "moving"})
+    changed: Table = replace(own, columns=columns, settings=loose("forced_run", {**own.settings, "start": "moving"}))
     return ForcedRun(changed, bench.rig(changed))
 
 
 def test_a_delay_is_integrated_out_and_found() -> None:
     seconds, sd = 1e-4, 2e-4
     with_delay, without = (delayed(seconds, **setting) for setting in ({"x_rel_delay_sd": sd}, {}))
-    own = with_delay.scaled(theta(0))[0]
+    own = with_delay.scaled(theta(0), np)[0]
     rest, nuisances = own.at_nuisance_mean(np)
     assert sd * nuisances[-1] == pytest.approx(seconds, rel=0.03)
-    plain = without.scaled(theta(0))[0].at_nuisance_mean(np)[0]
+    plain = without.scaled(theta(0), np)[0].at_nuisance_mean(np)[0]
     assert np.sum(np.square(rest)) < 0.05 * np.sum(np.square(plain))
 
 
 def test_a_creeping_start_is_told_from_rest_by_the_whole_record() -> None:
     moving = theta(0)
     assert abs(moving["capsule_start"]) > 1e-3  # this run starts in motion
-    run = restarted(make(0, samples=600), 0.0)
-    assert run.start == "stuck"
+    run = make(0, samples=600).restarted(0.0)
+    assert run.about.start == "stuck"
     wrong = moving | {"y_start": moving["y_start"] + moving["capsule_start"], "capsule_start": 0.0}
     found = better_start(run, wrong)
     assert found is not None
@@ -85,7 +98,7 @@ def test_a_creeping_start_is_told_from_rest_by_the_whole_record() -> None:
 
 
 def test_a_start_that_fits_stands() -> None:
-    assert better_start(restarted(make(0, samples=600), theta(0)["capsule_start"]), theta(0)) is None
+    assert better_start(make(0, samples=600).restarted(theta(0)["capsule_start"]), theta(0)) is None
     stuck = make(2, samples=600)
-    assert stuck.start == "stuck"
+    assert stuck.about.start == "stuck"
     assert better_start(stuck, theta(2)) is None

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.run_checks import check_agreement
+from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
 from capsule_id.inference.pipeline import fit_rig
 from capsule_id.rig.read import read_rig

@@ -1,13 +1,13 @@
 """Targets without readings: experiments that name parameters only, and known densities to sample from."""
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Experiment, Start, Theta, no_design
+from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
@@ -23,28 +23,19 @@ class Nothing(Experiment):
 
     def __init__(self, rows: Sequence[Parameter]) -> None:
         empty = Table("nothing", "nothing", "nothing.csv", {}, {}, np.zeros(0, dtype=int))
-        super().__init__(empty, rig_without_tables())
-        self.rows = tuple(rows)
-
-    @property
-    def signature(self) -> Hashable:
-        return type(self), self.rows
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return self.rows
+        self.about = About(empty, rig_without_tables(), tuple(rows))
 
     @property
     def observed(self) -> np.ndarray:
         return np.zeros(0)
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         return (Misfit(xp.zeros(0), 1.0, 0.0, no_design(0, xp)),)
 
     def starts(self) -> dict[str, Start]:
         return {}
 
-    def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         raise NotImplementedError
 
 

@@ -14,10 +14,10 @@ from scipy.signal import find_peaks
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.experiments.free_vibration.tables import DAMPING_MODELS
+from capsule_id.inference.fit.point_fit import bic, point_fit
 from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
-from capsule_id.inference.tables.notes import DAMPING_MODELS, bic
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity

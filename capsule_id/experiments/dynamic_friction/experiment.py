@@ -5,10 +5,10 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Start, Theta, no_design
+from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient, slide_distance
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.parameters import Parameter, parameter
+from capsule_id.parameters import parameter
 from capsule_id.rig.model import Rig, Table
 
 
@@ -19,25 +19,28 @@ class DynamicFriction(FrictionExperiment):
     push to push, to first order (d is proportional to 1/mu).
     """
 
+    speed: np.ndarray
+    distance: np.ndarray
+    speed_sd: float
+    distance_sd: float
+
     role = "dynamic"
-    scatters = ("push_scatter",)
-    ARRAYS = ("speed", "distance", "speed_sd", "distance_sd")
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig)
+        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), parameter("push_scatter")))
         self.speed, self.distance = table["speed"], table["distance"]
         self.speed_sd = table.columns["speed"].reading_sd
         self.distance_sd = table.columns["distance"].reading_sd
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return parameter("mu"), parameter("v_s"), parameter("push_scatter")
+    def scatters(self) -> tuple[str]:
+        return ("push_scatter",)
 
     @property
     def observed(self) -> np.ndarray:
         return self.distance
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         mu, v_s, g = theta["mu"], theta["v_s"], theta["g"]
         distance = slide_distance(self.speed, mu, v_s, g, xp)
         slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))

@@ -7,45 +7,61 @@ its own noise, and an offset that enters linearly and is integrated out (a gain 
 their sd is stated). X2 = 0 at the first sample by convention: X2 and the offset of x_capsule cannot both be free.
 """
 
-from dataclasses import replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Experiment, Start, Theta
-from capsule_id.experiments.forced_run.feasibility import feasibility
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import About, Start, ValuesBySymbol
+from capsule_id.experiments.checks.context import RunRecord
+from capsule_id.experiments.forced_run.feasibility import check_feasible
+from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts
 from capsule_id.experiments.forced_run.panels import run_comparisons
-from capsule_id.experiments.forced_run.parts import leads, record_of
-from capsule_id.experiments.forced_run.start import SPEED_FOUND, RunStart, rough_start
+from capsule_id.experiments.forced_run.parts import parts_of
+from capsule_id.experiments.forced_run.predictability import check_predictable, predictable_parts
+from capsule_id.experiments.forced_run.restart import corrected_start
+from capsule_id.experiments.forced_run.start import RunStart, rough_start
+from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
 from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.linear import NUISANCE_WIDTH
-from capsule_id.experiments.misfit import Misfit, ScaledMisfit
-from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.experiments.misfit import Misfit
+from capsule_id.parameters import CHANNELS
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
-from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.records.columns import stated_Omega
+from capsule_id.records.view import view_record
+from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Finding
 
-#: Channel of the table -> symbol of its noise; the order of the misfits.
-NOISES = {
-    "x_rel": "noise_x_rel",
-    "x_capsule": "noise_x_capsule",
-    "acceleration_rod": "noise_acceleration_rod",
-    "current": "noise_current",
-}
-#: Default prior of a channel's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
-NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
-#: Default prior of the current's amplitude: log-normal about half its range.
-AMPLITUDE_FACTOR = 3.0
-#: sd of the normal prior of the drive's phase, rad: wide, and proper.
-PHASE_WIDTH = np.pi
 #: Periods from rest after which a motion counts as settled (start = "settled").
 SETTLING_PERIODS = 40
 
 
-class ForcedRun(CapsuleForward, Experiment):
+@dataclass(frozen=True)
+class AboutRun(About):
+    """What a run was made of.
+
+    Attributes
+    ----------
+    record : label of the record that the run is, or is a part of
+    leads : the run is a whole record, or the first part of one
+    start : the kind of initial state
+    start_is_open : no kind of initial state was stated
+    rough : state and drive at the first sample, read off the record (the speed by the model, where that found one)
+    """
+
+    record: str = field(compare=False)
+    leads: bool = field(compare=False)
+    start: str = field(compare=False)
+    start_is_open: bool = field(compare=False)
+    rough: RunStart = field(compare=False)
+
+
+class ForcedRun(CapsuleForward):
     """One record of the driven capsule.
 
     Initial state, by ``start`` in rig.toml: "stuck" (capsule at rest and held: Y2 = 0), "moving" (Y2 sampled too),
@@ -55,64 +71,123 @@ class ForcedRun(CapsuleForward, Experiment):
     The drive is K times the recorded current, whose amplitude and phase are sampled; without a current it is the stated
     P_d. Where both are there, P_d is a second reading of the same amplitude.
 
-    A part of a record (``run_parts``) has a start and offsets of its own; gap, drive, noise and delays are the record's.
+    A part of a record (``parts``) has an initial state and offsets of its own; gap, drive, noise and delays are the
+    record's.
+
+    Attributes
+    ----------
+    time, values : (n,) s and (channels, n) SI
+    widths : (channels,) sds of the offsets' priors, SI
+    gain_sd, delay_sd : (channels,) stated, 1 and s
+    reading_variance : (channels,) stated, SI
+    moves : factor of ``capsule_start``, 0 or 1: runs of both kinds are computed together
     """
 
-    time_series = True
-    masses = ("m1", "m2")
-    ARRAYS = (
-        "time", "values", "Omega", "gap", "drive", "drive_sd", "widths", "gains", "delays", "reading_variance",
-        "smoothing", "moves",
-    )  # fmt: skip
-    STATIC = (
-        "channels", "settled", "gap_known", "drive_known", "gained", "delayed", "coloured", "second_reading", "model",
-    )  # fmt: skip
+    about: AboutRun = eqx.field(static=True)
+    time: np.ndarray
+    values: np.ndarray
+    Omega: float
+    gap: float
+    drive: float
+    drive_sd: float
+    widths: np.ndarray
+    gain_sd: np.ndarray
+    delay_sd: np.ndarray
+    reading_variance: np.ndarray
+    moves: float
+    channels: tuple[str, ...] = eqx.field(static=True)
+    settled: bool = eqx.field(static=True)
+    gap_known: bool = eqx.field(static=True)
+    drive_known: bool = eqx.field(static=True)
+    has_gain: tuple[bool, ...] = eqx.field(static=True)
+    has_delay: tuple[bool, ...] = eqx.field(static=True)
+    coloured: bool = eqx.field(static=True)
+    second_reading: bool = eqx.field(static=True)
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig)
-        self.channels = tuple(name for name in NOISES if name in table.columns)
+    bench = False
+    time_series = True
+    checks = (check_feasible, check_predictable)
+    tables = (predicted_motion, scaled_groups)
+
+    def __init__(
+        self,
+        table: Table,
+        rig: Rig,
+        part_of: str | None = None,
+        leads: bool = True,
+        capsule_rate: float | None = None,
+        smoothing: Smoothing | None = None,
+    ) -> None:
+        """One record, or a part of one.
+
+        Parameters
+        ----------
+        part_of : label of the record; None: the table is a whole record
+        leads : False for a part in the middle of a record. The kind of its initial state is found anew, and a P_d that
+            is a second reading of the current's amplitude counts in the first part only.
+        capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or read off the record
+        """
+        settings, gap = table.settings, table.settings.gap
+        self.smoothing = smoothing
+        self.channels = tuple(name for name in CHANNELS if name in table.columns)
         self.time = table["time"]
         self.values = np.stack([table[name] for name in self.channels])
-        self.Omega = _angular_frequency(table)
-        self.spring = str(table.settings["spring"])
-        gap, drive = table.settings["gap"], table.settings.get("P_d")
-        assert isinstance(gap, Quantity), "the schema makes it one"
-        self.gap, self.gap_sd = gap.value, gap.sd
-        self.gap_known = gap.sd == 0.0
-        assert drive is None or isinstance(drive, Quantity), "the schema makes it one"
+        self.Omega = stated_Omega(table)
+        self.gap, self.gap_known = gap.value, gap.sd == 0.0
+        drive = settings.P_d if leads or not self.driven_by_current else None
         self.drive, self.drive_sd = (0.0, 0.0) if drive is None else (drive.value, drive.sd)
         self.drive_known = drive is not None and drive.sd == 0.0
-        self.reading_variance = np.array([table.columns[name].reading_sd ** 2 for name in self.channels])
-        self.ranges = np.array([max(float(np.ptp(y)), _floor(table, name)) for name, y in self._by_channel()])
-        self.widths = NUISANCE_WIDTH * self.ranges
-        self.gains, self.gained = self._asked_for("gain")
-        self.delays, self.delayed = self._asked_for("delay")
+        reading_sd = np.array([table.columns[name].reading_sd for name in self.channels])
+        self.reading_variance = reading_sd**2
+        # A channel that does not vary has the size of its reading step, or next to none.
+        ranges = np.maximum(np.ptp(self.values, axis=1), np.maximum(reading_sd, 1e-9))
+        self.widths = NUISANCE_WIDTH * ranges
+        self.gain_sd, self.has_gain = self._stated(settings, "gain")
+        self.delay_sd, self.has_delay = self._stated(settings, "delay")
         self.second_reading = self.driven_by_current and self.drive_sd > 0.0
-        self.coloured = table.settings.get("noise") == "ar1"
-        wanted = str(table.settings.get("start", "auto"))
-        self.start_is_open = wanted == "auto"
-        self.start = self.rough.kind if self.start_is_open else wanted
-        self.settled = self.start == "settled"
-        #: Factor of ``capsule_start``, so that runs of both kinds are computed together.
-        self.moves = float(self.start == "moving")
+        self.coloured = settings.noise == "ar1"
+        rough = rough_start(self.time, dict(zip(self.channels, self.values, strict=True)), self.Omega)
+        if capsule_rate is not None:
+            rough = replace(rough, capsule_rate=capsule_rate, kind="stuck" if capsule_rate == 0.0 else "moving")
+        is_open = settings.start == "auto" or not leads
+        start = rough.kind if is_open else settings.start
+        self.settled = start == "settled"
+        self.moves = float(start == "moving")
+        self.about = AboutRun(table, rig, (), part_of or table.label, leads, start, is_open, rough)
+        self.about = replace(self.about, parameters=run_parameters(self, ranges))
 
-    def _asked_for(self, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
+    @classmethod
+    def make(cls, table: Table, rig: Rig) -> "tuple[ForcedRun, ...]":
+        run, seconds = cls(table, rig), table.settings.segment
+        return (run,) if seconds is None else run.parts(seconds)
+
+    def parts(self, seconds: float) -> "tuple[ForcedRun, ...]":
+        """The record in parts of about ``seconds``; the run itself where it is no longer than that."""
+        tables = parts_of(self.table, seconds)
+        if len(tables) == 1:
+            return (self,)
+        return tuple(
+            ForcedRun(table, self.rig, self.about.record, self.about.leads and i == 0, smoothing=self.smoothing)
+            for i, table in enumerate(tables)
+        )
+
+    def restarted(self, capsule_rate: float) -> "ForcedRun":
+        """The same record with its capsule at this speed, m/s, at the first sample; 0: stuck."""
+        about = self.about
+        return ForcedRun(self.table, self.rig, about.record, about.leads, capsule_rate, self.smoothing)
+
+    def _stated(self, settings: Any, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
         """Stated sd of a gain or delay by channel, and whether there is one."""
-        keys = [f"{name}_{nuisance}_sd" for name in self.channels]
-        sds = np.array([float(self.table.settings.get(key, 0.0)) for key in keys])  # type: ignore[arg-type]
-        return sds, tuple(key in self.table.settings for key in keys)
+        sds = [getattr(settings, f"{name}_{nuisance}_sd") for name in self.channels]
+        return np.array([sd or 0.0 for sd in sds]), tuple(sd is not None for sd in sds)
 
-    def _by_channel(self) -> list[tuple[str, np.ndarray]]:
-        return list(zip(self.channels, self.values, strict=True))
-
-    @cached_property
+    @property
     def rough(self) -> RunStart:
-        """State and drive at the first sample, read off the record (the speed by the model, where that found one)."""
-        rough = rough_start(self.time, dict(self._by_channel()), self.Omega)
-        speed = self.table.settings.get(SPEED_FOUND)
-        if not isinstance(speed, float):
-            return rough
-        return replace(rough, capsule_rate=speed, kind="stuck" if speed == 0.0 else "moving")
+        return self.about.rough
+
+    @property
+    def spring(self) -> str:
+        return self.table.settings.spring
 
     @property
     def driven_by_current(self) -> bool:
@@ -124,68 +199,17 @@ class ForcedRun(CapsuleForward, Experiment):
         readings = list(self.values)
         return np.concatenate([*readings, [self.drive]] if self.second_reading else readings)
 
-    # -- parameters -------------------------------------------------------------------------------------------------
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        of, whole = self.label, record_of(self.table)
-        rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")] + [parameter("k2", self.spring)]
-        if not self.gap_known:
-            rows.append(parameter("G", whole, Prior("positive_normal", self.gap, self.gap_sd)))
-        if self.driven_by_current:
-            amplitude = 0.5 * float(np.ptp(self.table["current"]))
-            rows += [parameter("K"), parameter("I_d", whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
-        elif not self.drive_known:
-            rows.append(parameter("P_d", whole, Prior("positive_normal", self.drive, self.drive_sd)))
-        rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
-        if not self.settled:
-            length = NUISANCE_WIDTH * self.rough.length
-            rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
-            rows.append(parameter("y_start", of, Prior("normal", 0.0, self.Omega * length)))
-        if self.start == "moving":
-            rows.append(
-                parameter("capsule_start", of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length))
-            )
-        for name, scale in zip(self.channels, self.ranges, strict=True):
-            rows.append(parameter(NOISES[name], whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
-        if self.coloured:
-            rows += [parameter(f"ar1_{name}", whole) for name in self.channels]
-        return tuple(rows)
-
     @property
     def scatters(self) -> tuple[str | None, ...]:
-        own: tuple[str | None, ...] = tuple(NOISES[name] for name in self.channels)
+        own: tuple[str | None, ...] = tuple(f"noise_{name}" for name in self.channels)
         return (*own, None) if self.second_reading else own
 
     def starts(self) -> dict[str, Start]:
-        """From the record: nuisances alone; what the bench measures has its start there, or at its prior's centre."""
-        rough, of = self.rough, self.label
-        starts = self._starts_of_record() if leads(self.table) else {}
-        if not self.settled:
-            starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
-            starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * self.Omega * rough.length)
-        if self.start == "moving":
-            starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * self.Omega * rough.length)
-        return starts
-
-    def _starts_of_record(self) -> dict[str, Start]:
-        rough, of = self.rough, record_of(self.table)
-        starts = {f"phase[{of}]": Start(rough.phase, 0.02)}
-        if not self.gap_known:
-            starts[f"G[{of}]"] = Start(self.gap, 0.5 * self.gap_sd / self.gap)
-        if self.driven_by_current:
-            starts[f"I_d[{of}]"] = Start(rough.amplitude, 0.005)
-        elif not self.drive_known:
-            starts[f"P_d[{of}]"] = Start(self.drive, 0.5 * self.drive_sd / self.drive)
-        for name, noise in rough.noise.items():
-            starts[f"{NOISES[name]}[{of}]"] = Start(noise, 0.1)
-        if self.coloured:
-            starts |= {f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in self.channels}
-        return starts
+        return run_starts(self)
 
     # -- the motion and what is seen of it --------------------------------------------------------------------------
 
-    def capsule(self, theta: Theta) -> tuple[CapsuleParameters, Excitation]:
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Excitation]:
         """Parameters and drive of this run; leaves as in ``theta``."""
         gap = self.gap if self.gap_known else theta["G"]
         stated: Any = self.drive if self.drive_known else theta.get("P_d")
@@ -195,7 +219,7 @@ class ForcedRun(CapsuleForward, Experiment):
             force, self.Omega, theta["phase"]
         )
 
-    def motion(self, theta: Theta, xp: ModuleType = jnp) -> Trajectory:
+    def motion(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Trajectory:
         """The model's motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
         if self.settled:
@@ -208,7 +232,7 @@ class ForcedRun(CapsuleForward, Experiment):
         initial = (theta["x_start"], theta["y_start"] + Y2, 0.0, Y2)
         return self.simulated(p, e, self.time, initial)
 
-    def predict(self, theta: Theta, xp: ModuleType = jnp) -> list[Any]:
+    def predict(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> list[Any]:
         """Noise-free channels (n,), offsets and gains left out, in the order of ``channels``.
 
         Concrete values in ``theta`` may carry a batch axis (draws,): then (draws, n).
@@ -234,15 +258,15 @@ class ForcedRun(CapsuleForward, Experiment):
                 seen.append(column(theta["I_d"]) * drive)
         return seen
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
         parts = []
         for i, (name, seen) in enumerate(zip(self.channels, self.predict(theta, xp), strict=True)):
             columns = [self.widths[i] * xp.ones(len(self.time))]
-            if self.gained[i]:
-                columns.append(self.gains[i] * seen)
-            if self.delayed[i]:
+            if self.has_gain[i]:
+                columns.append(self.gain_sd[i] * seen)
+            if self.has_delay[i]:
                 # To first order in the delay, which is a part of a sampling step.
-                columns.append(-self.delays[i] * xp.gradient(seen) / xp.gradient(xp.asarray(self.time)))
+                columns.append(-self.delay_sd[i] * xp.gradient(seen) / xp.gradient(xp.asarray(self.time)))
             raw, design = self.values[i] - seen, xp.stack(columns, axis=1)
             if self.coloured:
                 parts.append(_coloured(raw, self.reading_variance[i], design, xp.tanh(theta[f"ar1_{name}"]), xp))
@@ -253,28 +277,39 @@ class ForcedRun(CapsuleForward, Experiment):
             parts.append(Misfit(xp.reshape(raw, (1,)), self.drive_sd**2, 0.0, xp.zeros((1, 0))))
         return tuple(parts)
 
-    # -- what the report sees -----------------------------------------------------------------------------------------
+    # -- what the fit, the checks and the report see -----------------------------------------------------------------
 
-    def scaled(self, theta: Theta) -> list[ScaledMisfit]:
-        """The misfits at the scatters of ``theta``, NumPy."""
-        return self._scaled(theta, np)
+    def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[ForcedRun, ...], list[Finding]]":
+        return predictable_parts(self, theta)
 
-    def lint(self, theta: Theta) -> list[Finding]:
-        theta = self.local(theta)
-        drive = theta["K"] * theta["I_d"] if self.driven_by_current else theta.get("P_d", self.drive)
-        gap = theta.get("G", self.gap)
-        settings = {**self.table.settings, "P_d": Quantity(float(drive)), "gap": Quantity(float(gap))}
-        return feasibility(replace(self.table, settings=settings), theta)
+    def corrected_start(self, theta: ValuesBySymbol) -> "tuple[ForcedRun, dict[str, float]] | None":
+        return corrected_start(self, theta)
 
-    def records(self, theta: Theta) -> list[tuple[str, np.ndarray]]:
-        scaled = self.scaled(theta)[: len(self.channels)]
+    def excess_noise(self, theta: ValuesBySymbol) -> float:
+        # Coloured noise does not show in a record by itself.
+        if self.coloured:
+            return 0.0
+        shown = [max(self.rough.noise[name], self.table.columns[name].reading_sd) for name in self.channels]
+        return max(float(theta[f"noise_{name}"]) / sd for name, sd in zip(self.channels, shown, strict=True))
+
+    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
+        """Through the filter, where x_rel is recorded and sampled evenly."""
+        _, e = self.capsule(theta)
+        try:
+            view = view_record(self.table, K=theta["K"] if self.driven_by_current else None)
+        except InputError:
+            return None
+        return RunRecord(self.label, view, np.asarray(e.P_d * np.cos(self.Omega * self.time + e.phase)))
+
+    def records(self, theta: ValuesBySymbol) -> list[tuple[str, np.ndarray]]:
+        scaled = self.scaled(theta, np)[: len(self.channels)]
         parts = zip(self.channels, scaled, strict=True)
         return [(f"{self.label} {name}", np.asarray(part.at_nuisance_mean(np)[0])) for name, part in parts]
 
-    def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return self.comparisons(theta, draws)[0]
 
-    def comparisons(self, theta: Theta, draws: list[Theta]) -> tuple[Comparison, ...]:
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         return run_comparisons(self, theta, draws)
 
 
@@ -287,14 +322,3 @@ def _coloured(raw: Any, variance: Any, design: Any, rho: Any, xp: ModuleType) ->
     first = 1.0 / xp.sqrt(1.0 - rho**2)
     scale = xp.concatenate([xp.reshape(first, (1,)), xp.ones(raw.shape[0] - 1)])
     return Misfit(whiten(raw), variance * scale**2, scale, whiten(design))
-
-
-def _angular_frequency(table: Table) -> float:
-    """Stated drive frequency, rad/s; ``rules.py`` sees to it that one is stated."""
-    stated = table.settings.get("Omega")
-    return float(stated) if stated is not None else 2.0 * np.pi * float(table.settings["f"])  # type: ignore[arg-type]
-
-
-def _floor(table: Table, name: str) -> float:
-    """A channel that does not vary has the size of its reading step, or next to none."""
-    return max(table.columns[name].reading_sd, 1e-9)

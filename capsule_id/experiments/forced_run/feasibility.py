@@ -4,15 +4,22 @@ It judges settings, not readings, of a run that starts from rest: before a fit w
 (``rough_values.py``), and just as well at fitted ones.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from capsule_id.experiments.checks.context import Fitted
+from capsule_id.experiments.forced_run.start import harmonic
 from capsule_id.physics.grazing import grazing_load
-from capsule_id.rig.model import Quantity, Table
+from capsule_id.records.columns import stated_gap, stated_Omega
+from capsule_id.rig.model import Table
 from capsule_id.views import Finding
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.forced_run.experiment import ForcedRun
 
 #: The name that every finding of this module carries.
 CHECK = "feasible"
@@ -30,34 +37,35 @@ HELD_DECAYS = 50.0
 
 
 @dataclass(frozen=True)
-class Drive:
-    """What rig.toml and the current say of one run, SI: angular frequency, amplitude, gap."""
+class RunConditions:
+    """Angular frequency and amplitude of the drive, and the gap, of one run, SI."""
 
     Omega: float
     P_d: float
     G: float
 
 
-def drive_of(table: Table, K: float) -> Drive:
-    """The drive of a forced run: P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
-    stated, gap = table.settings.get("P_d"), table.settings["gap"]
-    assert isinstance(gap, Quantity), "the schema asks for the gap of a forced run"
-    Omega = table.settings.get("Omega")
-    if Omega is None:
-        Omega = 2.0 * np.pi * float(table.settings["f"])  # type: ignore[arg-type]
-    Omega = float(Omega)  # type: ignore[arg-type]
-    P_d = stated.value if isinstance(stated, Quantity) else K * _amplitude(table["time"], table["current"], Omega)
-    return Drive(Omega, P_d, gap.value)
+def stated_conditions(table: Table, K: float) -> RunConditions:
+    """Of a forced run: P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
+    Omega, stated = stated_Omega(table), table.settings.P_d
+    P_d = K * harmonic(table["time"], table["current"], Omega)[0] if stated is None else stated.value
+    return RunConditions(Omega, P_d, stated_gap(table).value)
 
 
-def _amplitude(time: np.ndarray, values: np.ndarray, Omega: float) -> float:
-    """Amplitude of ``values`` (n,) at Omega by least squares, an offset beside it."""
-    design = np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones(len(time))], axis=1)
-    coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
-    return float(np.hypot(coefficients[0], coefficients[1]))
+def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
+    """Expected: every run can determine what it is made for, at the point fit."""
+    findings = []
+    for run in runs:
+        theta = run.local(fit.values)
+        p, e = run.capsule(theta)
+        conditions = RunConditions(run.Omega, float(e.P_d), float(p.G))  # pyright: ignore[reportArgumentType]
+        findings += feasibility(run.table, theta, conditions=conditions)
+    return findings
 
 
-def feasibility(table: Table, theta: Mapping[str, float], note: str = "") -> list[Finding]:
+def feasibility(
+    table: Table, theta: Mapping[str, float], note: str = "", conditions: RunConditions | None = None
+) -> list[Finding]:
     """Findings, level ``warn``, on one forced run; none where its settings can do what they are for.
 
     Parameters
@@ -65,8 +73,9 @@ def feasibility(table: Table, theta: Mapping[str, float], note: str = "") -> lis
     table : a ``forced_run``
     theta : values by symbol, SI: m1, m2, k1, c, mu, k2 (of this run's spring), g, and K where P_d is not stated
     note : where the values come from, added to every finding that rests on them
+    conditions : None: as stated
     """
-    drive = drive_of(table, theta.get("K", np.nan))
+    drive = conditions or stated_conditions(table, theta.get("K", np.nan))
     reached, touches = held_rod(theta, drive)
     F_b = theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"]
     without_contact = drive.P_d / float(grazing_load(theta["m1"], theta["k1"], theta["c"], 1.0, drive.Omega))
@@ -89,7 +98,7 @@ def feasibility(table: Table, theta: Mapping[str, float], note: str = "") -> lis
     return [Finding(CHECK, "warn", f"{table.label}: {text}{note}", table.label) for text in texts]
 
 
-def held_rod(theta: Mapping[str, float], drive: Drive) -> tuple[float, bool]:
+def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, bool]:
     """Largest |f|, N, that the rod puts on a capsule held at rest, starting from rest, and whether it ever touches.
 
     A capsule at rest stays there while |f| <= F_b, so this is exact for the question whether it sets off.
@@ -129,7 +138,7 @@ def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[s
     ]
 
 
-def _length(table: Table, theta: Mapping[str, float], drive: Drive) -> list[str]:
+def _length(table: Table, theta: Mapping[str, float], drive: RunConditions) -> list[str]:
     """Excitation periods left once the start has died out."""
     time, start = table["time"], DECAY_TIMES * 2.0 * theta["m1"] / theta["c"]
     period = 2.0 * np.pi / drive.Omega

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Theta, axis_label, band
-from capsule_id.experiments.free_vibration.experiment import autocorrelation
+from capsule_id.experiments.base import ValuesBySymbol, axis_label, band
+from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay, window_samples
 from capsule_id.views import Comparison, Curve, Points
 
@@ -21,13 +21,13 @@ BAND_DRAWS, LAGS = 50, 60
 PORTRAIT_ORDER = 3
 
 
-def run_comparisons(run: "ForcedRun", theta: Theta, draws: list[Theta]) -> tuple[Comparison, ...]:
+def run_comparisons(run: "ForcedRun", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
     """A panel per channel with prediction, 95 % band, residuals and their autocorrelation; then the phase portrait.
 
     ``theta`` is the point fit; bands come from at most ``BAND_DRAWS`` of ``draws`` and leave the noise out.
     """
     predicted = run.predict(theta, np)
-    scaled = run.scaled(theta)
+    scaled = run.scaled(theta, np)
     stacked = {name: np.array([draw[name] for draw in draws[:BAND_DRAWS]]) for name in (draws[0] if draws else {})}
     bands = run.predict(stacked, np) if draws else []
     panels = []
@@ -60,12 +60,12 @@ def run_comparisons(run: "ForcedRun", theta: Theta, draws: list[Theta]) -> tuple
     return tuple(panels)
 
 
-def _portrait(run: "ForcedRun", theta: Theta) -> list[Comparison]:
+def _portrait(run: "ForcedRun", theta: ValuesBySymbol) -> list[Comparison]:
     """Rate of x_rel against x_rel, [] where the record is sampled unevenly: measured through Savitzky–Golay."""
     index = run.channels.index("x_rel")
     values, unit = run.values[index], run.table.columns["x_rel"].to_display
     motion = run.motion(theta, np)
-    offset = run.scaled(theta)[index].at_nuisance_mean(np)[1][0] * run.widths[index]
+    offset = run.scaled(theta, np)[index].at_nuisance_mean(np)[1][0] * run.widths[index]
     x, y = np.asarray(motion.x_rel) + offset, np.asarray(motion.Y1 - motion.Y2)
     try:
         window = choose_window(run.time, values, PORTRAIT_ORDER)

@@ -12,18 +12,14 @@ from capsule_id.experiments.forced_run.start import PARABOLA_SAMPLES
 from capsule_id.rig.model import Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 
-#: Setting of a part: the label of its record. Labels of parts: the record's, this mark (no file name has it), a number.
-PART_OF, PART_MARK = "part_of", "~"
+#: Labels of parts: the record's, this mark (no file name has it), a number.
+PART_MARK = "~"
 #: A cut may move by this share of a part's length to where the motion is smooth.
 LEEWAY = 0.3
 
 
 def parts_of(table: Table, seconds: float) -> list[Table]:
-    """The record in parts of about ``seconds``; [``table``] where it is no longer than that.
-
-    A part that starts in the middle of the record may start in motion: its kind of start is found anew. Of a P_d that
-    is a second reading of the current's amplitude the first part keeps the only copy.
-    """
+    """The record in parts of about ``seconds``; [``table``] where it is no longer than that."""
     time = table["time"]
     count = max(1, min(round((time[-1] - time[0]) / seconds), len(time) // SHORTEST_RECORD))
     if count == 1:
@@ -67,21 +63,5 @@ def _roughness(table: Table) -> np.ndarray:
 
 
 def _part(table: Table, index: int, rows: slice) -> Table:
-    dropped = {"segment"}
-    if index > 0:
-        dropped |= {"start", "P_d"} if "current" in table.columns else {"start"}
-    settings = {name: value for name, value in table.settings.items() if name not in dropped}
     columns = {name: replace(column, values=column.values[rows]) for name, column in table.columns.items()}
-    label = f"{table.label}{PART_MARK}{index + 1}"
-    own = settings | {PART_OF: table.label}
-    return replace(table, label=label, columns=columns, settings=own, rows=table.rows[rows])
-
-
-def record_of(table: Table) -> str:
-    """Label of the record that ``table`` is, or is a part of."""
-    return str(table.settings.get(PART_OF, table.label))
-
-
-def leads(table: Table) -> bool:
-    """Whether it is a whole record, or the first part of one."""
-    return PART_OF not in table.settings or table.label == f"{record_of(table)}{PART_MARK}1"
+    return replace(table, label=f"{table.label}{PART_MARK}{index + 1}", columns=columns, rows=table.rows[rows])

@@ -6,15 +6,13 @@ from typing import Literal
 
 import numpy as np
 
-from capsule_id.experiments.free_vibration.decrement import noise_level
+from capsule_id.experiments.checks.series import noise_level
 
 #: Samples of the polynomials through the start of the record: a straight line tells whether the capsule moves, a
 #: parabola where the rod is and how fast.
 LINE_SAMPLES, PARABOLA_SAMPLES = 4, 9
 #: The capsule counts as moving where its rate at the start stands out of its standard error by this factor.
 MOVING = 4.0
-#: Setting of a run: the capsule's speed at its first sample, m/s, once a fit has found it; 0: stuck.
-SPEED_FOUND = "speed_found"
 #: Without a current the drive's phase is that of x_rel's fundamental, ahead by the lag of a rod of this frequency, rad/s,
 #: and damping ratio (the middle of the default priors): rough, and good enough for a start.
 ROD_FREQUENCY, ROD_DAMPING = 115.0, 0.16
@@ -53,7 +51,7 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
     channels : by column name, (n,) each, SI; at least one
     Omega : of the drive, rad/s
     """
-    noise = {name: max(_noise(y), 1e-5 * float(np.ptp(y)), 1e-12) for name, y in channels.items()}
+    noise = {name: max(noise_level(y), 1e-5 * float(np.ptp(y)), 1e-12) for name, y in channels.items()}
     amplitude, phase = float("nan"), 0.0
     if "current" in channels:
         amplitude, phase = harmonic(time, channels["current"], Omega)
@@ -78,13 +76,6 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
         if abs(slope) > MOVING * factor * noise["x_capsule"]:
             capsule_rate, kind = slope, "moving"
     return RunStart(kind, x_rel, rate, capsule_rate, length, amplitude, phase, noise)  # type: ignore[arg-type]
-
-
-def _noise(values: np.ndarray) -> float:
-    """sd of white noise from third differences, by their median: a contact or a stop spoils few of them."""
-    if len(values) < 8:
-        return noise_level(values)
-    return float(np.median(np.abs(np.diff(values, 3)))) / (0.6745 * np.sqrt(20.0))
 
 
 def harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> tuple[float, float]:

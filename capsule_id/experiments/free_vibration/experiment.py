@@ -1,14 +1,15 @@
 """Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
 
-from dataclasses import replace
-from functools import cached_property
 from types import ModuleType
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment, Start, Theta, axis_label, band
+from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, band
+from capsule_id.experiments.checks.series import autocorrelation, noise_level
+from capsule_id.experiments.free_vibration.checks import check_free_decay, check_stiffness
 from capsule_id.experiments.free_vibration.decay_models import (
     STEP_PHASE,
     dry_decay,
@@ -18,14 +19,15 @@ from capsule_id.experiments.free_vibration.decay_models import (
 )
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
 from capsule_id.experiments.free_vibration.decay_trend import describe_trend
-from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement, noise_level
+from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement
+from capsule_id.experiments.free_vibration.tables import damping_table, decay_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
-from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.rig.windows import decay_window
-from capsule_id.views import Comparison, Curve, Finding, Points
+from capsule_id.views import Comparison, Curve, Points
 
 #: Default prior of a record's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
@@ -40,30 +42,78 @@ class FreeVibration(Experiment):
     (``damping`` in rig.toml) act beside the viscous one; then the start of the motion is sampled with the rest.
     """
 
-    time_series = True
-    masses = ("m1",)
-    scatters = ("noise_sd",)
-    ARRAYS = ("time", "values", "width", "reading_sd", "side", "folded", "step")
-    STATIC = ("damping", "half_cycles", "substeps", "uniform")
+    time: np.ndarray
+    values: np.ndarray
+    width: float
+    reading_sd: float
+    side: float
+    folded: np.ndarray
+    step: float
+    damping: str = eqx.field(static=True)
+    half_cycles: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    uniform: bool = eqx.field(static=True)
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig)
-        self.column = table.columns["x_rel"]
+    time_series = True
+    checks = (check_stiffness, check_free_decay)
+    tables = (decay_table, damping_table)
+
+    def __init__(self, table: Table, rig: Rig, damping: str | None = None) -> None:
+        """``damping`` None: as stated in the settings."""
         time, self.values = decay_window(table)
-        self.time0 = float(time[0])
-        self.time = time - self.time0
-        self.damping = str(table.settings.get("damping", "viscous"))
+        self.time = time - float(time[0])
+        self.damping = damping or table.settings.damping
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
-        self.reading_sd = self.column.reading_sd
+        self.reading_sd = table.columns["x_rel"].reading_sd
         step = uniform_step(self.time)
         self.uniform = step is not None and self.damping == "viscous"
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
+        self.side, self.half_cycles, self.substeps = 1.0, 0, 0
+        self.about = About(table, rig, ())
+        rows = (parameter("k1"), parameter("c"))
+        noise = parameter("noise_sd", table.label, self.noise_prior())
+        if self.damping == "viscous":
+            self.about = About(table, rig, (*rows, noise))
+            return
+        rough, last = self.rough_decrement(), float(self.time[-1])
+        if self.damping == "dry":
+            self.side = float(np.sign(rough.peaks[0]))
+            # The frequency may turn out half as high again.
+            self.half_cycles = int(1.5 * rough.Omega_o * last / np.pi) + 4
+            amplitude = parameter(
+                "amplitude", table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH)
+            )
+            turning = parameter("turning_time", table.label, Prior("normal", 0.0, last))
+            self.about = About(table, rig, (*rows, parameter("F_dry"), noise, amplitude, turning))
+        else:
+            self.substeps = max(1, int(np.ceil(rough.Omega_o * np.max(np.diff(self.time)) / STEP_PHASE)))
+            self.about = About(table, rig, (*rows, parameter("c_q"), noise, *self.motion_parameters(rough)))
 
     def with_damping(self, damping: str) -> "FreeVibration":
         """The same record under another damping model."""
-        table = replace(self.table, settings={**self.table.settings, "damping": damping})
-        return FreeVibration(table, self.rig)
+        return FreeVibration(self.table, self.rig, damping)
+
+    def noise_prior(self) -> Prior:
+        """Default prior of the record's noise sd, m."""
+        return Prior("lognormal", NOISE_MEDIAN * float(np.ptp(self.values)), NOISE_FACTOR)
+
+    def motion_parameters(self, rough: Decrement) -> tuple[Parameter, Parameter]:
+        """x_rel and its rate at the first sample, with wide priors."""
+        x_start = parameter("x_start", self.label, Prior("normal", 0.0, self.width))
+        return x_start, parameter("y_start", self.label, Prior("normal", 0.0, self.width * rough.Omega_o))
+
+    @property
+    def scatters(self) -> tuple[str]:
+        return ("noise_sd",)
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        return ("m1",)
+
+    @property
+    def column(self) -> Column:
+        return self.table.columns["x_rel"]
 
     @property
     def observed(self) -> np.ndarray:
@@ -74,31 +124,7 @@ class FreeVibration(Experiment):
         """For the legend."""
         return f"{self.damping} damping"
 
-    @property
-    def noise_name(self) -> str:
-        return f"noise_sd[{self.label}]"
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        scale = float(np.ptp(self.values))
-        noise = parameter("noise_sd", self.label, self.noise_prior(scale))
-        shared = (parameter("k1"), parameter("c"))
-        if self.damping == "dry":
-            amplitude = parameter("amplitude", self.label, Prior("lognormal", scale, NUISANCE_WIDTH))
-            turning = parameter("turning_time", self.label, Prior("normal", 0.0, float(self.time[-1])))
-            return *shared, parameter("F_dry"), noise, amplitude, turning
-        if self.damping == "quadratic":
-            x_start = parameter("x_start", self.label, Prior("normal", 0.0, self.width))
-            y_start = parameter("y_start", self.label, Prior("normal", 0.0, self.width * self._rough.Omega_o))
-            return *shared, parameter("c_q"), noise, x_start, y_start
-        return *shared, noise
-
-    @staticmethod
-    def noise_prior(scale: float) -> Prior:
-        """Of a record whose range is ``scale``, m."""
-        return Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)
-
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         k1, c, m1 = theta["k1"], theta["c"], theta["m1"]
         one = xp.ones((len(self.time), 1))
         raw, design = self.values, one
@@ -120,7 +146,7 @@ class FreeVibration(Experiment):
             design = xp.concatenate([viscous_basis(self.time, k1, c, m1, xp), one], axis=1)
         return (Misfit(raw, self.reading_sd**2, 1.0, self.width * design),)
 
-    def summaries(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
+    def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         if not self.uniform or xp is np:
             return super().summaries(theta, xp)
         gamma, omega = rates(theta["k1"], theta["c"], theta["m1"])
@@ -135,10 +161,10 @@ class FreeVibration(Experiment):
             sampling_step(self.time)
         except InputError:
             return self.values
-        window = self.table.settings.get("smoothing_window")
+        window = self.table.settings.smoothing_window
         if window is None:
             window = choose_window(self.time, self.values, SMOOTHING_ORDER)
-        return savitzky_golay(self.time, self.values, float(window), SMOOTHING_ORDER)  # type: ignore[arg-type]
+        return savitzky_golay(self.time, self.values, window, SMOOTHING_ORDER)
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
         """The paper's k1 and c of this record, from the smoothed or the raw peaks."""
@@ -151,8 +177,7 @@ class FreeVibration(Experiment):
         assert self.rig.m1 is not None
         return self.rig.m1.value
 
-    @cached_property
-    def _rough(self) -> Decrement:
+    def rough_decrement(self) -> Decrement:
         """The paper's estimate, or, where too few peaks stand out, one from the first zero crossings."""
         decrement = self.paper_decrement()
         if decrement is not None and decrement.delta > 0.0:
@@ -164,29 +189,8 @@ class FreeVibration(Experiment):
         k1 = self.mass * omega**2
         return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * self.mass)))
 
-    @cached_property
-    def side(self) -> float:
-        """Sign of the first turning point; 1 where not needed."""
-        if self.damping != "dry":
-            return 1.0
-        return float(np.sign(self._rough.peaks[0]))
-
-    @cached_property
-    def half_cycles(self) -> int:
-        """Bound on the half cycles of the record, with room for a frequency half as high again; 0 where not needed."""
-        if self.damping != "dry":
-            return 0
-        return int(1.5 * self._rough.Omega_o * self.time[-1] / np.pi) + 4
-
-    @cached_property
-    def substeps(self) -> int:
-        """Runge–Kutta steps between two samples; 0 where not needed."""
-        if self.damping != "quadratic":
-            return 0
-        return max(1, int(np.ceil(self._rough.Omega_o * np.max(np.diff(self.time)) / STEP_PHASE)))
-
     def starts(self) -> dict[str, Start]:
-        rough = self._rough
+        rough = self.rough_decrement()
         # A start must keep in step with the record for as long as it rings, or it falls into a side lobe.
         ringing = min(self.time[-1], 4.0 * self.mass / rough.c)
         spread = min(0.3, 1.0 / (rough.Omega_o * ringing))
@@ -194,7 +198,7 @@ class FreeVibration(Experiment):
         starts = {
             "k1": Start(rough.k1, spread),
             "c": Start(rough.c, 0.3),
-            self.noise_name: Start(noise, 0.2),
+            f"noise_sd[{self.label}]": Start(noise, 0.2),
         }
         if self.damping == "dry":
             starts["F_dry"] = Start(0.02 * rough.k1 * abs(float(rough.peaks[0])), 0.3)
@@ -203,16 +207,16 @@ class FreeVibration(Experiment):
         elif self.damping == "quadratic":
             speed = rough.Omega_o * abs(float(rough.peaks[0]))
             starts["c_q"] = Start(0.5 * rough.c / speed, 0.3)
-            starts |= self.starts_of_motion()
+            starts |= self.starts_of_motion(rough)
         return starts
 
-    def starts_of_motion(self) -> dict[str, Start]:
+    def starts_of_motion(self, rough: Decrement) -> dict[str, Start]:
         """Of x_rel and its rate at the first sample."""
-        size = abs(float(self._rough.peaks[0]))
+        size = abs(float(rough.peaks[0]))
         rate = np.polyfit(self.time[:5], self.values[:5], 1)[0]
         return {
             f"x_start[{self.label}]": Start(float(self.values[0] - equilibrium(self.values)), 0.02 * size),
-            f"y_start[{self.label}]": Start(float(rate), 0.05 * self._rough.Omega_o * size),
+            f"y_start[{self.label}]": Start(float(rate), 0.05 * rough.Omega_o * size),
         }
 
     # -- what the report and the checks see -------------------------------------------------------------------------
@@ -223,44 +227,26 @@ class FreeVibration(Experiment):
         return float(np.max(np.abs(self.values - equilibrium(self.values))))
 
     def damping_trend(self) -> str:
-        """What the peaks say of damping and frequency against amplitude; "" where nothing drifts."""
+        """How the peaks show damping and frequency to vary with amplitude; "" where nothing drifts."""
         decrement = self.paper_decrement()
         return "" if decrement is None else describe_trend(decrement, noise_level(self.values))
 
-    def largest_force(self, theta: Theta) -> float:
+    def largest_force(self, theta: ValuesBySymbol) -> float:
         """max |f|, f = k1 x_rel + c d(x_rel)/dt, over the record, N."""
         x = self.smoothed() - equilibrium(self.values)
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.time))))
 
-    def lint(self, theta: Theta) -> list[Finding]:
-        findings = []
-        if self.table.settings.get("capsule", "held") == "free" and "mu" in theta and "m2" in theta:
-            force = self.largest_force(theta)
-            threshold = float(theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"])
-            if force > threshold:
-                text = (
-                    f"{self.label}: a free capsule stays at rest while |f| <= F_b = {threshold:.3g} N; the record "
-                    f"reaches {force:.3g} N, so the capsule slips and this is no free decay: hold the capsule, or "
-                    "release from a smaller deflection"
-                )
-                findings.append(Finding("free decay", "fail", text, self.label))
-        gap = self.table.settings.get("gap")
-        if isinstance(gap, Quantity):
-            reach, limit = float(np.max(self.values - equilibrium(self.values))), gap.value
-            if reach >= limit:
-                text = (
-                    f"{self.label}: x_rel reaches {reach:.3g} m, the support spring stands at {limit:.3g} m, so the "
-                    "rod hits it and this is no free decay: move the spring away, or start the window later"
-                )
-                findings.append(Finding("free decay", "fail", text, self.label))
-        return findings
+    def advice_on_coloured_noise(self) -> str:
+        drift = self.damping_trend()
+        remedy = "compare the damping models below, cut the record to free decay with start/stop"
+        return f"{'; ' + drift if drift else ''}: {remedy}"
 
-    def comparison(self, theta: Theta, draws: list[Theta]) -> Comparison:
-        def curve(values: Theta) -> np.ndarray:
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+        def curve(values: ValuesBySymbol) -> np.ndarray:
             misfit = self.misfit(values)
             return self.values - misfit.raw + misfit.design @ misfit.at_nuisance_mean(np)[1]
 
-        unit, time = self.column.to_display, self.time + self.time0
+        unit, time = self.column.to_display, self.time + float(decay_window(self.table)[0][0])
         lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)
         residuals = np.asarray(self.residuals(theta, np))[: self.n]
         return Comparison(
@@ -276,13 +262,6 @@ class FreeVibration(Experiment):
             autocorrelation(residuals, min(60, self.n // 4)),
             1.96 / float(np.sqrt(self.n)),
         )
-
-
-def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
-    """(lags,) sample autocorrelation at lags 1 .. lags."""
-    r = residuals - np.mean(residuals)
-    power = float(r @ r)
-    return np.array([float(r[lag:] @ r[:-lag]) for lag in range(1, lags + 1)]) / power
 
 
 def twin(

@@ -11,7 +11,7 @@ class MotorCurrent(Line):
     """Force against current: F = F0 + K I."""
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig, "current", "force", parameter("K"))
+        super().__init__(table, rig, "current", "force", parameter("K"), table.settings.sd_ratio)
 
 
 def twin(

@@ -3,13 +3,14 @@
 from types import ModuleType
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Start, Theta, no_design
+from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.parameters import Parameter, parameter
+from capsule_id.parameters import parameter
 from capsule_id.rig.model import Rig, Table
 
 
@@ -19,32 +20,37 @@ class SlidingFriction(FrictionExperiment):
     Variance: reading errors of y and of v (through the slope of eq. (1)) and the relative scatter of mu.
     """
 
+    speed: np.ndarray
+    values: np.ndarray
+    speed_sd: float
+    values_sd: float
+    quantity: str = eqx.field(static=True)
+
     role = "sliding"
-    scatters = ("sliding_scatter",)
-    ARRAYS = ("speed", "values", "speed_sd", "values_sd")
-    STATIC = ("quantity",)
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig)
-        self.speed = table["speed"]
+        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), parameter("sliding_scatter")))
         self.quantity = "force" if "force" in table.columns else "coefficient"
-        self.values = table[self.quantity]
-        self.masses = ("m1", "m2") if self.quantity == "force" else ()
+        self.speed, self.values = table["speed"], table[self.quantity]
         self.speed_sd = table.columns["speed"].reading_sd
         self.values_sd = table.columns[self.quantity].reading_sd
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return parameter("mu"), parameter("v_s"), parameter("sliding_scatter")
+    def scatters(self) -> tuple[str]:
+        return ("sliding_scatter",)
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        return ("m1", "m2") if self.quantity == "force" else ()
 
     @property
     def observed(self) -> np.ndarray:
         return self.values
 
-    def _weight(self, theta: Theta) -> Any:
+    def _weight(self, theta: ValuesBySymbol) -> Any:
         return (theta["m1"] + theta["m2"]) * theta["g"] if self.quantity == "force" else 1.0
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         mu, v_s, weight = theta["mu"], theta["v_s"], self._weight(theta)
         predicted = weight * friction_coefficient(self.speed, mu, v_s, xp)
         slope = -0.5 * weight * mu * xp.exp(-self.speed / v_s) / v_s

@@ -5,10 +5,10 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Start, Theta, no_design
+from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.parameters import Parameter, parameter
+from capsule_id.parameters import parameter
 from capsule_id.rig.model import Rig, Table
 
 
@@ -19,23 +19,24 @@ class StaticFriction(FrictionExperiment):
     is: the tilted board (sin = height/length) or the base (tan = height/length).
     """
 
+    angle: np.ndarray
+    reading_sd: np.ndarray
+
     role = "static"
-    scatters = ("tilt_sd",)
-    ARRAYS = ("angle", "reading_sd")
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig)
+        self.about = About(table, rig, (parameter("mu"), parameter("tilt_sd")))
         self.angle, self.reading_sd = _angles(table)
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return parameter("mu"), parameter("tilt_sd")
+    def scatters(self) -> tuple[str]:
+        return ("tilt_sd",)
 
     @property
     def observed(self) -> np.ndarray:
         return self.angle
 
-    def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         return (Misfit(self.angle - xp.arctan(theta["mu"]), self.reading_sd**2, 1.0, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +59,7 @@ def _angles(table: Table) -> tuple[np.ndarray, np.ndarray]:
     height, length = table.columns["height"], table.columns["length"]
     ratio = height.values / length.values
     ratio_sd = ratio * np.hypot(height.reading_sd / height.values, length.reading_sd / length.values)
-    if table.settings["length_is"] == "board":
+    if table.settings.length_is == "board":
         return np.arcsin(ratio), ratio_sd / np.sqrt(1.0 - ratio**2)
     return np.arctan(ratio), ratio_sd / (1.0 + ratio**2)
 

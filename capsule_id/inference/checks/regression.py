@@ -1,4 +1,4 @@
-"""Local regression diagnostics of one experiment at the point fit: outliers, curvature, estimates without a row.
+"""Local regression diagnostics of one experiment at the point fit: outliers.
 
 Everything is linearised: r is the vector of residuals in units of the noise, J its Jacobian with respect to the
 experiment's own parameters and linear nuisances, and the hat matrix J (J'J)^-1 J' says how far a reading pulls the fit
@@ -9,10 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
-from scipy.optimize import least_squares
 
-from capsule_id.experiments.base import Experiment, Theta
-from capsule_id.experiments.line import Line
+from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.inference.fit.curvature import jacobian
 
 #: Relative step of difference quotients.
@@ -35,7 +33,7 @@ def moving_symbols(experiment: Experiment) -> list[str]:
     return [row.symbol for row in experiment.parameters if not row.scatter]
 
 
-def design(experiment: Experiment, theta: Theta) -> tuple[np.ndarray, np.ndarray]:
+def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (n,) in units of the noise at the conditional mean of the nuisances, and J (n, p)."""
     symbols = moving_symbols(experiment)
 
@@ -51,7 +49,7 @@ def design(experiment: Experiment, theta: Theta) -> tuple[np.ndarray, np.ndarray
     return np.asarray(experiment.residuals(theta, np))[: experiment.n], columns
 
 
-def outliers(experiment: Experiment, theta: Theta, level: float) -> list[Outlier]:
+def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> list[Outlier]:
     """Readings whose externally studentised residual is too large at family-wise ``level`` (Bonferroni over rows).
 
     The largest is taken out and the rest judged again, up to ``MOST_FLAGGED`` rows. Where the noise is known the
@@ -82,56 +80,3 @@ def _studentised(r: np.ndarray, columns: np.ndarray, known: bool) -> tuple[np.nd
     freedom = len(r) - columns.shape[1] - 1
     variance = np.maximum((rest @ rest - rest**2 / free) / freedom, 1e-300)
     return rest / np.sqrt(variance * free), freedom
-
-
-def curvature_test(line: Line, theta: Theta, left_out: list[int]) -> tuple[float, float]:
-    """Is a calibration line bent? Relative departure at mid range of the best parabola, and the p-value of "none"."""
-    misfit = line.misfit(theta)
-    keep = np.setdiff1d(np.arange(line.n), left_out)
-    x, sd = line.x[keep], misfit.sd[keep]
-    if len(keep) < 4 or len(np.unique(x)) < 3:
-        return 0.0, 1.0
-    z = (x - np.mean(x)) / np.ptp(x)
-    columns = np.stack([np.ones_like(z), z, z**2], axis=1) / sd[:, None]
-    y = line.y[keep] / sd
-    coefficients, *_ = np.linalg.lstsq(columns, y, rcond=None)
-    rest = y - columns @ coefficients
-    covariance = np.linalg.inv(columns.T @ columns)
-    freedom = len(keep) - 3
-    variance = 1.0 if line.scale_known else float(rest @ rest) / max(freedom, 1)
-    score = abs(coefficients[2]) / np.sqrt(max(variance * covariance[2, 2], 1e-300))
-    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, max(freedom, 1)))
-    return float(coefficients[2] * 0.25 / abs(coefficients[1])), float(p)
-
-
-def refit(experiment: Experiment, theta: Theta, left_out: list[int]) -> dict[str, tuple[float, float]]:
-    """Estimate and standard error of the experiment's physical parameters without some readings, SI.
-
-    Scatters stay at the point fit when nothing is left out, and are rescaled by the remaining misfit otherwise. The
-    slope of a line may come out negative: then it says that the line falls.
-    """
-    symbols = [row.symbol for row in experiment.parameters if row.physical]
-    keep = np.setdiff1d(np.arange(experiment.n), left_out)
-    falls = isinstance(experiment, Line)
-    at = np.array([float(theta[s]) for s in symbols])
-
-    def values_of(w: np.ndarray) -> np.ndarray:
-        return at * w if falls else at * np.exp(w)
-
-    def residuals(w: np.ndarray) -> np.ndarray:
-        moved = {**theta, **dict(zip(symbols, values_of(w), strict=True))}
-        misfit = experiment.misfit(moved)
-        sd = misfit.sd[keep]
-        y = misfit.raw[keep] / sd
-        a = misfit.design[keep] / sd[:, None]
-        return y - a @ np.linalg.lstsq(a, y, rcond=None)[0] if a.shape[1] else y
-
-    start = np.ones(len(at)) if falls else np.zeros(len(at))
-    solution = least_squares(residuals, start, method="lm", x_scale="jac")
-    nuisances = experiment.misfit(theta).design.shape[1]
-    freedom = len(keep) - len(symbols) - nuisances
-    scale = 1.0 if experiment.scale_known else float(2.0 * solution.cost / max(freedom, 1))
-    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * scale
-    values = values_of(solution.x)
-    errors = (at if falls else values) * np.sqrt(np.diag(covariance))
-    return {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)}

@@ -1,25 +1,15 @@
 """Do the experiments agree on a parameter that they share? Friction on the bench: tilts against slides."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import minimize
 
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.checks.context import Tension
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
-
-
-@dataclass(frozen=True)
-class Tension:
-    """``statistic``: twice the gain in log-posterior when the two sides may differ; ``p`` from chi-square with 1 d.f."""
-
-    statistic: float
-    p: float
-    one: dict[str, float]
-    other: dict[str, float]
 
 
 def tension(rig: Rig, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:

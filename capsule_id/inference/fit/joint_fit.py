@@ -18,32 +18,28 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.forced_run.experiment import NOISES, ForcedRun
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.fit.least_squares import LeastSquaresFit, covariance, least_squares
 from capsule_id.inference.fit.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target import density
-from capsule_id.inference.target.density import HeldResiduals
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
 TOLERANCE, MAX_STEPS = 1e-7, 80
 #: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
 ROUNDS, STILL = 8, 0.01
-#: Where a descent ends, every parameter alone is moved by so many standard deviations; what gains more than ``GAIN`` in
-#: log-posterior is a point to descend from again, and again at most.
-MOVES, GAIN, ESCAPES = 2.0 ** np.arange(8), 1.0, 4
+#: Where a descent ends, every parameter alone is moved by these many standard deviations. A point whose log-posterior is
+#: higher by more than ``LEAST_INCREASE`` starts another descent, at most ``ESCAPES`` times.
+MOVES, LEAST_INCREASE, ESCAPES = 2.0 ** np.arange(8), 1.0, 4
 #: No such move changes a positive parameter by more than this, natural logarithm.
 FARTHEST = 2.0
-#: Difference in log-posterior without a meaning. A contact that moves over a sample gives the likelihood a kink, and so
-#: maxima side by side, less than a standard deviation apart: to the posterior they are one. At a maximum on a kink no
-#: gradient vanishes: the descent has come to rest where its Gauss–Newton step promises no more than this.
+#: Differences in log-posterior below this count as equal. A contact that moves over a sample gives the likelihood a
+#: kink, and so maxima side by side, less than a standard deviation apart: to the posterior they are one. At a maximum
+#: on a kink no gradient vanishes: a descent ends where its Gauss–Newton step promises no more than this.
 DENT = 0.1
-#: A start that comes to rest with this many times the sum of squares of the best end before it has found another motion: its
-#: scatters are then not worth a round.
-ELSEWHERE = 3.0
-#: Starts go on until two ends leave no run with more than so many times the noise that its record shows.
+#: Stop refining a start whose cost exceeds this many times the best.
+COST_RATIO_TO_ABANDON = 3.0
+#: Try starts until two of them fit every channel within this many times its noise.
 NOISY = 1.2
 #: A scatter's conditional maximum is looked for within this factor (logarithm) of where it stands.
 REACH = 6.0
@@ -79,9 +75,9 @@ def joint_fit(
         if before is None or not np.isfinite(before.value):
             ends.append(_search(target, start, np.inf))
         else:
-            # A start knows the scatters no better than the best end does: its own stand for the noise of its record.
+            # Reuse the noise levels of the best fit.
             start = np.where(target.scatter, before.u, start)
-            ends.append(_search(target, start, ELSEWHERE * float(before.fit.cost[0])))
+            ends.append(_search(target, start, COST_RATIO_TO_ABANDON * float(before.fit.cost[0])))
     u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
     best = int(np.argmax(value))
     if not np.isfinite(value[best]):
@@ -90,7 +86,7 @@ def joint_fit(
             f"none of {len(starts)} starts leads to one",
             "look at masses, gaps and settings of the runs, and at what the bench tests tell (--experiments bench)",
         )
-    fit, located = ends[best].fit, np.flatnonzero(~target.scatter)
+    fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
     located_covariance = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0)
     matrix[np.ix_(located, located)] = located_covariance.matrix
@@ -123,18 +119,9 @@ def _elsewhere(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarr
 
 
 def _is_noisy(target: LogPosterior, u: np.ndarray) -> bool:
-    """At u (d,) a channel of a run has clearly more noise than its record shows: its motion is not described.
-
-    Coloured noise does not show in a record by itself: such a run is not asked.
-    """
+    """At u (d,) a record has clearly more noise than it shows: its motion is not described."""
     values = target.mapping(target.theta(u))
-    runs = [(e, e.local(values)) for e in target.experiments if isinstance(e, ForcedRun) and not e.coloured]
-    return any(theta[NOISES[name]] > NOISY * _shown(e, name) for e, theta in runs for name in e.channels)
-
-
-def _shown(run: ForcedRun, name: str) -> float:
-    """sd of the noise that the record itself shows in a channel."""
-    return max(run.rough.noise[name], run.table.columns[name].reading_sd)
+    return any(e.excess_noise(e.local(values)) > NOISY for e in target.experiments)
 
 
 def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
@@ -155,7 +142,7 @@ def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
 
 def _better_point(target: LogPosterior, end: _End) -> np.ndarray | None:
     """(d,) the likeliest of the points that differ from ``end`` in one located parameter; None where none gains."""
-    located = np.flatnonzero(~target.scatter)
+    located = target.located
     sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(end.fit.jacobian[0].T @ end.fit.jacobian[0])), 0.0))
     farthest = np.where(target.positive[located], FARTHEST, np.inf)
     sizes = np.minimum(MOVES[:, None] * sd, farthest)[:, None, :] * np.eye(len(located))
@@ -164,15 +151,15 @@ def _better_point(target: LogPosterior, end: _End) -> np.ndarray | None:
     points[1:, located] += steps
     value = weigh(target, points)
     best = int(np.argmax(value))
-    return points[best] if value[best] > value[0] + GAIN else None
+    return points[best] if value[best] > value[0] + LEAST_INCREASE else None
 
 
 def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> _End:
     """From one start (d,); above ``limit`` of the cost it goes no further, and neither where numbers are not finite."""
-    located = np.flatnonzero(~target.scatter)
+    located = target.located
     u, still, fit = start.copy(), False, None
     for _ in range(ROUNDS):
-        residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(u))
+        residual = HeldResiduals(target, jnp.asarray(u))
         fit = least_squares(
             residual, u[located][None], tolerance=TOLERANCE, max_steps=MAX_STEPS, normal_equations=True, heavy=True
         )
@@ -223,6 +210,7 @@ def _scatter_terms(target: LogPosterior, u: np.ndarray) -> dict[int, Callable[[f
     """log-density of every scatter's u given the located entries of u (d,), up to a constant, by index."""
     values = target.mapping(target.theta(u))
     parts: dict[int, list[Misfit | Moments]] = {int(i): [] for i in np.flatnonzero(target.scatter)}
+    priors = {i: target.priors.at(i, np) for i in parts}
     for experiment in target.experiments:
         names = {row.symbol: row.name for row in experiment.parameters}
         for part, symbol in zip(experiment.summaries(experiment.local(values), np), experiment.scatters, strict=True):
@@ -230,8 +218,7 @@ def _scatter_terms(target: LogPosterior, u: np.ndarray) -> dict[int, Callable[[f
                 parts[target.names.index(names[symbol])].append(part)
 
     def terms(i: int, t: float) -> float:
-        prior = {name: array[i] for name, array in target.priors.items()}
         own = sum(part.log_density(np.exp(t), np) for part in parts[i])
-        return float(own + density.prior_terms(prior, np.float64(t), np.exp(t), np))
+        return float(own + priors[i].terms(np.float64(t), np.exp(t), np))
 
     return {i: partial(terms, i) for i in parts}

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
+from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.inference.fit.curvature import BATCH, gradient, hessian, in_batches, jacobian, root_of_inverse
 from capsule_id.inference.fit.least_squares import covariance, least_squares
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.density import HeldResiduals
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
 STARTS = 5
 #: Ends count as the same where they differ by less than this many posterior standard deviations.
@@ -44,12 +44,12 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
     seed : of the dispersal
     """
     starts = dispersed_starts(target, seed, number_of_starts)
-    located = np.flatnonzero(~target.scatter)
+    located = target.located
     # The log-posterior compiles while least squares does.
     with ThreadPoolExecutor(1) as pool:
         compiled = pool.submit(target.batch, np.repeat(starts[:1], BATCH, axis=0))
         rough = least_squares(
-            HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(starts[0])),
+            HeldResiduals(target, jnp.asarray(starts[0])),
             starts[:, located],
             tolerance=LEAST_SQUARES_TOLERANCE,
             max_steps=LEAST_SQUARES_STEPS,
@@ -84,7 +84,8 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
 
 def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray:
     """(number, d) in u: the proposed centre, then normal draws about it with each parameter's own spread."""
-    proposed = [target.starts()[name] for name in target.names]
+    by_name = target.starts()
+    proposed = [by_name[name] for name in target.names]
     centre = target.unconstrain(np.array([start.centre for start in proposed]))
     spread = np.array([start.spread for start in proposed])
     z = np.random.default_rng(seed).standard_normal((number, target.dimension))
@@ -115,7 +116,7 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
 
 def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (s, n) and Jacobians (s, n, d) at located u (s, d), the scatters those of ``start``; not compiled."""
-    located = np.flatnonzero(~target.scatter)
+    located = target.located
 
     def residuals(v: np.ndarray) -> np.ndarray:
         u = start.copy()
@@ -154,3 +155,20 @@ def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> 
     matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
     errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
     return dict(zip(target.names, (float(e) for e in errors), strict=True))
+
+
+def bic(target: LogPosterior, fit: PointFit) -> float:
+    """Schwarz's criterion p log n - 2 log L at the point fit, linear nuisances at their best and counted in p.
+
+    Likelihoods that have integrated out different numbers of nuisances must not be compared by it: each integral
+    brings its own Occam factor.
+    """
+    values = target.mapping(target.theta(fit.u))
+    unknowns, readings, deviance = target.dimension, 0, 0.0
+    for e in target.experiments:
+        theta = e.local(values)
+        misfit, rest = e.misfit(theta), np.asarray(e.residuals(theta, np))[: e.n]
+        deviance += float(rest @ rest + e.n * LOG_2PI + 2.0 * np.sum(np.log(misfit.sd)))
+        unknowns += misfit.design.shape[1]
+        readings += e.n
+    return unknowns * float(np.log(readings)) + deviance

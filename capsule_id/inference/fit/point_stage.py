@@ -8,14 +8,8 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 
-import numpy as np
-
 from capsule_id.experiments import BENCH, make_experiments, paper_estimates
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.parts import parts_of
-from capsule_id.experiments.forced_run.restart import better_start, restarted
-from capsule_id.inference.checks.run_checks import LARGEST_GROWTH, growth
 from capsule_id.inference.fit.joint_fit import joint_fit
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.result import PointFit, Posterior
@@ -29,8 +23,6 @@ from capsule_id.views import Finding
 BENCH_BUDGET = 1000
 #: Fits, each after kinds of start that the one before found wrong have been put right.
 ROUNDS = 3
-#: A part of a cut record may amplify an error of its start this much, and is no shorter than so many periods.
-PART_GROWTH, PART_PERIODS = 30.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -65,8 +57,10 @@ def fit_points(rig: Rig, experiments: Sequence[Experiment], seed: int, sampled: 
             target = LogPosterior(rig, experiments)
             _compile(pool, target)
             return PointStage(target, point_fit(target, seed), BenchFit())
-        bench, known = BenchFit(), _rough(rig)
-        if closed:
+        bench = BenchFit()
+        if not closed:
+            known = _rough(rig)
+        else:
             alone = LogPosterior(rig, closed)
             fit = point_fit(alone, seed)
             own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
@@ -95,8 +89,8 @@ def _fit_with_right_starts(
             target, first = LogPosterior(rig, corrected[0]), corrected[1]
     doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
     text = (
-        f"{', '.join(doubtful)}: expected one kind of start to fit; after {ROUNDS} fits the record still speaks for "
-        'another: state start = "stuck" or "moving", or cut the record where the capsule is clearly at rest'
+        f"{', '.join(doubtful)}: expected one kind of start to fit; the kind of start did not settle after {ROUNDS} fits: "
+        'state start = "stuck" or "moving", or cut the record where the capsule is clearly at rest'
     )
     return target, joint, [Finding("start of a run", "fail", text, doubtful[0])]
 
@@ -116,58 +110,33 @@ def _rough(rig: Rig) -> dict[str, float]:
 def cut_unpredictable(
     rig: Rig, experiments: Sequence[Experiment], known: Mapping[str, float]
 ) -> tuple[list[Experiment], list[Finding]]:
-    """``experiments`` with every run in parts that amplifies an error of its start too much, and what was done.
+    """``experiments``, a run that amplifies an error of its initial state too much in parts, and what was done.
 
     Parameters
     ----------
-    known : estimates by name; whatever is missing stands where a fit would start
+    known : estimates by name; whatever is missing has the value where a fit would start
     """
-    values = _values(rig, experiments, known)
+    rough = LogPosterior(rig, experiments)
+    values = {**rough.fixed, **{name: start.centre for name, start in rough.starts().items()}, **known}
     kept: list[Experiment] = []
     findings: list[Finding] = []
     for e in experiments:
-        parts = [e]
-        if isinstance(e, ForcedRun) and not e.settled:
-            factor = growth(e, e.local(values))
-            if not factor <= LARGEST_GROWTH:
-                parts = [ForcedRun(table, rig) for table in parts_of(e.table, _part_length(e, factor))]
-        if len(parts) > 1:
-            seconds = (e.table["time"][-1] - e.table["time"][0]) / len(parts)
-            text = (
-                f"{e.label}: an error of the initial state grows {factor:.2g} times over the record where the fit starts, "
-                f"so it was cut into {len(parts)} parts of {seconds:.2g} s, each with an initial state of its own; "
-                'segment = { value = ..., unit = "s" } states another length'
-            )
-            findings.append(Finding("runs predictable", "warn", text, e.label))
+        parts, found = e.predictable_parts(e.local(values))
         kept += parts
+        findings += found
     return kept, findings
 
 
 def correct_starts(target: LogPosterior, fit: PointFit) -> tuple[list[Experiment], dict[str, float]] | None:
-    """Starts put right that the whole record speaks against at ``fit``: the experiments, and values by name to go on from.
+    """Replace initial conditions that the record contradicts at ``fit``: the experiments, and values to continue from.
 
     None: all stand.
     """
-    values, experiments = target.mapping(target.theta(fit.u)), list(target.experiments)
-    for i, e in enumerate(target.experiments):
-        if isinstance(e, ForcedRun) and e.start_is_open and "x_capsule" in e.channels:
-            better = better_start(e, e.local(values))
-            if better is not None:
-                experiments[i] = restarted(e, better["capsule_start"])
-                values |= {f"{symbol}[{e.label}]": value for symbol, value in better.items()}
-    return None if experiments == list(target.experiments) else (experiments, values)
-
-
-def _values(rig: Rig, experiments: Sequence[Experiment], known: Mapping[str, float]) -> dict[str, float]:
-    """Where a fit would start, by name, but for what is known."""
-    rough = LogPosterior(rig, experiments)
-    return {**rough.fixed, **{name: start.centre for name, start in rough.starts().items()}, **known}
-
-
-def _part_length(run: ForcedRun, factor: float) -> float:
-    """s over which errors grow about ``PART_GROWTH`` times."""
-    shortest = PART_PERIODS * 2.0 * np.pi / run.Omega
-    duration = float(run.time[-1] - run.time[0])
-    if not np.isfinite(factor):
-        return shortest
-    return max(shortest, duration * np.log(PART_GROWTH) / np.log(factor))
+    values = target.mapping(target.theta(fit.u))
+    corrected = [e.corrected_start(e.local(values)) for e in target.experiments]
+    if not any(corrected):
+        return None
+    for found in corrected:
+        values |= {} if found is None else found[1]
+    pairs = zip(target.experiments, corrected, strict=True)
+    return [e if found is None else found[0] for e, found in pairs], values

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.inference.fit.curvature import BATCH, in_batches
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target import density
 from capsule_id.inference.target.compiling import COMPILE
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.quadrature import NODES, Grid, add_to_blocks, choose_grid, log_stretch, position
@@ -33,13 +33,11 @@ class Layout:
 
     Attributes
     ----------
-    structure : of the joint one
     scatter, located : which entries of u are integrated out, and which are not
     block : of every entry of u, see ``LogPosterior.blocks``
     nodes : number of nodes of every integral
     """
 
-    structure: density.Structure
     scatter: tuple[int, ...]
     located: tuple[int, ...]
     block: tuple[int, ...]
@@ -123,9 +121,7 @@ class MarginalPosterior:
         size = (len(v), len(self._scatter))
         start, step = np.broadcast_to(grid.start, size), np.broadcast_to(grid.step, size)
         parts = [
-            conditional(
-                layout, self.target.numbers, v[i : i + BATCH], start[i : i + BATCH], step[i : i + BATCH], grid.bend
-            )
+            conditional(layout, self.target, v[i : i + BATCH], start[i : i + BATCH], step[i : i + BATCH], grid.bend)
             for i in range(0, len(v), BATCH)
         ]
         known, terms, integrals = zip(*parts, strict=True)
@@ -147,7 +143,7 @@ def compile_ahead(target: LogPosterior) -> None:
     """Compile what a ``MarginalPosterior`` of ``target`` needs: in another thread, while the point fit is at work."""
     layout = _layout(target)
     v, nodes = np.zeros((BATCH, len(layout.located))), np.ones((BATCH, len(layout.scatter)))
-    conditional(layout, target.numbers, v, nodes, nodes, nodes[0])
+    conditional(layout, target, v, nodes, nodes, nodes[0])
 
 
 def _layout(target: LogPosterior) -> Layout:
@@ -157,12 +153,12 @@ def _layout(target: LogPosterior) -> Layout:
     label = np.zeros(target.dimension, dtype=int)
     for i, block in enumerate(blocks):
         label[block] = i
-    scatter, located = (tuple(np.flatnonzero(which).tolist()) for which in (target.scatter, ~target.scatter))
-    return Layout(target.structure, scatter, located, tuple(label.tolist()), NODES[0])
+    scatter, located = np.flatnonzero(target.scatter), target.located
+    return Layout(tuple(scatter.tolist()), tuple(located.tolist()), tuple(label.tolist()), NODES[0])
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILE)
-def conditional(layout: Layout, numbers: density.Numbers, v: Any, start: Any, step: Any, bend: Any) -> tuple[Any, ...]:
+def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: Any, bend: Any) -> tuple[Any, ...]:
     """The log-posterior of the located v (w, dimension), scatters at their nodes: the forward models run once a walker.
 
     Returns
@@ -175,38 +171,34 @@ def conditional(layout: Layout, numbers: density.Numbers, v: Any, start: Any, st
     start, step : (w, scatters) first node and distance of the nodes, in t
     bend : (scatters,)
     """
-    return jax.vmap(partial(_conditional, layout, numbers, bend))(v, start, step)
+    return jax.vmap(partial(_conditional, layout, target, bend))(v, start, step)
 
 
 def _conditional(
-    layout: Layout, numbers: density.Numbers, bend: Any, v: Any, start: Any, step: Any
+    layout: Layout, target: LogPosterior, bend: Any, v: Any, start: Any, step: Any
 ) -> tuple[Any, Any, Any]:
     scatter, located = np.array(layout.scatter, dtype=int), np.array(layout.located)
     # Forward models do not read scatters: the zeros left for them reach nothing.
     u = jnp.zeros(len(layout.block)).at[located].set(v)
-    values = density.constrain(layout.structure, u)
-    prior = numbers["prior"]
+    values = target.constrain(u)
     t = start[:, None] + step[:, None] * jnp.arange(layout.nodes)
     nodes = position(t, bend[:, None])
     sizes = jnp.exp(nodes)
-    own_prior = {name: array[scatter][:, None] for name, array in prior.items()}
-    terms = density.prior_terms(own_prior, nodes, sizes) + log_stretch(t, bend[:, None])
-    known = [density.prior_terms(prior, u, values)[located]]
+    terms = target.priors.at(scatter[:, None]).terms(nodes, sizes) + log_stretch(t, bend[:, None])
+    known = [target.priors.terms(u, values)[located]]
     known_block = [layout.block[i] for i in layout.located]
     rows, row_scatter = [], []
-    for group, arrays in zip(layout.structure.groups, numbers["arrays"], strict=True):
-        symbols, entries = group.first.scatters, dict(group.entries)
+    for group in target.groups:
+        symbols, entries = group.experiments.scatters, dict(group.entries)
         places = [None if s is None else [layout.scatter.index(i) for i in entries[s]] for s in symbols]
-        theta = {s: density.pick(values, i) for s, i in entries.items() if s not in symbols}
-        constants = {name: numbers["fixed"][name] for name in group.constants}
-        members = len(group.entries[0][1])
-        own = tuple(jnp.zeros(members) if p is None else sizes[jnp.array(p)] for p in places)
+        own = tuple(jnp.zeros(len(group.members)) if p is None else sizes[jnp.array(p)] for p in places)
 
-        def one(arrays: Any, theta: Any, own: Any, constants: Any = constants, first: Any = group.first) -> Any:
-            summaries = first.with_arrays(arrays).summaries({**theta, **constants})
+        def one(experiment: Experiment, theta: ValuesBySymbol, own: Any) -> Any:
+            summaries = experiment.summaries({**theta, **target.constants})
             return tuple(part.log_density(s) for part, s in zip(summaries, own, strict=True))
 
-        for place, value in zip(places, jax.vmap(one)(arrays, theta, own), strict=True):
+        densities = jax.vmap(one)(group.experiments, group.local(values, without=symbols), own)
+        for place, value in zip(places, densities, strict=True):
             if place is None:
                 known.append(value)
                 known_block += [layout.block[entry[0]] for entry in zip(*entries.values(), strict=True)]

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.checks.lines import curvature_test
 from capsule_id.experiments.free_vibration import experiment as free_vibration
 from capsule_id.experiments.free_vibration.decay_models import dry_decay
 from capsule_id.experiments.line import Line
 from capsule_id.experiments.static_friction import experiment as static_friction
-from capsule_id.inference.checks.experiment_checks import Setting
-from capsule_id.inference.checks.regression import curvature_test, outliers
+from capsule_id.inference.checks.regression import outliers
+from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.pipeline import fit_rig
@@ -75,10 +76,9 @@ def findings(folder: Path, fault: Callable[[Path], None] | None = None) -> list[
     if fault is not None:
         fault(folder)
     rig = read_rig(folder)
-    experiments = make_experiments(rig)
-    target = LogPosterior(rig, experiments)
+    target = LogPosterior(rig, make_experiments(rig))
     fit = point_fit(target, SEED)
-    return run_checks(Setting(rig, experiments, target, fit, None, {**target.fixed, **fit.values}))[0]
+    return list(run_checks(Setting(target, fit, None, {**target.fixed, **fit.values})).findings)
 
 
 @pytest.fixture(scope="module")

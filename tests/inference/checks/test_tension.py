@@ -8,6 +8,7 @@ from capsule_id.experiments import KINDS
 from capsule_id.experiments.dynamic_friction import experiment as dynamic_friction
 from capsule_id.experiments.static_friction import experiment as static_friction
 from capsule_id.inference.checks.tension import tension
+from capsule_id.rig.loose_settings import loose
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.synthetic import (
     PUSH_DISTANCE_SD,
@@ -28,7 +29,7 @@ def column(name: str, values: np.ndarray, sd: float | None = None) -> Column:
 
 def table(kind: str, *columns: Column) -> Table:
     rows = np.arange(2, 2 + len(columns[0].values))
-    return Table(kind, kind, f"{kind}.csv", {c.name: c for c in columns}, {}, rows)
+    return Table(kind, kind, f"{kind}.csv", {c.name: c for c in columns}, loose(kind, {}), rows)
 
 
 def p_value(seed: int, tilted_mu: float = TRUTH.mu) -> float:
@@ -47,7 +48,7 @@ def p_value(seed: int, tilted_mu: float = TRUTH.mu) -> float:
         ),
     )
     rig = Rig("bench", True, Quantity(TRUTH.m1), Quantity(TRUTH.m2), Quantity(TRUTH.g), {}, tables, {}, Path("bench"))
-    tilt, push = (KINDS[t.kind](t, rig) for t in tables)
+    tilt, push = (KINDS[t.kind].make(t, rig)[0] for t in tables)
     return tension(rig, [tilt], [push]).p
 
 

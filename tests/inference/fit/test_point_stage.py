@@ -4,7 +4,6 @@ import pytest
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.restart import restarted
 from capsule_id.inference.fit import point_stage
 from capsule_id.inference.fit.point_stage import cut_unpredictable
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -47,7 +46,7 @@ def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypat
     def other_kind(target: LogPosterior, *_: object) -> tuple[list[Experiment], dict[str, float]]:
         (own,) = target.experiments
         assert isinstance(own, ForcedRun)
-        return [restarted(own, 0.0 if own.start == "moving" else 1e-2)], {}
+        return [own.restarted(0.0 if own.moves else 1e-2)], {}
 
     monkeypatch.setattr(point_stage, "joint_fit", joint_fit)
     monkeypatch.setattr(point_stage, "correct_starts", other_kind)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.experiment_checks import Setting, check_whiteness
+from capsule_id.inference.checks.experiment_checks import check_whiteness
+from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.rig.model import PriorOverride, Quantity
 from capsule_id.synthetic_runs import NOISE_SD
@@ -39,7 +40,7 @@ def whiteness_of(**departures: float) -> Finding:
     rig = bench.rig(table, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
     stage = fit_points(rig, make_experiments(rig), 0, sampled=False)
     values = stage.target.mapping(stage.target.theta(stage.fit.u))
-    return check_whiteness(Setting(rig, stage.target.experiments, stage.target, stage.fit, None, values))[0]
+    return check_whiteness(Setting(stage.target, stage.fit, None, values))[0]
 
 
 def test_the_papers_model_leaves_white_residuals() -> None:

@@ -1,25 +1,19 @@
-"""Do the runs agree with the bench, and can their motion be predicted at all?"""
+"""Whether forced runs agree with the bench tests."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.inference.fit.least_squares import linearised
 from capsule_id.inference.result import PointFit, Posterior
-from capsule_id.inference.target.density import HeldResiduals
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.views import Finding
 
 #: Family-wise false-alarm rate of the comparison of bench and runs.
 LEVEL = 0.02
-#: An error in the initial state that grows by this factor within the record makes an open-loop fit meaningless.
-LARGEST_GROWTH = 1e3
 
 
 @dataclass(frozen=True)
@@ -33,17 +27,9 @@ class RunsAlone:
 
 def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
     """One Gauss–Newton step from the joint ``fit`` with the bench's residuals left out."""
-    located = np.flatnonzero(~target.scatter)
-    residual = HeldResiduals(target.structure, tuple(int(i) for i in located), target.numbers, jnp.asarray(fit.u))
-    misses, jacobian = linearised(residual, fit.u[located])
-    values = target.mapping(target.theta(fit.u))
-    wanted: list[np.ndarray] = []
-    for group in target.structure.groups:
-        own = group.first
-        parts = own.misfits(own.local(values), np)
-        size = sum(part.raw.shape[0] + part.design.shape[1] for part in parts) * len(group.entries[0][1])
-        wanted.append(np.full(size, isinstance(own, ForcedRun)))
-    rows = np.concatenate([*wanted, np.ones(target.dimension, dtype=bool)])
+    located = target.located
+    misses, jacobian = linearised(HeldResiduals(target, jnp.asarray(fit.u)), fit.u[located])
+    rows = np.array([owner is None or not owner.bench for owner in target.residual_owners(fit.u)])
     kept = jacobian[rows]
     covariance = np.linalg.inv(kept.T @ kept)
     u = fit.u[located] - covariance @ (kept.T @ misses[rows])
@@ -120,8 +106,8 @@ def check_agreement(
 
     Masses are left out: their weighings stand on both sides.
     """
-    told = {row.name for e in target.experiments if isinstance(e, ForcedRun) for row in e.parameters}
-    shared = [] if bench is None else [name for name in bench.names if name in told]
+    known = {row.name for e in target.experiments if not e.bench for row in e.parameters}
+    shared = [] if bench is None else [name for name in bench.names if name in known]
     found = disagreement(shared, runs_alone(target, joint), bench, sample) if bench is not None and shared else {}
     return [agreement(found, sample is not None)] if found else []
 
@@ -166,48 +152,3 @@ def _family_wise(z: float, number: int) -> float:
 
 def _stated(p: float) -> str:
     return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"
-
-
-def growth(run: ForcedRun, values: Mapping[str, float]) -> float:
-    """Largest factor by which a small error of the initial state has grown at the end of the record, 1.
-
-    Positions count in units of the motion's length, velocities in that times Omega.
-    """
-    size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
-    motion = run.motion(values, np)
-    start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
-    derivative = np.asarray(_derivative_of_end(*run.capsule(values), run.time[[0, -1]], start))
-    return float(np.linalg.norm(derivative * size / size[:, None], 2))
-
-
-@jax.jit
-def _derivative_of_end(p: CapsuleParameters, e: Excitation, times: jax.Array, start: jax.Array) -> jax.Array:
-    """(3, 3) of (x_rel, its rate, Y2) at the last of ``times`` with respect to the same at the first."""
-
-    def end(state: jax.Array) -> jax.Array:
-        t = simulate(p, e, times, (state[0], state[1] + state[2], 0.0, state[2]))
-        return jnp.stack([t.X1[-1] - t.X2[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]])
-
-    return jax.jacfwd(end)(start)
-
-
-def check_runs(runs: Sequence[ForcedRun], values: Mapping[str, float]) -> list[Finding]:
-    """Expected: every run's motion predictable over its record, and complete."""
-    findings = []
-    for run in runs:
-        local = run.local(values)
-        status = Status(int(run.motion(local, np).status))
-        if status is Status.GRAZING:
-            text = (
-                f"{run.label}: {status.sentence} Its covariance at the point fit may be off; the sample does not use it"
-            )
-            findings.append(Finding("runs predictable", "warn", text, run.label))
-        factor = growth(run, local)
-        if not factor < LARGEST_GROWTH:
-            text = (
-                f"{run.label}: expected a motion that forgets its start; an error of the initial state grows {factor:.2g} "
-                f"times over the record, so one initial state cannot predict it: state segments, or record less of it"
-            )
-            findings.append(Finding("runs predictable", "fail", text, run.label))
-    seen = f"none of {len(runs)} runs amplifies an error of its start {LARGEST_GROWTH:g} times"
-    return findings or ([Finding("runs predictable", "ok", seen)] if runs else [])

@@ -1,0 +1,98 @@
+"""What a fit offers to the checks and tables of an experiment, and what an experiment offers to the report."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from capsule_id.records.view import RecordView
+from capsule_id.views import Finding, NoteTable
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.base import Experiment
+
+
+@dataclass(frozen=True)
+class Tension:
+    """Whether two groups of experiments agree on their shared parameters.
+
+    Attributes
+    ----------
+    statistic : twice the increase of the log-posterior when the two groups may differ
+    p : from chi-square with 1 degree of freedom
+    one, other : the estimates of each group alone, SI, by name
+    """
+
+    statistic: float
+    p: float
+    one: Mapping[str, float]
+    other: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A fit of some experiments under another model.
+
+    Attributes
+    ----------
+    values, standard_errors : SI, by name
+    agree : every start ended at the same maximum
+    bic : Schwarz's criterion
+    """
+
+    values: Mapping[str, float]
+    standard_errors: Mapping[str, float]
+    agree: bool
+    bic: float
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A recorded run as the paper looks at it, ``force`` (n,) N: the fitted drive at its samples."""
+
+    name: str
+    view: RecordView
+    force: np.ndarray
+
+
+class Fitted(Protocol):
+    """A finished fit.
+
+    Attributes
+    ----------
+    values : the point fit and the constants, SI, by name
+    flagged : row indices of the outliers, by label
+    draws : posterior draws, SI, by name; [] without a sample
+    findings : of the checks so far
+    """
+
+    @property
+    def values(self) -> Mapping[str, float]: ...
+
+    @property
+    def flagged(self) -> Mapping[str, Sequence[int]]: ...
+
+    @property
+    def draws(self) -> Sequence[Mapping[str, float]]: ...
+
+    @property
+    def findings(self) -> Sequence[Finding]: ...
+
+    def tension(self, one: Sequence["Experiment"], other: Sequence["Experiment"]) -> Tension:
+        """Likelihood-ratio test that two groups of experiments share their parameters."""
+        ...
+
+    def refit(self, experiments: Sequence["Experiment"]) -> Refit:
+        """Point fit of ``experiments`` alone."""
+        ...
+
+
+#: The experiments of a fit that declare a check, and the fit -> findings. Tables likewise.
+Check = Callable[[Sequence[Any], Fitted], list[Finding]]
+TableMaker = Callable[[Sequence[Any], Fitted], list[NoteTable]]
+
+
+def ok_if_empty(findings: list[Finding], check: str, text: str) -> list[Finding]:
+    """``findings``, or one of level "ok" where there are none."""
+    return findings or [Finding(check, "ok", text)]

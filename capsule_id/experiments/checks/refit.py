@@ -1,0 +1,45 @@
+"""Estimates of one experiment by itself at the point fit, with or without some of its readings."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from capsule_id.experiments.base import Experiment, ValuesBySymbol
+
+
+def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]) -> dict[str, tuple[float, float]]:
+    """Estimate and standard error of the experiment's physical parameters without some readings, SI.
+
+    Scatters stay at the point fit when nothing is left out, and are rescaled by the remaining misfit otherwise.
+
+    Parameters
+    ----------
+    theta : the point fit
+    left_out : row indices
+    """
+    symbols = [row.symbol for row in experiment.parameters if row.physical]
+    keep = np.setdiff1d(np.arange(experiment.n), left_out)
+    signed = experiment.estimates_may_be_negative
+    at = np.array([float(theta[s]) for s in symbols])
+
+    def values_of(w: np.ndarray) -> np.ndarray:
+        return at * w if signed else at * np.exp(w)
+
+    def residuals(w: np.ndarray) -> np.ndarray:
+        moved = {**theta, **dict(zip(symbols, values_of(w), strict=True))}
+        misfit = experiment.misfit(moved)
+        sd = misfit.sd[keep]
+        y = misfit.raw[keep] / sd
+        a = misfit.design[keep] / sd[:, None]
+        return y - a @ np.linalg.lstsq(a, y, rcond=None)[0] if a.shape[1] else y
+
+    start = np.ones(len(at)) if signed else np.zeros(len(at))
+    solution = least_squares(residuals, start, method="lm", x_scale="jac")
+    nuisances = experiment.misfit(theta).design.shape[1]
+    freedom = len(keep) - len(symbols) - nuisances
+    scale = 1.0 if experiment.scale_known else float(2.0 * solution.cost / max(freedom, 1))
+    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * scale
+    values = values_of(solution.x)
+    errors = (at if signed else values) * np.sqrt(np.diag(covariance))
+    return {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)}

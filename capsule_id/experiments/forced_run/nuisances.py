@@ -1,0 +1,72 @@
+"""The parameters of a forced run with their priors, and where a fit of them may start."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from capsule_id.experiments.base import Start
+from capsule_id.experiments.linear import NUISANCE_WIDTH
+from capsule_id.parameters import Parameter, Prior, parameter
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.forced_run.experiment import ForcedRun
+
+#: Default prior of a channel's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
+NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
+#: Default prior of the current's amplitude: log-normal about half its range.
+AMPLITUDE_FACTOR = 3.0
+#: sd of the normal prior of the drive's phase, rad: wide, and proper.
+PHASE_WIDTH = np.pi
+
+
+def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...]:
+    """Those sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
+    of, whole, settings = run.label, run.about.record, run.table.settings
+    rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")] + [parameter("k2", run.spring)]
+    if not run.gap_known:
+        rows.append(parameter("G", whole, Prior("positive_normal", settings.gap.value, settings.gap.sd)))
+    if run.driven_by_current:
+        amplitude = 0.5 * float(np.ptp(run.table["current"]))
+        rows += [parameter("K"), parameter("I_d", whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
+    elif not run.drive_known:
+        rows.append(parameter("P_d", whole, Prior("positive_normal", run.drive, run.drive_sd)))
+    rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
+    length = NUISANCE_WIDTH * run.rough.length
+    if not run.settled:
+        rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
+        rows.append(parameter("y_start", of, Prior("normal", 0.0, run.Omega * length)))
+    if run.moves:
+        rows.append(parameter("capsule_start", of, Prior("normal", 0.0, run.Omega * length)))
+    for name, scale in zip(run.channels, ranges.tolist(), strict=True):
+        rows.append(parameter(f"noise_{name}", whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
+    if run.coloured:
+        rows += [parameter(f"ar1_{name}", whole) for name in run.channels]
+    return tuple(rows)
+
+
+def run_starts(run: "ForcedRun") -> dict[str, Start]:
+    """From the record: nuisances alone; what the bench measures has its start there, or at its prior's centre."""
+    rough, of = run.rough, run.label
+    starts = _starts_of_record(run) if run.about.leads else {}
+    if not run.settled:
+        starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
+        starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * run.Omega * rough.length)
+    if run.moves:
+        starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * run.Omega * rough.length)
+    return starts
+
+
+def _starts_of_record(run: "ForcedRun") -> dict[str, Start]:
+    rough, of = run.rough, run.about.record
+    starts = {f"phase[{of}]": Start(rough.phase, 0.02)}
+    if not run.gap_known:
+        starts[f"G[{of}]"] = Start(run.gap, 0.5 * run.table.settings.gap.sd / run.gap)
+    if run.driven_by_current:
+        starts[f"I_d[{of}]"] = Start(rough.amplitude, 0.005)
+    elif not run.drive_known:
+        starts[f"P_d[{of}]"] = Start(run.drive, 0.5 * run.drive_sd / run.drive)
+    for name, noise in rough.noise.items():
+        starts[f"noise_{name}[{of}]"] = Start(noise, 0.1)
+    if run.coloured:
+        starts |= {f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in run.channels}
+    return starts

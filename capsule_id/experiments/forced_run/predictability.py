@@ -1,0 +1,94 @@
+"""Whether one initial state predicts the motion of a whole record."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.checks.context import Fitted, ok_if_empty
+from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.views import Finding
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.forced_run.experiment import ForcedRun
+
+#: An error in the initial state that grows by this factor within the record makes an open-loop fit meaningless.
+LARGEST_GROWTH = 1e3
+#: A part of a cut record may amplify an error of its start this much, and is no shorter than so many periods.
+PART_GROWTH, PART_PERIODS = 30.0, 2.0
+
+
+def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
+    """Largest factor by which a small error of the initial state has grown at the end of the record, 1.
+
+    Positions count in units of the motion's length, velocities in that times Omega.
+    """
+    size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
+    motion = run.motion(theta, np)
+    start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
+    derivative = np.asarray(_derivative_of_end(*run.capsule(theta), run.time[[0, -1]], start))
+    return float(np.linalg.norm(derivative * size / size[:, None], 2))
+
+
+@jax.jit
+def _derivative_of_end(p: CapsuleParameters, e: Excitation, times: jax.Array, start: jax.Array) -> jax.Array:
+    """(3, 3) of (x_rel, its rate, Y2) at the last of ``times`` with respect to the same at the first."""
+
+    def end(state: jax.Array) -> jax.Array:
+        t = simulate(p, e, times, (state[0], state[1] + state[2], 0.0, state[2]))
+        return jnp.stack([t.X1[-1] - t.X2[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]])
+
+    return jax.jacfwd(end)(start)
+
+
+def predictable_parts(run: "ForcedRun", theta: ValuesBySymbol) -> "tuple[tuple[ForcedRun, ...], list[Finding]]":
+    """``run`` in parts, where it amplifies an error of its initial state too much at ``theta``; and what was done."""
+    if run.settled:
+        return (run,), []
+    factor = growth(run, theta)
+    if factor <= LARGEST_GROWTH:
+        return (run,), []
+    parts = run.parts(_part_length(run, factor))
+    if len(parts) == 1:
+        return parts, []
+    seconds = (run.time[-1] - run.time[0]) / len(parts)
+    text = (
+        f"{run.label}: an error of the initial state grows {factor:.2g} times over the record where the fit starts, "
+        f"so it was cut into {len(parts)} parts of {seconds:.2g} s, each with an initial state of its own; "
+        'segment = { value = ..., unit = "s" } states another length'
+    )
+    return parts, [Finding("runs predictable", "warn", text, run.label)]
+
+
+def _part_length(run: "ForcedRun", factor: float) -> float:
+    """s over which errors grow about ``PART_GROWTH`` times."""
+    shortest = PART_PERIODS * 2.0 * np.pi / run.Omega
+    duration = float(run.time[-1] - run.time[0])
+    if not np.isfinite(factor):
+        return shortest
+    return max(shortest, duration * np.log(PART_GROWTH) / np.log(factor))
+
+
+def check_predictable(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
+    """Expected: every run's motion predictable over its record, and complete."""
+    findings = []
+    for run in runs:
+        local = run.local(fit.values)
+        status = Status(int(run.motion(local, np).status))
+        if status is Status.GRAZING:
+            text = (
+                f"{run.label}: {status.sentence} Its covariance at the point fit may be off; the sample does not use it"
+            )
+            findings.append(Finding("runs predictable", "warn", text, run.label))
+        factor = growth(run, local)
+        if not factor < LARGEST_GROWTH:
+            text = (
+                f"{run.label}: expected a motion that forgets its start; an error of the initial state grows {factor:.2g} "
+                f"times over the record, so one initial state cannot predict it: state segments, or record less of it"
+            )
+            findings.append(Finding("runs predictable", "fail", text, run.label))
+    seen = f"none of {len(runs)} runs amplifies an error of its start {LARGEST_GROWTH:g} times"
+    return ok_if_empty(findings, "runs predictable", seen)

@@ -1,0 +1,84 @@
+"""Tables of forced runs: nondimensional groups, and the motion that the model predicts."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.checks.context import Fitted
+from capsule_id.records.label import measured_motion
+from capsule_id.views import NoteTable
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.forced_run.experiment import ForcedRun
+
+
+def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable]:
+    """The paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
+
+    Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0, with Omega0 = sqrt(k1/m1) and F_b = mu (m1 + m2) g.
+    """
+    if not fit.draws:
+        return []
+    columns: dict[str, list[float]] = {}
+    for values in fit.draws:
+        for run in runs:
+            for name, value in _groups(run, run.local(values)).items():
+                columns.setdefault(name, []).append(value)
+    rows = {name: [np.mean(column), np.std(column, ddof=1)] for name, column in columns.items()}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["mean", "sd"]).rename_axis("group")
+    caption = (
+        "Groups that carry the rig over to a prototype of another size: equal groups, equal motion. Omega0 = √(k1/m1), "
+        "zeta = c/(2 m1 Omega0), F_b = mu (m1 + m2) g; a shared group is listed once."
+    )
+    return [NoteTable("Nondimensional groups", caption, frame)]
+
+
+def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
+    p, e = run.capsule(theta)
+    m1, m2, k1, k2, c, mu, v_s, G, g = (
+        float(getattr(p, name)) for name in ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")
+    )
+    Omega0, F_b = np.sqrt(k1 / m1), mu * (m1 + m2) * g
+    length, of = F_b / k1, run.label
+    return {
+        "Omega0, rad/s": Omega0,
+        "zeta": c / (2.0 * m1 * Omega0),
+        "m2/m1": m2 / m1,
+        "v_s / (Omega0 F_b/k1)": v_s / (Omega0 * length),
+        f"k2/k1 [{run.spring}]": k2 / k1,
+        f"Omega/Omega0 [{of}]": run.Omega / Omega0,
+        f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore[reportArgumentType]
+        f"G k1/F_b [{of}]": G / length,
+    }
+
+
+def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable]:
+    """Contacts and mean velocity of the capsule over the record: observed, at the point fit, 95 % band of the draws."""
+    rows = {}
+    for run in runs:
+        best = run.motion(run.local(fit.values), np)
+        span = run.time[-1] - run.time[0]
+        local = [run.local(draw) for draw in fit.draws]
+        stacked = {name: np.array([theta[name] for theta in local]) for name in (local[0] if local else {})}
+        sample = run.motion(stacked, np) if local else None
+        seen = measured_motion(run.table)
+        row: dict[str, object] = {"motion of the record": seen.label, "contacts, model": int(best.contacts)}
+        if sample is not None:
+            low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
+            row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"
+        row["mean velocity, model, mm/s"] = 1e3 * float(best.X2[-1]) / span
+        if sample is not None:
+            band = np.quantile(1e3 * np.asarray(sample.X2)[:, -1] / span, [0.025, 0.975])
+            row["95 % band, mm/s"] = f"{band[0]:.4g} to {band[1]:.4g}"
+        if "x_capsule" in run.channels:
+            place = run.values[run.channels.index("x_capsule")]
+            row["mean velocity, record, mm/s"] = 1e3 * float(np.mean(place[-5:]) - np.mean(place[:5])) / span
+        rows[run.label] = row
+    caption = (
+        "Over the record, from its first sample to its last; the record's velocity from five samples at either end."
+    )
+    frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("run")
+    return [NoteTable("Motion predicted and observed", caption, frame)]

@@ -1,0 +1,69 @@
+"""Checks of free decays: one stiffness at every amplitude, and a decay that is free."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import stats
+
+from capsule_id.experiments.checks.context import Fitted
+from capsule_id.experiments.checks.refit import refit
+from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.free_vibration.decrement import equilibrium
+from capsule_id.views import Finding
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.free_vibration.experiment import FreeVibration
+
+
+def check_stiffness(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """The paper's "linear near the working point": k1 of single records against release amplitude."""
+    if len(records) < 2:
+        return []
+    k1, sd, _ = stiffness_by_record(records, fit.values)
+    weight = sd**-2.0
+    mean = np.average(k1, weights=weight)
+    q = float(np.sum(weight * (k1 - mean) ** 2))
+    p = float(stats.chi2.sf(q, len(records) - 1))
+    if p < LEVEL:
+        text = (
+            f"expected one k1 for all releases (linear near the working point); the records give {k1.min():.5g} to "
+            f"{k1.max():.5g} N/m (chi-square {q:.1f} for {len(records) - 1} d.f., p = {p:.1g}): release from smaller "
+            "deflections, or treat k1 as valid at one amplitude only"
+        )
+        return [Finding("stiffness against amplitude", "fail", text)]
+    return [Finding("stiffness against amplitude", "ok", f"k1 is the same in all {len(records)} records (p = {p:.2g})")]
+
+
+def stiffness_by_record(
+    records: "Sequence[FreeVibration]", values: Mapping[str, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """k1, its standard error and the largest deflection of every record, (records,) SI."""
+    estimates = [refit(e, e.local(values), [])["k1"] for e in records]
+    k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
+    return k1, sd, np.array([e.largest_deflection for e in records])
+
+
+def check_free_decay(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """Expected: a free capsule that does not slip, and a rod that does not reach the support spring."""
+    findings, theta = [], fit.values
+    for e in records:
+        if e.table.settings.capsule == "free" and "mu" in theta and "m2" in theta:
+            force = e.largest_force(theta)
+            threshold = float(theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"])
+            if force > threshold:
+                text = (
+                    f"{e.label}: a free capsule stays at rest while |f| <= F_b = {threshold:.3g} N; the record "
+                    f"reaches {force:.3g} N, so the capsule slips and this is no free decay: hold the capsule, or "
+                    "release from a smaller deflection"
+                )
+                findings.append(Finding("free decay", "fail", text, e.label))
+        gap = e.table.settings.gap
+        reach = float(np.max(e.values - equilibrium(e.values)))
+        if gap is not None and reach >= gap.value:
+            text = (
+                f"{e.label}: x_rel reaches {reach:.3g} m, the support spring stands at {gap.value:.3g} m, so the "
+                "rod hits it and this is no free decay: move the spring away, or start the window later"
+            )
+            findings.append(Finding("free decay", "fail", text, e.label))
+    return findings

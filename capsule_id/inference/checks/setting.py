@@ -1,0 +1,47 @@
+"""A finished fit as checks and tables see it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.checks.context import Refit, Tension
+from capsule_id.inference.checks.tension import tension
+from capsule_id.inference.fit.point_fit import bic, point_fit
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.rig.model import Rig
+from capsule_id.views import Finding
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The fit, and what the checks have found so far; see ``capsule_id.experiments.checks.context.Fitted``.
+
+    ``seed`` is that of the starts of further point fits.
+    """
+
+    target: LogPosterior
+    fit: PointFit
+    posterior: Posterior | None
+    values: Mapping[str, float]
+    draws: Sequence[Mapping[str, float]] = ()
+    seed: int = 0
+    flagged: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    findings: Sequence[Finding] = ()
+
+    @property
+    def rig(self) -> Rig:
+        return self.target.rig
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        return self.target.experiments
+
+    def tension(self, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
+        return tension(self.rig, one, other)
+
+    def refit(self, experiments: Sequence[Experiment]) -> Refit:
+        target = LogPosterior(self.rig, experiments)
+        fit = point_fit(target, self.seed)
+        values = target.mapping(target.theta(fit.u))
+        return Refit(values, fit.standard_errors, fit.agree, bic(target, fit))

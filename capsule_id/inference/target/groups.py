@@ -1,0 +1,54 @@
+"""Experiments that differ only in numbers, stacked: each group is evaluated in one batch."""
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import Experiment
+
+
+class Group(eqx.Module):
+    """Stacked experiments.
+
+    Attributes
+    ----------
+    experiments : one experiment whose leaves have a leading axis (members, ...), on the device
+    members : which of the experiments of the log-posterior they are
+    entries : symbol and, for every member, which entry of u it is (d: the member lacks it, its value is 0)
+    """
+
+    experiments: Experiment
+    members: tuple[int, ...] = eqx.field(static=True)
+    entries: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+
+    def local(self, values: Any, without: Sequence[str | None] = ()) -> dict[str, Any]:
+        """(members,) by symbol, out of the constrained values (d,); symbols in ``without`` are left out."""
+        padded = jnp.concatenate([values, jnp.zeros(1)])
+        return {symbol: padded[jnp.array(entry)] for symbol, entry in self.entries if symbol not in without}
+
+
+def make_groups(experiments: Sequence[Experiment], names: Sequence[str]) -> tuple[Group, ...]:
+    """Groups of ``experiments`` in the order of their first members; ``names`` (d,) of the entries of u."""
+    members: dict[Hashable, list[int]] = {}
+    for i, experiment in enumerate(experiments):
+        leaves, structure = jax.tree.flatten(experiment)
+        members.setdefault((structure, *(np.shape(leaf) for leaf in leaves)), []).append(i)
+    place = {name: i for i, name in enumerate(names)}
+    return tuple(_group([experiments[i] for i in own], own, place) for own in members.values())
+
+
+def _group(experiments: Sequence[Experiment], members: Sequence[int], place: Mapping[str, int]) -> Group:
+    """One group; ``place`` of every name among the entries of u."""
+    first = experiments[0]
+    own = [{row.symbol: row.name for row in e.parameters} for e in experiments]
+    sampled = [*dict.fromkeys(s for table in own for s in table), *(m for m in first.masses if m in place)]
+    entries = tuple((s, tuple(place.get(table.get(s, s), len(place)) for table in own)) for s in sampled)
+    return Group(jax.tree.map(_stack, *experiments), tuple(members), entries)
+
+
+def _stack(*leaves: Any) -> jax.Array:
+    return jnp.asarray(np.stack([np.asarray(leaf, dtype=float) for leaf in leaves]))

@@ -1,0 +1,101 @@
+"""The prior densities of all parameters as arrays, so that their density is one expression."""
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from capsule_id.experiments.linear import LOG_2PI
+from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
+from capsule_id.rig.model import PriorOverride
+
+
+class Priors(eqx.Module):
+    """Normal densities of z = (value - centre)/width, one a parameter; every array is (d,).
+
+    Attributes
+    ----------
+    lognormal : the value is u = log(theta); else it is theta
+    centre, width : of the normal density
+    constant : log of what truncation adds to the density
+    jacobian : theta is sampled through its logarithm, and its prior is a density of theta: log |d theta/du| = u
+    """
+
+    lognormal: Any
+    centre: Any
+    width: Any
+    constant: Any
+    jacobian: Any
+
+    def __init__(self, parameters: Sequence[Parameter]) -> None:
+        priors = [prior_of(row) for row in parameters]
+        kinds = np.array([prior.kind for prior in priors])
+        location = np.array([prior.location for prior in priors])
+        spread = np.array([prior.spread for prior in priors])
+        lognormal = kinds == "lognormal"
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # The log-normal is a normal density of u; the others are normal densities of theta.
+            centre = np.where(lognormal, np.log(location), location)
+            width = np.where(lognormal, np.log(spread) / QUANTILE_975, spread)
+        mass = np.where(kinds == "positive_normal", location / spread, 0.0)
+        constant = np.where(kinds == "halfnormal", np.log(2.0), 0.0)
+        self.lognormal, self.centre, self.width = jnp.asarray(lognormal), jnp.asarray(centre), jnp.asarray(width)
+        self.constant = jnp.asarray(constant - np.where(kinds == "positive_normal", stats.norm.logcdf(mass), 0.0))
+        self.jacobian = jnp.asarray(np.array([row.positive for row in parameters]) & ~lognormal)
+
+    def at(self, index: Any, xp: ModuleType = jnp) -> "Priors":
+        """Those of some parameters: arrays of the shape of ``index``, of ``xp``."""
+        return jax.tree.map(lambda array: xp.asarray(array)[index], self)
+
+    def terms(self, u: Any, value: Any, xp: ModuleType = jnp) -> Any:
+        """Log-density of u parameter by parameter, Jacobian included; ``value`` is the constrained u."""
+        z = self.residuals(u, value, xp)
+        density = -0.5 * (z**2 + LOG_2PI) - xp.log(self.width) + self.constant
+        return density + xp.where(self.jacobian, u, 0.0)
+
+    def residuals(self, u: Any, value: Any, xp: ModuleType = jnp) -> Any:
+        """(value - centre)/width parameter by parameter."""
+        return (xp.where(self.lognormal, u, value) - self.centre) / self.width
+
+
+def prior_of(row: Parameter) -> Prior:
+    """The row's prior.
+
+    Raises
+    ------
+    ValueError
+        If it has none.
+    """
+    if row.prior is None:
+        raise ValueError(f"parameter {row.name} has no prior: the experiment that names it must supply one")
+    return row.prior
+
+
+def prior_sd(row: Parameter) -> float:
+    """sd of u under the row's prior (half-normal: of its logarithm, pi/sqrt(8))."""
+    prior = prior_of(row)
+    if prior.kind == "lognormal":
+        return float(np.log(prior.spread) / QUANTILE_975)
+    if prior.kind == "halfnormal":
+        return float(np.pi / np.sqrt(8.0))
+    if prior.kind == "positive_normal":
+        return prior.spread / prior.location
+    return prior.spread
+
+
+def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
+    """The row with the prior of ``rig.toml``, if that states one."""
+    if stated is None:
+        return row
+    if stated.scale is not None:
+        prior = Prior("halfnormal", 0.0, stated.scale)
+    else:
+        assert stated.median is not None, "the schema requires median and factor"
+        assert stated.factor is not None, "the schema requires median and factor"
+        prior = Prior("lognormal", stated.median, stated.factor)
+    return parameter(row.symbol, row.of, prior)
