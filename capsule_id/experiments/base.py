@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,6 +27,9 @@ from capsule_id.parameters import Parameter
 from capsule_id.precision import require_float64
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Finding
+
+if TYPE_CHECKING:
+    from capsule_id.physics.smooth.engine import Smoothing
 
 require_float64()
 
@@ -233,6 +236,11 @@ class Experiment(eqx.Module):
         """Largest ratio of a noise level of ``theta`` to the one that the record itself shows; 0 where it shows none."""
         del theta
         return 0.0
+
+    def with_smoothing(self, widths: "Smoothing | None") -> Self:
+        """The same readings with the smoothed capsule model of these ``widths``; the same where no capsule is modelled."""
+        del widths
+        return self
 
     def advice_on_coloured_noise(self) -> str:
         """What to do where the residuals are not white; continues the sentence of the finding."""

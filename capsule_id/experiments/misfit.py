@@ -134,3 +134,14 @@ class Misfit:
 
 def _variance(fixed: Any, scale: Any, scatter: Any) -> Any:
     return fixed + (scale * scatter) ** 2
+
+
+def innovations(raw: Any, variance: Any, design: Any, rho: Any, xp: ModuleType) -> Misfit:
+    """Readings with AR(1) noise as their innovations: e_t = rho e_(t-1) + N(0, variance + scatter^2), stationary."""
+
+    def whiten(y: Any) -> Any:
+        return xp.concatenate([y[:1], y[1:] - rho * y[:-1]])
+
+    first = 1.0 / xp.sqrt(1.0 - rho**2)
+    scale = xp.concatenate([xp.reshape(first, (1,)), xp.ones(raw.shape[0] - 1)])
+    return Misfit(whiten(raw), variance * scale**2, scale, whiten(design))

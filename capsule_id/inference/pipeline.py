@@ -1,7 +1,7 @@
 """The whole path from a rig to a result: experiments, log-posterior, point fit, sample, checks."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -71,6 +71,7 @@ def fit_rig(
         *check_agreement(target, point, stage.bench.fit, stage.bench.sample),
     )
     tables = _tables(rig, target, point, posterior)
+    predictive = {e.label: e.predictive_p([e.local(d) for d in draws], rng) for e in target.experiments}
     return Result(
         rig=rig,
         summary=tables["physical"],
@@ -78,8 +79,8 @@ def fit_rig(
         point_fit=point,
         posterior=posterior,
         findings=findings,
-        comparisons=_comparisons(setting, rng),
-        notes=(*make_notes(setting, stage.bench), *_predictive(setting, rng)),
+        comparisons=_comparisons(setting, predictive),
+        notes=(*make_notes(setting, stage.bench), *_predictive(setting, predictive)),
         provenance=_provenance(rig, seed, experiments),
         groups=_groups(target, posterior, rng),
         records=_records(setting),
@@ -109,9 +110,8 @@ def _draws(target: LogPosterior, posterior: Posterior | None) -> list[dict[str, 
     return [target.mapping(flat[i]) for i in np.linspace(0, len(flat) - 1, BAND_DRAWS).astype(int)]
 
 
-def _comparisons(s: Setting, rng: np.random.Generator) -> tuple[Comparison, ...]:
+def _comparisons(s: Setting, predictive: Mapping[str, float | None]) -> tuple[Comparison, ...]:
     """Panels with flagged rows marked and predictive p-values filled in."""
-    by_label = {e.label: e for e in s.experiments}
     panels = []
     for panel in compare(s.experiments, s.values, s.draws):
         points = []
@@ -119,17 +119,15 @@ def _comparisons(s: Setting, rng: np.random.Generator) -> tuple[Comparison, ...]
             mask = np.zeros(len(part.x), dtype=bool)
             mask[s.flagged.get(part.label, [])] = True
             points.append(replace(part, flagged=mask))
-        own = by_label.get(panel.label)
-        p = None if own is None else own.predictive_p([own.local(d) for d in s.draws], rng)
-        panels.append(replace(panel, points=tuple(points), predictive_p=p))
+        panels.append(replace(panel, points=tuple(points), predictive_p=predictive.get(panel.label)))
     return tuple(panels)
 
 
-def _predictive(s: Setting, rng: np.random.Generator) -> list[NoteTable]:
+def _predictive(s: Setting, predictive: Mapping[str, float | None]) -> list[NoteTable]:
     """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
     if not s.draws:
         return []
-    rows = {e.label: (e.kind, e.n, e.predictive_p([e.local(d) for d in s.draws], rng)) for e in s.experiments}
+    rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in s.experiments}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"]).rename_axis("experiment")
     caption = (
         "Chance that a replicate would miss the model by more than the readings do (chi-square discrepancy). Near 0: the "

@@ -7,7 +7,7 @@ its own noise, and an offset that enters linearly and is integrated out (a gain 
 their sd is stated). X2 = 0 at the first sample by convention: X2 and the offset of x_capsule cannot both be free.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import About, Start, ValuesBySymbol
+from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
+from capsule_id.experiments.forced_run.about import AboutRun
 from capsule_id.experiments.forced_run.feasibility import check_feasible
 from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts
 from capsule_id.experiments.forced_run.panels import run_comparisons
@@ -28,7 +29,7 @@ from capsule_id.experiments.forced_run.start import RunStart, rough_start
 from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
 from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.linear import NUISANCE_WIDTH
-from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.misfit import Misfit, innovations
 from capsule_id.parameters import CHANNELS
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.physics.smooth.engine import Smoothing
@@ -39,26 +40,6 @@ from capsule_id.views import Comparison, Finding
 
 #: Periods from rest after which a motion counts as settled (start = "settled").
 SETTLING_PERIODS = 40
-
-
-@dataclass(frozen=True)
-class AboutRun(About):
-    """What a run was made of.
-
-    Attributes
-    ----------
-    record : label of the record that the run is, or is a part of
-    leads : the run is a whole record, or the first part of one
-    start : the kind of initial state
-    start_is_open : no kind of initial state was stated
-    rough : state and drive at the first sample, read off the record (the speed by the model, where that found one)
-    """
-
-    record: str = field(compare=False)
-    leads: bool = field(compare=False)
-    start: str = field(compare=False)
-    start_is_open: bool = field(compare=False)
-    rough: RunStart = field(compare=False)
 
 
 class ForcedRun(CapsuleForward):
@@ -269,7 +250,7 @@ class ForcedRun(CapsuleForward):
                 columns.append(-self.delay_sd[i] * xp.gradient(seen) / xp.gradient(xp.asarray(self.time)))
             raw, design = self.values[i] - seen, xp.stack(columns, axis=1)
             if self.coloured:
-                parts.append(_coloured(raw, self.reading_variance[i], design, xp.tanh(theta[f"ar1_{name}"]), xp))
+                parts.append(innovations(raw, self.reading_variance[i], design, xp.tanh(theta[f"ar1_{name}"]), xp))
             else:
                 parts.append(Misfit(raw, self.reading_variance[i], 1.0, design))
         if self.second_reading:
@@ -311,14 +292,3 @@ class ForcedRun(CapsuleForward):
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         return run_comparisons(self, theta, draws)
-
-
-def _coloured(raw: Any, variance: Any, design: Any, rho: Any, xp: ModuleType) -> Misfit:
-    """Readings with AR(1) noise as their innovations: e_t = rho e_(t-1) + N(0, variance + scatter^2), stationary."""
-
-    def whiten(y: Any) -> Any:
-        return xp.concatenate([y[:1], y[1:] - rho * y[:-1]])
-
-    first = 1.0 / xp.sqrt(1.0 - rho**2)
-    scale = xp.concatenate([xp.reshape(first, (1,)), xp.ones(raw.shape[0] - 1)])
-    return Misfit(whiten(raw), variance * scale**2, scale, whiten(design))

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.inference.checks.agreement import runs_alone
 from capsule_id.inference.fit.least_squares import linearised
 from capsule_id.inference.fit.point_stage import BenchFit
@@ -76,7 +75,7 @@ def _evaluate(residual: HeldResiduals, v: Any) -> Any:
 def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing) -> tuple[np.ndarray, np.ndarray]:
     """(d_located,) shift of u between a fit with the smoothed model of ``widths`` and the exact one, and the sd of u."""
     located = target.located
-    smoothed = [e.with_smoothing(widths) if isinstance(e, CapsuleForward) else e for e in target.experiments]
+    smoothed = [e.with_smoothing(widths) for e in target.experiments]
     centre = jnp.asarray(fit.u)
     misses = _evaluate(HeldResiduals(LogPosterior(target.rig, smoothed), centre), centre[located])
     exact, jacobian = linearised(HeldResiduals(target, centre), fit.u[located])
