@@ -59,26 +59,22 @@ def fit_points(rig: Rig, experiments: Sequence[Experiment], seed: int, sampled: 
             return PointStage(target, point_fit(target, seed), BenchFit())
         bench = BenchFit()
         if not closed:
-            known = _rough(rig)
+            known = _rough(rig, experiments)
         else:
             alone = LogPosterior(rig, closed)
             fit = point_fit(alone, seed)
             own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
             bench, known = BenchFit(fit, own), dict(fit.values)
-        experiments, findings = cut_unpredictable(rig, experiments, known)
-        target, joint, wavering = _fit_with_right_starts(rig, experiments, known, seed, pool)
+        target, findings = cut_unpredictable(LogPosterior(rig, experiments), known)
+        target, joint, wavering = _fit_with_right_starts(target, known, seed, pool)
     return PointStage(target, joint, bench, (*findings, *wavering))
 
 
 def _fit_with_right_starts(
-    rig: Rig,
-    experiments: Sequence[Experiment],
-    known: Mapping[str, float],
-    seed: int,
-    pool: Executor | None,
+    target: LogPosterior, known: Mapping[str, float], seed: int, pool: Executor | None
 ) -> tuple[LogPosterior, PointFit, list[Finding]]:
-    """The joint fit, again from where it ended as long as it finds a start of a run wrong; and what is left of that."""
-    target, first = LogPosterior(rig, experiments), None
+    """The joint fit, repeated from its end while it contradicts the kind of start of a run; a finding if it still does."""
+    first = None
     for remaining in reversed(range(ROUNDS)):
         _compile(pool, target)
         joint = joint_fit(target, known, seed, first)
@@ -86,7 +82,7 @@ def _fit_with_right_starts(
         if corrected is None:
             return target, joint, []
         if remaining:
-            target, first = LogPosterior(rig, corrected[0]), corrected[1]
+            target, first = LogPosterior(target.rig, corrected[0]), corrected[1]
     doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
     text = (
         f"{', '.join(doubtful)}: expected one kind of start to fit; the kind of start did not settle after {ROUNDS} fits: "
@@ -101,30 +97,29 @@ def _compile(pool: Executor | None, target: LogPosterior) -> None:
         pool.submit(compile_ahead, target)
 
 
-def _rough(rig: Rig) -> dict[str, float]:
-    """The paper's estimates of what the rig's bench tables tell, fitted or not."""
-    measured = [table for table in rig.tables if table.kind in BENCH]
-    return paper_estimates(make_experiments(rig, "bench")) if measured else {}
+def _rough(rig: Rig, experiments: Sequence[Experiment]) -> dict[str, float]:
+    """The paper's estimates from the rig's bench tests; those that are not among ``experiments`` are made for it."""
+    bench = [e for e in experiments if e.bench]
+    if not bench and any(table.kind in BENCH for table in rig.tables):
+        bench = make_experiments(rig, "bench")
+    return paper_estimates(bench)
 
 
-def cut_unpredictable(
-    rig: Rig, experiments: Sequence[Experiment], known: Mapping[str, float]
-) -> tuple[list[Experiment], list[Finding]]:
-    """``experiments``, a run that amplifies an error of its initial state too much in parts, and what was done.
+def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple[LogPosterior, list[Finding]]:
+    """``target`` with every run that amplifies an error of its initial state too much in parts; and what was done.
 
     Parameters
     ----------
     known : estimates by name; whatever is missing has the value where a fit would start
     """
-    rough = LogPosterior(rig, experiments)
-    values = {**rough.fixed, **{name: start.centre for name, start in rough.starts().items()}, **known}
+    values = {**target.fixed, **{name: start.centre for name, start in target.starts().items()}, **known}
     kept: list[Experiment] = []
     findings: list[Finding] = []
-    for e in experiments:
+    for e in target.experiments:
         parts, found = e.predictable_parts(e.local(values))
         kept += parts
         findings += found
-    return kept, findings
+    return (LogPosterior(target.rig, kept) if len(kept) > len(target.experiments) else target), findings
 
 
 def correct_starts(target: LogPosterior, fit: PointFit) -> tuple[list[Experiment], dict[str, float]] | None:

@@ -25,13 +25,15 @@ def chaotic() -> tuple[Table, dict[str, float]]:
 def test_a_chaotic_record_is_cut_and_a_tame_one_is_not() -> None:
     table, truth = chaotic()
     rig = bench.rig(table, m2=Quantity(0.3))
-    parts, findings = cut_unpredictable(rig, [ForcedRun(table, rig)], truth)
+    target, findings = cut_unpredictable(LogPosterior(rig, [ForcedRun(table, rig)]), truth)
+    parts = target.experiments
     assert len(parts) >= 3
     assert [(finding.level, finding.experiment) for finding in findings] == [("warn", "wild")]
     assert f"cut into {len(parts)} parts" in findings[0].text
-    tame = make(1, samples=1000)
-    kept, findings = cut_unpredictable(tame.rig, [tame], TRUTH)
-    assert kept == [tame]
+    run = make(1, samples=1000)
+    tame = LogPosterior(run.rig, [run])
+    kept, findings = cut_unpredictable(tame, TRUTH)
+    assert kept is tame
     assert findings == []
 
 
@@ -50,10 +52,10 @@ def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypat
 
     monkeypatch.setattr(point_stage, "joint_fit", joint_fit)
     monkeypatch.setattr(point_stage, "correct_starts", other_kind)
-    target, fit, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, 0, None)
+    target, fit, findings = point_stage._fit_with_right_starts(LogPosterior(run.rig, [run]), {}, 0, None)
     assert len(fitted) == point_stage.ROUNDS
     assert target is fit is fitted[-1]
     assert [(finding.level, finding.experiment) for finding in findings] == [("fail", "run_3")]
     monkeypatch.setattr(point_stage, "correct_starts", lambda *_: None)
-    *_, findings = point_stage._fit_with_right_starts(run.rig, [run], {}, 0, None)
+    *_, findings = point_stage._fit_with_right_starts(LogPosterior(run.rig, [run]), {}, 0, None)
     assert findings == []
