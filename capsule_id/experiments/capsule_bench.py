@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import Start, Theta, no_design
+from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.forward import CapsuleForward
+from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import friction_coefficient, slide_distance
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -44,7 +46,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
     def __init__(self, table: Table, rig: Rig) -> None:
         super().__init__(table, rig)
-        gap = table.settings.get("gap")
+        gap = table.settings.gap
         self.within_reach = isinstance(gap, Quantity)
         self.gap, self.gap_sd = (gap.value, gap.sd) if isinstance(gap, Quantity) else (FAR, 0.0)
         self.gap_known = self.gap_sd == 0.0
@@ -54,12 +56,12 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         of, scale = self.label, float(np.ptp(self.values))
         rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")]
         if self.within_reach:
-            rows.append(parameter("k2", str(self.table.settings["spring"])))
+            rows.append(parameter("k2", self.table.settings.spring))
         if not self.gap_known:
             rows.append(parameter("G", of, Prior("positive_normal", self.gap, self.gap_sd)))
         rows.append(parameter("x_start", of, Prior("normal", 0.0, self.width)))
         rows.append(parameter("y_start", of, Prior("normal", 0.0, self.width * self._rough.Omega_o)))
-        return (*rows, parameter("noise_sd", of, self.noise_prior(scale)))
+        return (*rows, NOISE_SD.named(of, self.noise_prior(scale)))
 
     def motion_of(self, theta: Theta) -> Any:
         """(n,) x_rel of the model."""
@@ -104,7 +106,7 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        return (*(parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")), parameter("push_scatter"))
+        return (*(parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")), PUSH_SCATTER)
 
     def slide(self, theta: Theta, xp: ModuleType = jnp) -> Any:
         """(n,) m that the capsule goes."""

@@ -36,8 +36,7 @@ class Line(Experiment):
         self.x, self.y = self.x_column.values, self.y_column.values
         self.x_sd, self.y_sd = self.x_column.reading_sd, self.y_column.reading_sd
         self.width = NUISANCE_WIDTH * float(np.ptp(self.y))
-        ratio = table.settings.get("sd_ratio")
-        self.sd_ratio = None if ratio is None else float(ratio)  # type: ignore[arg-type]
+        self.sd_ratio = table.settings.sd_ratio
         self.scale_known = self.x_column.sd is not None and self.y_column.sd is not None
         self.scatters = (None,) if self.scale_known else ("scatter",)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments import compare, make_experiments, paper_estimates
+from capsule_id.experiments import Choice, compare, make_experiments, paper_estimates
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.inference.checks.experiment_checks import Setting
@@ -37,7 +37,7 @@ PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "panda
 def fit_rig(
     rig: Rig,
     seed: int = 0,
-    which: str = "all",
+    which: Choice = "all",
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
     progress: Progress | None = None,

@@ -57,7 +57,7 @@ def delayed(seconds: float, **settings: object) -> ForcedRun:
     t = simulate(p, e, late, (run.truth.x_rel, run.truth.Y1, 0.0, run.truth.Y2))
     x = np.asarray(t.x_rel)
     columns = {**own.columns, "x_rel": replace(own.columns["x_rel"], values=x)}
-    changed: Table = replace(own, columns=columns, settings={**own.settings, "start": "moving"})
+    changed: Table = replace(own, columns=columns, settings=replace(own.settings, start="moving"))
     return ForcedRun(changed, bench.rig(changed))
 
 

@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import Experiment, Start, Theta
+from capsule_id.experiments.forced_run.declaration import CAPSULE_START, CORRELATION, CURRENT_AMPLITUDE, NOISE
 from capsule_id.experiments.forced_run.feasibility import feasibility
 from capsule_id.experiments.forced_run.panels import run_comparisons
 from capsule_id.experiments.forced_run.parts import leads, record_of
-from capsule_id.experiments.forced_run.start import SPEED_FOUND, RunStart, rough_start
+from capsule_id.experiments.forced_run.start import RunStart, rough_start
 from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, ScaledMisfit
@@ -29,12 +30,7 @@ from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Comparison, Finding
 
 #: Channel of the table -> symbol of its noise; the order of the misfits.
-NOISES = {
-    "x_rel": "noise_x_rel",
-    "x_capsule": "noise_x_capsule",
-    "acceleration_rod": "noise_acceleration_rod",
-    "current": "noise_current",
-}
+NOISES = {name: row.symbol for name, row in NOISE.items()}
 #: Default prior of a channel's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 #: Default prior of the current's amplitude: log-normal about half its range.
@@ -68,18 +64,18 @@ class ForcedRun(CapsuleForward, Experiment):
         "channels", "settled", "gap_known", "drive_known", "gained", "delayed", "coloured", "second_reading", "model",
     )  # fmt: skip
 
-    def __init__(self, table: Table, rig: Rig) -> None:
+    def __init__(self, table: Table, rig: Rig, speed_found: float | None = None) -> None:
         super().__init__(table, rig)
+        #: The capsule's speed at the first sample, m/s, once a fit has found it; 0: stuck; None: not known.
+        self.speed_found = speed_found
         self.channels = tuple(name for name in NOISES if name in table.columns)
         self.time = table["time"]
         self.values = np.stack([table[name] for name in self.channels])
-        self.Omega = _angular_frequency(table)
-        self.spring = str(table.settings["spring"])
-        gap, drive = table.settings["gap"], table.settings.get("P_d")
-        assert isinstance(gap, Quantity), "the schema makes it one"
+        self.Omega = table.settings.angular_frequency
+        self.spring = table.settings.spring
+        gap, drive = table.settings.gap, table.settings.P_d
         self.gap, self.gap_sd = gap.value, gap.sd
         self.gap_known = gap.sd == 0.0
-        assert drive is None or isinstance(drive, Quantity), "the schema makes it one"
         self.drive, self.drive_sd = (0.0, 0.0) if drive is None else (drive.value, drive.sd)
         self.drive_known = drive is not None and drive.sd == 0.0
         self.reading_variance = np.array([table.columns[name].reading_sd ** 2 for name in self.channels])
@@ -88,8 +84,8 @@ class ForcedRun(CapsuleForward, Experiment):
         self.gains, self.gained = self._asked_for("gain")
         self.delays, self.delayed = self._asked_for("delay")
         self.second_reading = self.driven_by_current and self.drive_sd > 0.0
-        self.coloured = table.settings.get("noise") == "ar1"
-        wanted = str(table.settings.get("start", "auto"))
+        self.coloured = table.settings.noise == "ar1"
+        wanted = table.settings.start
         self.start_is_open = wanted == "auto"
         self.start = self.rough.kind if self.start_is_open else wanted
         self.settled = self.start == "settled"
@@ -98,9 +94,8 @@ class ForcedRun(CapsuleForward, Experiment):
 
     def _asked_for(self, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
         """Stated sd of a gain or delay by channel, and whether there is one."""
-        keys = [f"{name}_{nuisance}_sd" for name in self.channels]
-        sds = np.array([float(self.table.settings.get(key, 0.0)) for key in keys])  # type: ignore[arg-type]
-        return sds, tuple(key in self.table.settings for key in keys)
+        stated = [getattr(self.table.settings, f"{name}_{nuisance}_sd") for name in self.channels]
+        return np.array([sd or 0.0 for sd in stated]), tuple(sd is not None for sd in stated)
 
     def _by_channel(self) -> list[tuple[str, np.ndarray]]:
         return list(zip(self.channels, self.values, strict=True))
@@ -109,8 +104,8 @@ class ForcedRun(CapsuleForward, Experiment):
     def rough(self) -> RunStart:
         """State and drive at the first sample, read off the record (the speed by the model, where that found one)."""
         rough = rough_start(self.time, dict(self._by_channel()), self.Omega)
-        speed = self.table.settings.get(SPEED_FOUND)
-        if not isinstance(speed, float):
+        speed = self.speed_found
+        if speed is None:
             return rough
         return replace(rough, capsule_rate=speed, kind="stuck" if speed == 0.0 else "moving")
 
@@ -134,7 +129,7 @@ class ForcedRun(CapsuleForward, Experiment):
             rows.append(parameter("G", whole, Prior("positive_normal", self.gap, self.gap_sd)))
         if self.driven_by_current:
             amplitude = 0.5 * float(np.ptp(self.table["current"]))
-            rows += [parameter("K"), parameter("I_d", whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
+            rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
         elif not self.drive_known:
             rows.append(parameter("P_d", whole, Prior("positive_normal", self.drive, self.drive_sd)))
         rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
@@ -143,13 +138,11 @@ class ForcedRun(CapsuleForward, Experiment):
             rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
             rows.append(parameter("y_start", of, Prior("normal", 0.0, self.Omega * length)))
         if self.start == "moving":
-            rows.append(
-                parameter("capsule_start", of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length))
-            )
+            rows.append(CAPSULE_START.named(of, Prior("normal", 0.0, self.Omega * NUISANCE_WIDTH * self.rough.length)))
         for name, scale in zip(self.channels, self.ranges, strict=True):
-            rows.append(parameter(NOISES[name], whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
+            rows.append(NOISE[name].named(whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
         if self.coloured:
-            rows += [parameter(f"ar1_{name}", whole) for name in self.channels]
+            rows += [CORRELATION[name].named(whole) for name in self.channels]
         return tuple(rows)
 
     @property
@@ -263,7 +256,7 @@ class ForcedRun(CapsuleForward, Experiment):
         theta = self.local(theta)
         drive = theta["K"] * theta["I_d"] if self.driven_by_current else theta.get("P_d", self.drive)
         gap = theta.get("G", self.gap)
-        settings = {**self.table.settings, "P_d": Quantity(float(drive)), "gap": Quantity(float(gap))}
+        settings = replace(self.table.settings, P_d=Quantity(float(drive)), gap=Quantity(float(gap)))
         return feasibility(replace(self.table, settings=settings), theta)
 
     def records(self, theta: Theta) -> list[tuple[str, np.ndarray]]:
@@ -287,12 +280,6 @@ def _coloured(raw: Any, variance: Any, design: Any, rho: Any, xp: ModuleType) ->
     first = 1.0 / xp.sqrt(1.0 - rho**2)
     scale = xp.concatenate([xp.reshape(first, (1,)), xp.ones(raw.shape[0] - 1)])
     return Misfit(whiten(raw), variance * scale**2, scale, whiten(design))
-
-
-def _angular_frequency(table: Table) -> float:
-    """Stated drive frequency, rad/s; ``rules.py`` sees to it that one is stated."""
-    stated = table.settings.get("Omega")
-    return float(stated) if stated is not None else 2.0 * np.pi * float(table.settings["f"])  # type: ignore[arg-type]
 
 
 def _floor(table: Table, name: str) -> float:

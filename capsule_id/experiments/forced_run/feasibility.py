@@ -11,7 +11,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from capsule_id.physics.grazing import grazing_load
-from capsule_id.rig.model import Quantity, Table
+from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
 #: The name that every finding of this module carries.
@@ -40,14 +40,9 @@ class Drive:
 
 def drive_of(table: Table, K: float) -> Drive:
     """The drive of a forced run: P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
-    stated, gap = table.settings.get("P_d"), table.settings["gap"]
-    assert isinstance(gap, Quantity), "the schema asks for the gap of a forced run"
-    Omega = table.settings.get("Omega")
-    if Omega is None:
-        Omega = 2.0 * np.pi * float(table.settings["f"])  # type: ignore[arg-type]
-    Omega = float(Omega)  # type: ignore[arg-type]
-    P_d = stated.value if isinstance(stated, Quantity) else K * _amplitude(table["time"], table["current"], Omega)
-    return Drive(Omega, P_d, gap.value)
+    stated, Omega = table.settings.P_d, table.settings.angular_frequency
+    P_d = K * _amplitude(table["time"], table["current"], Omega) if stated is None else stated.value
+    return Drive(Omega, P_d, table.settings.gap.value)
 
 
 def _amplitude(time: np.ndarray, values: np.ndarray, Omega: float) -> float:

@@ -12,8 +12,8 @@ from capsule_id.experiments.forced_run.start import PARABOLA_SAMPLES
 from capsule_id.rig.model import Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 
-#: Setting of a part: the label of its record. Labels of parts: the record's, this mark (no file name has it), a number.
-PART_OF, PART_MARK = "part_of", "~"
+#: Labels of parts: the record's, this mark (no label in rig.toml has it), a number.
+PART_MARK = "~"
 #: A cut may move by this share of a part's length to where the motion is smooth.
 LEEWAY = 0.3
 
@@ -67,21 +67,19 @@ def _roughness(table: Table) -> np.ndarray:
 
 
 def _part(table: Table, index: int, rows: slice) -> Table:
-    dropped = {"segment"}
+    settings = replace(table.settings, segment=None)
     if index > 0:
-        dropped |= {"start", "P_d"} if "current" in table.columns else {"start"}
-    settings = {name: value for name, value in table.settings.items() if name not in dropped}
+        settings = replace(settings, start="auto", P_d=None if "current" in table.columns else settings.P_d)
     columns = {name: replace(column, values=column.values[rows]) for name, column in table.columns.items()}
     label = f"{table.label}{PART_MARK}{index + 1}"
-    own = settings | {PART_OF: table.label}
-    return replace(table, label=label, columns=columns, settings=own, rows=table.rows[rows])
+    return replace(table, label=label, columns=columns, settings=settings, rows=table.rows[rows])
 
 
 def record_of(table: Table) -> str:
     """Label of the record that ``table`` is, or is a part of."""
-    return str(table.settings.get(PART_OF, table.label))
+    return table.label.split(PART_MARK)[0]
 
 
 def leads(table: Table) -> bool:
     """Whether it is a whole record, or the first part of one."""
-    return PART_OF not in table.settings or table.label == f"{record_of(table)}{PART_MARK}1"
+    return PART_MARK not in table.label or table.label == f"{record_of(table)}{PART_MARK}1"

@@ -4,13 +4,10 @@ A capsule that creeps at the first sample looks like one at rest that is about t
 apart once the rest of the model is known.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from capsule_id.experiments.base import Theta
 from capsule_id.experiments.forced_run.experiment import NOISES, ForcedRun
-from capsule_id.experiments.forced_run.start import SPEED_FOUND
 
 #: Speeds at the first sample, m/s, that are held against the record; the middle one is rest.
 CREEP = np.concatenate([-np.geomspace(60e-3, 0.5e-3, 13), [0.0], np.geomspace(0.5e-3, 60e-3, 13)])
@@ -23,8 +20,7 @@ GAIN = 3.0
 
 def restarted(run: ForcedRun, speed: float) -> ForcedRun:
     """The same record with its capsule at this ``speed``, m/s, at the first sample; 0: stuck."""
-    settings = {**run.table.settings, SPEED_FOUND: speed}
-    other = ForcedRun(replace(run.table, settings=settings), run.rig)
+    other = ForcedRun(run.table, run.rig, speed)
     other.model, other.smoothing = run.model, run.smoothing
     return other
 

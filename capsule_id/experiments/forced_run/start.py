@@ -13,8 +13,6 @@ from capsule_id.experiments.free_vibration.decrement import noise_level
 LINE_SAMPLES, PARABOLA_SAMPLES = 4, 9
 #: The capsule counts as moving where its rate at the start stands out of its standard error by this factor.
 MOVING = 4.0
-#: Setting of a run: the capsule's speed at its first sample, m/s, once a fit has found it; 0: stuck.
-SPEED_FOUND = "speed_found"
 #: Without a current the drive's phase is that of x_rel's fundamental, ahead by the lag of a rod of this frequency, rad/s,
 #: and damping ratio (the middle of the default priors): rough, and good enough for a start.
 ROD_FREQUENCY, ROD_DAMPING = 115.0, 0.16

@@ -18,13 +18,14 @@ from capsule_id.experiments.free_vibration.decay_models import (
 )
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
 from capsule_id.experiments.free_vibration.decay_trend import describe_trend
+from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement, noise_level
+from capsule_id.experiments.free_vibration.window import decay_window
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Quantity, Rig, Table
-from capsule_id.rig.windows import decay_window
 from capsule_id.views import Comparison, Curve, Finding, Points
 
 #: Default prior of a record's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
@@ -52,7 +53,7 @@ class FreeVibration(Experiment):
         time, self.values = decay_window(table)
         self.time0 = float(time[0])
         self.time = time - self.time0
-        self.damping = str(table.settings.get("damping", "viscous"))
+        self.damping = table.settings.damping
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.reading_sd = self.column.reading_sd
         step = uniform_step(self.time)
@@ -62,7 +63,7 @@ class FreeVibration(Experiment):
 
     def with_damping(self, damping: str) -> "FreeVibration":
         """The same record under another damping model."""
-        table = replace(self.table, settings={**self.table.settings, "damping": damping})
+        table = replace(self.table, settings=replace(self.table.settings, damping=damping))
         return FreeVibration(table, self.rig)
 
     @property
@@ -81,11 +82,11 @@ class FreeVibration(Experiment):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         scale = float(np.ptp(self.values))
-        noise = parameter("noise_sd", self.label, self.noise_prior(scale))
+        noise = NOISE_SD.named(self.label, self.noise_prior(scale))
         shared = (parameter("k1"), parameter("c"))
         if self.damping == "dry":
-            amplitude = parameter("amplitude", self.label, Prior("lognormal", scale, NUISANCE_WIDTH))
-            turning = parameter("turning_time", self.label, Prior("normal", 0.0, float(self.time[-1])))
+            amplitude = AMPLITUDE.named(self.label, Prior("lognormal", scale, NUISANCE_WIDTH))
+            turning = TURNING_TIME.named(self.label, Prior("normal", 0.0, float(self.time[-1])))
             return *shared, parameter("F_dry"), noise, amplitude, turning
         if self.damping == "quadratic":
             x_start = parameter("x_start", self.label, Prior("normal", 0.0, self.width))
@@ -135,10 +136,10 @@ class FreeVibration(Experiment):
             sampling_step(self.time)
         except InputError:
             return self.values
-        window = self.table.settings.get("smoothing_window")
+        window = self.table.settings.smoothing_window
         if window is None:
             window = choose_window(self.time, self.values, SMOOTHING_ORDER)
-        return savitzky_golay(self.time, self.values, float(window), SMOOTHING_ORDER)  # type: ignore[arg-type]
+        return savitzky_golay(self.time, self.values, window, SMOOTHING_ORDER)
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
         """The paper's k1 and c of this record, from the smoothed or the raw peaks."""
@@ -234,7 +235,7 @@ class FreeVibration(Experiment):
 
     def lint(self, theta: Theta) -> list[Finding]:
         findings = []
-        if self.table.settings.get("capsule", "held") == "free" and "mu" in theta and "m2" in theta:
+        if self.table.settings.capsule == "free" and "mu" in theta and "m2" in theta:
             force = self.largest_force(theta)
             threshold = float(theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"])
             if force > threshold:
@@ -244,7 +245,7 @@ class FreeVibration(Experiment):
                     "release from a smaller deflection"
                 )
                 findings.append(Finding("free decay", "fail", text, self.label))
-        gap = self.table.settings.get("gap")
+        gap = self.table.settings.gap
         if isinstance(gap, Quantity):
             reach, limit = float(np.max(self.values - equilibrium(self.values))), gap.value
             if reach >= limit:
@@ -283,21 +284,3 @@ def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
     r = residuals - np.mean(residuals)
     power = float(r @ r)
     return np.array([float(r[lag:] @ r[:-lag]) for lag in range(1, lags + 1)]) / power
-
-
-def twin(
-    rng: np.random.Generator,
-    k1: float,
-    c: float,
-    m1: float,
-    release: float,
-    relative_sd: float,
-    duration: float = 0.5,
-    rate: float = 2000.0,
-) -> dict[str, np.ndarray]:
-    """A synthetic decay, released at rest from ``release`` m at time 0; noise is ``relative_sd`` of the release."""
-    time = np.arange(round(duration * rate)) / rate
-    gamma, omega = rates(k1, c, m1, np)
-    cosine, sine = viscous_basis(time, k1, c, m1, np).T
-    x = release * (cosine + gamma / omega * sine)
-    return {"time [s]": time, "x_rel [mm]": 1e3 * (x + relative_sd * release * rng.standard_normal(time.size))}

@@ -8,6 +8,7 @@ import numpy as np
 from capsule_id.experiments.base import Start, Theta, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment
 from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.static_friction.declaration import TILT_SD
 from capsule_id.parameters import Parameter, parameter
 from capsule_id.rig.model import Rig, Table
 
@@ -29,7 +30,7 @@ class StaticFriction(FrictionExperiment):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        return parameter("mu"), parameter("tilt_sd")
+        return parameter("mu"), TILT_SD
 
     @property
     def observed(self) -> np.ndarray:
@@ -58,14 +59,6 @@ def _angles(table: Table) -> tuple[np.ndarray, np.ndarray]:
     height, length = table.columns["height"], table.columns["length"]
     ratio = height.values / length.values
     ratio_sd = ratio * np.hypot(height.reading_sd / height.values, length.reading_sd / length.values)
-    if table.settings["length_is"] == "board":
+    if table.settings.length_is == "board":
         return np.arcsin(ratio), ratio_sd / np.sqrt(1.0 - ratio**2)
     return np.arctan(ratio), ratio_sd / (1.0 + ratio**2)
-
-
-def twin(
-    rng: np.random.Generator, mu: float, trials: int = 4, tilt_sd: float = np.deg2rad(0.5)
-) -> dict[str, np.ndarray]:
-    """A synthetic table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
-    angle = np.arctan(mu) + tilt_sd * rng.standard_normal(trials)
-    return {"angle [deg]": np.rad2deg(angle)}

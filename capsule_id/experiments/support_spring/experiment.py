@@ -12,14 +12,13 @@ class SupportSpring(Line):
     """F = F0 + k2[spring] x."""
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        self.spring = str(table.settings["spring"])
+        self.spring = table.settings.spring
         super().__init__(table, rig, "deflection", "force", parameter("k2", self.spring))
 
     @property
     def length(self) -> Quantity | None:
         """Free length of the cantilever, m, where stated."""
-        length = self.table.settings.get("length")
-        return length if isinstance(length, Quantity) else None
+        return self.table.settings.length
 
 
 def cantilever_exponent(
@@ -35,10 +34,3 @@ def cantilever_exponent(
     exponent = float(np.sum(weight * x * np.log(k2)) / np.sum(weight * x**2))
     sd = float(1.0 / np.sqrt(np.sum(weight * x**2)))
     return exponent, sd, float(2.0 * stats.norm.sf(abs(exponent + 3.0) / sd))
-
-
-def twin(rng: np.random.Generator, k2: float, deflections: np.ndarray, relative_sd: float) -> dict[str, np.ndarray]:
-    """A synthetic static test at ``deflections`` (n,) m; the force is read with ``relative_sd`` of full scale."""
-    force = k2 * deflections
-    noise = relative_sd * np.max(np.abs(force)) * rng.standard_normal(len(force))
-    return {"deflection [mm]": 1e3 * deflections, "force [N]": force + noise}

@@ -9,11 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from capsule_id.experiments import DynamicFriction, SlidingFriction, StaticFriction, SupportSpring
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.free_vibration.experiment import FreeVibration, autocorrelation
 from capsule_id.experiments.line import Line
-from capsule_id.experiments.support_spring.experiment import cantilever_exponent
+from capsule_id.experiments.sliding_friction.experiment import SlidingFriction
+from capsule_id.experiments.static_friction.experiment import StaticFriction
+from capsule_id.experiments.support_spring.experiment import SupportSpring, cantilever_exponent
 from capsule_id.inference.checks.regression import MOST_FLAGGED, curvature_test, outliers, refit
 from capsule_id.inference.checks.tension import tension
 from capsule_id.inference.result import PointFit, Posterior

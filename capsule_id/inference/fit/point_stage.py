@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capsule_id.experiments import BENCH, make_experiments, paper_estimates
+from capsule_id.experiments import make_experiments, paper_estimates, select_tables
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.parts import parts_of
@@ -109,8 +109,7 @@ def _compile(pool: Executor | None, target: LogPosterior) -> None:
 
 def _rough(rig: Rig) -> dict[str, float]:
     """The paper's estimates of what the rig's bench tables tell, fitted or not."""
-    measured = [table for table in rig.tables if table.kind in BENCH]
-    return paper_estimates(make_experiments(rig, "bench")) if measured else {}
+    return paper_estimates(make_experiments(rig, "bench")) if select_tables(rig, "bench") else {}
 
 
 def cut_unpredictable(

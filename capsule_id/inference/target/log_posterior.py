@@ -192,4 +192,4 @@ def _override(row: Parameter, override: PriorOverride | None) -> Parameter:
         assert override.median is not None, "the schema asks for median and factor"
         assert override.factor is not None, "the schema asks for median and factor"
         prior = Prior("lognormal", override.median, override.factor)
-    return parameter(row.symbol, row.of, prior)
+    return row.named(row.of, prior)
