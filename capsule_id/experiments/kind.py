@@ -55,35 +55,6 @@ class Twin:
     truth: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
-def no_lint(table: Table, rig: Rig, estimate: Estimate) -> Iterable[str]:
-    """Lint of a kind without any."""
-    del table, rig, estimate
-    return ()
-
-
-def no_description(table: Table) -> Iterable[str]:
-    """Description of a kind that needs none."""
-    del table
-    return ()
-
-
-def no_check(tables: Sequence[Table]) -> None:
-    """Check of a kind whose tables need none."""
-    del tables
-
-
-def no_estimate(experiments: Sequence["Experiment"]) -> Values:
-    """The paper's estimates from a kind that the paper does not have."""
-    del experiments
-    return {}
-
-
-def no_rough_values(experiments: Sequence["Experiment"], rig: Rig) -> Values:
-    """Rough values of a kind for which the paper's estimates do."""
-    del experiments, rig
-    return {}
-
-
 def own_panels(experiments: Sequence["Experiment"], values: Values, draws: Sequence[Values]) -> Iterable["Comparison"]:
     """Panels of experiments that share none, one after the other."""
     for e in experiments:
@@ -101,7 +72,8 @@ class Kind(KindRule):
     informs : the parameters that it measures, for tables
     captions : of its panels in the report, by ``Comparison.kind``
     bench : a bench test; else a forced run
-    lint : what deserves attention before a fit, a line each
+    lint : what deserves attention in a table before a fit, a line each
+    lint_rig : the same, where it takes the rest of the rig or rough values
     describe : what ``capsule-id check`` says of a table, a line each
     check : raises an ``InputError`` where all tables of the kind together cannot be fitted
     paper : estimates by the paper's own protocol, by parameter name. Kinds with the same function are evaluated together
@@ -117,11 +89,12 @@ class Kind(KindRule):
     informs: str
     captions: Mapping[str, str]
     bench: bool = True
-    lint: Callable[[Table[Any], Rig, Estimate], Iterable[str]] = no_lint
-    describe: Callable[[Table[Any]], Iterable[str]] = no_description
-    check: Callable[[Sequence[Table[Any]]], None] = no_check
-    paper: Callable[[Sequence[Any]], Values] = no_estimate
-    rough: Callable[[Sequence[Any], Rig], Values] = no_rough_values
+    lint: tuple[Callable[[Table[Any]], Iterable[str]], ...] = ()
+    lint_rig: Callable[[Table[Any], Rig, Estimate], Iterable[str]] = field(default=lambda table, rig, estimate: ())
+    describe: Callable[[Table[Any]], Iterable[str]] = field(default=lambda table: ())
+    check: Callable[[Sequence[Table[Any]]], None] = field(default=lambda tables: None)
+    paper: Callable[[Sequence[Any]], Values] = field(default=lambda experiments: {})
+    rough: Callable[[Sequence[Any], Rig], Values] = field(default=lambda experiments, rig: {})
     panels: Callable[[Sequence[Any], Values, Sequence[Values]], Iterable["Comparison"]] = own_panels
     twin: Callable[[Values, np.random.Generator, int], Twin] | None = None
     truth: Values = field(default_factory=dict)

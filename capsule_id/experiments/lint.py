@@ -21,7 +21,12 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> list[str]:
         if mass is not None and mass.sd == 0.0
     ]
     for table in rig.tables:
-        findings += [f"{table.label}: {text}" for text in kinds[table.kind].lint(table, rig, estimate)]
+        kind = kinds[table.kind]
+        texts = [
+            *(text for lint_table in kind.lint for text in lint_table(table)),
+            *kind.lint_rig(table, rig, estimate),
+        ]
+        findings += [f"{table.label}: {text}" for text in texts]
     by_content: dict[str, list[str]] = {}
     for table in rig.tables:
         by_content.setdefault(rig.files[table.file], []).append(table.label)

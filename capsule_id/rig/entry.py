@@ -31,10 +31,6 @@ class Entry(Generic[S]):
         path = (*self.path, key) if key else self.path
         return self.document.error(path, rule, value, remedy, of_key)
 
-    def cell_error(self, row: int, column: str, rule: str, value: str, remedy: str) -> InputError:
-        """The error to raise about a cell of the table."""
-        return self.file.error(row, column, rule, value, remedy)
-
     def check_length(self) -> None:
         """Refuse a record that is too short to fit.
 
@@ -47,4 +43,4 @@ class Entry(Generic[S]):
         if samples < SHORTEST_RECORD:
             rule = f"a record must have at least {SHORTEST_RECORD} samples"
             remedy = f"record {self.table.kind} for longer or faster"
-            raise self.cell_error(samples - 1, "time", rule, f"{samples} samples", remedy)
+            raise self.file.error(samples - 1, "time", rule, f"{samples} samples", remedy)

@@ -1,7 +1,7 @@
 """The types in which a kind of experiment states its columns, settings and rules. The reader knows these types only."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from types import MappingProxyType, UnionType
 from typing import (
@@ -89,12 +89,6 @@ class NameRule:
         return read_name(document, path, value)
 
 
-def no_masses(table: Table) -> tuple[str, ...]:
-    """Masses that an experiment needs where it needs none."""
-    del table
-    return ()
-
-
 @dataclass(frozen=True, kw_only=True)
 class KindRule:
     """What the reader must know of one kind of experiment.
@@ -120,7 +114,7 @@ class KindRule:
     optional: tuple[str, ...] = ()
     settings: type[Settings] = Settings
     rules: tuple[Callable[["Entry[Any]"], None], ...] = ()
-    masses: Callable[[Table[Any]], tuple[str, ...]] = no_masses
+    masses: Callable[[Table[Any]], tuple[str, ...]] = field(default=lambda table: ())
     parameters: tuple[Parameter, ...] = ()
 
     @property

@@ -140,9 +140,9 @@ def test_rough_values_come_from_the_bench_tests_of_the_folder() -> None:
 
 
 def lint_runs(rig: Rig) -> dict[str, list[str]]:
-    """Lint of the forced runs of a rig, by label."""
+    """Feasibility of the forced runs of a rig, by label."""
     kind, estimate = default_registry()["forced_run"], rough_values(rig)
-    return {table.label: list(kind.lint(table, rig, estimate)) for table in rig.tables if table.kind == kind.name}
+    return {table.label: list(kind.lint_rig(table, rig, estimate)) for table in rig.tables if table.kind == kind.name}
 
 
 def test_runs_of_a_rig_are_judged_each_by_its_own_settings() -> None:

@@ -1,13 +1,13 @@
 """Pushes: columns, settings, template and twin."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
-from capsule_id.experiments.kind import Estimate, Kind, Twin, TwinTable, Values
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
@@ -41,12 +41,6 @@ def _make(table: Table[PushSettings], rig: Rig) -> tuple["DynamicFriction"]:
     from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 
     return ((CapsulePushes if table.settings.forward == "capsule" else DynamicFriction)(table, rig),)
-
-
-def _lint(table: Table[PushSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
-    del rig, estimate
-    yield from lint_rows(table, 5)
-    yield from lint_reading_errors(table)
 
 
 def pushes(
@@ -104,7 +98,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="mu, v_s",
     captions=CAPTIONS,
-    lint=_lint,
+    lint=(partial(lint_rows, fewest=5), lint_reading_errors),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

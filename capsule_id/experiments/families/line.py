@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from capsule_id.experiments.kind import Estimate, Values
+from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Table
 
 if TYPE_CHECKING:
     from capsule_id.experiments.line import Line
@@ -37,9 +37,8 @@ def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
         raise entry.error("sd_ratio", rule, "all three", "remove sd_ratio", of_key=True)
 
 
-def lint_line(table: Table[Any], rig: Rig, estimate: Estimate) -> Iterable[str]:
+def lint_line(table: Table[Any]) -> Iterable[str]:
     """Few rows, and reading errors that are not stated."""
-    del rig, estimate
     yield from lint_rows(table, 5)
     if table.settings.sd_ratio is None:
         yield from lint_reading_errors(table)

@@ -102,8 +102,8 @@ def _make(table: Table[RunSettings], rig: Rig) -> tuple["ForcedRun", ...]:
     return tuple(ForcedRun(part, rig) for part in parts)
 
 
-def _lint(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
-    """Feasibility at rough values, and a stated frequency that the current does not have."""
+def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
+    """What the run cannot measure, at rough values."""
     from capsule_id.experiments.forced_run.feasibility import feasibility
 
     assert rig.m1 is not None, "the reader requires both masses for a forced run"
@@ -117,10 +117,12 @@ def _lint(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[s
     note = f" (by the prior's median, not measured here: {', '.join(guessed)})" if guessed else ""
     theta = {"m1": rig.m1.value, "m2": rig.m2.value, "g": rig.g.value}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
-    yield from (finding.text.removeprefix(f"{table.label}: ") for finding in feasibility(table, theta, note))
-    warning = run_warning(table)
-    if warning:
-        yield warning
+    return [finding.text.removeprefix(f"{table.label}: ") for finding in feasibility(table, theta, note)]
+
+
+def _lint_drive(table: Table[RunSettings]) -> Iterable[str]:
+    """A stated frequency that the current does not have."""
+    return filter(None, [run_warning(table)])
 
 
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
@@ -175,7 +177,8 @@ KIND = Kind(
         "phase_portrait": "Phase plane as the paper draws it: the record through Savitzky–Golay, the model, the impact line.",
     },
     bench=False,
-    lint=_lint,
+    lint=(_lint_drive,),
+    lint_rig=_lint_feasibility,
     describe=describe_run,
     twin=_measure,
     truth={f"k2[{name}]": k2 for name, k2 in RUN_SPRINGS.items()},

@@ -9,7 +9,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.free_vibration.window import decay_window
-from capsule_id.experiments.kind import Estimate, Kind, Values
+from capsule_id.experiments.kind import Kind, Values
 from capsule_id.parameters import nuisance, scatter
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
@@ -104,9 +104,8 @@ def _make(table: Table[DecaySettings], rig: Rig) -> tuple["FreeVibration"]:
     return ((CapsuleDecay if table.settings.forward == "capsule" else FreeVibration)(table, rig),)
 
 
-def _lint(table: Table[DecaySettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
+def _lint(table: Table[DecaySettings]) -> Iterable[str]:
     """Sampling and length of a free decay."""
-    del rig, estimate
     time, x_rel = decay_window(table)
     try:
         period = 1.0 / dominant_frequency(time, x_rel)
@@ -171,7 +170,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="k1, c",
     captions={"free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation."},
-    lint=_lint,
+    lint=(_lint,),
     paper=_paper,
     rough=_rough,
     twin=measure,

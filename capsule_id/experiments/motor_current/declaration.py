@@ -72,7 +72,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="K",
     captions={"motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K."},
-    lint=lint_line,
+    lint=(lint_line,),
     paper=line_estimates,
     twin=_measure,
 )

@@ -1,10 +1,10 @@
 """Steady sliding: columns and template."""
 
-from collections.abc import Iterable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
-from capsule_id.experiments.kind import Estimate, Kind
+from capsule_id.experiments.kind import Kind
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
@@ -30,11 +30,6 @@ def _make(table: Table, rig: Rig) -> tuple["SlidingFriction"]:
     return (SlidingFriction(table, rig),)
 
 
-def _lint(table: Table, rig: Rig, estimate: Estimate) -> Iterable[str]:
-    del rig, estimate
-    return lint_rows(table, 5)
-
-
 TEMPLATE = """\
 #: Steady sliding, a row per point: mu and v_s. Columns: speed [m/s], and force [N] or coefficient [1].
 # [[experiment]]
@@ -56,7 +51,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="mu, v_s",
     captions=CAPTIONS,
-    lint=_lint,
+    lint=(partial(lint_rows, fewest=5),),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

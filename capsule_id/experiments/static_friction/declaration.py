@@ -1,13 +1,13 @@
 """Tilts until the capsule slips: columns, settings, rules, template and twin."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
-from capsule_id.experiments.kind import Estimate, Kind, Twin, TwinTable, Values
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE, SLOPE_ANGLE
@@ -52,18 +52,13 @@ def _check_tilt(entry: Entry[TiltSettings]) -> None:
             for name in ("height", "length")
         )
         remedy = 'correct it, or write length_is = "base"'
-        raise entry.cell_error(row, "height", "height must be less than the length of the board", value, remedy)
+        raise entry.file.error(row, "height", "height must be less than the length of the board", value, remedy)
 
 
 def _make(table: Table[TiltSettings], rig: Rig) -> tuple["StaticFriction"]:
     from capsule_id.experiments.static_friction.experiment import StaticFriction
 
     return (StaticFriction(table, rig),)
-
-
-def _lint(table: Table[TiltSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
-    del rig, estimate
-    return lint_rows(table, 4)
 
 
 def tilts(
@@ -103,7 +98,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="mu",
     captions=CAPTIONS,
-    lint=_lint,
+    lint=(partial(lint_rows, fewest=4),),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

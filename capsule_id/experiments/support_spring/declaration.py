@@ -77,7 +77,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="k2 of that spring",
     captions={"support_spring": "The slope of the line is the stiffness of the support spring."},
-    lint=lint_line,
+    lint=(lint_line,),
     paper=line_estimates,
     twin=_measure,
 )

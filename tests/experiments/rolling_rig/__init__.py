@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from capsule_id.experiments.kind import Estimate, Kind
+from capsule_id.experiments.kind import Kind
 from capsule_id.parameters import Parameter, Prior, scatter
 from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.model import Rig, Settings, Table
@@ -33,8 +33,7 @@ def _masses(table: Table[RollingSettings]) -> tuple[str, ...]:
     return "m1", "m2"
 
 
-def _lint(table: Table[RollingSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
-    del rig, estimate
+def _lint(table: Table[RollingSettings]) -> Iterable[str]:
     if len(np.unique(table["speed"])) < 6:
         yield "fewer than 6 speeds; measure more"
 
@@ -62,5 +61,5 @@ KIND = Kind(
 """,
     informs="c_rr",
     captions={"rolling_resistance": "Rolling resistance: the force at each speed, and the fitted one."},
-    lint=_lint,
+    lint=(_lint,),
 )
