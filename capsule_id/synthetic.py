@@ -98,7 +98,8 @@ def synthesize(
     InputError
         If ``folder`` exists and is not empty: nothing is overwritten.
     """
-    kinds = [kind for kind in (registry or default_registry()).values() if kind.bench or runs]
+    known_kinds = (registry or default_registry()).values()
+    kinds = [kind for kind in known_kinds if kind.bench or runs]
     truth = (truth or Truth()).with_kinds(kinds)
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -108,7 +109,7 @@ def synthesize(
         raise InputError(f"the name of a rig matches {NAME_PATTERN}", name, "choose another with --name")
     rng = np.random.default_rng(seed)
     values = truth.flat()
-    of_runs = {name for kind in kinds if not kind.bench for name in kind.truth}
+    of_runs = {name for kind in known_kinds if not kind.bench for name in kind.truth}
     on_bench = {name: value for name, value in values.items() if name not in of_runs}
     twins = [(k, k.twin(on_bench if k.bench else values, rng, seed)) for k in kinds if k.twin is not None]
     masses = {symbol: getattr(truth, symbol) + sd * rng.standard_normal() for symbol, sd in MASS_SD.items()}

@@ -1,22 +1,25 @@
 """The declarations of kinds: what they say, that nothing else lists them, and what a faulty one leads to."""
 
 import ast
+import json
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import pytest
 
 from capsule_id.api import fit, read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import CHOICES, make_experiments, select_tables
-from capsule_id.experiments.kind import Kind
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.experiments.registry import BUILT_IN, Registry, default_registry
 from capsule_id.parameters import TABLE, scatter
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
 from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ChoiceRule, ColumnRule, NameRule, QuantityRule, SettingRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.synthetic import Truth, synthesize
 from tests.cli_tools import ROOT
 from tests.rig.folder import TABLES, write_folder
 
@@ -149,6 +152,32 @@ def progression() -> Kind:
         masses=lambda table: ("m2",) if "duty" in table.columns else (),
         parameters=(),
     )
+
+
+def test_a_new_kind_joins_the_synthetic_rig(tmp_path: Path) -> None:
+    """Its own true value can be set; the other bench tests and the weighings come from the stream as before it."""
+
+    def measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+        del rng
+        columns = {"f [Hz]": np.array([4.0, 5.0]), "distance [cm]": values["stride"] * np.array([1.0, seed])}
+        return Twin((TwinTable("progression.csv", columns, ('drive = "base"',)),))
+
+    kind = replace(progression(), twin=measure, truth={"stride": 2.0})
+    kinds = Registry((*KINDS.kinds, kind))
+    truth = Truth().with_kinds(kinds.values()).with_values({"stride": 3.0, "k2[soft]": 2000.0})
+    synthesize(tmp_path / "with", 7, truth, registry=kinds)
+    synthesize(tmp_path / "without", 7, Truth().with_values({"k2[soft]": 2000.0}))
+    table = read_rig(tmp_path / "with", kinds).tables[-1]
+    assert (table.kind, table.settings.drive) == ("progression", ("base",))
+    np.testing.assert_allclose(table["distance"], [0.03, 0.21])
+    known = json.loads((tmp_path / "with.truth.json").read_text(encoding="utf-8"))["parameters"]
+    assert (known["stride"], known["k2[soft]"], known["k1"]) == (3.0, 2000.0, 1420.0)
+    for file in (tmp_path / "without").glob("*.csv"):
+        assert file.read_bytes() == (tmp_path / "with" / file.name).read_bytes()
+    files, before = ({file.name for file in (tmp_path / name).iterdir()} for name in ("with", "without"))
+    assert files - before == {"progression.csv"}
+    with pytest.raises(InputError, match="--set takes a parameter of the twin, stride"):
+        Truth().with_values({"stride": 3.0})
 
 
 def write_progression(folder: Path, columns: str, *settings: str) -> Path:
