@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from capsule_id.api import Fit as Fit
     from capsule_id.api import fit as fit
+    from capsule_id.api import read_rig as read_rig
     from capsule_id.errors import InputError as InputError
     from capsule_id.motions.response import Response as Response
     from capsule_id.motions.response import Settling as Settling
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from capsule_id.physics.model import simulate as simulate
     from capsule_id.physics.model import status_message as status_message
     from capsule_id.physics.smooth.engine import Smoothing as Smoothing
-    from capsule_id.rig.read import read_rig as read_rig
     from capsule_id.synthetic import synthesize as synthesize
 
 _HOME = {
@@ -41,7 +41,7 @@ _HOME = {
     "fit": "capsule_id.api",
     "InputError": "capsule_id.errors",
     "motion_map": "capsule_id.motions.sweep",
-    "read_rig": "capsule_id.rig.read",
+    "read_rig": "capsule_id.api",
     "Response": "capsule_id.motions.response",
     "response": "capsule_id.motions.response",
     "Settling": "capsule_id.motions.response",

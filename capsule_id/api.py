@@ -1,13 +1,16 @@
-"""``fit``: what ``fit-params`` does, as an object."""
+"""What the commands do, as functions: read a rig folder, fit it."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from capsule_id.experiments import Choice
+from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.report.write import write_result
+from capsule_id.rig import read
 from capsule_id.rig.model import Rig
 
 
@@ -30,7 +33,23 @@ class Fit(Result):
             publish(partial, path)
 
 
-def fit(rig: Rig, seed: int = 0, experiments: str = "all", budget: int | None = DEFAULT_BUDGET) -> Fit:
+def read_rig(folder: str | Path, registry: Registry | None = None) -> Rig:
+    """Read and check a rig folder.
+
+    Parameters
+    ----------
+    folder : holds ``rig.toml`` and the tables that it names
+    registry : the kinds of experiments that it may have, by default the built-in ones and those of installed packages
+
+    Raises
+    ------
+    InputError
+        At the first fault: file, line and column, the rule, the value found, the remedy.
+    """
+    return read.read_rig(folder, registry or default_registry())
+
+
+def fit(rig: Rig, seed: int = 0, experiments: Choice = "all", budget: int | None = DEFAULT_BUDGET) -> Fit:
     """Fit a rig: point estimate, posterior, checks.
 
     Parameters
@@ -43,7 +62,7 @@ def fit(rig: Rig, seed: int = 0, experiments: str = "all", budget: int | None = 
     Raises
     ------
     InputError
-        If the rig holds nothing to fit.
+        If the rig holds nothing to fit, or ``experiments`` is another word.
     """
     result = fit_rig(rig, seed, experiments, budget)
     return Fit(**{field.name: getattr(result, field.name) for field in fields(result)})

@@ -1,6 +1,7 @@
 """THE parameter table: symbol, unit, meaning, LaTeX label, default prior, sign, and which leaf of the model it is.
 
-Priors, engines, command options, sweeps, axes, report and README read it. A parameter's *name* is its symbol, with a
+Priors, engines, command options, sweeps, axes, report and README read it. Parameters that only one kind of experiment
+has are declared with that kind (``capsule_id.experiments``). A parameter's *name* is its symbol, with a
 bracket where there is one per spring or per record: ``k2[soft]``, ``noise_sd[free_vibration_1]``. Positive parameters
 are sampled through their logarithm, the others as they are.
 """
@@ -90,6 +91,10 @@ class Parameter:
         """LaTeX label with the bracket as a subscript text."""
         return f"${self.latex}$ [{self.of}]" if self.of else f"${self.latex}$"
 
+    def named(self, of: str, prior: Prior | None = None) -> "Parameter":
+        """The row for one spring or record, with another prior if given."""
+        return replace(self, of=of, prior=prior if prior is not None else self.prior)
+
     @property
     def positive(self) -> bool:
         """Sampled through its logarithm."""
@@ -117,10 +122,6 @@ def _lognormal(median: float, factor: float) -> Prior:
     return Prior("lognormal", median, factor)
 
 
-def _halfnormal(scale: float) -> Prior:
-    return Prior("halfnormal", 0.0, scale)
-
-
 def _capsule(symbol: str, unit: str, meaning: str, latex: str, **others: object) -> Parameter:
     return Parameter(symbol, unit, meaning, latex, leaf="capsule", **others)  # type: ignore[arg-type]
 
@@ -129,19 +130,15 @@ def _drive(symbol: str, unit: str, meaning: str, latex: str, **others: object) -
     return Parameter(symbol, unit, meaning, latex, leaf="drive", sign="any", **others)  # type: ignore[arg-type]
 
 
-def _nuisance(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | None = None) -> Parameter:
+def nuisance(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | None = None) -> Parameter:
+    """A row for a nuisance of either sign; without ``prior`` the experiment supplies it."""
     return Parameter(symbol, unit, meaning, latex, prior, physical=False, sign="any")
 
 
-def _scatter(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | None = None) -> Parameter:
+def scatter(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | None = None) -> Parameter:
+    """A row for a standard deviation, absolute or relative; without ``prior`` the experiment supplies it."""
     return Parameter(symbol, unit, meaning, latex, prior, physical=False, scatter=True)
 
-
-#: Recorded channels of a forced run: name, unit, LaTeX subscript.
-_CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
-
-#: Recorded channels of a forced run by name.
-CHANNELS = tuple(name for name, _, _ in _CHANNELS)
 
 TABLE: Mapping[str, Parameter] = {
     row.symbol: row
@@ -172,30 +169,9 @@ TABLE: Mapping[str, Parameter] = {
         Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
-        _nuisance("I_d", "A", "amplitude of the current in a run", "I_d"),
-        _scatter("noise_sd", "m", "noise of a record", r"\sigma"),
-        *(
-            _scatter(f"noise_{name}", unit, f"noise of {name} in a run", rf"\sigma_{{{index}}}")
-            for name, unit, index in _CHANNELS
-        ),
-        _nuisance("amplitude", "m", "first turning point of a decay", "a_0"),
-        _nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0"),
-        _nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
-        _nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
-        *(
-            _nuisance(
-                f"ar1_{name}", "1", f"atanh of the noise's lag-1 correlation, {name} of a run", r"\alpha",
-                Prior("normal", 0.0, 1.0),
-            )
-            for name, _, _ in _CHANNELS
-        ),
-        _nuisance("capsule_start", "m/s", "speed of the capsule at the start of a run", "v_0"),
-        _scatter("tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", _halfnormal(np.deg2rad(1.0))),
-        _scatter(
-            "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", _halfnormal(0.05)
-        ),
-        _scatter("sliding_scatter", "1", "relative scatter of mu, steady sliding", r"s_\mathrm{sl}", _halfnormal(0.05)),
-        _scatter("scatter", "N", "scatter about a calibration line", "s"),
+        nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
+        nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
+        scatter("scatter", "N", "scatter about a calibration line", "s"),
     )
 }  # fmt: skip
 
@@ -211,8 +187,7 @@ TABLE_1: Mapping[str, float] = {s: row.table_1 for s, row in TABLE.items() if ro
 
 def parameter(symbol: str, of: str = "", prior: Prior | None = None) -> Parameter:
     """The table's row for ``symbol``, for one spring or record, with another prior if given."""
-    row = TABLE[symbol]
-    return replace(row, of=of, prior=prior if prior is not None else row.prior)
+    return TABLE[symbol].named(of, prior)
 
 
 def symbol_of(name: str) -> str:

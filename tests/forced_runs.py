@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 
 from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.twin import SyntheticRun, make_runs
 from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.synthetic import Truth
-from capsule_id.synthetic_runs import SyntheticRun, make_runs
 from tests.experiments import bench
 
 SAMPLES = 120

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from capsule_id.commands.init import TEMPLATE
-from capsule_id.parameters import TABLE
-from capsule_id.rig.schema import KINDS
+from capsule_id.experiments.registry import default_registry
 from tests.cli_tools import DATA, ROOT, environment
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+KINDS = default_registry()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
@@ -57,17 +56,16 @@ def test_the_installed_command_reads_the_folder_that_readme_names(tmp_path: Path
 
 
 def test_the_parameter_table_is_the_packages() -> None:
-    expected = {symbol: [row.unit, row.meaning, row.describe_prior()] for symbol, row in TABLE.items()}
+    expected = {symbol: [row.unit, row.meaning, row.describe_prior()] for symbol, row in KINDS.parameters.items()}
     assert rows("| symbol | unit | meaning | default prior |") == expected
 
 
 def test_the_kinds_of_experiments_are_the_packages() -> None:
-    table = rows("| kind | columns | tells |")
-    assert set(table) <= set(KINDS)
-    for kind, (columns, _) in table.items():
-        named = re.findall(r"`(\w+) \[", columns)
-        assert set(named) <= set(KINDS[kind].columns)
-        assert f'kind = "{kind}"' in TEMPLATE
+    table = rows("| kind | columns | informs |")
+    assert list(table) == list(KINDS)
+    for kind, (columns, informs) in table.items():
+        assert set(re.findall(r"`(\w+) \[", columns)) == set(KINDS[kind].columns)
+        assert informs == KINDS[kind].informs
 
 
 def test_every_path_that_readme_names_exists() -> None:

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.forced_run.twin import NOISE_SD, RUNS
 from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
-from capsule_id.rig.model import Quantity, Table
-from capsule_id.rig.read import read_rig
+from capsule_id.rig.model import Table
 from capsule_id.synthetic import Truth, synthesize
-from capsule_id.synthetic_runs import NOISE_SD, RUNS
 from tests.cli_tools import ROOT
 
 SEED = 3
@@ -84,8 +84,7 @@ def test_runs_are_in_full_motion_at_random_phases(folder: Path) -> None:
     assert [run["spring"] for run in runs.values()] == ["medium", "stiff", "hard", "hard"]
     assert len({round(run["phase"], 3) for run in runs.values()}) == len(runs)
     for table in runs_of(folder):
-        gap = table.settings["gap"]
-        assert isinstance(gap, Quantity)
+        gap = table.settings.gap
         assert 0.0 < abs(gap.value - runs[table.label]["G"]) < 5.0 * gap.sd
         assert len(table["time"]) == 2000
         assert abs(table["x_capsule"][0]) < 5.0 * NOISE_SD["x_capsule"]  # X2 counts from here

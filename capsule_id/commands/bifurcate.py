@@ -20,6 +20,7 @@ from capsule_id.commands.progress import Progress
 from capsule_id.commands.sweep_output import publish_pair, remove_store, take_store
 from capsule_id.console import say
 from capsule_id.errors import InputError
+from capsule_id.experiments.registry import default_registry
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVE_LEAVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     """
     axes = _axes(args)
     _check_combination(args, axes)
-    rig = read_rig(args.data) if args.data is not None else None
+    rig = read_rig(args.data, default_registry()) if args.data is not None else None
     if rig is not None and args.result is None:
         args.result = Path("results") / rig.name
         if not (args.result / "parameters.json").is_file():
@@ -192,7 +193,7 @@ def _measured(
     from capsule_id.commands.measured_runs import Span, overlay
 
     diagram = len(axes) == 1 and args.posterior is None
-    if not diagram or not any(table.kind == "forced_run" for table in rig.tables):
+    if not diagram or not default_registry().has_runs(rig):
         return ()
     x = axes[0].values()
     by_name = args.spring if args.k2 is None else None

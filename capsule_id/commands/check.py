@@ -1,13 +1,14 @@
-"""``capsule-id check DATA``: read a rig folder, say what stands in it and what to mind; fits nothing."""
+"""``capsule-id check DATA``: read a rig folder, describe it, list problems before a fit; fits nothing."""
 
 import argparse
 
 from capsule_id.console import say
 from capsule_id.errors import InputError
-from capsule_id.records.text import describe_run, run_warning
+from capsule_id.experiments.lint import lint
+from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.rough_values import rough_values
 from capsule_id.rig.filters import sampling_step
-from capsule_id.rig.lint import lint
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Table
 from capsule_id.rig.read import read_rig
 
 
@@ -24,26 +25,15 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the folder is no valid rig.
     """
-    rig = read_rig(args.data)
+    kinds = default_registry()
+    rig = read_rig(args.data, kinds)
     lines = [f"{rig.name}: {len(rig.tables)} experiments{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
-    runs = [table for table in rig.tables if table.kind == "forced_run"]
-    lines += [f"{table.label}: {line}" for table in runs for line in describe_run(table)]
-    warnings = {table.label: run_warning(table) for table in runs}
-    findings = [*lint(rig), *_feasibility(rig)]
-    findings += [f"{label}: {text}" for label, text in warnings.items() if text]
+    lines += [f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)]
+    findings = lint(rig, kinds, rough_values(rig, kinds))
     lines += [f"lint: {finding}" for finding in findings]
     say("\n".join([*lines, f"{len(findings)} findings" if findings else "no findings"]))
     return 0
-
-
-def _feasibility(rig: Rig) -> list[str]:
-    """What the settings of forced runs cannot do, a line each; the physics is loaded where there are such runs only."""
-    if not any(table.kind == "forced_run" for table in rig.tables):
-        return []
-    from capsule_id.experiments.rough_values import lint_runs
-
-    return [finding.text for finding in lint_runs(rig)]
 
 
 def _summary(table: Table) -> str:

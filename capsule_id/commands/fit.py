@@ -8,6 +8,8 @@ from capsule_id.commands.capsule_options import prefer_whole_loops
 from capsule_id.commands.progress import Progress
 from capsule_id.console import say
 from capsule_id.errors import InputError
+from capsule_id.experiments import CHOICES, make_experiments
+from capsule_id.experiments.registry import default_registry
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress
 from capsule_id.rig.read import read_rig
 
@@ -19,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", metavar="DATA", help="rig folder, with its rig.toml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default results/<rig name>)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="the same seed gives the same numbers")
-    parser.add_argument("--experiments", choices=("bench", "runs", "all"), default="all", help="which to fit")
+    parser.add_argument("--experiments", choices=CHOICES, default="all", help="which to fit")
     parser.add_argument("--resume", action="store_true", help="go on from an interrupted run")
     parser.add_argument("--no-sample", action="store_true", help="point fit only: no posterior, no intervals")
     parser.add_argument(
@@ -40,18 +42,18 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
     if args.max_steps < 1:
         raise InputError("--max-steps must be positive", str(args.max_steps), "give 1 or more")
-    rig = read_rig(args.data)
+    kinds = default_registry()
+    rig = read_rig(args.data, kinds)
     directory = args.out if args.out is not None else Path("results") / rig.name
     check_directory(directory)
-    if args.experiments != "bench" and any(table.kind == "forced_run" for table in rig.tables):
+    if args.experiments != "bench" and kinds.has_runs(rig):
         prefer_whole_loops()
-    # Heavy rooms only now: a wrong folder is answered at once.
-    from capsule_id.experiments import make_experiments
+    # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.inference.pipeline import PACKAGES, fit_rig, package_versions
     from capsule_id.report.text import table_text
     from capsule_id.report.write import write_result
 
-    make_experiments(rig, args.experiments)
+    make_experiments(rig, args.experiments, kinds)
     fingerprint = {
         "data": dict(rig.files),
         "seed": args.seed,

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.rough_values import rough_values
 from capsule_id.parameters import SWEPT
 from capsule_id.records.columns import stated_gap, stated_Omega
@@ -67,7 +68,7 @@ def overlay(
 
     motions, left_out = [], []
     for table in rig.tables:
-        if table.kind == "forced_run":
+        if isinstance(table.settings, RunSettings):
             found = _motion(table, _settings(table, known), span, values, spring)
             if isinstance(found, MeasuredMotion):
                 motions.append(found)
@@ -77,15 +78,19 @@ def overlay(
 
 
 def _motion(
-    table: Table, settings: Mapping[str, Quantity], span: Span, values: Mapping[str, float], spring: str | None
+    table: Table[RunSettings],
+    settings: Mapping[str, Quantity],
+    span: Span,
+    values: Mapping[str, float],
+    spring: str | None,
 ) -> MeasuredMotion | str:
     """Where the run stands on the diagram, or why it does not."""
     swept = "Omega" if span.name == "f" else span.name
     if swept not in settings:
         return f"{swept} is no setting of a run"
     by_name = spring is not None and swept != "k2"
-    if by_name and table.settings["spring"] != spring:
-        return f"spring {table.settings['spring']}, not {spring}"
+    if by_name and table.settings.spring != spring:
+        return f"spring {table.settings.spring}, not {spring}"
     for name, quantity in settings.items():
         if name == "k2" and by_name:
             continue
@@ -103,17 +108,17 @@ def _motion(
     return MeasuredMotion(value, motion.label, motion.mean_velocity)
 
 
-def _settings(table: Table, known: Callable[[str], Quantity]) -> dict[str, Quantity]:
+def _settings(table: Table[RunSettings], known: Callable[[str], Quantity]) -> dict[str, Quantity]:
     """k2, G, P_d and Omega of a run, SI; NaN where nothing is known."""
-    k2 = known(f"k2[{table.settings['spring']}]")
+    k2 = known(f"k2[{table.settings.spring}]")
     return {"k2": k2, "G": stated_gap(table), "P_d": _load(table, known), "Omega": Quantity(stated_Omega(table))}
 
 
-def _load(table: Table, known: Callable[[str], Quantity]) -> Quantity:
+def _load(table: Table[RunSettings], known: Callable[[str], Quantity]) -> Quantity:
     """P_d of a run, N."""
-    stated, drive = table.settings.get("P_d"), drive_of(table)
-    if isinstance(stated, Quantity):
-        return stated
-    assert drive is not None, "the schema asks for P_d or for the current"
+    drive = drive_of(table)
+    if table.settings.P_d is not None:
+        return table.settings.P_d
+    assert drive is not None, "the reader requires P_d or the current"
     K = known("K")
     return Quantity(K.value * drive.amplitude, K.sd * drive.amplitude)

@@ -28,9 +28,10 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.seed < 0:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
+    from capsule_id.experiments.registry import default_registry
     from capsule_id.synthetic import Truth, synthesize
 
-    truth = Truth().with_runs() if args.runs else Truth()
+    truth = Truth().with_kinds(kind for kind in default_registry().values() if kind.bench or args.runs)
     truth = truth.with_values(dict(_assignment(text) for text in args.set))
     try:
         synthesize(args.directory, args.seed, truth, args.name, args.runs)

@@ -1,125 +1,91 @@
-"""One file per rig test: its readings, the paper's estimator, its likelihood, what the report shows of it.
+"""Experiments: a folder per kind, one declaration each; here what is done with all experiments of a rig together."""
 
-The next experiment is one file with a subclass of ``Experiment``, one entry in ``KINDS`` here and its columns in
-``capsule_id.rig.schema``.
-"""
-
-from collections.abc import Mapping, Sequence
-
-import numpy as np
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.experiments.capsule_bench import CapsuleDecay, CapsulePushes
-from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
-from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.friction_curve import FrictionExperiment, friction_comparison, paper_friction_fit
-from capsule_id.experiments.line import Line
-from capsule_id.experiments.motor_current.experiment import MotorCurrent
-from capsule_id.experiments.sliding_friction.experiment import SlidingFriction
-from capsule_id.experiments.static_friction.experiment import StaticFriction
-from capsule_id.experiments.support_spring.experiment import SupportSpring
+from capsule_id.experiments.kind import Kind, Values, own_panels
+from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.rig.model import Rig, Table
-from capsule_id.views import Comparison
 
-KINDS: Mapping[str, type[Experiment]] = {
-    "free_vibration": FreeVibration,
-    "static_friction": StaticFriction,
-    "dynamic_friction": DynamicFriction,
-    "sliding_friction": SlidingFriction,
-    "motor_current": MotorCurrent,
-    "support_spring": SupportSpring,
-    "forced_run": ForcedRun,
-}
-#: What ``forward = "capsule"`` makes of them.
-CAPSULE_KINDS: Mapping[str, type[Experiment]] = {"free_vibration": CapsuleDecay, "dynamic_friction": CapsulePushes}
-#: Experiments on the bench, as against forced runs.
-BENCH = tuple(kind for kind in KINDS if kind != "forced_run")
+if TYPE_CHECKING:
+    from capsule_id.experiments.base import Experiment
+    from capsule_id.views import Comparison
+
+#: Which experiments of a rig are fitted: bench tests, forced runs, or both.
+Choice = Literal["bench", "runs", "all"]
+CHOICES: tuple[Choice, ...] = get_args(Choice)
+
+Shared = TypeVar("Shared")
 
 
-def make_experiments(rig: Rig, which: str = "all") -> tuple[Experiment, ...]:
+def select_tables(rig: Rig, experiments: Choice, registry: Registry | None = None) -> list[Table]:
+    """The rig's tables that ``experiments`` names; may be empty.
+
+    Raises
+    ------
+    InputError
+        If ``experiments`` is not one of ``CHOICES``.
+    """
+    if experiments not in CHOICES:
+        known = ", ".join(f'"{choice}"' for choice in CHOICES)
+        raise InputError(f"experiments must be one of {known}", repr(experiments), "correct the word")
+    kinds = registry or default_registry()
+    return [t for t in rig.tables if experiments == "all" or kinds[t.kind].bench == (experiments == "bench")]
+
+
+def make_experiments(
+    rig: Rig, experiments: Choice = "all", registry: Registry | None = None
+) -> tuple["Experiment", ...]:
     """The rig's experiments, in the order of ``rig.toml``.
 
     Parameters
     ----------
-    which : "bench", "runs" or "all"
+    experiments : which of them
+    registry : the kinds that read the rig, by default all
 
     Raises
     ------
     InputError
-        If nothing is left to fit.
+        If nothing is left to fit, the tables of a kind cannot be fitted together, or ``experiments`` is unknown.
     """
-    tables = [t for t in rig.tables if which == "all" or (t.kind in BENCH) == (which == "bench")]
+    kinds = registry or default_registry()
+    tables = select_tables(rig, experiments, kinds)
     if not tables:
         rule = "the rig folder must hold an experiment to fit"
-        raise InputError(rule, f"none with --experiments {which}", "add one to rig.toml", rig.folder / "rig.toml")
-    for kind in ("static_friction", "dynamic_friction", "sliding_friction"):
-        _check_scatter([table for table in tables if table.kind == kind])
-    return tuple(e for table in tables for e in _experiments_of(table, rig))
+        raise InputError(rule, f"none with --experiments {experiments}", "add one to rig.toml", rig.folder / "rig.toml")
+    for name, kind in kinds.items():
+        kind.check([table for table in tables if table.kind == name])
+    return tuple(e for table in tables for e in kinds[table.kind].make(table, rig))
 
 
-def _experiments_of(table: Table, rig: Rig) -> tuple[Experiment, ...]:
-    """One experiment; of a record that is to be cut, one a part."""
-    kinds = CAPSULE_KINDS if table.settings.forward == "capsule" else KINDS
-    return kinds[table.kind].make(table, rig)
-
-
-def _check_scatter(tables: Sequence[Table]) -> None:
-    """Readings all the same, without a reading error, let their scatter run to zero: the posterior has no integral.
-
-    Raises
-    ------
-    InputError
-        If they are.
-    """
-    if len({tuple(table.columns) for table in tables}) != 1:
-        return
-    rows = np.concatenate([np.stack([c.values for c in t.columns.values()], axis=1) for t in tables])
-    if len(rows) < 2 or np.any(rows != rows[0]):
-        return
-    if not any(column.reading_sd > 0.0 for table in tables for column in table.columns.values()):
-        name = next(iter(tables[0].columns))
-        rule = f"{tables[0].kind} readings that are all the same need their reading step"
-        raise InputError(rule, f"{len(rows)} rows", f"state {name}_resolution", tables[0].file)
-
-
-def paper_estimates(experiments: Sequence[Experiment]) -> dict[str, float]:
-    """What the paper's own protocol gives (section 2.2), by parameter name, SI; absent where it gives nothing.
-
-    k1 and c: the mean over the records of m1 Omega_o^2 and of the logarithmic decrement after Savitzky–Golay. mu and
-    v_s: eq. (1) fitted to the static and dynamic points. K and k2: ordinary straight lines, the mean over tables.
-    """
-    collected: dict[str, list[float]] = {}
-    for experiment in experiments:
-        if isinstance(experiment, FreeVibration):
-            decrement = experiment.paper_decrement()
-            if decrement is not None:
-                collected.setdefault("k1", []).append(decrement.k1)
-                collected.setdefault("c", []).append(decrement.c)
-        elif isinstance(experiment, Line):
-            collected.setdefault(experiment.slope.name, []).append(experiment.ordinary_line()[0])
-    estimates = {name: float(np.mean(values)) for name, values in collected.items()}
-    friction = [e.paper_points() for e in experiments if isinstance(e, FrictionExperiment)]
-    if friction:
-        speed, coefficient = (np.concatenate(parts) for parts in zip(*friction, strict=True))
-        estimates |= paper_friction_fit(speed, coefficient)
+def paper_estimates(experiments: Sequence["Experiment"], registry: Registry | None = None) -> dict[str, float]:
+    """What the paper's own protocol gives (section 2.2), by parameter name, SI; absent where it gives nothing."""
+    estimates: dict[str, float] = {}
+    for paper, together in _by_shared(lambda kind: kind.paper, experiments, registry):
+        estimates |= paper(together)
     return estimates
 
 
 def compare(
-    experiments: Sequence[Experiment], values: Mapping[str, float], draws: Sequence[Mapping[str, float]]
-) -> tuple[Comparison, ...]:
-    """One panel per experiment, at ``values`` by name with a band from ``draws``; friction experiments share one."""
-    friction = [e for e in experiments if isinstance(e, FrictionExperiment)]
-    panels = []
-    if friction:
-        # Their local values differ in scatters only; together they know both mu and v_s where one of them does.
-        everything: list[ValuesBySymbol] = [
-            {k: v for e in friction for k, v in e.local(point).items()} for point in (values, *draws)
-        ]
-        panels.append(friction_comparison(friction, everything[0], everything[1:]))
+    experiments: Sequence["Experiment"],
+    values: Values,
+    draws: Sequence[Values],
+    registry: Registry | None = None,
+) -> tuple["Comparison", ...]:
+    """Panels of all experiments, at ``values`` by name with a band from ``draws``; shared panels come first."""
+    groups = sorted(
+        _by_shared(lambda kind: kind.panels, experiments, registry), key=lambda group: group[0] is own_panels
+    )
+    return tuple(panel for panels, together in groups for panel in panels(together, values, draws))
+
+
+def _by_shared(
+    function: Callable[[Kind], Shared], experiments: Sequence["Experiment"], registry: Registry | None
+) -> Iterable[tuple[Shared, list["Experiment"]]]:
+    """Experiments grouped by the function that their kinds share."""
+    kinds: Mapping[str, Kind] = registry or default_registry()
+    groups: dict[Shared, list[Experiment]] = {}
     for e in experiments:
-        if not isinstance(e, FrictionExperiment):
-            panels += e.comparisons(e.local(values), [e.local(draw) for draw in draws])
-    return tuple(panels)
+        groups.setdefault(function(kinds[e.kind]), []).append(e)
+    return groups.items()

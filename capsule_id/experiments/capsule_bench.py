@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
+from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.forward import CapsuleForward
+from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import friction_coefficient, slide_distance
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -57,7 +59,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
             if gap.sd > 0.0:
                 rows.append(parameter("G", table.label, Prior("positive_normal", gap.value, gap.sd)))
         rows += self.motion_parameters(self.rough_decrement())
-        rows.append(parameter("noise_sd", table.label, self.noise_prior()))
+        rows.append(NOISE_SD.named(table.label, self.noise_prior()))
         self.about = About(table, rig, tuple(rows))
 
     @property
@@ -101,7 +103,7 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         DynamicFriction.__init__(self, table, rig)
         self.smoothing = None
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
-        rows = tuple(parameter(symbol) for symbol in ("k1", "c", "mu", "v_s", "push_scatter"))
+        rows = (*(parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")), PUSH_SCATTER)
         self.about = About(table, rig, rows)
 
     def slide(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from capsule_id.experiments import compare, make_experiments, paper_estimates
+from capsule_id.experiments import Choice, compare, make_experiments, paper_estimates
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import informed, run_checks
@@ -34,7 +34,7 @@ PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "panda
 def fit_rig(
     rig: Rig,
     seed: int = 0,
-    experiments: str = "all",
+    experiments: Choice = "all",
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
     progress: Progress | None = None,

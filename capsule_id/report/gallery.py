@@ -7,6 +7,7 @@ from typing import Literal
 
 from matplotlib.figure import Figure
 
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.result import Result, RunRecord
 from capsule_id.report.figures import comparisons as figures
 from capsule_id.report.figures.corner import corner
@@ -18,14 +19,6 @@ from capsule_id.views import Comparison
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 # Wider than this (CSS pixels) does not go in pairs.
 _HALF_PAGE = 650
-_KINDS = {
-    "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours.",
-    "motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K.",
-    "support_spring": "The slope of the line is the stiffness of the support spring.",
-    "forced_run": "Forced run: one recorded channel, its residuals at the point fit, and their autocorrelation.",
-    "phase_portrait": "Phase plane as the paper draws it: the record through Savitzky–Golay, the model, the impact line.",
-    "free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation.",
-}
 
 
 @dataclass(frozen=True)
@@ -101,7 +94,7 @@ def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Pict
 
 def comparison_caption(item: Comparison) -> str:
     """What the panel shows, and its posterior predictive p-value where there is one."""
-    parts = [_KINDS.get(item.kind, "Measured beside predicted.")]
+    parts = [default_registry().captions.get(item.kind, "Measured beside predicted.")]
     if item.residuals is not None:
         parts.append("Shaded: the range that holds 95 % of a good fit's residuals.")
     if any(points.flagged is not None and points.flagged.any() for points in item.points):

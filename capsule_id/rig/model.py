@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -54,17 +54,24 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
+class Settings:
+    """Settings of one experiment. Every kind has a subclass; numbers are SI, None is an absent setting."""
+
+
+S = TypeVar("S", bound=Settings)
+
+
+@dataclass(frozen=True)
+class Table(Generic[S]):
     """One ``[[experiment]]`` of the folder: its columns and its settings.
 
     Attributes
     ----------
-    kind : "free_vibration", "static_friction", ... as in ``rig.toml``
+    kind : name of its kind, as in ``rig.toml``
     label : unique within the rig, the file's name without suffix
     file : path relative to the folder
     columns : by name
-    settings : validated keys of the entry other than kind, file and reading errors; numbers are SI floats,
-        quantities with an sd are ``Quantity``
+    settings : of its kind, checked, defaults filled in
     rows : (n,) 1-based line number in the file of every row, read-only: how a finding names a row
     """
 
@@ -72,7 +79,7 @@ class Table:
     label: str
     file: str
     columns: Mapping[str, Column]
-    settings: Any
+    settings: S
     rows: np.ndarray
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -99,6 +106,6 @@ class Rig:
     m2: Quantity | None
     g: Quantity
     priors: Mapping[str, PriorOverride]
-    tables: tuple[Table, ...]
+    tables: tuple[Table[Any], ...]
     files: Mapping[str, str]
     folder: Path

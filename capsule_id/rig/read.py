@@ -1,51 +1,42 @@
-"""A rig folder becomes a ``Rig``: ``rig.toml`` against the schema, tables through the door, then the cross rules."""
+"""A rig folder becomes a ``Rig``: ``rig.toml`` by the rules of the kinds, its tables in SI, then the rules between them."""
 
 import hashlib
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from capsule_id.errors import InputError
-from capsule_id.rig.loose_settings import loose
-from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Table
-from capsule_id.rig.rules import check_experiment, check_masses, check_prior_springs
-from capsule_id.rig.schema import (
-    HALF_NORMAL_PRIORS,
-    KINDS,
-    LOG_NORMAL_PRIORS,
+from capsule_id.rig.decode import decode
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
+from capsule_id.rig.schema import RIG_QUANTITIES, KindRule, parameter_rows
+from capsule_id.rig.tables import TableFile, read_table_file
+from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
+from capsule_id.rig.toml_values import (
     NAME_PATTERN,
-    POSITIVE,
-    RIG_QUANTITIES,
-    ChoiceRule,
-    KindRule,
-    QuantityRule,
-)
-from capsule_id.rig.settings import (
     read_bool,
     read_name,
     read_prior,
     read_quantity,
-    read_setting,
     read_string,
     read_table,
     refuse_unknown_keys,
     shown,
 )
-from capsule_id.rig.tables import TableFile, read_table_file
-from capsule_id.rig.text import decode
-from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
 _READING_ERRORS = ("_sd", "_resolution")
 
 
-def read_rig(folder: str | Path) -> Rig:
+def read_rig(folder: str | Path, kinds: Mapping[str, KindRule]) -> Rig:
     """Read and check a rig folder.
 
     Parameters
     ----------
     folder : holds ``rig.toml`` and the tables that it names
+    kinds : the kinds of experiments that it may have, by name
 
     Returns
     -------
@@ -70,19 +61,19 @@ def read_rig(folder: str | Path) -> Rig:
     name = read_name(document, ("rig", "name"), head["name"])
     synthetic = read_bool(document, ("rig", "synthetic"), head.get("synthetic", False))
     stated = {
-        key: read_quantity(document, ("rig", key), head[key], rule)
+        key: read_quantity(document, ("rig", key), head[key], rule.si, rule.domain, rule.has_sd)
         for key, rule in RIG_QUANTITIES.items()
         if key in head
     }
-    tables, files = _read_experiments(document)
-    check_masses(document, tables, set(stated))
+    tables, files = _read_experiments(document, kinds)
+    _check_masses(document, tables, kinds, set(stated))
     return Rig(
         name=name,
         synthetic=synthetic,
         m1=stated.get("m1"),
         m2=stated.get("m2"),
         g=stated.get("g", Quantity(STANDARD_GRAVITY)),
-        priors=MappingProxyType(_read_priors(document, tables)),
+        priors=MappingProxyType(_read_priors(document, tables, kinds)),
         tables=tables,
         files=MappingProxyType({"rig.toml": sha256, **files}),
         folder=folder,
@@ -108,25 +99,50 @@ def _read_document(folder: Path) -> tuple[TomlDocument, str]:
     return parse_toml(decode(content, path), path), hashlib.sha256(content).hexdigest()
 
 
-def _read_priors(document: TomlDocument, tables: tuple[Table, ...]) -> dict[str, PriorOverride]:
+def _check_masses(
+    document: TomlDocument, tables: Sequence[Table], kinds: Mapping[str, KindRule], stated: set[str]
+) -> None:
+    """Masses that an experiment needs must be stated in [rig]."""
+    for index, table in enumerate(tables):
+        for mass in kinds[table.kind].masses(table):
+            if mass not in stated:
+                remedy = f'add {mass} = {{ value = ..., sd = ..., unit = "kg" }} to [rig]'
+                raise document.error(
+                    ("experiment", index, "kind"), f"{table.kind} needs {mass}", f"no {mass} in [rig]", remedy
+                )
+
+
+def _read_priors(
+    document: TomlDocument, tables: Sequence[Table], kinds: Mapping[str, KindRule]
+) -> dict[str, PriorOverride]:
     """``[prior]``."""
     entries = read_table(document, ("prior",), document.data.get("prior", {}), "[prior]")
+    rows = {symbol: row for symbol, row in parameter_rows(kinds).items() if row.prior_can_be_stated}
+    known = ["k2[<spring>]" if symbol == "k2" else symbol for symbol in sorted(rows, key=lambda s: rows[s].scatter)]
     priors = {}
-    known = [key for key in LOG_NORMAL_PRIORS if key != "k2"] + ["k2[<spring>]", *HALF_NORMAL_PRIORS]
     for key, value in entries.items():
         path = ("prior", key)
         spring = re.fullmatch(rf"k2\[({NAME_PATTERN})\]", key)
         if spring:
-            check_prior_springs(document, path, spring[1], tables)
+            _check_prior_of_spring(document, path, spring[1], tables)
         elif key not in known:
             refuse_unknown_keys(document, ("prior",), {key: value}, known)
-        is_scatter = key in HALF_NORMAL_PRIORS
-        si = HALF_NORMAL_PRIORS[key] if is_scatter else LOG_NORMAL_PRIORS["k2" if spring else key]
-        priors[key] = read_prior(document, path, value, si, is_scatter)
+        row = rows["k2" if spring else key]
+        priors[key] = read_prior(document, path, value, row.unit, row.scatter)
     return priors
 
 
-def _read_experiments(document: TomlDocument) -> tuple[tuple[Table, ...], dict[str, str]]:
+def _check_prior_of_spring(document: TomlDocument, path: KeyPath, spring: str, tables: Sequence[Table]) -> None:
+    """A prior of k2[spring] needs an experiment with that spring."""
+    springs = sorted({table.settings.spring for table in tables if getattr(table.settings, "spring", None)})
+    if spring not in springs:
+        known = f"known springs: {' '.join(springs)}" if springs else "no experiment names a spring"
+        raise document.error(path, "a prior of k2 must name a spring of an experiment", spring, known, of_key=True)
+
+
+def _read_experiments(
+    document: TomlDocument, kinds: Mapping[str, KindRule]
+) -> tuple[tuple[Table, ...], dict[str, str]]:
     """Every ``[[experiment]]``, and the sha256 of every table read."""
     entries = document.data.get("experiment", [])
     if not isinstance(entries, list) or not entries:
@@ -137,7 +153,7 @@ def _read_experiments(document: TomlDocument) -> tuple[tuple[Table, ...], dict[s
     for index, entry in enumerate(entries):
         path: KeyPath = ("experiment", index)
         read_table(document, path, entry, "[[experiment]]")
-        table, sha256 = _read_experiment(document, path, entry)
+        table, sha256 = _read_experiment(document, path, entry, kinds)
         for other in tables:
             if other.label == table.label:
                 place = "label" if "label" in entry else "file"
@@ -148,61 +164,56 @@ def _read_experiments(document: TomlDocument) -> tuple[tuple[Table, ...], dict[s
     return tuple(tables), files
 
 
-def _read_experiment(document: TomlDocument, path: KeyPath, entry: dict[str, Any]) -> tuple[Table, str]:
+def _read_experiment(
+    document: TomlDocument, path: KeyPath, entry: dict[str, Any], kinds: Mapping[str, KindRule]
+) -> tuple[Table, str]:
     """One entry with its table."""
     for key in ("kind", "file"):
         if key not in entry:
             raise document.error(path, f"an experiment must have a {key}", "none", f'add {key} = "..."')
-    kind = read_string(document, (*path, "kind"), entry["kind"])
-    if kind not in KINDS:
-        raise document.error((*path, "kind"), "unknown kind", shown(kind), f"write one of {' '.join(KINDS)}")
-    rule = KINDS[kind]
-    errors = [column + suffix for column in rule.columns for suffix in _READING_ERRORS]
-    refuse_unknown_keys(document, path, entry, ("kind", "file", "label", *rule.settings, *errors))
-    settings = _read_settings(document, path, entry, kind, rule)
+    word = read_string(document, (*path, "kind"), entry["kind"])
+    if word not in kinds:
+        raise document.error((*path, "kind"), "unknown kind", shown(word), f"write one of {' '.join(kinds)}")
+    kind = kinds[word]
+    errors = [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
+    refuse_unknown_keys(document, path, entry, ("kind", "file", "label", *kind.setting_rules, *errors))
+    settings = _read_settings(document, path, entry, kind)
     name = read_string(document, (*path, "file"), entry["file"])
-    file = read_table_file(document, (*path, "file"), name, kind, rule)
+    file = read_table_file(document, (*path, "file"), name, kind)
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
-    columns = {key: _with_reading_error(document, path, entry, column, rule) for key, column in file.columns.items()}
+    columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
     _refuse_idle_reading_errors(document, path, entry, errors, file)
-    table = Table(kind, label, name, MappingProxyType(columns), loose(kind, settings), file.raw.rows)
-    check_experiment(document, path, table, file)
+    table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows)
+    for rule in kind.rules:
+        rule(Entry(table, document, path, file))
     return table, file.sha256
 
 
-def _read_settings(
-    document: TomlDocument, path: KeyPath, entry: dict[str, Any], kind: str, rule: KindRule
-) -> dict[str, object]:
+def _read_settings(document: TomlDocument, path: KeyPath, entry: dict[str, Any], kind: KindRule) -> Settings:
     """The entry's settings, defaults filled in."""
-    settings: dict[str, object] = {}
-    for key, setting in rule.settings.items():
-        if key in entry:
-            settings[key] = read_setting(document, (*path, key), entry[key], setting)
-        elif key in rule.required:
-            raise document.error(path, f"{kind} must have a {key}", "none", f"add {key} = ...")
-        elif isinstance(setting, ChoiceRule) and setting.has_default:
-            settings[key] = setting.choices[0]
-    return settings
+    rules = kind.setting_rules
+    stated = {key: rule.read(document, (*path, key), entry[key]) for key, rule in rules.items() if key in entry}
+    for key in kind.required:
+        if key not in stated:
+            raise document.error(path, f"{kind.name} must have a {key}", "none", f"add {key} = ...")
+    return kind.settings(**stated)
 
 
 def _with_reading_error(
-    document: TomlDocument, path: KeyPath, entry: dict[str, Any], column: Column, rule: KindRule
+    document: TomlDocument, path: KeyPath, entry: dict[str, Any], column: Column, kind: KindRule
 ) -> Column:
     """The column with its stated sd and resolution."""
     stated: dict[str, float | None] = {}
     for suffix in _READING_ERRORS:
-        key = column.name + suffix
-        quantity_rule = QuantityRule(rule.columns[column.name].si, POSITIVE)
-        stated[suffix] = (
-            read_quantity(document, (*path, key), entry[key], quantity_rule).value if key in entry else None
-        )
+        key, si = column.name + suffix, kind.columns[column.name].si
+        stated[suffix] = read_quantity(document, (*path, key), entry[key], si).value if key in entry else None
     return Column(column.name, column.unit, column.to_display, column.values, stated["_sd"], stated["_resolution"])
 
 
 def _refuse_idle_reading_errors(
     document: TomlDocument, path: KeyPath, entry: dict[str, Any], keys: list[str], file: TableFile
 ) -> None:
-    """A reading error of a column that the file does not have is a slip, not a wish."""
+    """Refuse reading errors of columns that the file does not have."""
     for key in keys:
         column = key.rsplit("_", 1)[0]
         if key in entry and column not in file.columns:

@@ -1,41 +1,33 @@
-"""What a rig folder may say: every kind of experiment with its columns and settings, as data.
+"""The types in which a kind of experiment states its columns, settings and rules. The reader knows these types only."""
 
-One reader (``read.py``, ``tables.py``) interprets these declarations; a new kind
-needs an entry here, and in ``rules.py`` what ties its settings together.
-"""
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from functools import cache
+from types import MappingProxyType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    Protocol,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    runtime_checkable,
+)
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from math import inf, pi
+from capsule_id.parameters import TABLE, Parameter
+from capsule_id.rig.domains import ANY, POSITIVE, Domain
+from capsule_id.rig.model import Quantity, Settings, Table
+from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.rig.toml_values import read_choice, read_name, read_quantity
 
-import numpy as np
+if TYPE_CHECKING:
+    from capsule_id.rig.entry import Entry
 
-from capsule_id.parameters import TABLE
-
-NAME_PATTERN = r"[A-Za-z0-9._-]+"
-SHORTEST_RECORD = 8  # samples: six unknowns of a free decay (k1, c, amplitude, phase, offset, noise) and two to spare
-
-
-@dataclass(frozen=True)
-class Domain:
-    """An interval that SI values must lie in; ``text`` continues "<name> must ..."."""
-
-    text: str
-    low: float = -inf
-    high: float = inf
-    low_allowed: bool = False
-
-    def holds(self, values: np.ndarray | float) -> np.ndarray:
-        """Elementwise: inside?"""
-        values = np.asarray(values)
-        return ((values >= self.low) if self.low_allowed else (values > self.low)) & (values < self.high)
-
-
-ANY = Domain("be a finite number")
-POSITIVE = Domain("be greater than 0", low=0.0)
-NOT_NEGATIVE = Domain("be 0 or greater", low=0.0, low_allowed=True)
-ABOVE_ONE = Domain("be greater than 1", low=1.0)
-SLOPE_ANGLE = Domain("lie between 0 and 90 deg", low=0.0, high=pi / 2)
+#: Fewest samples of a record: six unknowns of a free decay (k1, c, amplitude, phase, offset, noise) and two more.
+SHORTEST_RECORD = 8
 
 
 @dataclass(frozen=True)
@@ -48,138 +40,140 @@ class ColumnRule:
     varies: bool = False
 
 
+@runtime_checkable
+class SettingRule(Protocol):
+    """What a setting may be. A kind may bring a rule of its own: any object with this method."""
+
+    def read(self, document: TomlDocument, path: KeyPath, value: object) -> object:
+        """The value at ``path`` of ``rig.toml`` as the settings hold it.
+
+        Raises
+        ------
+        InputError
+            At ``path``, where the value breaks the rule.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class QuantityRule:
-    """A setting ``{ value = ..., unit = ... }``; with ``has_sd`` it takes ``sd`` too and becomes a ``Quantity``."""
+    """``{ value = ..., unit = ... }``, read as an SI float; with ``has_sd`` it takes ``sd`` too: a ``Quantity``."""
 
     si: str
     domain: Domain = POSITIVE
     has_sd: bool = False
 
+    def read(self, document: TomlDocument, path: KeyPath, value: object) -> float | Quantity:
+        """See ``SettingRule``."""
+        quantity = read_quantity(document, path, value, self.si, self.domain, self.has_sd)
+        return quantity if self.has_sd else quantity.value
+
 
 @dataclass(frozen=True)
 class ChoiceRule:
-    """A setting that is one of a few words; the first is the default where ``has_default``."""
+    """One of a few words."""
 
     choices: tuple[str, ...]
-    has_default: bool = True
+
+    def read(self, document: TomlDocument, path: KeyPath, value: object) -> str:
+        """See ``SettingRule``."""
+        return read_choice(document, path, value, self.choices)
 
 
 @dataclass(frozen=True)
 class NameRule:
-    """A setting that is a name: letters, digits, dot, underscore, hyphen."""
+    """A name of letters, digits, dot, underscore, hyphen."""
+
+    def read(self, document: TomlDocument, path: KeyPath, value: object) -> str:
+        """See ``SettingRule``."""
+        return read_name(document, path, value)
 
 
-SettingRule = QuantityRule | ChoiceRule | NameRule
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class KindRule:
-    """One kind of experiment.
+    """What the reader must know of one kind of experiment.
 
     Attributes
     ----------
+    name : as ``kind`` in ``rig.toml``
     columns : every column that the file may have
-    sets : the file must have exactly one of these sets of columns (and any of ``channels``)
-    channels : of these at least one, where there are any
-    settings : every setting that the entry may have
-    required : settings that it must have
+    sets : the file must have exactly one of these sets of columns
+    channels : of these it must have at least one, where the kind has channels
+    optional : of these it may have any
+    settings : the dataclass of the entry's settings. A field's type states its rule: ``Literal`` a choice,
+        ``Annotated[type, rule]`` any other. A field with a default may be absent
+    rules : each raises an ``InputError`` where columns and settings do not go together
+    masses : the masses of [rig] that an experiment with this table needs
+    parameters : rows of the parameters that only experiments of this kind have
     """
 
+    name: str
     columns: Mapping[str, ColumnRule]
     sets: tuple[tuple[str, ...], ...]
     channels: tuple[str, ...] = ()
-    settings: Mapping[str, SettingRule] = field(default_factory=dict)
-    required: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+    settings: type[Settings] = Settings
+    rules: tuple[Callable[["Entry[Any]"], None], ...] = ()
+    masses: Callable[[Table[Any]], tuple[str, ...]] = field(default=lambda table: ())
+    parameters: tuple[Parameter, ...] = ()
+
+    @property
+    def setting_rules(self) -> Mapping[str, SettingRule]:
+        """The rule of every setting, by key."""
+        return _setting_rules(self.settings)
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Settings that the entry must have."""
+        stated = fields(self.settings)
+        return tuple(f.name for f in stated if f.default is MISSING and f.default_factory is MISSING)
 
 
-_TIME = ColumnRule("s", increasing=True)
-_FORWARD = ChoiceRule(("closed", "capsule"))
-_CHANNELS = ("x_rel", "x_capsule", "acceleration_rod", "current")
-_GAP = QuantityRule("m", NOT_NEGATIVE, has_sd=True)
+@cache
+def _setting_rules(settings: type[Settings]) -> Mapping[str, SettingRule]:
+    """The rule of every field of a settings dataclass.
 
-KINDS: Mapping[str, KindRule] = {
-    "free_vibration": KindRule(
-        columns={"time": _TIME, "x_rel": ColumnRule("m", varies=True)},
-        sets=(("time", "x_rel"),),
-        settings={
-            "start": QuantityRule("s", ANY),
-            "stop": QuantityRule("s", ANY),
-            "capsule": ChoiceRule(("held", "free")),
-            "damping": ChoiceRule(("viscous", "dry", "quadratic")),
-            "smoothing_window": QuantityRule("s"),
-            "spring": NameRule(),
-            "gap": _GAP,
-            "forward": _FORWARD,
-        },
-    ),
-    "static_friction": KindRule(
-        columns={
-            "angle": ColumnRule("rad", SLOPE_ANGLE),
-            "height": ColumnRule("m", POSITIVE),
-            "length": ColumnRule("m", POSITIVE),
-        },
-        sets=(("angle",), ("height", "length")),
-        settings={"length_is": ChoiceRule(("board", "base"), has_default=False)},
-    ),
-    "dynamic_friction": KindRule(
-        columns={"speed": ColumnRule("m/s", POSITIVE), "distance": ColumnRule("m", POSITIVE)},
-        sets=(("speed", "distance"),),
-        settings={"forward": _FORWARD},
-    ),
-    "sliding_friction": KindRule(
-        columns={
-            "speed": ColumnRule("m/s", POSITIVE),
-            "force": ColumnRule("N", POSITIVE),
-            "coefficient": ColumnRule("1", POSITIVE),
-        },
-        sets=(("speed", "force"), ("speed", "coefficient")),
-    ),
-    "motor_current": KindRule(
-        columns={"force": ColumnRule("N", varies=True), "current": ColumnRule("A", varies=True)},
-        sets=(("force", "current"),),
-        settings={"sd_ratio": QuantityRule("N/A")},
-    ),
-    "support_spring": KindRule(
-        columns={"deflection": ColumnRule("m", varies=True), "force": ColumnRule("N", varies=True)},
-        sets=(("deflection", "force"),),
-        settings={"spring": NameRule(), "length": QuantityRule("m", has_sd=True), "sd_ratio": QuantityRule("N/m")},
-        required=("spring",),
-    ),
-    "forced_run": KindRule(
-        columns={
-            "time": _TIME,
-            "x_rel": ColumnRule("m", varies=True),
-            "x_capsule": ColumnRule("m"),  # may be constant: a capsule that never leaves its place is a result
-            "acceleration_rod": ColumnRule("m/s^2", varies=True),
-            "current": ColumnRule("A", varies=True),
-        },
-        sets=(("time",),),
-        channels=_CHANNELS,
-        settings={
-            "spring": NameRule(),
-            "gap": _GAP,
-            "Omega": QuantityRule("rad/s"),
-            "f": QuantityRule("Hz"),
-            "P_d": QuantityRule("N", has_sd=True),
-            "start": ChoiceRule(("auto", "stuck", "moving", "settled")),
-            "noise": ChoiceRule(("white", "ar1")),
-            "segment": QuantityRule("s"),
-            **{f"{name}_gain_sd": QuantityRule("1") for name in _CHANNELS},
-            **{f"{name}_delay_sd": QuantityRule("s") for name in _CHANNELS},
-        },
-        required=("spring", "gap"),
-    ),
-}
+    Raises
+    ------
+    TypeError
+        If the type of a field states no rule.
+    """
+    hints = get_type_hints(settings, include_extras=True)
+    return MappingProxyType({f.name: _rule_of(f.name, hints[f.name]) for f in fields(settings)})
 
-# [rig]: quantities by key
+
+def _rule_of(name: str, hint: object) -> SettingRule:
+    """The rule that a field's type states."""
+    if get_origin(hint) is Annotated:
+        for extra in get_args(hint)[1:]:
+            if isinstance(extra, SettingRule):
+                return extra
+    one_of = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    for option in one_of:
+        if get_origin(option) is Literal:
+            return ChoiceRule(get_args(option))
+    raise TypeError(f"the type of setting {name} must be a Literal, or Annotated with its rule")
+
+
+def parameter_rows(kinds: Mapping[str, KindRule]) -> dict[str, Parameter]:
+    """Every parameter by symbol: the package's table, then the rows of ``kinds``.
+
+    Raises
+    ------
+    ValueError
+        If one symbol has two different rows.
+    """
+    rows = dict(TABLE)
+    for kind in kinds.values():
+        for row in kind.parameters:
+            if rows.setdefault(row.symbol, row) != row:
+                raise ValueError(f"parameter {row.symbol} of kind {kind.name} is declared twice")
+    return rows
+
+
+#: Quantities of [rig], by key.
 RIG_QUANTITIES: Mapping[str, QuantityRule] = {
     "m1": QuantityRule("kg", has_sd=True),
     "m2": QuantityRule("kg", has_sd=True),
     "g": QuantityRule("m/s^2", has_sd=True),
 }
-
-# [prior]: SI unit by key; "k2[<spring>]" has the unit of "k2"
-_STATED = [row for row in TABLE.values() if row.prior_can_be_stated]
-LOG_NORMAL_PRIORS: Mapping[str, str] = {row.symbol: row.unit for row in _STATED if not row.scatter}
-HALF_NORMAL_PRIORS: Mapping[str, str] = {row.symbol: row.unit for row in _STATED if row.scatter}

@@ -12,8 +12,8 @@ from capsule_id.rig.formats import READERS
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import Column
 from capsule_id.rig.schema import ColumnRule, KindRule
-from capsule_id.rig.settings import closest, shown
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.rig.toml_values import closest, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 
@@ -70,8 +70,8 @@ def locate(document: TomlDocument, path: KeyPath, name: str) -> Path:
     return file
 
 
-def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: str, rule: KindRule) -> TableFile:
-    """Read the table ``name`` and check its columns against ``rule``.
+def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: KindRule) -> TableFile:
+    """Read the table ``name`` and check its columns against ``kind``.
 
     Raises
     ------
@@ -87,30 +87,29 @@ def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: str,
     raw = READERS[file.suffix.lower()](content, file)
     raw.rows.flags.writeable = False
     table = TableFile(file, hashlib.sha256(content).hexdigest(), raw, {})
-    _check_names(table, kind, rule)
-    columns = {column: _to_si(table, index, rule.columns[column]) for index, column in enumerate(raw.names)}
+    _check_names(table, kind)
+    columns = {column: _to_si(table, index, kind.columns[column]) for index, column in enumerate(raw.names)}
     return TableFile(file, table.sha256, raw, columns)
 
 
-def _check_names(table: TableFile, kind: str, rule: KindRule) -> None:
+def _check_names(table: TableFile, kind: KindRule) -> None:
     """Only known columns, exactly one of the kind's sets of them, and a channel where it has channels."""
     names = table.raw.names
     for name in names:
-        if name not in rule.columns:
-            close = closest(name, rule.columns)
+        if name not in kind.columns:
+            close = closest(name, kind.columns)
             remedy = f"rename it to {close}" if close else "remove it"
-            known = " ".join(rule.columns)
-            raise table.error(None, name, f"unknown column in {kind}", shown(name), f"{remedy}; known: {known}")
-    stated = {name for name in names if name not in rule.channels}
-    if stated not in [set(columns) for columns in rule.sets]:
-        wanted = ", or ".join(" and ".join(columns) for columns in rule.sets)
+            known = " ".join(kind.columns)
+            raise table.error(None, name, f"unknown column in {kind.name}", shown(name), f"{remedy}; known: {known}")
+    stated = {name for name in names if name not in (*kind.channels, *kind.optional)}
+    if stated not in [set(columns) for columns in kind.sets]:
+        wanted = ", or ".join(" and ".join(columns) for columns in kind.sets)
         value = " and ".join(names)
-        raise table.error(None, names[0], f"{kind} must have the columns {wanted}", value, "add or remove columns")
-    if rule.channels and not stated.symmetric_difference(names):
-        wanted = " ".join(rule.channels)
-        raise table.error(
-            None, names[0], f"{kind} must have a channel beside time", " ".join(names), f"add one of {wanted}"
-        )
+        raise table.error(None, names[0], f"{kind.name} must have the columns {wanted}", value, "add or remove columns")
+    if kind.channels and not set(kind.channels).intersection(names):
+        wanted = " ".join(kind.channels)
+        rule = f"{kind.name} must have a channel beside {' and '.join(sorted(stated))}"
+        raise table.error(None, names[0], rule, " ".join(names), f"add one of {wanted}")
 
 
 def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:

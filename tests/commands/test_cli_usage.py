@@ -146,7 +146,7 @@ def test_experiments_that_are_not_there(
 def test_an_internal_failure_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(folder: str) -> None:
+    def fail(*given: object) -> None:
         raise ZeroDivisionError("first line\nsecond line")
 
     monkeypatch.setattr("capsule_id.commands.check.read_rig", fail)

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.cli import capsule_id
 from capsule_id.commands import bifurcate
 from capsule_id.commands.measured_runs import Span, overlay
 from capsule_id.report.figures.sweeps import MeasuredMotion
-from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 
 #: The paper's Fig. 10, of which runs 3 and 4 are synthesized; and near Fig. 6, of which run 1 is.

@@ -7,11 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.commands import check, init
 from capsule_id.errors import InputError
-from capsule_id.rig.read import read_rig
-from capsule_id.rig.schema import HALF_NORMAL_PRIORS, KINDS, LOG_NORMAL_PRIORS, ChoiceRule
+from capsule_id.experiments.registry import default_registry
+from capsule_id.rig.schema import ChoiceRule
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
+
+KINDS = default_registry()
 
 
 def call(command: object, *words: str) -> int:
@@ -51,7 +54,7 @@ def test_the_whole_template_reads_once_its_comments_are_removed(tmp_path: Path, 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_experiment_of_the_template_alone(tmp_path: Path, kind: str) -> None:
-    head, *blocks = init.TEMPLATE.replace("@NAME@", "a").split("# [[experiment]]")
+    head, *blocks = init.template(KINDS, "a").split("# [[experiment]]")
     block = next(block for block in blocks if f'kind = "{kind}"' in block)
     head = re.sub(r"(?m)^# (?=m[12] )", "", head)
     name = re.findall(r'file = "(.*)"', block)[0]
@@ -60,13 +63,14 @@ def test_each_experiment_of_the_template_alone(tmp_path: Path, kind: str) -> Non
 
 
 def test_the_template_mentions_everything_that_a_rig_may_say() -> None:
-    for rule in KINDS.values():
-        assert all(column in init.TEMPLATE for column in rule.columns)
-        assert all(key in init.TEMPLATE for key in rule.settings)
-        for setting in rule.settings.values():
-            if isinstance(setting, ChoiceRule) and len(setting.choices) > 1:
-                assert all(f'"{choice}"' in init.TEMPLATE for choice in setting.choices)
-    assert all(re.search(rf"\b{key}\b", init.TEMPLATE) for key in (*LOG_NORMAL_PRIORS, *HALF_NORMAL_PRIORS))
+    for kind in KINDS.values():
+        assert [column for column in kind.columns if not re.search(rf"\b{column}\b", kind.template)] == []
+        assert [key for key in kind.setting_rules if not re.search(rf"\b{key}\b", kind.template)] == []
+        choices = [rule.choices for rule in kind.setting_rules.values() if isinstance(rule, ChoiceRule)]
+        assert [word for words in choices for word in words if f'"{word}"' not in kind.template] == []
+    stated = [symbol for symbol, row in KINDS.parameters.items() if row.prior_can_be_stated]
+    assert {"k1", "tilt_sd", "sliding_scatter"} < set(stated)
+    assert [key for key in stated if not re.search(rf"\b{key}\b", init.template(KINDS, "a"))] == []
 
 
 def test_an_untouched_template_asks_for_an_experiment(tmp_path: Path) -> None:
@@ -118,7 +122,7 @@ def test_lint(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     rows = '[rig]\nname = "a"\n[[experiment]]\nkind = "motor_current"\nfile = "motor_current.csv"\n'
     found = findings(write_folder(tmp_path / "rig", rows), capsys)
     assert found == [
-        "motor_current: 3 rows, which hardly tell the scatter; measure 5 or more",
+        "motor_current: 3 rows, too few to estimate the scatter; measure 5 or more",
         "motor_current: no reading error stated for force and current; add force_sd",
     ]
     twice = rows + '[[experiment]]\nkind = "motor_current"\nfile = "copy.csv"\n'

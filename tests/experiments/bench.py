@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from capsule_id.rig.loose_settings import loose
+from capsule_id.experiments.registry import default_registry
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Table
 
 G = 9.81
@@ -23,7 +23,8 @@ def column(name: str, values: ArrayLike, sd: float | None = None, resolution: fl
 def table(kind: str, columns: Sequence[Column], label: str = "", **settings: object) -> Table:
     """An ``[[experiment]]`` of these columns."""
     rows = np.arange(2, 2 + len(columns[0].values))
-    return Table(kind, label or kind, f"{label or kind}.csv", {c.name: c for c in columns}, loose(kind, settings), rows)
+    own = default_registry()[kind].settings(**settings)
+    return Table(kind, label or kind, f"{label or kind}.csv", {c.name: c for c in columns}, own, rows)
 
 
 def rig(

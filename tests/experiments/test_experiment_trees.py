@@ -26,7 +26,7 @@ from capsule_id.inference.target import log_posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.read import read_rig
+from capsule_id.api import read_rig
 from capsule_id.synthetic import synthesize
 from capsule_id.views import Comparison, Finding, NoteTable
 from tests.experiments import bench

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments.forced_run.feasibility import RunConditions, contact_time, feasibility, held_rod
-from capsule_id.experiments.rough_values import lint_runs, rough_values
+from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.rough_values import rough_values
 from capsule_id.physics.grazing import grazing_load
 from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
@@ -138,14 +139,22 @@ def test_rough_values_come_from_the_bench_tests_of_the_folder() -> None:
     assert rough_values(bench.rig(priors={"k1": PriorOverride(900.0, 2.0)}))("k1") == (900.0, False)
 
 
+def lint_runs(rig: Rig) -> dict[str, list[str]]:
+    """Feasibility of the forced runs of a rig, by label."""
+    kind, estimate = default_registry()["forced_run"], rough_values(rig)
+    return {table.label: list(kind.lint_rig(table, rig, estimate)) for table in rig.tables if table.kind == kind.name}
+
+
 def test_runs_of_a_rig_are_judged_each_by_its_own_settings() -> None:
-    findings = lint_runs(bench_rig(run_table(0.8, 73.58, 1e-3, label="low"), run_table(1.4, 73.58, 1e-3, label="high")))
-    assert {(f.experiment, f.level, f.check) for f in findings} == {("low", "warn", "feasible")}
-    assert all("prior's median" not in f.text for f in findings)
+    rig = bench_rig(run_table(0.8, 73.58, 1e-3, label="low"), run_table(1.4, 73.58, 1e-3, label="high"))
+    findings = lint_runs(rig)
+    assert findings["low"]
+    assert not findings["high"]
+    assert all("prior's median" not in text for text in findings["low"])
 
 
 def test_the_amplitude_comes_from_the_current_where_it_is_not_stated() -> None:
     """2 A at the prior's 2 N/A: 4 N, enough; and the note names what was not measured."""
-    assert lint_runs(bench_rig(run_table(None, 34.56, 1e-3))) == []
-    (first, *_) = lint_runs(bench.rig(run_table(0.1, 34.56, 1e-3)))
-    assert first.text.endswith("(by the prior's median, not measured here: k1, c, mu, k2[s])")
+    assert list(lint_runs(bench_rig(run_table(None, 34.56, 1e-3))).values()) == [[]]
+    ((first, *_),) = lint_runs(bench.rig(run_table(0.1, 34.56, 1e-3))).values()
+    assert first.endswith("(by the prior's median, not measured here: k1, c, mu, k2[s])")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from capsule_id.experiments import KINDS
+from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.free_vibration.decay_models import dry_decay, quadratic_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -24,7 +24,8 @@ UNEVEN = np.sort(RNG.uniform(0.0, 0.16, 160))
 
 
 def make(table: Table) -> Experiment:
-    return KINDS[table.kind](table, bench.rig(table))
+    (experiment,) = make_experiments(bench.rig(table))
+    return experiment
 
 
 def coefficient(speed: np.ndarray, mu: float, v_s: float) -> np.ndarray:

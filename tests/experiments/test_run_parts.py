@@ -11,7 +11,6 @@ from capsule_id.experiments.forced_run.parts import parts_of
 from capsule_id.experiments.forced_run.restart import better_start
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.model import simulate
-from capsule_id.rig.loose_settings import loose
 from capsule_id.rig.model import Quantity, Table
 from tests.experiments import bench
 from tests.forced_runs import make, recorded, table, theta
@@ -70,7 +69,7 @@ def delayed(seconds: float, **settings: object) -> ForcedRun:
     t = simulate(p, e, late, (run.truth.x_rel, run.truth.Y1, 0.0, run.truth.Y2))
     x = np.asarray(t.x_rel)
     columns = {**own.columns, "x_rel": replace(own.columns["x_rel"], values=x)}
-    changed: Table = replace(own, columns=columns, settings=loose("forced_run", {**own.settings, "start": "moving"}))
+    changed: Table = replace(own, columns=columns, settings=replace(own.settings, start="moving"))
     return ForcedRun(changed, bench.rig(changed))
 
 

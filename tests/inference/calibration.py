@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from capsule_id.api import read_rig
 from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Posterior, Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
-from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 
 #: Truths are log-uniform within this factor of the paper's Table 1.

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
 from capsule_id.inference.pipeline import fit_rig
-from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.calibration import normal_score
 

@@ -10,7 +10,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter
-from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
+from capsule_id.rig.model import PriorOverride, Quantity, Rig, Settings, Table
 from capsule_id.views import Comparison
 
 
@@ -22,7 +22,7 @@ class Nothing(Experiment):
     """Names parameters and holds no reading: its posterior is the prior."""
 
     def __init__(self, rows: Sequence[Parameter]) -> None:
-        empty = Table("nothing", "nothing", "nothing.csv", {}, {}, np.zeros(0, dtype=int))
+        empty = Table("nothing", "nothing", "nothing.csv", {}, Settings(), np.zeros(0, dtype=int))
         self.about = About(empty, rig_without_tables(), tuple(rows))
 
     @property

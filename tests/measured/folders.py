@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from capsule_id.api import read_rig
 from capsule_id.inference.result import Result
 from capsule_id.rig.model import Rig
-from capsule_id.rig.read import read_rig
 from capsule_id.views import NoteTable
 
 

@@ -60,7 +60,7 @@ def test_the_two_readings_of_the_foam_die(tmp_path: Path) -> None:
 
 
 def test_without_a_word_on_the_length_the_toolkit_asks(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is it the board") as caught:
+    with pytest.raises(InputError, match=r"length_is = \"board\" for the sloping side") as caught:
         _rig(tmp_path, "foam_box", None)
     assert "length_is" in caught.value.rule
     assert caught.value.file == str(tmp_path / "rig.toml")

@@ -6,9 +6,10 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from capsule_id.experiments.forced_run.declaration import RunSettings
+from capsule_id.experiments.forced_run.twin import GAP_SD, NOISE_SD, RunSetup, SyntheticRun, make_runs
 from capsule_id.records.label import MeasuredMotion, measured_motion
 from capsule_id.rig.model import Column, Quantity, Table
-from capsule_id.synthetic_runs import GAP_SD, NOISE_SD, RunSettings, SyntheticRun, make_runs
 from tests.capsule_cases import read_cases
 
 #: (k2, mu, G, P_d, Omega) with Table 1's masses and k1, c = 1 N s/m, v_s = 0.3 m/s, and the model's label (``response``;
@@ -64,7 +65,7 @@ def table_of(
     """A ``forced_run``: the first ``samples`` rows, ``only`` these channels, some settings changed."""
     channels = {k: v for k, v in record.items() if k != "settings" and (not only or k in (*only, "time"))}
     columns = {name: Column(name, "", 1.0, values[:samples]) for name, values in channels.items()}
-    stated = dict(record["settings"]) | settings  # type: ignore[call-overload]
+    stated = RunSettings(**(dict(record["settings"]) | settings))  # type: ignore[call-overload]
     return Table("forced_run", "run", "run.csv", columns, stated, np.arange(len(columns["time"].values)) + 2)
 
 
@@ -74,7 +75,7 @@ def reference() -> tuple[Known, ...]:
     known = []
     for seed, case in enumerate(read_cases().raw):
         parameters = {name: case[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
-        settings = RunSettings("s", case["Omega"], case["P_d"], case["G"])
+        settings = RunSetup("s", case["Omega"], case["P_d"], case["G"])
         run = make_runs({**parameters, "K": 2.0, "k2[s]": case["k2"]}, 100 + seed, (settings,))[0]
         known.append(Known(case["name"], case["label"], 1e-3 * case["mean_velocity_mm_per_s"], run))
     return tuple(known)
@@ -86,6 +87,6 @@ def longer() -> tuple[Known, ...]:
     known = []
     for seed, ((k2, mu, G, P_d, Omega), label) in enumerate(LONGER.items()):
         parameters = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 1.0, "mu": mu, "v_s": 0.3, "g": 9.81, "K": 2.0}
-        run = make_runs({**parameters, "k2[s]": k2}, 200 + seed, (RunSettings("s", Omega, P_d, G),))[0]
+        run = make_runs({**parameters, "k2[s]": k2}, 200 + seed, (RunSetup("s", Omega, P_d, G),))[0]
         known.append(Known(f"{k2:g} N/m, {Omega:g} rad/s", label, float("nan"), run))
     return tuple(known)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from capsule_id.experiments.forced_run.twin import GAP_SD, SAMPLES
 from capsule_id.motions.response import response
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.records.label import UNDECIDED, measured_motion
-from capsule_id.synthetic_runs import GAP_SD, SAMPLES
 from tests.records.runs import LONGER, Known, longer, noisier, reference, table_of
 
 

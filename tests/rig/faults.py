@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.rig.read import read_rig
 
 MARK = "‸"
 

@@ -4,8 +4,8 @@ import random
 import re
 from pathlib import Path
 
+from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.rig.read import read_rig
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 
 MUTATIONS = 300

@@ -1,5 +1,6 @@
 """What a valid rig folder becomes."""
 
+import dataclasses
 import hashlib
 import math
 from pathlib import Path
@@ -7,14 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.rig.model import PriorOverride, Quantity
-from capsule_id.rig.read import read_rig
-from capsule_id.rig.schema import KINDS
-from capsule_id.rig.windows import decay_window
+from capsule_id.experiments.free_vibration.window import decay_window
+from capsule_id.experiments.registry import default_registry
+from capsule_id.rig.model import PriorOverride, Quantity, Table
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 
 DEGREE = math.pi / 180.0
+
+
+def stated(table: Table) -> dict[str, object]:
+    """The settings that are not absent."""
+    settings = ((field.name, getattr(table.settings, field.name)) for field in dataclasses.fields(table.settings))
+    return {name: value for name, value in settings if value is not None}
 
 
 def test_everything_is_si(tmp_path: Path) -> None:
@@ -37,12 +44,12 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "support_spring",
         "forced_run",
     ]
-    assert {table.kind for table in rig.tables} == set(KINDS)
+    assert {table.kind for table in rig.tables} == set(default_registry())
     decay, tilts, boards, pushes, _, motor, spring, run = rig.tables
     np.testing.assert_array_equal(decay["time"], np.arange(10) / 1000)
     np.testing.assert_array_equal(decay["x_rel"][:3], [0.002, 0.0015, 0.0005])
     assert decay.columns["x_rel"].reading_sd == pytest.approx(math.hypot(2e-5, 1e-6 / math.sqrt(12.0)), rel=1e-15)
-    assert dict(decay.settings) == {
+    assert stated(decay) == {
         "start": 0.0,
         "stop": 0.009,
         "capsule": "held",
@@ -52,13 +59,13 @@ def test_everything_is_si(tmp_path: Path) -> None:
     }
     np.testing.assert_allclose(tilts["angle"], np.array([33.1, 33.6, 33.2]) * DEGREE, rtol=1e-15)
     assert tilts.columns["angle"].to_display * tilts["angle"][0] == pytest.approx(33.1, rel=1e-15)
-    assert (boards.label, boards.file, boards.settings["length_is"]) == ("lifted", "boards/lifted.csv", "board")
+    assert (boards.label, boards.file, boards.settings.length_is) == ("lifted", "boards/lifted.csv", "board")
     np.testing.assert_array_equal(boards["height"], [0.3315, 0.329])
     np.testing.assert_array_equal(pushes["distance"], [0.0019, 0.025])
     assert (pushes.columns["speed"].sd, pushes.columns["distance"].sd) == (0.005, None)
-    assert motor.settings["sd_ratio"] == 3.0
-    assert dict(spring.settings) == {"spring": "L60", "length": Quantity(0.06, 0.0005)}
-    assert dict(run.settings) == {
+    assert motor.settings.sd_ratio == 3.0
+    assert stated(spring) == {"spring": "L60", "length": Quantity(0.06, 0.0005)}
+    assert stated(run) == {
         "spring": "L60",
         "gap": Quantity(0.001, 0.02 / 1000),
         "Omega": 34.56,
@@ -81,9 +88,11 @@ def test_nothing_can_be_changed(tmp_path: Path) -> None:
     for array in (*(column.values for column in table.columns.values()), table.rows):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
-    for mapping in (rig.files, rig.priors, table.columns, table.settings):
+    for mapping in (rig.files, rig.priors, table.columns):
         with pytest.raises(TypeError):
             mapping["new"] = 1  # type: ignore[index]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        table.settings.damping = "viscous"  # type: ignore[misc]
 
 
 def minimal(tmp_path: Path, head: str, entry: str, table: str) -> Path:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
+from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient, slide_distance
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import parameter
@@ -27,7 +28,7 @@ class DynamicFriction(FrictionExperiment):
     role = "dynamic"
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), parameter("push_scatter")))
+        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), PUSH_SCATTER))
         self.speed, self.distance = table["speed"], table["distance"]
         self.speed_sd = table.columns["speed"].reading_sd
         self.distance_sd = table.columns["distance"].reading_sd
@@ -58,25 +59,3 @@ class DynamicFriction(FrictionExperiment):
             "v_s": Start(float(np.median(self.speed)), 0.5),
             "push_scatter": Start(0.02, 0.3),
         }
-
-
-def twin(
-    rng: np.random.Generator,
-    mu: float,
-    v_s: float,
-    g: float,
-    speeds: np.ndarray,
-    speed_sd: float,
-    distance_sd: float,
-    push_scatter: float,
-) -> dict[str, np.ndarray]:
-    """A synthetic table: pushes at ``speeds`` (n,) m/s, read with ``speed_sd`` m/s and ``distance_sd`` m.
-
-    The surface's mu scatters by ``push_scatter`` (relative) from push to push.
-    """
-    surface = mu * (1.0 + push_scatter * rng.standard_normal(len(speeds)))
-    distance = np.asarray(slide_distance(speeds, 1.0, v_s, g, np)) / surface
-    return {
-        "speed [m/s]": speeds + speed_sd * rng.standard_normal(len(speeds)),
-        "distance [mm]": 1e3 * (distance + distance_sd * rng.standard_normal(len(speeds))),
-    }

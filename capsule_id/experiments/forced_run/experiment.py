@@ -19,6 +19,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
 from capsule_id.experiments.forced_run.about import AboutRun
+from capsule_id.experiments.forced_run.declaration import NOISE
 from capsule_id.experiments.forced_run.feasibility import check_feasible
 from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts
 from capsule_id.experiments.forced_run.panels import run_comparisons
@@ -30,10 +31,8 @@ from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_gr
 from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, innovations
-from capsule_id.parameters import CHANNELS
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.records.columns import stated_Omega
 from capsule_id.records.view import view_record
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Finding
@@ -110,10 +109,10 @@ class ForcedRun(CapsuleForward):
         """
         settings, gap = table.settings, table.settings.gap
         self.smoothing = smoothing
-        self.channels = tuple(name for name in CHANNELS if name in table.columns)
+        self.channels = tuple(name for name in NOISE if name in table.columns)
         self.time = table["time"]
         self.values = np.stack([table[name] for name in self.channels])
-        self.Omega = stated_Omega(table)
+        self.Omega = settings.angular_frequency
         self.gap, self.gap_known = gap.value, gap.sd == 0.0
         drive = settings.P_d if leads or not self.driven_by_current else None
         self.drive, self.drive_sd = (0.0, 0.0) if drive is None else (drive.value, drive.sd)

@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.forced_run.start import harmonic
 from capsule_id.physics.grazing import grazing_load
-from capsule_id.records.columns import stated_gap, stated_Omega
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
@@ -47,9 +46,9 @@ class RunConditions:
 
 def stated_conditions(table: Table, K: float) -> RunConditions:
     """Of a forced run: P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
-    Omega, stated = stated_Omega(table), table.settings.P_d
+    Omega, stated = table.settings.angular_frequency, table.settings.P_d
     P_d = K * harmonic(table["time"], table["current"], Omega)[0] if stated is None else stated.value
-    return RunConditions(Omega, P_d, stated_gap(table).value)
+    return RunConditions(Omega, P_d, table.settings.gap.value)
 
 
 def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:

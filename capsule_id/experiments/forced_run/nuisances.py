@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.experiments.base import Start
+from capsule_id.experiments.forced_run.declaration import CAPSULE_START, CORRELATION, CURRENT_AMPLITUDE, NOISE
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.parameters import Parameter, Prior, parameter
 
@@ -27,7 +28,7 @@ def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...
         rows.append(parameter("G", whole, Prior("positive_normal", settings.gap.value, settings.gap.sd)))
     if run.driven_by_current:
         amplitude = 0.5 * float(np.ptp(run.table["current"]))
-        rows += [parameter("K"), parameter("I_d", whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
+        rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
     elif not run.drive_known:
         rows.append(parameter("P_d", whole, Prior("positive_normal", run.drive, run.drive_sd)))
     rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
@@ -36,11 +37,11 @@ def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...
         rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
         rows.append(parameter("y_start", of, Prior("normal", 0.0, run.Omega * length)))
     if run.moves:
-        rows.append(parameter("capsule_start", of, Prior("normal", 0.0, run.Omega * length)))
+        rows.append(CAPSULE_START.named(of, Prior("normal", 0.0, run.Omega * length)))
     for name, scale in zip(run.channels, ranges.tolist(), strict=True):
-        rows.append(parameter(f"noise_{name}", whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
+        rows.append(NOISE[name].named(whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
     if run.coloured:
-        rows += [parameter(f"ar1_{name}", whole) for name in run.channels]
+        rows += [CORRELATION[name].named(whole) for name in run.channels]
     return tuple(rows)
 
 

@@ -19,14 +19,15 @@ from capsule_id.experiments.free_vibration.decay_models import (
 )
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
 from capsule_id.experiments.free_vibration.decay_trend import describe_trend
+from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_table
+from capsule_id.experiments.free_vibration.window import decay_window
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.rig.windows import decay_window
 from capsule_id.views import Comparison, Curve, Points
 
 #: Default prior of a record's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
@@ -72,7 +73,7 @@ class FreeVibration(Experiment):
         self.side, self.half_cycles, self.substeps = 1.0, 0, 0
         self.about = About(table, rig, ())
         rows = (parameter("k1"), parameter("c"))
-        noise = parameter("noise_sd", table.label, self.noise_prior())
+        noise = NOISE_SD.named(table.label, self.noise_prior())
         if self.damping == "viscous":
             self.about = About(table, rig, (*rows, noise))
             return
@@ -81,10 +82,8 @@ class FreeVibration(Experiment):
             self.side = float(np.sign(rough.peaks[0]))
             # The frequency may turn out half as high again.
             self.half_cycles = int(1.5 * rough.Omega_o * last / np.pi) + 4
-            amplitude = parameter(
-                "amplitude", table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH)
-            )
-            turning = parameter("turning_time", table.label, Prior("normal", 0.0, last))
+            amplitude = AMPLITUDE.named(table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH))
+            turning = TURNING_TIME.named(table.label, Prior("normal", 0.0, last))
             self.about = About(table, rig, (*rows, parameter("F_dry"), noise, amplitude, turning))
         else:
             self.substeps = max(1, int(np.ceil(rough.Omega_o * np.max(np.diff(self.time)) / STEP_PHASE)))
@@ -262,21 +261,3 @@ class FreeVibration(Experiment):
             autocorrelation(residuals, min(60, self.n // 4)),
             1.96 / float(np.sqrt(self.n)),
         )
-
-
-def twin(
-    rng: np.random.Generator,
-    k1: float,
-    c: float,
-    m1: float,
-    release: float,
-    relative_sd: float,
-    duration: float = 0.5,
-    rate: float = 2000.0,
-) -> dict[str, np.ndarray]:
-    """A synthetic decay, released at rest from ``release`` m at time 0; noise is ``relative_sd`` of the release."""
-    time = np.arange(round(duration * rate)) / rate
-    gamma, omega = rates(k1, c, m1, np)
-    cosine, sine = viscous_basis(time, k1, c, m1, np).T
-    x = release * (cosine + gamma / omega * sine)
-    return {"time [s]": time, "x_rel [mm]": 1e3 * (x + relative_sd * release * rng.standard_normal(time.size))}

@@ -10,6 +10,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient
 from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.sliding_friction.declaration import SLIDING_SCATTER
 from capsule_id.parameters import parameter
 from capsule_id.rig.model import Rig, Table
 
@@ -29,7 +30,7 @@ class SlidingFriction(FrictionExperiment):
     role = "sliding"
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), parameter("sliding_scatter")))
+        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), SLIDING_SCATTER))
         self.quantity = "force" if "force" in table.columns else "coefficient"
         self.speed, self.values = table["speed"], table[self.quantity]
         self.speed_sd = table.columns["speed"].reading_sd
@@ -73,11 +74,3 @@ class SlidingFriction(FrictionExperiment):
             "v_s": Start(float(np.median(speed)), 0.5),
             "sliding_scatter": Start(0.02, 0.3),
         }
-
-
-def twin(
-    rng: np.random.Generator, mu: float, v_s: float, speeds: np.ndarray, sliding_scatter: float
-) -> dict[str, np.ndarray]:
-    """A synthetic table of coefficients at ``speeds`` (n,) m/s with relative scatter ``sliding_scatter``."""
-    scatter = 1.0 + sliding_scatter * rng.standard_normal(len(speeds))
-    return {"speed [m/s]": speeds, "coefficient [1]": scatter * friction_coefficient(speeds, mu, v_s, np)}

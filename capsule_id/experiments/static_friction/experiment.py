@@ -8,6 +8,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction_curve import FrictionExperiment
 from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.static_friction.declaration import TILT_SD
 from capsule_id.parameters import parameter
 from capsule_id.rig.model import Rig, Table
 
@@ -25,7 +26,7 @@ class StaticFriction(FrictionExperiment):
     role = "static"
 
     def __init__(self, table: Table, rig: Rig) -> None:
-        self.about = About(table, rig, (parameter("mu"), parameter("tilt_sd")))
+        self.about = About(table, rig, (parameter("mu"), TILT_SD))
         self.angle, self.reading_sd = _angles(table)
 
     @property
@@ -62,11 +63,3 @@ def _angles(table: Table) -> tuple[np.ndarray, np.ndarray]:
     if table.settings.length_is == "board":
         return np.arcsin(ratio), ratio_sd / np.sqrt(1.0 - ratio**2)
     return np.arctan(ratio), ratio_sd / (1.0 + ratio**2)
-
-
-def twin(
-    rng: np.random.Generator, mu: float, trials: int = 4, tilt_sd: float = np.deg2rad(0.5)
-) -> dict[str, np.ndarray]:
-    """A synthetic table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
-    angle = np.arctan(mu) + tilt_sd * rng.standard_normal(trials)
-    return {"angle [deg]": np.rad2deg(angle)}

@@ -1,7 +1,5 @@
 """Support spring: static force against deflection (paper, section 2.2)."""
 
-import numpy as np
-
 from capsule_id.experiments.line import Line
 from capsule_id.experiments.support_spring.checks import check_cantilever
 from capsule_id.parameters import parameter
@@ -24,10 +22,3 @@ class SupportSpring(Line):
 
     def table_extras(self) -> dict[str, float]:
         return {} if self.length is None else {"length, m": self.length.value}
-
-
-def twin(rng: np.random.Generator, k2: float, deflections: np.ndarray, relative_sd: float) -> dict[str, np.ndarray]:
-    """A synthetic static test at ``deflections`` (n,) m; the force is read with ``relative_sd`` of full scale."""
-    force = k2 * deflections
-    noise = relative_sd * np.max(np.abs(force)) * rng.standard_normal(len(force))
-    return {"deflection [mm]": 1e3 * deflections, "force [N]": force + noise}

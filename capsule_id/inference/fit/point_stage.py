@@ -8,7 +8,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 
-from capsule_id.experiments import BENCH, make_experiments, paper_estimates
+from capsule_id.experiments import make_experiments, paper_estimates, select_tables
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.fit.joint_fit import joint_fit
 from capsule_id.inference.fit.point_fit import point_fit
@@ -100,7 +100,7 @@ def _compile(pool: Executor | None, target: LogPosterior) -> None:
 def _rough(rig: Rig, experiments: Sequence[Experiment]) -> dict[str, float]:
     """The paper's estimates from the rig's bench tests; those that are not among ``experiments`` are made for it."""
     bench = [e for e in experiments if e.bench]
-    if not bench and any(table.kind in BENCH for table in rig.tables):
+    if not bench and select_tables(rig, "bench"):
         bench = make_experiments(rig, "bench")
     return paper_estimates(bench)
 

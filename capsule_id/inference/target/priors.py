@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from capsule_id.experiments.linear import LOG_2PI
-from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
+from capsule_id.parameters import QUANTILE_975, Parameter, Prior
 from capsule_id.rig.model import PriorOverride
 
 
@@ -98,4 +98,4 @@ def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
         assert stated.median is not None, "the schema requires median and factor"
         assert stated.factor is not None, "the schema requires median and factor"
         prior = Prior("lognormal", stated.median, stated.factor)
-    return parameter(row.symbol, row.of, prior)
+    return row.named(row.of, prior)

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.rig.decode import decode
 from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.text import decode
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")

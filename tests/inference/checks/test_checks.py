@@ -6,20 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.lines import curvature_test
-from capsule_id.experiments.free_vibration import experiment as free_vibration
 from capsule_id.experiments.free_vibration.decay_models import dry_decay
+from capsule_id.experiments.free_vibration.twin import DECAY_NOISE, RELEASES, decay
 from capsule_id.experiments.line import Line
-from capsule_id.experiments.static_friction import experiment as static_friction
+from capsule_id.experiments.static_friction.declaration import tilts as tilted
 from capsule_id.inference.checks.regression import outliers
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.rig.read import read_rig
-from capsule_id.synthetic import DECAY_NOISE, RELEASES, TILT_SD, TILTS, Truth, synthesize
+from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Finding
 
 SEED = 7
@@ -50,7 +50,7 @@ def outlier(folder: Path) -> None:
 def dry_friction(folder: Path) -> None:
     """The second record rubs."""
     header, values = read(folder / "free_vibration_2.csv")
-    clean = free_vibration.twin(np.random.default_rng(0), TRUTH.k1, TRUTH.c, TRUTH.m1, RELEASES[1], 0.0)
+    clean = decay(np.random.default_rng(0), TRUTH.k1, TRUTH.c, TRUTH.m1, RELEASES[1], 0.0)
     time = clean["time [s]"]
     rubbed = dry_decay(time, TRUTH.k1, TRUTH.c, TRUTH.m1, DRY_FORCE, RELEASES[1], 0.0, half_cycles=40)
     noise = DECAY_NOISE * RELEASES[1] * np.random.default_rng(SEED).standard_normal(len(time))
@@ -66,7 +66,7 @@ def bent_line(folder: Path) -> None:
 
 
 def other_surface(folder: Path) -> None:
-    tilts = static_friction.twin(np.random.default_rng(SEED), TRUTH.mu - OTHER_SURFACE, TILTS, TILT_SD)
+    tilts = tilted(np.random.default_rng(SEED), TRUTH.mu - OTHER_SURFACE)
     write(folder / "static_friction.csv", "angle [deg]", tilts["angle [deg]"][:, None])
 
 

@@ -4,21 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from capsule_id.experiments import KINDS
-from capsule_id.experiments.dynamic_friction import experiment as dynamic_friction
-from capsule_id.experiments.static_friction import experiment as static_friction
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.dynamic_friction.declaration import DISTANCE_SD, SPEED_SD, pushes
+from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.static_friction.declaration import tilts
 from capsule_id.inference.checks.tension import tension
-from capsule_id.rig.loose_settings import loose
 from capsule_id.rig.model import Column, Quantity, Rig, Table
-from capsule_id.synthetic import (
-    PUSH_DISTANCE_SD,
-    PUSH_SCATTER,
-    PUSH_SPEED_SD,
-    PUSH_SPEEDS,
-    TILT_SD,
-    TILTS,
-    Truth,
-)
+from capsule_id.synthetic import Truth
 
 TRUTH = Truth()
 
@@ -29,26 +21,23 @@ def column(name: str, values: np.ndarray, sd: float | None = None) -> Column:
 
 def table(kind: str, *columns: Column) -> Table:
     rows = np.arange(2, 2 + len(columns[0].values))
-    return Table(kind, kind, f"{kind}.csv", {c.name: c for c in columns}, loose(kind, {}), rows)
+    return Table(kind, kind, f"{kind}.csv", {c.name: c for c in columns}, default_registry()[kind].settings(), rows)
 
 
 def p_value(seed: int, tilted_mu: float = TRUTH.mu) -> float:
     """Of a surface measured by the twin's protocol; the tilts on one of ``tilted_mu``."""
     rng = np.random.default_rng(seed)
-    tilts = static_friction.twin(rng, tilted_mu, TILTS, TILT_SD)
-    pushes = dynamic_friction.twin(
-        rng, TRUTH.mu, TRUTH.v_s, TRUTH.g, PUSH_SPEEDS, PUSH_SPEED_SD, PUSH_DISTANCE_SD, PUSH_SCATTER
-    )
+    tilted, pushed = tilts(rng, tilted_mu), pushes(rng, TRUTH.mu, TRUTH.v_s, TRUTH.g)
     tables = (
-        table("static_friction", column("angle", np.deg2rad(tilts["angle [deg]"]))),
+        table("static_friction", column("angle", np.deg2rad(tilted["angle [deg]"]))),
         table(
             "dynamic_friction",
-            column("speed", pushes["speed [m/s]"], PUSH_SPEED_SD),
-            column("distance", 1e-3 * pushes["distance [mm]"], PUSH_DISTANCE_SD),
+            column("speed", pushed["speed [m/s]"], SPEED_SD),
+            column("distance", 1e-3 * pushed["distance [mm]"], DISTANCE_SD),
         ),
     )
     rig = Rig("bench", True, Quantity(TRUTH.m1), Quantity(TRUTH.m2), Quantity(TRUTH.g), {}, tables, {}, Path("bench"))
-    tilt, push = (KINDS[t.kind].make(t, rig)[0] for t in tables)
+    tilt, push = make_experiments(rig)
     return tension(rig, [tilt], [push]).p
 
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.inference.checks.verdict import check_starts
 from capsule_id.inference.fit.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 
 

@@ -4,11 +4,11 @@ import pytest
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.twin import RunSetup, make_runs
 from capsule_id.inference.fit import point_stage
 from capsule_id.inference.fit.point_stage import cut_unpredictable
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Quantity, Table
-from capsule_id.synthetic_runs import RunSettings, make_runs
 from tests.experiments import bench
 from tests.forced_runs import TRUTH, make
 
@@ -16,7 +16,7 @@ from tests.forced_runs import TRUTH, make
 def chaotic() -> tuple[Table, dict[str, float]]:
     """Two seconds of the chaotic motion of tests/capsule/test_lyapunov.py, and its true parameters."""
     truth = TRUTH | {"m2": 0.3, "c": 0.5, "mu": 0.2}
-    run = make_runs(truth, 0, (RunSettings("stiff", 34.56, 8.0, 0.5e-3),))[0]
+    run = make_runs(truth, 0, (RunSetup("stiff", 34.56, 8.0, 0.5e-3),))[0]
     columns = [bench.column("time", run.time), *(bench.column(name, y) for name, y in run.channels.items())]
     settings = {"spring": "stiff", "gap": Quantity(run.stated_gap, 2e-5), "Omega": run.truth.Omega}
     return bench.table("forced_run", columns, "wild", **settings), truth

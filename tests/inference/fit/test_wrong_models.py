@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.forced_run.twin import NOISE_SD
 from capsule_id.inference.checks.experiment_checks import check_whiteness
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.rig.model import PriorOverride, Quantity
-from capsule_id.synthetic_runs import NOISE_SD
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.forced_runs import TRUTH

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
+from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.static_friction.declaration import TILT_SD
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import TABLE, Prior, parameter
 from capsule_id.rig.model import PriorOverride
-from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.stub import Nothing, rig_without_tables
 
@@ -83,21 +86,21 @@ def test_joint_prior_is_the_sum() -> None:
 
 def test_default_priors_are_as_documented() -> None:
     """95 % of a log-normal within median/factor .. median*factor; scatters half-normal."""
-    for row in TABLE.values():
+    for row in default_registry().parameters.values():
         if row.prior is not None and row.prior.kind == "lognormal":
             x = row.prior.sample(np.random.default_rng(1), 40000)
             inside = np.abs(np.log(x / row.prior.location)) < np.log(row.prior.spread)
             assert np.mean(inside) == pytest.approx(0.95, abs=4.0 * np.sqrt(0.95 * 0.05 / 40000))
     assert TABLE["v_s"].prior == Prior("lognormal", 0.3, 10.0)
     assert TABLE["mu"].prior == Prior("lognormal", 0.4, 5.0)
-    assert TABLE["tilt_sd"].prior == Prior("halfnormal", 0.0, np.deg2rad(1.0))
-    assert TABLE["push_scatter"].prior == Prior("halfnormal", 0.0, 0.05)
+    assert TILT_SD.prior == Prior("halfnormal", 0.0, np.deg2rad(1.0))
+    assert PUSH_SCATTER.prior == Prior("halfnormal", 0.0, 0.05)
     assert min(TABLE[s].prior.spread for s in ("k1", "c", "k2", "K")) >= 100.0  # type: ignore[union-attr]
 
 
 def test_a_parameter_without_a_prior_is_refused() -> None:
     with pytest.raises(ValueError, match=r"noise_sd\[x\] has no prior"):
-        LogPosterior(rig_without_tables(), [Nothing([parameter("noise_sd", "x")])])
+        LogPosterior(rig_without_tables(), [Nothing([NOISE_SD.named("x")])])
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +167,7 @@ def test_rigs_of_one_structure_do_not_share_numbers(tmp_path: Path) -> None:
 
 def test_overrides_replace_priors() -> None:
     override = {"mu": PriorOverride(median=0.5, factor=2.0), "tilt_sd": PriorOverride(scale=0.01)}
-    target = LogPosterior(rig_without_tables(override), [Nothing([parameter("mu"), parameter("tilt_sd")])])
+    target = LogPosterior(rig_without_tables(override), [Nothing([parameter("mu"), TILT_SD])])
     assert [row.prior for row in target.parameters] == [Prior("lognormal", 0.5, 2.0), Prior("halfnormal", 0.0, 0.01)]
 
 

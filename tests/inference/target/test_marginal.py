@@ -11,6 +11,7 @@ import pytest
 from scipy import integrate, optimize, stats
 
 import tests.experiments.bench as bench
+from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.fit.curvature import hessian, root_of_inverse
@@ -19,7 +20,6 @@ from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior, conditional
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import Rig
-from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 
 WALKERS, OVERDISPERSION = 6, 2.0

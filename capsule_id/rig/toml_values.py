@@ -1,26 +1,17 @@
 """The values of ``rig.toml``, one by one: type, unit, domain, then SI. A fault is named at its own line and column."""
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from difflib import get_close_matches
 from math import isfinite
 from typing import Any
 
+from capsule_id.rig.domains import ABOVE_ONE, NOT_NEGATIVE, POSITIVE, Domain
 from capsule_id.rig.model import PriorOverride, Quantity
-from capsule_id.rig.schema import (
-    ABOVE_ONE,
-    NAME_PATTERN,
-    NOT_NEGATIVE,
-    POSITIVE,
-    ChoiceRule,
-    Domain,
-    NameRule,
-    QuantityRule,
-    SettingRule,
-)
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
+NAME_PATTERN = r"[A-Za-z0-9._-]+"
 _LONGEST_SHOWN = 60  # characters of a faulty value that an error line repeats
 
 
@@ -80,29 +71,26 @@ def read_table(document: TomlDocument, path: KeyPath, value: object, example: st
     return value
 
 
-def read_quantity(document: TomlDocument, path: KeyPath, value: object, rule: QuantityRule) -> Quantity:
-    """``{ value = ..., sd = ..., unit = "..." }`` in SI."""
-    example = f'{{ value = ..., {"sd = ..., " if rule.has_sd else ""}unit = "{rule.si}" }}'
+def read_quantity(
+    document: TomlDocument, path: KeyPath, value: object, si: str, domain: Domain = POSITIVE, has_sd: bool = False
+) -> Quantity:
+    """``{ value = ..., sd = ..., unit = "..." }`` in SI; ``sd`` is refused unless ``has_sd``."""
+    example = f'{{ value = ..., {"sd = ..., " if has_sd else ""}unit = "{si}" }}'
     entry = read_table(document, path, value, example)
-    refuse_unknown_keys(document, path, entry, ("value", "sd", "unit") if rule.has_sd else ("value", "unit"))
-    factor = _read_unit(document, path, entry, rule.si)
-    number = _read_scaled(document, path, entry, "value", factor, rule.domain)
+    refuse_unknown_keys(document, path, entry, ("value", "sd", "unit") if has_sd else ("value", "unit"))
+    factor = _read_unit(document, path, entry, si)
+    number = _read_scaled(document, path, entry, "value", factor, domain)
     sd = _read_scaled(document, path, entry, "sd", factor, NOT_NEGATIVE) if "sd" in entry else 0.0
     return Quantity(number, sd)
 
 
-def read_setting(document: TomlDocument, path: KeyPath, value: object, rule: SettingRule) -> str | float | Quantity:
-    """A setting as its rule has it: a word, a name, an SI float, or a ``Quantity`` where it may have an sd."""
-    if isinstance(rule, NameRule):
-        return read_name(document, path, value)
-    if isinstance(rule, ChoiceRule):
-        word = read_string(document, path, value)
-        if word not in rule.choices:
-            choices = " or ".join(f'"{choice}"' for choice in rule.choices)
-            raise document.error(path, f"{path[-1]} must be {choices}", shown(word), f"write {choices}")
-        return word
-    quantity = read_quantity(document, path, value, rule)
-    return quantity if rule.has_sd else quantity.value
+def read_choice(document: TomlDocument, path: KeyPath, value: object, choices: Sequence[str]) -> str:
+    """One of ``choices``."""
+    word = read_string(document, path, value)
+    if word not in choices:
+        known = " or ".join(f'"{choice}"' for choice in choices)
+        raise document.error(path, f"{path[-1]} must be {known}", shown(word), f"write {known}")
+    return word
 
 
 def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, is_scatter: bool) -> PriorOverride:

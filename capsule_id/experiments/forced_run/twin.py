@@ -6,11 +6,14 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.forced_run.declaration import RUN_SPRINGS
+from capsule_id.experiments.kind import Twin, TwinTable, Values
+from capsule_id.parameters import QUANTILE_975
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, status_message
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunSetup:
     """What the experimenter sets for one run, SI: the spring by name, the drive and the gap."""
 
     spring: str
@@ -21,15 +24,13 @@ class RunSettings:
 
 #: One run near the paper's Fig. 6, one of its Fig. 11, two of its Fig. 10.
 RUNS = (
-    RunSettings("medium", 34.56, 4.0, 1.0e-3),
-    RunSettings("stiff", 73.58, 1.2, 1.0e-3),
-    RunSettings("hard", 26.58, 2.5, 1.5e-3),
-    RunSettings("hard", 46.0, 2.5, 1.5e-3),
+    RunSetup("medium", 34.56, 4.0, 1.0e-3),
+    RunSetup("stiff", 73.58, 1.2, 1.0e-3),
+    RunSetup("hard", 26.58, 2.5, 1.5e-3),
+    RunSetup("hard", 46.0, 2.5, 1.5e-3),
 )
-#: Springs that only runs meet (Fig. 10): no static test, a rough stiffness stated as a prior with this factor.
-RUN_SPRINGS = {"hard": 59410.0}
+#: The springs that only runs meet have no static test but a prior with this factor.
 SPRING_FACTOR = 1.5
-_QUANTILE_975 = 1.959963984540054
 #: Excitation periods from rest that are left out before the cut; the cut itself falls at a random phase.
 SETTLED = 40
 SAMPLES, RATE = 2000, 1000.0
@@ -75,15 +76,26 @@ class SyntheticRun:
             "current [A]": np.round(self.channels["current"], 5),
         }
 
-    def entry(self, file: str) -> str:
-        """The ``[[experiment]]`` of ``rig.toml``."""
+    def settings(self) -> tuple[str, ...]:
+        """Lines of its entry in ``rig.toml``."""
         gap = f'gap = {{ value = {1e3 * self.stated_gap:.3f}, sd = {1e3 * GAP_SD:g}, unit = "mm" }}'
-        Omega = f'Omega = {{ value = {self.truth.Omega:g}, unit = "rad/s" }}'
-        lines = ['kind = "forced_run"', f'file = "{file}"', f'spring = "{self.truth.spring}"', gap, Omega]
-        return "\n".join(["[[experiment]]", *lines, ""])
+        return f'spring = "{self.truth.spring}"', gap, f'Omega = {{ value = {self.truth.Omega:g}, unit = "rad/s" }}'
 
 
-def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSettings, ...] = RUNS) -> list[SyntheticRun]:
+def measure(values: Values, seed: int) -> Twin:
+    """The runs, priors of the springs that only they meet, and the truth of every run by label.
+
+    Raises
+    ------
+    InputError
+        If the model cannot complete a run with these values.
+    """
+    runs = {f"run_{number}": run for number, run in enumerate(make_runs(values, seed), start=1)}
+    tables = tuple(TwinTable(f"{label}.csv", run.table(), run.settings()) for label, run in runs.items())
+    return Twin(tables, spring_priors(values, seed), {label: asdict(run.truth) for label, run in runs.items()})
+
+
+def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, ...] = RUNS) -> list[SyntheticRun]:
     """Simulate and measure every run; each has a generator of its own, none is the bench's.
 
     Parameters
@@ -119,7 +131,7 @@ def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetting
 def _measure(
     rng: np.random.Generator,
     parameters: Mapping[str, float],
-    run: RunSettings,
+    run: RunSetup,
     time: np.ndarray,
     state: np.ndarray,
     phase: float,
@@ -147,18 +159,13 @@ def _measure(
     return SyntheticRun(time, channels, stated_gap, truth)
 
 
-def spring_priors(parameters: Mapping[str, float], seed: int) -> list[str]:
+def spring_priors(parameters: Mapping[str, float], seed: int) -> tuple[str, ...]:
     """Lines of ``[prior]`` for the springs that only runs meet, each off its truth as its factor says."""
-    spread = np.log(SPRING_FACTOR) / _QUANTILE_975
+    spread = np.log(SPRING_FACTOR) / QUANTILE_975
     # a key that no run's generator has, so that neither depends on how many there are of the other
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**20,)))
     lines = []
     for spring in RUN_SPRINGS:
         median = parameters[f"k2[{spring}]"] * np.exp(spread * rng.standard_normal())
         lines.append(f'"k2[{spring}]" = {{ median = {1e-3 * median:.3g}, factor = {SPRING_FACTOR:g}, unit = "kN/m" }}')
-    return lines
-
-
-def truths(runs: list[SyntheticRun]) -> dict[str, dict]:
-    """The truth of every run by label, for the truth file."""
-    return {f"run_{number}": asdict(run.truth) for number, run in enumerate(runs, start=1)}
+    return tuple(lines)

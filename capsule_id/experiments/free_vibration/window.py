@@ -7,7 +7,8 @@ from capsule_id.rig.model import Table
 
 def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
     """(time, x_rel) of a free vibration, SI, from ``start`` to ``stop``, both included; by default the whole record."""
-    time = table["time"]
-    start, stop = table.settings.get("start", time[0]), table.settings.get("stop", time[-1])
+    time, settings = table["time"], table.settings
+    start = time[0] if settings.start is None else settings.start
+    stop = time[-1] if settings.stop is None else settings.stop
     inside = (time >= start) & (time <= stop)
     return time[inside], table["x_rel"][inside]

@@ -1,0 +1,106 @@
+"""Pushes: columns, settings, template and twin."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
+from capsule_id.experiments.lint import lint_reading_errors, lint_rows
+from capsule_id.parameters import Prior, scatter
+from capsule_id.rig.domains import POSITIVE
+from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.schema import ColumnRule
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
+
+PUSH_SCATTER = scatter(
+    "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", Prior("halfnormal", 0.0, 0.05)
+)
+#: Pushes of the twin: speeds, m/s; reading errors, m/s and m; relative scatter of mu.
+SPEEDS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])
+SPEED_SD, DISTANCE_SD, SURFACE_SCATTER = 5e-3, 0.3e-3, 0.015
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushSettings(Settings):
+    """``forward``: the closed form of a locked rod, or the capsule model of a free one."""
+
+    forward: Literal["closed", "capsule"] = "closed"
+
+
+def _masses(table: Table[PushSettings]) -> tuple[str, ...]:
+    return ("m1", "m2") if table.settings.forward == "capsule" else ()
+
+
+def _make(table: Table[PushSettings], rig: Rig) -> tuple["DynamicFriction"]:
+    from capsule_id.experiments.capsule_bench import CapsulePushes
+    from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
+
+    return ((CapsulePushes if table.settings.forward == "capsule" else DynamicFriction)(table, rig),)
+
+
+def pushes(
+    rng: np.random.Generator,
+    mu: float,
+    v_s: float,
+    g: float,
+    speeds: np.ndarray = SPEEDS,
+    speed_sd: float = SPEED_SD,
+    distance_sd: float = DISTANCE_SD,
+    surface_scatter: float = SURFACE_SCATTER,
+) -> dict[str, np.ndarray]:
+    """A synthetic table: pushes at ``speeds`` (n,) m/s, read with ``speed_sd`` m/s and ``distance_sd`` m.
+
+    The surface's mu scatters by ``surface_scatter`` (relative) from push to push. Each argument is one quantity of the
+    protocol, so there are more than six.
+    """
+    from capsule_id.experiments.friction_curve import slide_distance
+
+    surface = mu * (1.0 + surface_scatter * rng.standard_normal(len(speeds)))
+    distance = np.asarray(slide_distance(speeds, 1.0, v_s, g, np)) / surface
+    return {
+        "speed [m/s]": speeds + speed_sd * rng.standard_normal(len(speeds)),
+        "distance [mm]": 1e3 * (distance + distance_sd * rng.standard_normal(len(speeds))),
+    }
+
+
+def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+    del seed
+    errors = (
+        f'speed_sd = {{ value = {1e3 * SPEED_SD:g}, unit = "mm/s" }}',
+        f'distance_sd = {{ value = {1e3 * DISTANCE_SD:g}, unit = "mm" }}',
+    )
+    return Twin((TwinTable("dynamic_friction.csv", pushes(rng, values["mu"], values["v_s"], values["g"]), errors),))
+
+
+TEMPLATE = """\
+#: Pushes, a row each, the rod locked to the capsule: mu and v_s. Columns: speed [m/s], distance [mm].
+# [[experiment]]
+# kind = "dynamic_friction"
+# file = "dynamic_friction.csv"
+# speed_sd = { value = 5, unit = "mm/s" }
+# distance_sd = { value = 0.3, unit = "mm" }
+# forward = "closed"                                  # "capsule": the rod was free and vibrates
+"""
+
+KIND = Kind(
+    name="dynamic_friction",
+    columns={"speed": ColumnRule("m/s", POSITIVE), "distance": ColumnRule("m", POSITIVE)},
+    sets=(("speed", "distance"),),
+    settings=PushSettings,
+    masses=_masses,
+    parameters=(PUSH_SCATTER,),
+    make=_make,
+    template=TEMPLATE,
+    informs="mu, v_s",
+    captions=CAPTIONS,
+    lint=(partial(lint_rows, fewest=5), lint_reading_errors),
+    check=check_scatter,
+    paper=friction_estimates,
+    panels=friction_panels,
+    twin=_measure,
+)

@@ -1,0 +1,1 @@
+"""What kinds of experiments share with each other."""

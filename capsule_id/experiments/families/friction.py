@@ -1,0 +1,57 @@
+"""Friction experiments share eq. (1), the paper's fit of it, one panel, and one condition on their readings."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.kind import Values
+from capsule_id.rig.model import Table
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.friction_curve import FrictionExperiment
+    from capsule_id.views import Comparison
+
+CAPTIONS = {
+    "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours."
+}
+
+
+def friction_estimates(experiments: Sequence["FrictionExperiment"]) -> Values:
+    """The paper's mu and v_s: eq. (1) fitted to the points of all friction experiments."""
+    from capsule_id.experiments.friction_curve import paper_friction_fit
+
+    points = [e.paper_points() for e in experiments]
+    speed, coefficient = (np.concatenate(parts) for parts in zip(*points, strict=True))
+    return paper_friction_fit(speed, coefficient)
+
+
+def friction_panels(
+    experiments: Sequence["FrictionExperiment"], values: Values, draws: Sequence[Values]
+) -> tuple["Comparison"]:
+    """One panel of all friction experiments."""
+    from capsule_id.experiments.friction_curve import friction_comparison
+
+    # Local values differ in scatters only; together they have both mu and v_s where one experiment has them.
+    points: list[Values] = [{k: v for e in experiments for k, v in e.local(p).items()} for p in (values, *draws)]
+    return (friction_comparison(list(experiments), points[0], points[1:]),)
+
+
+def check_scatter(tables: Sequence[Table[Any]]) -> None:
+    """Refuse readings that are all the same and have no reading error: their scatter could be 0, no proper posterior.
+
+    Raises
+    ------
+    InputError
+        If they are.
+    """
+    if len({tuple(table.columns) for table in tables}) != 1:
+        return
+    rows = np.concatenate([np.stack([c.values for c in t.columns.values()], axis=1) for t in tables])
+    if len(rows) < 2 or np.any(rows != rows[0]):
+        return
+    if not any(column.reading_sd > 0.0 for table in tables for column in table.columns.values()):
+        name = next(iter(tables[0].columns))
+        rule = f"{tables[0].kind} readings that are all the same need their reading step"
+        raise InputError(rule, f"{len(rows)} rows", f"state {name}_resolution", tables[0].file)

@@ -1,0 +1,44 @@
+"""Calibration lines share the rule on their reading errors, the paper's straight line and their lint."""
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from capsule_id.experiments.kind import Values
+from capsule_id.experiments.lint import lint_reading_errors, lint_rows
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Table
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.line import Line
+
+
+def line_estimates(experiments: Sequence["Line"]) -> Values:
+    """The slopes of ordinary straight lines, by name; the mean over tables."""
+    slopes: dict[str, list[float]] = {}
+    for e in experiments:
+        slopes.setdefault(e.slope.name, []).append(e.ordinary_line()[0])
+    return {name: float(np.mean(values)) for name, values in slopes.items()}
+
+
+def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
+    """Two stated reading errors already have a ratio.
+
+    Raises
+    ------
+    InputError
+        At ``sd_ratio``.
+    """
+    columns = entry.table.columns
+    if entry.table.settings.sd_ratio is not None and all(column.sd is not None for column in columns.values()):
+        one, other = (f"{name}_sd" for name in sorted(columns, key=lambda name: name != "force"))
+        rule = f"state sd_ratio or both of {one} and {other}"
+        raise entry.error("sd_ratio", rule, "all three", "remove sd_ratio", of_key=True)
+
+
+def lint_line(table: Table[Any]) -> Iterable[str]:
+    """Few rows, and reading errors that are not stated."""
+    yield from lint_rows(table, 5)
+    if table.settings.sd_ratio is None:
+        yield from lint_reading_errors(table)

@@ -1,0 +1,182 @@
+"""Forced runs: columns, settings, rules, template, lint and what ``check`` says of a record."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+
+from capsule_id.experiments.kind import Estimate, Kind, Twin, Values
+from capsule_id.parameters import Prior, nuisance, scatter
+from capsule_id.records.text import describe_run, run_warning
+from capsule_id.rig.domains import NOT_NEGATIVE
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Quantity, Rig, Settings, Table
+from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.forced_run.experiment import ForcedRun
+
+#: Recorded channels: name, unit, LaTeX subscript.
+_CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
+
+CURRENT_AMPLITUDE = nuisance("I_d", "A", "amplitude of the current in a run", "I_d")
+CAPSULE_START = nuisance("capsule_start", "m/s", "speed of the capsule at the start of a run", "v_0")
+#: Noise and atanh of the noise's correlation, by channel.
+NOISE = {
+    name: scatter(f"noise_{name}", unit, f"noise of {name} in a run", rf"\sigma_{{{index}}}")
+    for name, unit, index in _CHANNELS
+}
+CORRELATION = {
+    name: nuisance(
+        f"ar1_{name}", "1", f"atanh of the noise's lag-1 correlation, {name} of a run", r"\alpha",
+        Prior("normal", 0.0, 1.0),
+    )
+    for name, _, _ in _CHANNELS
+}  # fmt: skip
+
+Gain = Annotated[float | None, QuantityRule("1")]
+Delay = Annotated[float | None, QuantityRule("s")]
+#: The hard spring of the paper's Fig. 10, N/m: only runs meet it.
+RUN_SPRINGS = {"hard": 59410.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings(Settings):
+    """Settings of a forced run, SI. ``<channel>_gain_sd`` and ``<channel>_delay_sd``: sds of a gain and of a delay."""
+
+    spring: Annotated[str, NameRule()]
+    gap: Annotated[Quantity, QuantityRule("m", NOT_NEGATIVE, has_sd=True)]
+    Omega: Annotated[float | None, QuantityRule("rad/s")] = None
+    f: Annotated[float | None, QuantityRule("Hz")] = None
+    P_d: Annotated[Quantity | None, QuantityRule("N", has_sd=True)] = None
+    start: Literal["auto", "stuck", "moving", "settled"] = "auto"
+    noise: Literal["white", "ar1"] = "white"
+    segment: Annotated[float | None, QuantityRule("s")] = None
+    x_rel_gain_sd: Gain = None
+    x_capsule_gain_sd: Gain = None
+    acceleration_rod_gain_sd: Gain = None
+    current_gain_sd: Gain = None
+    x_rel_delay_sd: Delay = None
+    x_capsule_delay_sd: Delay = None
+    acceleration_rod_delay_sd: Delay = None
+    current_delay_sd: Delay = None
+
+    @property
+    def angular_frequency(self) -> float:
+        """Stated frequency of the drive, rad/s; the reader has checked that there is one."""
+        if self.Omega is not None:
+            return self.Omega
+        assert self.f is not None, "a forced run has Omega or f"
+        return 2.0 * np.pi * self.f
+
+
+def _check_drive(entry: Entry[RunSettings]) -> None:
+    """One frequency; and an amplitude, from P_d or from the recorded current."""
+    settings, columns = entry.table.settings, entry.table.columns
+    stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
+    if len(stated) != 1:
+        rule = "forced_run must have Omega (rad/s) or f (Hz), not both"
+        raise entry.error("f" if stated else "", rule, " and ".join(stated) or "none", "state one of them")
+    if settings.P_d is None and "current" not in columns:
+        rule = "forced_run must have P_d where current is not recorded"
+        remedy = 'add P_d = { value = ..., sd = ..., unit = "N" }'
+        raise entry.error("", rule, f"columns {' '.join(columns)}", remedy)
+    if "current" in columns and settings.P_d is not None and settings.P_d.sd == 0.0:
+        rule = "P_d beside a recorded current is a second reading of the same amplitude and must have an sd"
+        raise entry.error("P_d", rule, "none", "add sd = ... to it, or leave P_d out")
+
+
+def _masses(table: Table[RunSettings]) -> tuple[str, ...]:
+    del table
+    return "m1", "m2"
+
+
+def _make(table: Table[RunSettings], rig: Rig) -> tuple["ForcedRun", ...]:
+    """A run, or its parts where ``segment`` is stated."""
+    from capsule_id.experiments.forced_run.experiment import ForcedRun
+
+    return ForcedRun.make(table, rig)
+
+
+def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
+    """What the run cannot measure, at rough values."""
+    from capsule_id.experiments.forced_run.feasibility import feasibility
+
+    assert rig.m1 is not None, "the reader requires both masses for a forced run"
+    assert rig.m2 is not None, "the reader requires both masses for a forced run"
+    settings = table.settings
+    names = {symbol: symbol for symbol in ("k1", "c", "mu", "K")} | {"k2": f"k2[{settings.spring}]"}
+    if settings.P_d is not None:
+        del names["K"]
+    values = {symbol: estimate(name) for symbol, name in names.items()}
+    guessed = [names[symbol] for symbol, (_, measured) in values.items() if not measured]
+    note = f" (by the prior's median, not measured here: {', '.join(guessed)})" if guessed else ""
+    theta = {"m1": rig.m1.value, "m2": rig.m2.value, "g": rig.g.value}
+    theta |= {symbol: value for symbol, (value, _) in values.items()}
+    return [finding.text.removeprefix(f"{table.label}: ") for finding in feasibility(table, theta, note)]
+
+
+def _lint_drive(table: Table[RunSettings]) -> Iterable[str]:
+    """A stated frequency that the current does not have."""
+    return filter(None, [run_warning(table)])
+
+
+def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+    from capsule_id.experiments.forced_run.twin import measure
+
+    del rng
+    return measure(values, seed)
+
+
+TEMPLATE = """\
+#: Forced run. Columns: time [s], and any of x_rel [mm], x_capsule [mm], acceleration_rod [m/s^2], current [A].
+#: State Omega in rad/s or f in Hz. P_d is needed where current is not recorded.
+# [[experiment]]
+# kind = "forced_run"
+# file = "run_01.csv"
+# spring = "L60"
+# gap = { value = 1.0, sd = 0.02, unit = "mm" }
+# Omega = { value = 34.56, unit = "rad/s" }
+# P_d = { value = 4.0, sd = 0.1, unit = "N" }
+#: state of the capsule at the first sample: "auto" (default, from the record), "stuck", "moving" or "settled"
+# start = "auto"
+#: "white" (default) or "ar1": coloured noise, its correlation is estimated
+# noise = "white"
+#: sd of a channel's gain; also x_capsule_gain_sd acceleration_rod_gain_sd current_gain_sd
+# x_rel_gain_sd = { value = 0.01, unit = "1" }
+#: sd of a delay below one sample; also x_capsule_delay_sd acceleration_rod_delay_sd current_delay_sd
+# x_rel_delay_sd = { value = 0.1, unit = "ms" }
+#: length of the parts, each with initial conditions of its own, into which a chaotic record is cut
+# segment = { value = 0.3, unit = "s" }
+"""
+
+KIND = Kind(
+    name="forced_run",
+    columns={
+        "time": ColumnRule("s", increasing=True),
+        "x_rel": ColumnRule("m", varies=True),
+        "x_capsule": ColumnRule("m"),  # may be constant: a capsule that never moves is a result
+        "acceleration_rod": ColumnRule("m/s^2", varies=True),
+        "current": ColumnRule("A", varies=True),
+    },
+    sets=(("time",),),
+    channels=tuple(NOISE),
+    settings=RunSettings,
+    rules=(_check_drive, Entry.check_length),
+    masses=_masses,
+    parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
+    make=_make,
+    template=TEMPLATE,
+    informs="all of them together, and the gap",
+    captions={
+        "forced_run": "Forced run: one recorded channel, its residuals at the point fit, and their autocorrelation.",
+        "phase_portrait": "Phase plane as the paper draws it: the record through Savitzky–Golay, the model, the impact line.",
+    },
+    bench=False,
+    lint=(_lint_drive,),
+    lint_rig=_lint_feasibility,
+    describe=describe_run,
+    twin=_measure,
+    truth={f"k2[{name}]": k2 for name, k2 in RUN_SPRINGS.items()},
+)

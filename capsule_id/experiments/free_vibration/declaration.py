@@ -1,0 +1,177 @@
+"""Free vibration: columns, settings, rules, template, lint and the paper's estimates."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.twin import measure
+from capsule_id.experiments.free_vibration.window import decay_window
+from capsule_id.experiments.kind import Kind, Values
+from capsule_id.parameters import nuisance, scatter
+from capsule_id.rig.domains import ANY, NOT_NEGATIVE
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.filters import dominant_frequency, sampling_step
+from capsule_id.rig.model import Quantity, Rig, Settings, Table
+from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, NameRule, QuantityRule
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.free_vibration.experiment import FreeVibration
+
+#: Samples per period below which the highest sample misses the peak by more than 1 - cos(pi/20) = 1.2 %.
+SAMPLES_PER_PERIOD = 20
+#: Periods below which the damping rests on one peak.
+FEWEST_PERIODS = 2
+
+NOISE_SD = scatter("noise_sd", "m", "noise of a record", r"\sigma")
+AMPLITUDE = nuisance("amplitude", "m", "first turning point of a decay", "a_0")
+TURNING_TIME = nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecaySettings(Settings):
+    """Settings of a free vibration, SI."""
+
+    start: Annotated[float | None, QuantityRule("s", ANY)] = None
+    stop: Annotated[float | None, QuantityRule("s", ANY)] = None
+    capsule: Literal["held", "free"] = "held"
+    damping: Literal["viscous", "dry", "quadratic"] = "viscous"
+    smoothing_window: Annotated[float | None, QuantityRule("s")] = None
+    spring: Annotated[str | None, NameRule()] = None
+    gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
+    forward: Literal["closed", "capsule"] = "closed"
+
+
+def _check_spring_with_gap(entry: Entry[DecaySettings]) -> None:
+    """A spring within reach has a gap."""
+    spring, gap = entry.table.settings.spring, entry.table.settings.gap
+    if (spring is None) != (gap is None):
+        one, other = ("spring", "gap") if gap is None else ("gap", "spring")
+        remedy = f"add {other}, or remove {one} where the support spring is out of reach"
+        raise entry.error(one, "spring and gap must stand together", f"{one} alone", remedy, of_key=True)
+
+
+def _check_window(entry: Entry[DecaySettings]) -> None:
+    """start < stop, both inside the record to one sampling step, and enough samples between them."""
+    entry.check_length()
+    time, settings = entry.table["time"], entry.table.settings
+    # A record of n steps is often said to last n steps: one sample more than it has.
+    step = float(np.median(np.diff(time)))
+    edges = {"start": float(time[0]), "stop": float(time[-1])}
+    for key, value in (("start", settings.start), ("stop", settings.stop)):
+        if value is None:
+            continue
+        if not time[0] - step <= value <= time[-1] + step:
+            span = f"a time from {time[0]:g} to {time[-1]:g} s"
+            raise entry.error(key, f"{key} must lie inside the record", f"{value:g} s", f"write {span}")
+        edges[key] = value
+    place = "start" if settings.stop is None else "stop"
+    if edges["start"] >= edges["stop"]:
+        value = f"{edges['start']:g} s and {edges['stop']:g} s"
+        raise entry.error(place, "start must be before stop", value, "correct one of them")
+    inside = len(decay_window(entry.table)[0])
+    if inside < SHORTEST_RECORD:
+        rule = f"at least {SHORTEST_RECORD} samples must lie between start and stop"
+        raise entry.error(place, rule, f"{inside} samples", "widen the window")
+
+
+def _check_forward(entry: Entry[DecaySettings]) -> None:
+    """The capsule model needs a capsule that is free to move, and has viscous damping only."""
+    settings = entry.table.settings
+    if settings.forward != "capsule":
+        return
+    if settings.capsule == "held":
+        remedy = 'add capsule = "free", or write forward = "closed" where the capsule was held'
+        raise entry.error("forward", "forward capsule needs a capsule that is free to move", "held", remedy)
+    if settings.damping != "viscous":
+        remedy = 'remove damping, or write forward = "closed"'
+        raise entry.error("forward", "forward capsule has viscous damping only", settings.damping, remedy)
+
+
+def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
+    """The rod's mass; the capsule's where it may move."""
+    moves = table.settings.capsule == "free" or table.settings.forward == "capsule"
+    return ("m1", "m2") if moves else ("m1",)
+
+
+def _make(table: Table[DecaySettings], rig: Rig) -> tuple["FreeVibration"]:
+    """The closed form, or the capsule model."""
+    from capsule_id.experiments.capsule_bench import CapsuleDecay
+    from capsule_id.experiments.free_vibration.experiment import FreeVibration
+
+    return ((CapsuleDecay if table.settings.forward == "capsule" else FreeVibration)(table, rig),)
+
+
+def _lint(table: Table[DecaySettings]) -> Iterable[str]:
+    """Sampling and length of a free decay."""
+    time, x_rel = decay_window(table)
+    try:
+        period = 1.0 / dominant_frequency(time, x_rel)
+        step = sampling_step(time)
+    except InputError as error:
+        yield f"{error.rule} ({error.value}): the paper's estimate is left out; {error.remedy}"
+        return
+    if period / step < SAMPLES_PER_PERIOD:
+        yield f"{period / step:.1f} samples per period, {SAMPLES_PER_PERIOD} or more are wanted; sample faster"
+    if (time[-1] - time[0]) / period < FEWEST_PERIODS:
+        yield f"{(time[-1] - time[0]) / period:.1f} periods, {FEWEST_PERIODS} or more are wanted; record for longer"
+
+
+def _paper(experiments: Sequence["FreeVibration"]) -> Values:
+    """The paper's k1 = m1 Omega_o^2 and c of the logarithmic decrement after Savitzky–Golay; the mean over records."""
+    found = [d for d in (e.paper_decrement() for e in experiments) if d is not None]
+    return {"k1": float(np.mean([d.k1 for d in found])), "c": float(np.mean([d.c for d in found]))} if found else {}
+
+
+def _rough(experiments: Sequence["FreeVibration"], rig: Rig) -> Values:
+    """k1 and c without the paper's bias: m1 (Omega_o^2 + gamma^2) and 2 m1 gamma, gamma = delta Omega_o / 2 pi."""
+    decays = [e.paper_decrement() for e in experiments]
+    found = [(d.Omega_o, d.delta * d.Omega_o / (2.0 * np.pi)) for d in decays if d is not None and d.delta > 0.0]
+    if not found or rig.m1 is None:
+        return {}
+    return {
+        "k1": float(np.mean([rig.m1.value * (Omega_o**2 + gamma**2) for Omega_o, gamma in found])),
+        "c": float(np.mean([2.0 * rig.m1.value * gamma for _, gamma in found])),
+    }
+
+
+TEMPLATE = """\
+#: Free vibration of the rod on its spring: k1 and c. Columns: time [s], x_rel [mm] (positive towards the support
+#: spring).
+# [[experiment]]
+# kind = "free_vibration"
+# file = "free_vibration_1.csv"
+#: the part of the record that is free decay; default: the whole record
+# start = { value = 0.0, unit = "s" }
+# stop = { value = 0.5, unit = "s" }
+#: "held" (default) or "free"
+# capsule = "held"
+#: "viscous" (default); "dry" or "quadratic" add this damping to the viscous one
+# damping = "viscous"
+#: "closed" form (default), or the "capsule" model: a free capsule may slip, and the rod may hit the support spring
+# forward = "closed"
+#: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record
+# smoothing_window = { value = 10, unit = "ms" }
+# x_rel_sd = { value = 0.02, unit = "mm" }
+#: a support spring within reach: both of spring = "L60" and gap = { value = 1.0, sd = 0.02, unit = "mm" }
+"""
+
+KIND = Kind(
+    name="free_vibration",
+    columns={"time": ColumnRule("s", increasing=True), "x_rel": ColumnRule("m", varies=True)},
+    sets=(("time", "x_rel"),),
+    settings=DecaySettings,
+    rules=(_check_spring_with_gap, _check_window, _check_forward),
+    masses=_masses,
+    parameters=(NOISE_SD, AMPLITUDE, TURNING_TIME),
+    make=_make,
+    template=TEMPLATE,
+    informs="k1, c",
+    captions={"free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation."},
+    lint=(_lint,),
+    paper=_paper,
+    rough=_rough,
+    twin=measure,
+)

@@ -1,0 +1,100 @@
+"""The declaration of one kind of experiment: everything that the rest of the package must know of it.
+
+A kind is a folder with a ``declaration.py`` whose ``KIND`` is a ``Kind``. Declarations load no JAX: what needs it is
+imported where it is used.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.schema import KindRule
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.base import Experiment
+    from capsule_id.views import Comparison
+
+#: Parameter values, SI, by name (``k1``, ``k2[soft]``).
+Values = Mapping[str, float]
+#: A rough value, SI, by parameter name, and whether a bench test of the rig gave it (else the prior's median).
+Estimate = Callable[[str], tuple[float, bool]]
+
+
+@dataclass(frozen=True)
+class TwinTable:
+    """One synthetic table.
+
+    Attributes
+    ----------
+    file : its name
+    columns : (n,) by header cell, e.g. ``x_rel [mm]``, in the header's unit
+    settings : lines of its entry in ``rig.toml``
+    """
+
+    file: str
+    columns: Mapping[str, np.ndarray]
+    settings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Twin:
+    """What ``synthesize`` writes for one kind.
+
+    Attributes
+    ----------
+    tables : in the order of ``rig.toml``
+    priors : lines of its ``[prior]``
+    truth : what lies behind each table beyond the parameters, by label
+    """
+
+    tables: tuple[TwinTable, ...]
+    priors: tuple[str, ...] = ()
+    truth: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def own_panels(experiments: Sequence["Experiment"], values: Values, draws: Sequence[Values]) -> Iterable["Comparison"]:
+    """Panels of experiments that share none, one after the other."""
+    for e in experiments:
+        yield from e.comparisons(e.local(values), [e.local(draw) for draw in draws])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind(KindRule):
+    """One kind of experiment; the attributes of ``KindRule`` besides these.
+
+    Attributes
+    ----------
+    make : the experiments of one table, several where a record is cut into parts
+    template : the commented lines of ``rig.toml`` that ``capsule-id init`` writes
+    informs : the parameters that it measures, for tables
+    captions : of its panels in the report, by ``Comparison.kind``
+    bench : a bench test; else a forced run
+    lint : what deserves attention in a table before a fit, a line each
+    lint_rig : the same, where it takes the rest of the rig or rough values
+    describe : what ``capsule-id check`` says of a table, a line each
+    check : raises an ``InputError`` where all tables of the kind together cannot be fitted
+    paper : estimates by the paper's own protocol, by parameter name. Kinds with the same function are evaluated together
+    rough : better rough values than the paper's, before a fit, by parameter name
+    panels : predictions beside readings, with a band from draws. Kinds with the same function share their panels
+    twin : tables measured on true values, SI by name, with reading errors from a generator (shared by all bench kinds)
+        or from a seed. None: ``synthesize`` leaves the kind out
+    truth : true values, SI by name, that only this kind adds to a synthetic rig
+    """
+
+    make: Callable[[Table[Any], Rig], tuple["Experiment", ...]]
+    template: str
+    informs: str
+    captions: Mapping[str, str]
+    bench: bool = True
+    lint: tuple[Callable[[Table[Any]], Iterable[str]], ...] = ()
+    lint_rig: Callable[[Table[Any], Rig, Estimate], Iterable[str]] = field(default=lambda table, rig, estimate: ())
+    describe: Callable[[Table[Any]], Iterable[str]] = field(default=lambda table: ())
+    check: Callable[[Sequence[Table[Any]]], None] = field(default=lambda tables: None)
+    paper: Callable[[Sequence[Any]], Values] = field(default=lambda experiments: {})
+    rough: Callable[[Sequence[Any], Rig], Values] = field(default=lambda experiments, rig: {})
+    panels: Callable[[Sequence[Any], Values, Sequence[Values]], Iterable["Comparison"]] = own_panels
+    twin: Callable[[Values, np.random.Generator, int], Twin] | None = None
+    truth: Values = field(default_factory=dict)

@@ -1,0 +1,104 @@
+"""Every kind of experiment, by name: the built-in ones and those of installed packages.
+
+A package adds kinds through the entry-point group ``capsule_id.experiments``; each entry point names a ``Kind``.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib import import_module
+from importlib.metadata import entry_points
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.kind import Kind
+from capsule_id.parameters import Parameter
+from capsule_id.rig.model import Rig
+from capsule_id.rig.schema import parameter_rows
+
+GROUP = "capsule_id.experiments"
+
+#: Folders of the built-in kinds, in the order of templates and synthetic rigs.
+BUILT_IN = (
+    "free_vibration",
+    "static_friction",
+    "dynamic_friction",
+    "sliding_friction",
+    "motor_current",
+    "support_spring",
+    "forced_run",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Registry(Mapping[str, Kind]):
+    """Kinds of experiments by name, in a fixed order.
+
+    Raises
+    ------
+    ValueError
+        If two kinds have one name, or declare one parameter differently.
+    TypeError
+        If a type of a setting states no rule.
+    """
+
+    kinds: tuple[Kind, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.by_name) < len(self.kinds):
+            names = [kind.name for kind in self.kinds]
+            raise ValueError(f"kind {next(n for n in names if names.count(n) > 1)} is declared twice")
+        for kind in self.kinds:
+            _ = kind.setting_rules
+        _ = self.parameters
+
+    @cached_property
+    def by_name(self) -> dict[str, Kind]:
+        """The kinds by name."""
+        return {kind.name: kind for kind in self.kinds}
+
+    @cached_property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Every parameter by symbol: the package's table, then the rows of the kinds."""
+        return parameter_rows(self.by_name)
+
+    @property
+    def captions(self) -> Mapping[str, str]:
+        """Captions of all panels, by ``Comparison.kind``."""
+        return {name: text for kind in self.kinds for name, text in kind.captions.items()}
+
+    def has_runs(self, rig: Rig) -> bool:
+        """Whether ``rig`` has forced runs."""
+        return any(not self.by_name[table.kind].bench for table in rig.tables)
+
+    def __getitem__(self, name: str) -> Kind:
+        return self.by_name[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.by_name)
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+
+@cache
+def default_registry() -> Registry:
+    """The built-in kinds and those of installed packages; made once.
+
+    Raises
+    ------
+    InputError
+        If a package's kind does not load or clashes with another one; the error names the package.
+    """
+    registry = Registry(tuple(import_module(f"{__package__}.{folder}.declaration").KIND for folder in BUILT_IN))
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+        package = point.dist.name if point.dist is not None else point.value
+        remedy = f"update the package {package}, or uninstall it"
+        try:
+            kind = point.load()
+            if not isinstance(kind, Kind):
+                raise TypeError(f"{point.value} is no Kind")
+            registry = Registry((*registry.kinds, kind))
+        except Exception as error:  # a package may raise anything while it loads
+            rule = f"the experiment kind {point.name} of an installed package must load"
+            raise InputError(rule, f"{type(error).__name__}: {error}", remedy, package) from error
+    return registry

@@ -1,0 +1,106 @@
+"""Tilts until the capsule slips: columns, settings, rules, template and twin."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
+from capsule_id.experiments.lint import lint_rows
+from capsule_id.parameters import Prior, scatter
+from capsule_id.rig.domains import POSITIVE, SLOPE_ANGLE
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.schema import ColumnRule
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.static_friction.experiment import StaticFriction
+
+TILT_SD = scatter(
+    "tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", Prior("halfnormal", 0.0, np.deg2rad(1.0))
+)
+#: Trials of the twin, and their scatter, rad.
+TRIALS, TRIAL_SD = 4, np.deg2rad(0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiltSettings(Settings):
+    """``length_is``: the side of the triangle that the column length is; None beside a column angle."""
+
+    length_is: Literal["board", "base"] | None = None
+
+
+def _check_tilt(entry: Entry[TiltSettings]) -> None:
+    """Height and length make an angle only where the meaning of length is stated."""
+    table, meaning = entry.table, entry.table.settings.length_is
+    if "angle" in table.columns:
+        if meaning is not None:
+            remedy = "remove it, or give height and length"
+            raise entry.error("length_is", "length_is needs the columns height and length", "angle", remedy)
+        return
+    if meaning is None:
+        rule = "length_is must say which side of the triangle length is"
+        remedy = 'write length_is = "board" for the sloping side, or length_is = "base" for the side on the floor'
+        raise entry.error("", rule, "none", remedy)
+    too_high = table["height"] >= table["length"]
+    if meaning == "board" and too_high.any():
+        row = int(np.argmax(too_high))
+        value = " of ".join(
+            f"{table[name][row] * table.columns[name].to_display:g} {table.columns[name].unit}"
+            for name in ("height", "length")
+        )
+        remedy = 'correct it, or write length_is = "base"'
+        raise entry.file.error(row, "height", "height must be less than the length of the board", value, remedy)
+
+
+def _make(table: Table[TiltSettings], rig: Rig) -> tuple["StaticFriction"]:
+    from capsule_id.experiments.static_friction.experiment import StaticFriction
+
+    return (StaticFriction(table, rig),)
+
+
+def tilts(
+    rng: np.random.Generator, mu: float, trials: int = TRIALS, tilt_sd: float = TRIAL_SD
+) -> dict[str, np.ndarray]:
+    """A synthetic table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
+    angle = np.arctan(mu) + tilt_sd * rng.standard_normal(trials)
+    return {"angle [deg]": np.rad2deg(angle)}
+
+
+def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+    del seed
+    return Twin((TwinTable("static_friction.csv", tilts(rng, values["mu"])),))
+
+
+TEMPLATE = """\
+#: Tilts of the board until the capsule slips: mu. Column: angle [deg]; or height [mm] and length [mm] with
+#: length_is = "board" (the sloping side) or "base" (the side on the floor).
+# [[experiment]]
+# kind = "static_friction"
+# file = "static_friction.csv"
+# angle_resolution = { value = 0.1, unit = "deg" }
+"""
+
+KIND = Kind(
+    name="static_friction",
+    columns={
+        "angle": ColumnRule("rad", SLOPE_ANGLE),
+        "height": ColumnRule("m", POSITIVE),
+        "length": ColumnRule("m", POSITIVE),
+    },
+    sets=(("angle",), ("height", "length")),
+    settings=TiltSettings,
+    rules=(_check_tilt,),
+    parameters=(TILT_SD,),
+    make=_make,
+    template=TEMPLATE,
+    informs="mu",
+    captions=CAPTIONS,
+    lint=(partial(lint_rows, fewest=4),),
+    check=check_scatter,
+    paper=friction_estimates,
+    panels=friction_panels,
+    twin=_measure,
+)

@@ -1,0 +1,83 @@
+"""Support spring: columns, settings, template and twin."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from capsule_id.experiments.families.line import line_estimates, lint_line, refuse_idle_sd_ratio
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
+from capsule_id.rig.model import Quantity, Rig, Settings, Table
+from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.support_spring.experiment import SupportSpring
+
+#: The twin's deflections, m, and the noise of the force as a share of full scale.
+DEFLECTIONS = np.linspace(0.0, 1e-3, 11)
+SPRING_NOISE = 0.002
+#: The twin's lengths follow the cantilever law from this one, m, which belongs to this k2, N/m; read with this sd, m.
+LENGTH, LENGTH_OF, LENGTH_SD = 60e-3, 18960.0, 0.1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringSettings(Settings):
+    """The spring's name; its free length, m; the force's reading error per the deflection's, N/m."""
+
+    spring: Annotated[str, NameRule()]
+    length: Annotated[Quantity | None, QuantityRule("m", has_sd=True)] = None
+    sd_ratio: Annotated[float | None, QuantityRule("N/m")] = None
+
+
+def _make(table: Table[SpringSettings], rig: Rig) -> tuple["SupportSpring"]:
+    from capsule_id.experiments.support_spring.experiment import SupportSpring
+
+    return (SupportSpring(table, rig),)
+
+
+def static_test(
+    rng: np.random.Generator, k2: float, deflections: np.ndarray, relative_sd: float
+) -> dict[str, np.ndarray]:
+    """A synthetic static test at ``deflections`` (n,) m; the force is read with ``relative_sd`` of full scale."""
+    force = k2 * deflections
+    noise = relative_sd * np.max(np.abs(force)) * rng.standard_normal(len(force))
+    return {"deflection [mm]": 1e3 * deflections, "force [N]": force + noise}
+
+
+def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+    del seed
+    tables = []
+    for name, k2 in values.items():
+        if name.startswith("k2["):
+            spring = name[len("k2[") : -1]
+            length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
+            stated = f'length = {{ value = {1e3 * length:.2f}, sd = {1e3 * LENGTH_SD:g}, unit = "mm" }}'
+            columns = static_test(rng, k2, DEFLECTIONS, SPRING_NOISE)
+            tables.append(TwinTable(f"support_spring_{spring}.csv", columns, (f'spring = "{spring}"', stated)))
+    return Twin(tuple(tables))
+
+
+TEMPLATE = """\
+#: Force of a support spring against its deflection: its k2. Columns: deflection [mm], force [N]; a file per spring.
+#: sd_ratio as above, in N/m.
+# [[experiment]]
+# kind = "support_spring"
+# file = "support_spring_L60.csv"
+# spring = "L60"
+# length = { value = 60, sd = 0.5, unit = "mm" }
+"""
+
+KIND = Kind(
+    name="support_spring",
+    columns={"deflection": ColumnRule("m", varies=True), "force": ColumnRule("N", varies=True)},
+    sets=(("deflection", "force"),),
+    settings=SpringSettings,
+    rules=(refuse_idle_sd_ratio,),
+    make=_make,
+    template=TEMPLATE,
+    informs="k2 of that spring",
+    captions={"support_spring": "The slope of the line is the stiffness of the support spring."},
+    lint=(lint_line,),
+    paper=line_estimates,
+    twin=_measure,
+)

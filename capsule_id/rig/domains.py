@@ -1,0 +1,28 @@
+"""Intervals that values must lie in."""
+
+from dataclasses import dataclass
+from math import inf, pi
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Domain:
+    """An interval of SI values; ``text`` continues "<name> must ..."."""
+
+    text: str
+    low: float = -inf
+    high: float = inf
+    low_allowed: bool = False
+
+    def holds(self, values: np.ndarray | float) -> np.ndarray:
+        """Elementwise: inside?"""
+        values = np.asarray(values)
+        return ((values >= self.low) if self.low_allowed else (values > self.low)) & (values < self.high)
+
+
+ANY = Domain("be a finite number")
+POSITIVE = Domain("be greater than 0", low=0.0)
+NOT_NEGATIVE = Domain("be 0 or greater", low=0.0, low_allowed=True)
+ABOVE_ONE = Domain("be greater than 1", low=1.0)
+SLOPE_ANGLE = Domain("lie between 0 and 90 deg", low=0.0, high=pi / 2)

@@ -1,0 +1,65 @@
+"""A package that adds a kind of experiment, with parameters of its own, to capsule-id; ``test_plugin.py`` installs it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from capsule_id.experiments.kind import Kind
+from capsule_id.parameters import Parameter, Prior, scatter
+from capsule_id.rig.domains import POSITIVE
+from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.schema import ColumnRule, NameRule
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.base import Experiment
+
+C_RR = Parameter("c_rr", "1", "rolling resistance coefficient", r"c_\mathrm{rr}", Prior("lognormal", 0.01, 100.0))
+SCATTER = scatter(
+    "rolling_scatter", "N", "scatter of the rolling resistance", r"s_\mathrm{rr}", Prior("halfnormal", 0.0, 0.01)
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RollingSettings(Settings):
+    """The wheel's name."""
+
+    wheel: Annotated[str, NameRule()]
+
+
+def _masses(table: Table[RollingSettings]) -> tuple[str, ...]:
+    del table
+    return "m1", "m2"
+
+
+def _lint(table: Table[RollingSettings]) -> Iterable[str]:
+    if len(np.unique(table["speed"])) < 6:
+        yield "fewer than 6 speeds; measure more"
+
+
+def _make(table: Table[RollingSettings], rig: Rig) -> "tuple[Experiment]":
+    from rolling_rig.experiment import RollingResistance
+
+    return (RollingResistance(table, rig),)
+
+
+KIND = Kind(
+    name="rolling_resistance",
+    columns={"speed": ColumnRule("m/s", POSITIVE), "force": ColumnRule("N", POSITIVE)},
+    sets=(("speed", "force"),),
+    settings=RollingSettings,
+    masses=_masses,
+    parameters=(C_RR, SCATTER),
+    make=_make,
+    template="""\
+#: Rolling resistance: c_rr. Columns: speed [m/s], force [N].
+# [[experiment]]
+# kind = "rolling_resistance"
+# file = "rolling_resistance.csv"
+# wheel = "W1"
+""",
+    informs="c_rr",
+    captions={"rolling_resistance": "Rolling resistance: the force at each speed, and the fitted one."},
+    lint=(_lint,),
+)

@@ -1,0 +1,124 @@
+"""A kind of experiment, with a parameter of its own, that comes from another installed package."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.registry import GROUP, Registry, default_registry
+from tests import cli_tools
+
+#: The kinds without the package, made before a test installs it.
+KINDS = default_registry()
+PLUGIN = Path(__file__).with_name("rolling_rig")
+SPEEDS = (0.1, 0.2, 0.3, 0.4, 0.5)
+#: Measured force, N: c_rr (m1 + m2) g = 0.0628 N at c_rr = 0.01, and a scatter of 1 mN.
+FORCES = (0.0638, 0.0618, 0.0628, 0.0633, 0.0623)
+
+
+def install(site: Path, target: str = "rolling_rig:KIND") -> Path:
+    """``site`` as ``pip install --target`` leaves it: the package, and metadata with its entry point."""
+    info = site / "rolling_rig-0.1.dist-info"
+    info.mkdir(parents=True)
+    shutil.copytree(PLUGIN, site / "rolling_rig", ignore=shutil.ignore_patterns("__pycache__"))
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: rolling-rig\nVersion: 0.1\n", encoding="utf-8")
+    (info / "entry_points.txt").write_text(f"[{GROUP}]\nrolling_resistance = {target}\n", encoding="utf-8")
+    return site
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return install(tmp_path_factory.mktemp("site"))
+
+
+def run(site: Path, *words: str, name: str = "capsule_id") -> subprocess.CompletedProcess[str]:
+    """A command with the package in ``site`` installed."""
+    paths = os.pathsep.join([str(cli_tools.ROOT), str(site)])
+    return cli_tools.run(*words, cwd=site, name=name, env=cli_tools.environment(PYTHONPATH=paths))
+
+
+@pytest.fixture(scope="module")
+def folder(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rig folder from ``init``, with the entry of the new kind in use."""
+    folder = tmp_path_factory.mktemp("rigs") / "rolling"
+    done = run(site, "init", str(folder))
+    assert (done.returncode, done.stderr) == (0, "")
+    text = (folder / "rig.toml").read_text(encoding="utf-8")
+    head, entry = text.split("#: Rolling resistance")
+    assert "rolling_scatter" in head.split("Half-normal")[1]  # [prior] may override the parameters of the kind
+    masses = head.replace("# m1 =", "m1 =").replace("# m2 =", "m2 =")
+    (folder / "rig.toml").write_text(masses + "#:" + entry.replace("\n# ", "\n"), encoding="utf-8")
+    rows = "\n".join(f"{v},{1e3 * force:.2f}" for v, force in zip(SPEEDS, FORCES, strict=True))
+    (folder / "rolling_resistance.csv").write_text(f"speed [m/s],force [mN]\n{rows}\n", encoding="utf-8")
+    return folder
+
+
+def test_check_reads_and_lints_it(site: Path, folder: Path) -> None:
+    done = run(site, "check", str(folder))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "rolling_resistance rolling_resistance: 5 rows of speed [m/s], force [mN]" in done.stdout
+    assert "lint: rolling_resistance: fewer than 6 speeds; measure more" in done.stdout
+
+
+def test_without_the_package_the_kind_is_unknown(folder: Path, tmp_path: Path) -> None:
+    """The negative control."""
+    done = run(tmp_path, "check", str(folder))
+    assert done.returncode == 2
+    assert "unknown kind, 'rolling_resistance'" in done.stderr
+
+
+def test_it_is_fitted_and_reported(site: Path, folder: Path, tmp_path: Path) -> None:
+    """Independent route: the mean force over the weight."""
+    done = run(site, str(folder), "--out", str(tmp_path / "out"), "--no-sample", "--quiet", name="fit_params")
+    assert (done.returncode, done.stderr) == (0, "")
+    fitted = json.loads((tmp_path / "out" / "parameters.json").read_text())["parameters"]
+    weight = (0.110 + 0.530) * 9.81
+    assert set(fitted) == {"c_rr", "m1", "m2"}
+    assert fitted["c_rr"]["map"] == pytest.approx(sum(FORCES) / len(FORCES) / weight, rel=2e-3)
+    assert "Rolling resistance: the force at each speed" in (tmp_path / "out" / "report.html").read_text()
+
+
+def load(site: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
+    """The default registry, made anew with the package in ``site`` installed."""
+    monkeypatch.syspath_prepend(site)
+    for name in [name for name in sys.modules if name.split(".")[0] == "rolling_rig"]:
+        monkeypatch.delitem(sys.modules, name)
+    return default_registry.__wrapped__()
+
+
+def test_its_parameters_and_settings_join_those_of_the_package(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = load(site, monkeypatch)
+    assert list(kinds) == [*KINDS, "rolling_resistance"]
+    assert set(kinds.parameters) - set(KINDS.parameters) == {"c_rr", "rolling_scatter"}
+    assert kinds["rolling_resistance"].required == ("wheel",)
+
+
+@pytest.mark.parametrize(
+    ("change", "target", "fault"),
+    [
+        (("import numpy", "import no_such_module\nimport numpy"), "rolling_rig:KIND", "ModuleNotFoundError"),
+        (("", ""), "rolling_rig:MISSING", "AttributeError"),
+        (("", ""), "rolling_rig:C_RR", "TypeError: rolling_rig:C_RR is no Kind"),
+        (('name="rolling_resistance"', 'name="forced_run"'), "rolling_rig:KIND", "kind forced_run is declared"),
+        (('"c_rr", "1"', '"mu", "1"'), "rolling_rig:KIND", "parameter mu of kind rolling_resistance is declared"),
+        (("Annotated[str, NameRule()]", "str"), "rolling_rig:KIND", "the type of setting wheel must be"),
+    ],
+)
+def test_a_faulty_package_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: tuple[str, str], target: str, fault: str
+) -> None:
+    site = install(tmp_path / "site", target)
+    source = site / "rolling_rig" / "__init__.py"
+    text = source.read_text(encoding="utf-8")
+    assert change[0] in text
+    source.write_text(text.replace(*change), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        load(site, monkeypatch)
+    assert str(caught.value).startswith("rolling-rig: the experiment kind rolling_resistance of an installed package")
+    assert fault in caught.value.value
+    assert caught.value.remedy == "update the package rolling-rig, or uninstall it"

@@ -1,0 +1,228 @@
+"""The declarations of kinds: what they say, that nothing else lists them, and what a faulty one leads to."""
+
+import ast
+import json
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pytest
+
+from capsule_id.api import fit, read_rig
+from capsule_id.errors import InputError
+from capsule_id.experiments import CHOICES, make_experiments, select_tables
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
+from capsule_id.experiments.registry import BUILT_IN, Registry, default_registry
+from capsule_id.parameters import TABLE, scatter
+from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
+from capsule_id.rig.model import Settings
+from capsule_id.rig.schema import ChoiceRule, ColumnRule, NameRule, QuantityRule, SettingRule
+from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.synthetic import Truth, synthesize
+from tests.cli_tools import ROOT
+from tests.rig.folder import TABLES, write_folder
+
+KINDS = default_registry()
+
+#: Every setting of every kind by the interface: its rule, and its default (...: it must be stated).
+_CHANNELS = ("x_rel", "x_capsule", "acceleration_rod", "current")
+_FORWARD = (ChoiceRule(("closed", "capsule")), "closed")
+_GAP = QuantityRule("m", NOT_NEGATIVE, has_sd=True)
+SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
+    "free_vibration": {
+        "start": (QuantityRule("s", ANY), None),
+        "stop": (QuantityRule("s", ANY), None),
+        "capsule": (ChoiceRule(("held", "free")), "held"),
+        "damping": (ChoiceRule(("viscous", "dry", "quadratic")), "viscous"),
+        "smoothing_window": (QuantityRule("s"), None),
+        "spring": (NameRule(), None),
+        "gap": (_GAP, None),
+        "forward": _FORWARD,
+    },
+    "static_friction": {"length_is": (ChoiceRule(("board", "base")), None)},
+    "dynamic_friction": {"forward": _FORWARD},
+    "sliding_friction": {},
+    "motor_current": {"sd_ratio": (QuantityRule("N/A"), None)},
+    "support_spring": {
+        "spring": (NameRule(), ...),
+        "length": (QuantityRule("m", has_sd=True), None),
+        "sd_ratio": (QuantityRule("N/m"), None),
+    },
+    "forced_run": {
+        "spring": (NameRule(), ...),
+        "gap": (_GAP, ...),
+        "Omega": (QuantityRule("rad/s"), None),
+        "f": (QuantityRule("Hz"), None),
+        "P_d": (QuantityRule("N", has_sd=True), None),
+        "start": (ChoiceRule(("auto", "stuck", "moving", "settled")), "auto"),
+        "noise": (ChoiceRule(("white", "ar1")), "white"),
+        "segment": (QuantityRule("s"), None),
+        **{f"{name}_gain_sd": (QuantityRule("1"), None) for name in _CHANNELS},
+        **{f"{name}_delay_sd": (QuantityRule("s"), None) for name in _CHANNELS},
+    },
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_the_settings_are_those_of_the_interface(name: str) -> None:
+    kind = KINDS[name]
+    assert dict(kind.setting_rules) == {key: rule for key, (rule, _) in SETTINGS[name].items()}
+    assert kind.required == tuple(key for key, (_, default) in SETTINGS[name].items() if default is ...)
+    defaults = {field.name: field.default for field in fields(kind.settings) if field.name not in kind.required}
+    assert defaults == {key: default for key, (_, default) in SETTINGS[name].items() if default is not ...}
+
+
+def test_the_registry_has_every_built_in_kind_in_order() -> None:
+    assert tuple(KINDS)[: len(BUILT_IN)] == BUILT_IN == tuple(SETTINGS)
+    assert [name for name, kind in KINDS.items() if not kind.bench] == ["forced_run"]
+    own = {row.symbol for kind in KINDS.values() for row in kind.parameters}
+    assert own.isdisjoint(TABLE)
+    assert set(KINDS.parameters) == own | set(TABLE)
+
+
+def test_nothing_else_lists_kinds() -> None:
+    """No string that is a kind's name stands outside of its folder and of the registry's one line."""
+    package = ROOT / "capsule_id"
+    found = [
+        (file.relative_to(package).as_posix(), node.value)
+        for file in package.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value in KINDS
+    ]
+    elsewhere = [(file, kind) for file, kind in found if not file.startswith(f"experiments/{kind}/")]
+    assert elsewhere == [("experiments/registry.py", kind) for kind in BUILT_IN]
+    assert ("experiments/static_friction/declaration.py", "static_friction") in found  # the search does find them
+
+
+def test_two_kinds_of_one_name_are_refused() -> None:
+    with pytest.raises(ValueError, match="kind motor_current is declared twice"):
+        Registry((*KINDS.kinds, KINDS["motor_current"]))
+
+
+def test_two_meanings_of_one_parameter_are_refused() -> None:
+    own = replace(KINDS["motor_current"], name="other", parameters=(scatter("tilt_sd", "rad", "another one", "s"),))
+    with pytest.raises(ValueError, match="parameter tilt_sd of kind other is declared twice"):
+        Registry((*KINDS.kinds, own))
+    shared = replace(own, parameters=KINDS["static_friction"].parameters)
+    assert Registry((*KINDS.kinds, shared)).parameters == KINDS.parameters
+
+
+def test_a_setting_without_a_rule_is_refused() -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class NoRule(Settings):
+        size: float = 0.0
+
+    with pytest.raises(TypeError, match="setting size must be a Literal, or Annotated with its rule"):
+        Registry((replace(KINDS["motor_current"], settings=NoRule),))
+
+
+@dataclass(frozen=True)
+class WordsRule:
+    """One word, or a list of words: a rule that the package does not have."""
+
+    def read(self, document: TomlDocument, path: KeyPath, value: object) -> tuple[str, ...]:
+        words = value if isinstance(value, list) else [value]
+        if not all(isinstance(word, str) for word in words):
+            raise document.error(path, f"{path[-1]} must be words", repr(value), "write them in quotes")
+        return tuple(words)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressionSettings(Settings):
+    """Settings with a rule of their own."""
+
+    drive: Annotated[tuple[str, ...], WordsRule()] = ("harmonic",)
+
+
+def progression() -> Kind:
+    """A kind that another issue adds: optional columns, a setting by a rule of its own, masses by its table."""
+    return replace(
+        KINDS["dynamic_friction"],
+        name="progression",
+        columns={
+            "period": ColumnRule("s", POSITIVE),
+            "f": ColumnRule("Hz", POSITIVE),
+            "duty": ColumnRule("1", POSITIVE),
+            "distance": ColumnRule("m"),
+        },
+        sets=(("period", "distance"), ("f", "distance")),
+        optional=("duty",),
+        settings=ProgressionSettings,
+        masses=lambda table: ("m2",) if "duty" in table.columns else (),
+        parameters=(),
+    )
+
+
+def test_a_new_kind_joins_the_synthetic_rig(tmp_path: Path) -> None:
+    """Its own true value can be set; the other bench tests and the weighings come from the stream as before it."""
+
+    def measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+        del rng
+        columns = {"f [Hz]": np.array([4.0, 5.0]), "distance [cm]": values["stride"] * np.array([1.0, seed])}
+        return Twin((TwinTable("progression.csv", columns, ('drive = "base"',)),))
+
+    kind = replace(progression(), twin=measure, truth={"stride": 2.0})
+    kinds = Registry((*KINDS.kinds, kind))
+    truth = Truth().with_kinds(kinds.values()).with_values({"stride": 3.0, "k2[soft]": 2000.0})
+    synthesize(tmp_path / "with", 7, truth, registry=kinds)
+    synthesize(tmp_path / "without", 7, Truth().with_values({"k2[soft]": 2000.0}))
+    table = read_rig(tmp_path / "with", kinds).tables[-1]
+    assert (table.kind, table.settings.drive) == ("progression", ("base",))
+    np.testing.assert_allclose(table["distance"], [0.03, 0.21])
+    known = json.loads((tmp_path / "with.truth.json").read_text(encoding="utf-8"))["parameters"]
+    assert (known["stride"], known["k2[soft]"], known["k1"]) == (3.0, 2000.0, 1420.0)
+    for file in (tmp_path / "without").glob("*.csv"):
+        assert file.read_bytes() == (tmp_path / "with" / file.name).read_bytes()
+    files, before = ({file.name for file in (tmp_path / name).iterdir()} for name in ("with", "without"))
+    assert files - before == {"progression.csv"}
+    with pytest.raises(InputError, match="--set takes a parameter of the twin, stride"):
+        Truth().with_values({"stride": 3.0})
+
+
+def write_progression(folder: Path, columns: str, *settings: str) -> Path:
+    entry = "\n".join(['[rig]\nname = "a"\n[[experiment]]\nkind = "progression"\nfile = "p.csv"', *settings])
+    return write_folder(folder, entry, {"p.csv": f"{columns}\n{','.join('1' for _ in columns.split(','))}\n"})
+
+
+def test_a_new_kind_needs_no_change_of_the_reader(tmp_path: Path) -> None:
+    kinds = Registry((*KINDS.kinds, progression()))
+    (table,) = read_rig(write_progression(tmp_path / "a", "period [ms],distance [cm]"), kinds).tables
+    assert (table.settings.drive, table["period"][0], table["distance"][0]) == (("harmonic",), 1e-3, 1e-2)
+    several = write_progression(tmp_path / "b", "f [Hz],distance [cm]", 'drive = ["pulses", "base"]')
+    assert read_rig(several, kinds).tables[0].settings.drive == ("pulses", "base")
+    for columns, settings, place, rule in (
+        ("f [Hz],distance [cm]", ["drive = 3"], "rig.toml:6:9", "drive must be words"),
+        ("f [Hz],distance [cm],duty [1]", [], "rig.toml:4:8", "progression needs m2"),
+        ("f [Hz],duty [1]", [], "p.csv:1:1", "must have the columns period and distance, or f and distance"),
+    ):
+        folder = write_progression(tmp_path / "c", columns, *settings)
+        with pytest.raises(InputError, match=rule) as caught:
+            read_rig(folder, kinds)
+        assert str(caught.value).startswith(f"{folder}/{place}: ")
+
+
+def test_a_kind_outside_of_the_registry_is_unknown(tmp_path: Path) -> None:
+    """The negative control: the same folder without the kind."""
+    folder = write_progression(tmp_path / "a", "period [ms],distance [cm]")
+    with pytest.raises(InputError, match=r"rig\.toml:4:8: unknown kind, 'progression', write one of free_vibration"):
+        read_rig(folder)
+
+
+@pytest.mark.parametrize("word", ["bensch", "", "ALL"])
+def test_an_unknown_choice_of_experiments_is_refused(tmp_path: Path, word: str) -> None:
+    rig = read_rig(write_folder(tmp_path / "rig"))
+    for choose in (select_tables, make_experiments, lambda r, w: fit(r, experiments=w, budget=None)):
+        with pytest.raises(InputError) as caught:
+            choose(rig, word)  # type: ignore[arg-type]
+        assert str(caught.value) == f'experiments must be one of "bench", "runs", "all", {word!r}, correct the word'
+
+
+def test_the_choices_of_experiments(tmp_path: Path) -> None:
+    rig = read_rig(write_folder(tmp_path / "rig"))
+    chosen = {choice: [table.label for table in select_tables(rig, choice)] for choice in CHOICES}
+    assert chosen["runs"] == ["run_01"]
+    assert chosen["all"] == [*chosen["bench"], *chosen["runs"]]
+    assert len(chosen["bench"]) == len(TABLES) - 1
+    assert KINDS.has_runs(rig)
+    assert not KINDS.has_runs(replace(rig, tables=rig.tables[:-1]))
