@@ -24,6 +24,7 @@ def make_notes(setting: Setting, bench_fit: BenchFit) -> list[NoteTable]:
 
 
 def prior_table(target: LogPosterior) -> NoteTable:
+    """Every parameter with its prior, SI."""
     rows = [
         {"parameter": row.name, "unit": row.unit, "meaning": row.meaning, "prior (SI)": row.prior.describe()}
         for row in target.parameters
