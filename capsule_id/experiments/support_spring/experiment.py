@@ -16,6 +16,10 @@ class SupportSpring(Line):
         super().__init__(table, rig, "deflection", "force", slope, table.settings.sd_ratio)
 
     @property
+    def spring(self) -> str:
+        return self.table.settings.spring
+
+    @property
     def length(self) -> Quantity | None:
         """Free length of the cantilever, m, where stated."""
         return self.table.settings.length

@@ -37,20 +37,21 @@ def run_checks(setting: Setting) -> Setting:
         *whiteness,
         *outliers,
         *check_stated_errors(setting),
+        *(finding for check in declared(setting.experiments, "checks", bench=True) for finding in check(setting)),
         *_informed(setting),
         *_boundary(setting),
-        *(finding for check in declared(setting.experiments, "checks") for finding in check(setting)),
+        *(finding for check in declared(setting.experiments, "checks", bench=False) for finding in check(setting)),
     ]
     return replace(setting, findings=tuple(findings))
 
 
 def declared(
-    experiments: Sequence[Experiment], what: Literal["checks", "tables"]
+    experiments: Sequence[Experiment], what: Literal["checks", "tables"], bench: bool
 ) -> list[Callable[[Setting], list[Any]]]:
-    """Every check (or table) that the experiments declare, each with the experiments that declare it."""
+    """Every check (or table) that bench tests, or runs, declare, each with the experiments that declare it."""
     members: dict[Callable[..., list[Any]], list[Experiment]] = {}
     for experiment in experiments:
-        for function in getattr(experiment, what):
+        for function in getattr(experiment, what) if experiment.bench == bench else ():
             members.setdefault(function, []).append(experiment)
     return [partial(function, own) for function, own in members.items()]
 

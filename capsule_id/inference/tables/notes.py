@@ -10,17 +10,21 @@ from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.views import NoteTable
 
 
-def make_notes(setting: Setting, bench: BenchFit) -> list[NoteTable]:
+def make_notes(setting: Setting, bench_fit: BenchFit) -> list[NoteTable]:
     """All tables; those about bench and runs together where there are runs."""
     target, fit = setting.target, setting.fit
-    own = [table for maker in declared(setting.experiments, "tables") for table in maker(setting)]
-    if all(e.bench for e in setting.experiments):
-        return [*own, prior_table(target)]
-    gained = precision_gained(target, fit, setting.posterior, bench)
-    return [gained, *own, smoothing_certificate(target, fit), prior_table(target)]
+    of_runs, of_bench = (
+        [table for maker in declared(setting.experiments, "tables", bench) for table in maker(setting)]
+        for bench in (False, True)
+    )
+    if any(not e.bench for e in setting.experiments):
+        gained = precision_gained(target, fit, setting.posterior, bench_fit)
+        of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
+    return [*of_runs, *of_bench, prior_table(target)]
 
 
 def prior_table(target: LogPosterior) -> NoteTable:
+    """Every parameter with its prior, SI."""
     rows = [
         {"parameter": row.name, "unit": row.unit, "meaning": row.meaning, "prior (SI)": row.prior.describe()}
         for row in target.parameters
