@@ -85,8 +85,7 @@ def smoothing_bias(
     if periods < 1:
         raise InputError("the bias is measured over at least one period", f"periods = {periods}", "give 1 or more")
     smoothing = smoothing or Smoothing()
-    (lanes, _), _ = lanes_of((p, e), 0.0 * np.ones(1))
-    p, e = lanes
+    (p, e), _, _ = lanes_of((p, e), np.zeros(1))
     Omega = np.asarray(e.Omega)
     if not np.all(Omega > 0.0):
         raise InputError("the bias is measured per period of the drive", "Omega <= 0", "give Omega > 0, in rad/s")

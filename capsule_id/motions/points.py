@@ -75,7 +75,7 @@ def points_of(
         leaves["Omega"] = 2.0 * np.pi * leaves.pop("f")
     p = CapsuleParameters(**{**vars(p), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "capsule"}})
     e = Excitation(**{**vars(e), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "drive"}})
-    (lanes, _), _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
+    lanes, _, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
     return Points(*lanes)
 
 
