@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import Start, Theta, no_design
-from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient, slide_distance
+from capsule_id.experiments.friction_curve import FrictionExperiment, unit_law
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, parameter
+from capsule_id.physics.friction import slide_distance
 from capsule_id.rig.model import Rig, Table
 
 
@@ -38,9 +39,9 @@ class DynamicFriction(FrictionExperiment):
         return self.distance
 
     def misfits(self, theta: Theta, xp: ModuleType = jnp) -> tuple[Misfit]:
-        mu, v_s, g = theta["mu"], theta["v_s"], theta["g"]
-        distance = slide_distance(self.speed, mu, v_s, g, xp)
-        slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))
+        law, g = unit_law(theta["mu"], theta["v_s"]), theta["g"]
+        distance = slide_distance(law, 1.0 / g, self.speed)
+        slope = self.speed / (g * law.forward(self.speed))
         variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
         return (Misfit(self.distance - distance, variance, distance, no_design(self.n, xp)),)
 
@@ -72,7 +73,7 @@ def twin(
     The surface's mu scatters by ``push_scatter`` (relative) from push to push.
     """
     surface = mu * (1.0 + push_scatter * rng.standard_normal(len(speeds)))
-    distance = np.asarray(slide_distance(speeds, 1.0, v_s, g, np)) / surface
+    distance = slide_distance(unit_law(1.0, v_s), 1.0 / g, speeds) / surface
     return {
         "speed [m/s]": speeds + speed_sd * rng.standard_normal(len(speeds)),
         "distance [mm]": 1e3 * (distance + distance_sd * rng.standard_normal(len(speeds))),

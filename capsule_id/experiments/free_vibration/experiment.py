@@ -22,6 +22,7 @@ from capsule_id.experiments.free_vibration.decrement import Decrement, equilibri
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.friction import normal_force
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.windows import decay_window
@@ -236,7 +237,7 @@ class FreeVibration(Experiment):
         findings = []
         if self.table.settings.get("capsule", "held") == "free" and "mu" in theta and "m2" in theta:
             force = self.largest_force(theta)
-            threshold = float(theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"])
+            threshold = float(theta["mu"] * normal_force(theta["m1"], theta["m2"], theta["g"]))
             if force > threshold:
                 text = (
                     f"{self.label}: a free capsule stays at rest while |f| <= F_b = {threshold:.3g} N; the record "

@@ -18,6 +18,7 @@ from capsule_id.inference.fit.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior, RunRecord
 from capsule_id.inference.target.density import HeldResiduals
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.friction import normal_force
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.records.label import measured_motion
 from capsule_id.records.view import view_record
@@ -53,7 +54,7 @@ def run_records(target: LogPosterior, fit: PointFit) -> tuple[RunRecord, ...]:
             view = view_record(run.table, K=theta["K"] if run.driven_by_current else None)
         except InputError:
             continue
-        force = np.asarray(e.P_d * np.cos(run.Omega * run.time + e.phase))
+        force = np.asarray(e.force(run.time))
         found.append(RunRecord(run.label, view, force))
     return tuple(found)
 
@@ -111,7 +112,7 @@ def _groups(run: ForcedRun, theta: Theta) -> dict[str, float]:
     m1, m2, k1, k2, c, mu, v_s, G, g = (
         float(getattr(p, name)) for name in ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")
     )
-    Omega0, F_b = np.sqrt(k1 / m1), mu * (m1 + m2) * g
+    Omega0, F_b = np.sqrt(k1 / m1), mu * normal_force(m1, m2, g)
     length, of = F_b / k1, run.label
     return {
         "Omega0, rad/s": Omega0,
