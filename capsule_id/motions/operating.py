@@ -58,7 +58,7 @@ def draws_diagram(
     if not any(np.ndim(leaf) for leaf in jax.tree.leaves((p, e))):
         raise InputError("a posterior band needs draws", "every leaf is one number", "use diagram, or give arrays")
     drawn, _, _ = lanes_of((p, e), np.zeros(1))
-    n, draws = len(grid[over]), len(drawn[0].m1)
+    n, draws = len(grid[over]), len(np.asarray(drawn[0].m1))
     p, e = jax.tree.map(lambda leaf: np.tile(leaf, n), drawn)
     points = points_of(p, e, {over: np.repeat(grid[over], draws)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client)

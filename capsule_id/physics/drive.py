@@ -81,7 +81,7 @@ class Excitation:
 
     def value(self, state: tuple[jax.Array, ...]) -> jax.Array:
         """P_d cos(Omega t + phase), N."""
-        return self.P_d * state[0]
+        return jnp.asarray(self.P_d * state[0])
 
     def shifted(self, state: tuple[jax.Array, ...], dt: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The change of cosine and sine over dt, to first order."""
@@ -91,9 +91,10 @@ class Excitation:
 
     def series(self, state: tuple[jax.Array, ...], h: jax.Array, order: int) -> Series:
         """The coefficients follow from D'' = -Omega^2 D."""
-        cosine, sine = state
-        turn = -((self.Omega * h) ** 2)
-        D: Series = [self.P_d * cosine, -self.P_d * self.Omega * h * sine]
+        _cosine, sine = state
+        angle = jnp.asarray(self.Omega * h)
+        turn = -(angle**2)
+        D: Series = [self.value(state), -self.P_d * angle * sine]
         for k in range(2, order):
             D.append(D[k - 2] * turn * (1.0 / (k * (k - 1))))
         return D

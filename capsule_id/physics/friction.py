@@ -32,8 +32,9 @@ class FrictionLaw(Protocol):
     Both methods work elementwise and are analytic on speed >= 0. The value at speed 0 is the break-away force. Leaves
     are () or (batch,); ``parameters`` has one row per leaf, with the leaf's name as its symbol.
 
-    A law may have a method ``series(sigma, v) -> FrictionSeries``, its own Taylor recursion. It is optional and only
-    saves time: without it the exact engine takes the derivatives of the law from automatic differentiation.
+    A law may have a method ``series(sigma, v, breakaway) -> FrictionSeries``, its own Taylor recursion. It is optional
+    and only saves time: without it the exact engine takes the law's derivatives from automatic differentiation.
+    sigma (L,) is the direction, v (L,) m/s the velocity; breakaway are forward(0) and backward(0), each (L,).
     """
 
     parameters: ClassVar[tuple[Parameter, ...]]
@@ -75,10 +76,10 @@ class CoulombStribeck:
         """Resistance at ``speed``, N: the same both ways."""
         return self.forward(speed)
 
-    def series(self, sigma: jax.Array, v: jax.Array) -> FrictionSeries:
+    def series(self, sigma: jax.Array, v: jax.Array, breakaway: tuple[jax.Array, jax.Array]) -> FrictionSeries:
         """Friction along a step: u = exp(-sigma v/v_s) obeys u' = -sigma v' u / v_s, one Cauchy product per order."""
         sliding = sigma != 0.0
-        half = sigma * (0.5 * self.mu * self.N)
+        half = sigma * (0.5 * breakaway[0])
         v_s = jnp.where(sliding, -sigma * self.v_s, jnp.inf)
         u = [jnp.exp(-sigma * v / self.v_s)]
 

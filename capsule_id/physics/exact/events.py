@@ -92,30 +92,28 @@ def first_event(
     step, so no root can be passed, double ones included.
     """
     sliding = mode.sigma != 0.0
-    upper, lower = (jnp.where(sliding, 0.0, F) for F in (constants.F_forward, constants.F_backward))
-    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in step.d], s_end), jnp.zeros_like(upper), s_end)
+    middle = 0.5 * (constants.F_forward - constants.F_backward)
+    level = jnp.where(sliding, 0.0, 0.5 * (constants.F_forward + constants.F_backward))
+    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in step.d], s_end), jnp.zeros_like(level), s_end)
     speed = _divided([mode.sigma * x for x in step.v], s_end)
-    # While stuck F_forward - f and F_backward + f, while sliding sigma Y2, written as level + sign * p.
-    force_or_speed = [jnp.where(sliding, a, -b) for a, b in zip(speed, step.f, strict=True)]
-    other = _watched(force_or_speed, jnp.maximum(upper, lower), s_end)
-    upper, lower = upper / other.scale, lower / other.scale
+    # While stuck level - (f - middle) and level + (f - middle), while sliding sigma Y2, written as level + sign * p.
+    force = [step.f[0] - middle, *step.f[1:]]
+    other = _watched([jnp.where(sliding, a, -b) for a, b in zip(speed, force, strict=True)], level, s_end)
+    base = level / other.scale
 
     def leap(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         s, kind, going, leaps = carry
         g0, g1 = gap.at(s)
         p0, p1 = other.at(s)
         to_gap = _leap(g0, g1, gap.rest - gap.p2)
-        to_upper = _leap(upper + p0, p1, other.rest - other.p2)
-        to_lower = jnp.where(sliding, jnp.inf, _leap(lower - p0, -p1, other.rest + other.p2))
+        to_upper = _leap(base + p0, p1, other.rest - other.p2)
+        to_lower = jnp.where(sliding, jnp.inf, _leap(base - p0, -p1, other.rest + other.p2))
         to_motion = jnp.minimum(to_upper, to_lower)
         tau = jnp.minimum(to_gap, to_motion)
-        is_gap, is_upper = to_gap <= to_motion, to_upper <= to_lower
-        sign = jnp.where(is_upper, 1.0, -1.0)
-        sure = jnp.where(
-            is_gap, _sure(g0, g1, tau), _sure(jnp.where(is_upper, upper, lower) + sign * p0, sign * p1, tau)
-        )
+        is_gap, sign = to_gap <= to_motion, jnp.where(to_upper <= to_lower, 1.0, -1.0)
+        sure = jnp.where(is_gap, _sure(g0, g1, tau), _sure(base + sign * p0, sign * p1, tau))
         arrived = tau <= jnp.where(sure, SURE_LEAP, LEAP_TOLERANCE) * s_end
-        which = jnp.where(is_gap, GAP, jnp.where(sliding, VELOCITY, jnp.where(is_upper, UPPER, LOWER)))
+        which = jnp.where(is_gap, GAP, jnp.where(sliding, VELOCITY, jnp.where(sign > 0.0, UPPER, LOWER)))
         kind = jnp.where(going & arrived, which, kind)
         onward = s + tau
         return (

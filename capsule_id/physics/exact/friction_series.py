@@ -15,10 +15,15 @@ from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.series import DEGREE, FrictionSeries, Series, divide
 
 
-def friction_series(law: FrictionLaw, sigma: jax.Array, v: jax.Array) -> FrictionSeries:
-    """Friction from the velocity v (L,), m/s, on, in the direction sigma (L,): the law's own series if it has one."""
+def friction_series(
+    law: FrictionLaw, sigma: jax.Array, v: jax.Array, breakaway: tuple[jax.Array, jax.Array]
+) -> FrictionSeries:
+    """Friction from the velocity v (L,), m/s, on, in the direction sigma (L,): the law's own series if it has one.
+
+    breakaway : forward(0) and backward(0), each (L,), N, computed once per run
+    """
     own = getattr(law, "series", None)
-    return by_chain_rule(law, sigma, v) if own is None else own(sigma, v)
+    return by_chain_rule(law, sigma, v) if own is None else own(sigma, v, breakaway)
 
 
 def by_chain_rule(law: FrictionLaw, sigma: jax.Array, v: jax.Array) -> FrictionSeries:

@@ -85,10 +85,10 @@ class StepSeries(NamedTuple):
 
 def constants_of(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> Constants:
     """The constants of a run from lanes of parameters, drive and friction law."""
-    p, e, law = jax.tree.map(jnp.asarray, (p, e, law))
-    still = jnp.zeros_like(p.m1)
-    thresholds = (jnp.broadcast_to(F, still.shape) for F in (law.forward(still), law.backward(still)))
-    return Constants(p.m1, p.m2, p.k1, p.k2, p.c, p.G, e, law, *thresholds)
+    m1, m2, k1, k2, c, G = (jnp.asarray(leaf) for leaf in (p.m1, p.m2, p.k1, p.k2, p.c, p.G))
+    still = jnp.zeros_like(m1)
+    F_forward, F_backward = (jnp.broadcast_to(F, still.shape) for F in (law.forward(still), law.backward(still)))
+    return Constants(m1, m2, k1, k2, c, G, e, law, F_forward, F_backward)
 
 
 def step_rate(constants: Constants, mode: Mode, friction_rate: jax.Array) -> jax.Array:
@@ -113,7 +113,7 @@ def series(constants: Constants, state: CapsuleState, mode: Mode, left: jax.Arra
     """Series of degree DEGREE about the state, in the mode; left (L,) s bounds the step."""
     sliding = mode.sigma != 0.0
     stiffness = stiffness_of(constants, mode.contact)
-    friction = friction_series(constants.law, mode.sigma, state.v)
+    friction = friction_series(constants.law, mode.sigma, state.v, (constants.F_forward, constants.F_backward))
     f0 = rod_force(constants, state, mode.contact)
     friction_rate = friction.rate((f0 - friction.start) / constants.m2, constants.m2)
     guess = step_rate(constants, mode, jnp.where(sliding, friction_rate, 0.0))
