@@ -91,10 +91,10 @@ class Excitation:
 
     def series(self, state: tuple[jax.Array, ...], h: jax.Array, order: int) -> Series:
         """The coefficients follow from D'' = -Omega^2 D."""
-        _cosine, sine = state
+        _, sine = state
         angle = jnp.asarray(self.Omega * h)
         turn = -(angle**2)
-        D: Series = [self.value(state), -self.P_d * angle * sine]
+        D: Series = [self.value(state), jnp.asarray(-self.P_d * angle * sine)]
         for k in range(2, order):
             D.append(D[k - 2] * turn * (1.0 / (k * (k - 1))))
         return D
