@@ -1,4 +1,4 @@
-"""What smoothing costs in truth: the smoothed model measured against the exact one, as data.
+"""Bias of the smoothed model against the exact one, as data.
 
 smoothing_bias        one set of widths: mean velocity, advance and contacts of both models
 bias_against_width    a grid of widths: how fast the bias goes to zero, with the fitted slope
@@ -73,7 +73,7 @@ def smoothing_bias(
     periods: int = 10,
     semantics: Literal["stick-slip", "eq2"] = "stick-slip",
 ) -> SmoothingBias:
-    """How far the smoothed model is from the exact one for these parameters, over ``periods`` periods from rest.
+    """Bias of the smoothed model for these parameters, over ``periods`` periods from rest.
 
     p, e : leaves () or (batch,)        smoothing : default the certified widths
 

@@ -2,7 +2,7 @@
 
     draws over values -> settled motions (value, draw) -> bands: probabilities, quantiles, best operating point
 
-Where the draws come from is no matter of the physics: they are arrays of leaves.
+Draws are arrays of leaves; this module does not depend on where they come from.
 """
 
 from dataclasses import asdict
@@ -72,12 +72,12 @@ def draws_diagram(
 
 
 def bands(seen: xr.Dataset, objective: str = "mean_velocity") -> xr.Dataset:
-    """What the draws say: of each value, and of the best operating point.
+    """Probabilities and quantiles over the draws, at each value and at the best operating point.
 
     Parameters
     ----------
     seen : from ``draws_diagram``
-    objective : what is best: the largest "mean_velocity" (forward), or "efficiency"
+    objective : the quantity to maximise: "mean_velocity" (forward), or "efficiency"
 
     Returns a Dataset with
 

@@ -1,48 +1,25 @@
 """The force between rod and capsule, and the acceleration of the rod: eq. (2); NumPy and JAX, elementwise, SI.
 
-Sign: f is the force that the rod puts on the capsule. The leaves of p and e broadcast with the state, so leaves
-(batch,) need a last axis of length 1 beside samples (batch, n).
+Sign: f is the force that the rod puts on the capsule. p has the fields m1, k1, k2, c and G. The leaves of p and of the
+drive broadcast with the state, so leaves (batch,) need a last axis of length 1 beside samples (batch, n).
 """
 
-from typing import Any, Protocol
+from typing import Any
 
 from capsule_id.physics.contacts import support
 from capsule_id.physics.drive import Drive
 
 
-class SpringAndDamper(Protocol):
-    """Whatever holds k1 and c."""
-
-    @property
-    def k1(self) -> Any: ...
-
-    @property
-    def c(self) -> Any: ...
-
-
-class Coupling(SpringAndDamper, Protocol):
-    """Whatever holds m1 and everything between rod and capsule."""
-
-    @property
-    def m1(self) -> Any: ...
-
-    @property
-    def k2(self) -> Any: ...
-
-    @property
-    def G(self) -> Any: ...
-
-
-def spring_and_damper(p: SpringAndDamper, r: Any, w: Any) -> Any:
+def spring_and_damper(p: Any, r: Any, w: Any) -> Any:
     """k1 r + c w, N: what acts without contact; r = X1 - X2, w = Y1 - Y2."""
     return p.k1 * r + p.c * w
 
 
-def rod_on_capsule(p: Coupling, r: Any, w: Any) -> Any:
+def rod_on_capsule(p: Any, r: Any, w: Any) -> Any:
     """f = k1 r + c w + [r >= G] k2 (r - G), N."""
     return spring_and_damper(p, r, w) + support(p.k2, p.G, r)
 
 
-def rod_acceleration(p: Coupling, drive: Drive, t: Any, r: Any, w: Any) -> Any:
+def rod_acceleration(p: Any, drive: Drive, t: Any, r: Any, w: Any) -> Any:
     """X1'' = (drive - f)/m1, m/s^2, at the times t: the reading of an accelerometer on the rod."""
     return (drive.force(t) - rod_on_capsule(p, r, w)) / p.m1

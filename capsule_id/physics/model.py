@@ -216,8 +216,7 @@ def simulate(
         )
     if model == "exact" and smoothing is not None:
         raise InputError("the exact model has no smoothing", repr(smoothing), 'leave it out or use model="smooth"')
-    given = (p, e, friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
-    (p, e, friction, initial), grid, batched = lanes_of(given, times)
+    (p, e, friction, initial), grid, batched = lanes_of((p, e, friction, initial or (0.0, 0.0, 0.0, 0.0)), times)
     lanes = (p, e, friction_law(p, friction), initial)
     if model == "exact":
         from capsule_id.physics.exact import engine as exact
