@@ -9,7 +9,7 @@ are sampled through their logarithm, the others as they are.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -111,11 +111,10 @@ class Parameter:
             return "constant"
         return "by the experiment" if self.prior is None else self.prior.describe()
 
-    def admits(self, value: float | np.ndarray) -> np.ndarray:
-        """Elementwise: finite, and of the sign that the model admits."""
-        value = np.asarray(value)
-        bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": True}[self.sign]
-        return np.isfinite(value) & bound
+    def admits(self, value: Any) -> Any:
+        """Elementwise: finite, and of the sign that the model admits; a number, a NumPy or a JAX array."""
+        bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": value == value}[self.sign]
+        return (abs(value) < np.inf) & bound
 
 
 def _lognormal(median: float, factor: float) -> Prior:

@@ -1,9 +1,12 @@
 """The capsule by SciPy alone: DOP853 with terminal events, mode by mode. Shares no code with the package."""
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
 Parameters = dict[str, float]
+Law = tuple[Callable[[float], float], Callable[[float], float]]  # resistance forward and backward, N, at a speed, m/s
 
 
 def _force(q: Parameters, y: np.ndarray, contact: bool) -> float:
@@ -12,15 +15,24 @@ def _force(q: Parameters, y: np.ndarray, contact: bool) -> float:
     return own + q["c"] * (y[1] - y[3]) + (q["k2"] * (r - q["G"]) if contact else 0.0)
 
 
-def _modes(q: Parameters, y: np.ndarray, F_b: float) -> tuple[bool, int]:
+def eq_1(q: Parameters) -> Law:
+    """The paper's law, its backward side times q["backward"]."""
+
+    def forward(speed: float) -> float:
+        return 0.5 * q["mu"] * (q["m1"] + q["m2"]) * q["g"] * (1.0 + np.exp(-speed / q["v_s"]))
+
+    return forward, lambda speed: q.get("backward", 1.0) * forward(speed)
+
+
+def _modes(q: Parameters, y: np.ndarray, law: Law) -> tuple[bool, int]:
     """In contact?, and the direction in which the capsule slides (0: stuck)."""
     contact = bool(y[0] - y[2] >= q["G"])
-    return contact, int(np.sign(y[3])) or _sets_off(q, _force(q, y, contact), F_b)
+    return contact, int(np.sign(y[3])) or _sets_off(_force(q, y, contact), law)
 
 
-def _sets_off(q: Parameters, f: float, F_b: float) -> int:
+def _sets_off(f: float, law: Law) -> int:
     """Direction in which a stuck capsule sets off; 0: it stays."""
-    return int(f > F_b) - int(f < -q.get("backward", 1.0) * F_b)
+    return int(f > law[0](0.0)) - int(f < -law[1](0.0))
 
 
 def simulate_scipy(
@@ -30,15 +42,17 @@ def simulate_scipy(
     atol: float,
     max_step: float = np.inf,
     start: np.ndarray | None = None,
+    law: Law | None = None,
 ) -> tuple[np.ndarray, int]:
     """(states (n, 4) at ``times`` from ``start`` (4,), default at rest; closings of the gap).
 
     q holds the parameters, P_d, Omega, possibly a phase, and departures from the paper's model: k1_cubic, N/m^3, and
-    backward, the friction of backward over that of forward motion.
+    backward, the friction of backward over that of forward motion. law: another law of friction than eq. (1).
     """
-    F_b, phase = q["mu"] * (q["m1"] + q["m2"]) * q["g"], q.get("phase", 0.0)
+    law, phase = law or eq_1(q), q.get("phase", 0.0)
+    holds_forward, holds_backward = law[0](0.0), law[1](0.0)
     y, t, contacts = np.zeros(4) if start is None else start.copy(), float(times[0]), 0
-    contact, sigma = _modes(q, y, F_b)
+    contact, sigma = _modes(q, y, law)
     out = np.full((len(times), 4), np.nan)
     out[0] = y
     while t < times[-1]:
@@ -47,8 +61,7 @@ def simulate_scipy(
             t: float, y: np.ndarray, contact: bool = contact, sigma: int = sigma
         ) -> tuple[float, float, float, float]:
             f = _force(q, y, contact)
-            side = q.get("backward", 1.0) if sigma < 0 else 1.0
-            friction = 0.5 * side * F_b * (1.0 + np.exp(-sigma * y[3] / q["v_s"])) * sigma
+            friction = law[sigma < 0](sigma * y[3]) * sigma
             a2 = (f - friction) / q["m2"] if sigma else 0.0
             return y[1], (q["P_d"] * np.cos(q["Omega"] * t + phase) - f) / q["m1"], y[3] if sigma else 0.0, a2
 
@@ -57,7 +70,7 @@ def simulate_scipy(
 
         def hold(t: float, y: np.ndarray, contact: bool = contact) -> float:
             f = _force(q, y, contact)
-            return min(F_b - f, q.get("backward", 1.0) * F_b + f)
+            return min(holds_forward - f, holds_backward + f)
 
         def speed(t: float, y: np.ndarray) -> float:
             return y[3]
@@ -79,6 +92,6 @@ def simulate_scipy(
             contacts += contact
         if run.t_events[1].size:
             f = _force(q, y, contact)
-            sigma = _sets_off(q, f, F_b) if sigma else int(np.sign(f))
+            sigma = _sets_off(f, law) if sigma else int(np.sign(f))
             y[3] = 0.0
     return out, contacts

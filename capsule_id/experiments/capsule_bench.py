@@ -18,9 +18,10 @@ from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.friction_curve import friction_coefficient, slide_distance
+from capsule_id.experiments.friction_curve import unit_law
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Prior, parameter
+from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.rig.model import Rig, Table
 
@@ -114,9 +115,9 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         return xp.asarray(t.X2)[:, -1]
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        mu, v_s, g = theta["mu"], theta["v_s"], theta["g"]
-        locked = slide_distance(self.speed, mu, v_s, g, xp)
-        slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))
+        law, g = unit_law(theta["mu"], theta["v_s"]), theta["g"]
+        locked = slide_distance(law, 1.0 / g, self.speed)
+        slope = self.speed / (g * law.forward(self.speed))
         variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
         return (Misfit(self.distance - self.slide(theta, xp), variance, locked, no_design(self.n, xp)),)
 

@@ -1,31 +1,20 @@
-"""Eq. (1), the Coulomb–Stribeck coefficient, the slide that follows from it, and the picture of both (Fig. 2)."""
+"""The friction coefficient of eq. (1) against velocity: the paper's protocol and the picture (Fig. 2)."""
 
 from abc import abstractmethod
-from types import ModuleType
 from typing import Any, ClassVar, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import curve_fit
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol, band
 from capsule_id.experiments.checks.friction import check_one_surface
+from capsule_id.physics.friction import CoulombStribeck, slide_distance
 from capsule_id.views import Comparison, Curve, Points
 
-#: Gauss–Legendre nodes on (0, 1). 48 give 1e-12 relative up to v = 50 v_s (tests compare with the dilogarithm).
-_POINTS, _HALF_WEIGHTS = np.polynomial.legendre.leggauss(48)
-_NODES, _WEIGHTS = 0.5 * (_POINTS + 1.0), 0.5 * _HALF_WEIGHTS
 
-
-def friction_coefficient(speed: Any, mu: Any, v_s: Any, xp: ModuleType = jnp) -> Any:
-    """Eq. (1): mu/2 (1 + exp(-|v|/v_s)), dimensionless; ``speed`` m/s."""
-    return 0.5 * mu * (1.0 + xp.exp(-xp.abs(speed) / v_s))
-
-
-def slide_distance(speed: Any, mu: Any, v_s: Any, g: Any, xp: ModuleType = jnp) -> Any:
-    """Distance, m, of a slide from ``speed`` (n,) to rest under eq. (1): integral of u du / (g mu_d(u)) from 0 to v."""
-    u = speed[:, None] * _NODES
-    return speed * ((u / friction_coefficient(u, mu, v_s, xp)) @ _WEIGHTS) / g
+def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
+    """Eq. (1) for a normal force of 1 N: its resistance is the friction coefficient, its mass is 1/g."""
+    return CoulombStribeck(mu, 1.0, v_s)
 
 
 def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, float]:
@@ -41,7 +30,7 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
     start = (float(np.max(coefficient)), float(np.median(speed[sliding])))
     try:
         (mu, v_s), _ = curve_fit(
-            lambda v, mu, v_s: friction_coefficient(v, mu, v_s, np),
+            lambda v, mu, v_s: unit_law(mu, v_s).forward(v),
             speed,
             coefficient,
             p0=start,
@@ -77,16 +66,16 @@ def friction_comparison(
     def curve(values: ValuesBySymbol) -> np.ndarray:
         if "v_s" not in values:
             return np.full(speed.size, float(values["mu"]))
-        return friction_coefficient(speed, values["mu"], values["v_s"], np)
+        return unit_law(values["mu"], values["v_s"]).forward(speed)
 
     lower, upper = band(np.array([curve(draw) for draw in draws]))
     curves = [Curve("this fit, eq. (1)", speed, curve(theta), lower, upper)]
     paper = paper_friction_fit(np.concatenate([p.x for p in points]), np.concatenate([p.y for p in points]))
     if "v_s" in paper:
-        curves.append(Curve("the paper's fit", speed, friction_coefficient(speed, **paper, xp=np), role="paper"))
+        curves.append(Curve("the paper's fit", speed, unit_law(**paper).forward(speed), role="paper"))
     if "v_s" in theta and any(p.role == "dynamic" for p in points):
         reading = np.maximum(speed[1:], 1e-3 * speed[-1])
-        distance = slide_distance(reading, theta["mu"], theta["v_s"], theta["g"], np)
+        distance = slide_distance(unit_law(theta["mu"], theta["v_s"]), 1.0 / theta["g"], reading)
         expected = reading**2 / (2.0 * theta["g"] * distance)
         curves.append(Curve("this fit, read as v²/(2gd)", reading, expected, role="alternative"))
     return Comparison(

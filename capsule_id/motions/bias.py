@@ -1,4 +1,4 @@
-"""What smoothing costs in truth: the smoothed model measured against the exact one, as data.
+"""Bias of the smoothed model against the exact one, as data.
 
 smoothing_bias        one set of widths: mean velocity, advance and contacts of both models
 bias_against_width    a grid of widths: how fast the bias goes to zero, with the fitted slope
@@ -73,7 +73,7 @@ def smoothing_bias(
     periods: int = 10,
     semantics: Literal["stick-slip", "eq2"] = "stick-slip",
 ) -> SmoothingBias:
-    """How far the smoothed model is from the exact one for these parameters, over ``periods`` periods from rest.
+    """Bias of the smoothed model for these parameters, over ``periods`` periods from rest.
 
     p, e : leaves () or (batch,)        smoothing : default the certified widths
 
@@ -85,8 +85,7 @@ def smoothing_bias(
     if periods < 1:
         raise InputError("the bias is measured over at least one period", f"periods = {periods}", "give 1 or more")
     smoothing = smoothing or Smoothing()
-    (lanes, _), _ = lanes_of((p, e), 0.0 * np.ones(1))
-    p, e = lanes
+    (p, e), _, _ = lanes_of((p, e), np.zeros(1))
     Omega = np.asarray(e.Omega)
     if not np.all(Omega > 0.0):
         raise InputError("the bias is measured per period of the drive", "Omega <= 0", "give Omega > 0, in rad/s")

@@ -39,14 +39,14 @@ def compute(
     client: "Client | None" = None,
     block: int = BLOCK,
 ) -> Columns:
-    """What is seen of all points, (points, ...) by name.
+    """Settled motions of all points: columns (points, ...) by name.
 
     Parameters
     ----------
-    keep : the names of ``SEEN`` that are wanted
+    keep : the names of ``SEEN`` to return
     progress : called with the points done, their number, and the word "points"
-    store : a folder, made where it does not exist: finished blocks are written there and taken up from there
-    client : of a Dask cluster; a worker that dies costs the blocks it was at, which others take over. Workers must
+    store : a folder, created if missing: finished blocks are saved there and read from there
+    client : of a Dask cluster; the blocks of a worker that dies are computed again by others. Workers must
         have the same versions and XLA flags as each other, or the last bits of the blocks may differ.
     block : points of a block
 
@@ -60,18 +60,18 @@ def compute(
         _check_store(store, points, settling, keep, block)
     parts: dict[int, Columns] = {}
     for begin in begins:
-        finished = _taken_up(store, begin)
+        finished = _saved_block(store, begin)
         if finished is not None:
             parts[begin] = finished
     missing = [begin for begin in begins if begin not in parts]
     make = _in_process if client is None else _on_cluster(client)
     done = sum(len(part["status"]) for part in parts.values())
-    _tell(progress, done, points.size)
+    _report(progress, done, points.size)
     for begin, part in make(points, settling, tuple(keep), missing, block):
         parts[begin] = part
-        _keep(store, begin, part)
+        _save_block(store, begin, part)
         done += len(part["status"])
-        _tell(progress, done, points.size)
+        _report(progress, done, points.size)
     return {name: np.concatenate([parts[begin][name] for begin in begins]) for name in keep}
 
 
@@ -104,13 +104,13 @@ def _on_cluster(client: "Client") -> Callable[..., Iterator[tuple[int, Columns]]
     return run
 
 
-def _tell(progress: Progress | None, done: int, total: int) -> None:
+def _report(progress: Progress | None, done: int, total: int) -> None:
     if progress is not None:
         progress(done, total, "points")
 
 
 def _check_store(store: Path, points: Points, settling: Settling, keep: Sequence[str], block: int) -> None:
-    """Make the folder, or see to it that what it holds is of these points."""
+    """Create the folder, or check that its blocks belong to these points."""
     leaves = hashlib.sha256()
     for leaf in jax.tree.leaves((points.p, points.e, points.initial)):
         leaves.update(np.ascontiguousarray(leaf).tobytes())
@@ -141,7 +141,7 @@ def _file(store: Path, begin: int) -> Path:
     return store / f"block_{begin:09d}.npz"
 
 
-def _keep(store: Path | None, begin: int, part: Columns) -> None:
+def _save_block(store: Path | None, begin: int, part: Columns) -> None:
     if store is None:
         return
     new = store / "block.new"
@@ -150,8 +150,8 @@ def _keep(store: Path | None, begin: int, part: Columns) -> None:
     new.replace(_file(store, begin))
 
 
-def _taken_up(store: Path | None, begin: int) -> Columns | None:
-    """A finished block, None if there is none or it cannot be read."""
+def _saved_block(store: Path | None, begin: int) -> Columns | None:
+    """A saved block; None if there is none or it cannot be read."""
     if store is None or not _file(store, begin).exists():
         return None
     try:

@@ -2,7 +2,7 @@
 
     draws over values -> settled motions (value, draw) -> bands: probabilities, quantiles, best operating point
 
-Where the draws come from is no matter of the physics: they are arrays of leaves.
+Draws are arrays of leaves; this module does not depend on where they come from.
 """
 
 from dataclasses import asdict
@@ -57,8 +57,8 @@ def draws_diagram(
     grid = grid_of({over: values})
     if not any(np.ndim(leaf) for leaf in jax.tree.leaves((p, e))):
         raise InputError("a posterior band needs draws", "every leaf is one number", "use diagram, or give arrays")
-    (drawn, _), _ = lanes_of((p, e), np.zeros(1))
-    n, draws = len(grid[over]), len(drawn[0].m1)
+    drawn, _, _ = lanes_of((p, e), np.zeros(1))
+    n, draws = len(grid[over]), len(np.asarray(drawn[0].m1))
     p, e = jax.tree.map(lambda leaf: np.tile(leaf, n), drawn)
     points = points_of(p, e, {over: np.repeat(grid[over], draws)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client)
@@ -72,12 +72,12 @@ def draws_diagram(
 
 
 def bands(seen: xr.Dataset, objective: str = "mean_velocity") -> xr.Dataset:
-    """What the draws say: of each value, and of the best operating point.
+    """Probabilities and quantiles over the draws, at each value and at the best operating point.
 
     Parameters
     ----------
     seen : from ``draws_diagram``
-    objective : what is best: the largest "mean_velocity" (forward), or "efficiency"
+    objective : the quantity to maximise: "mean_velocity" (forward), or "efficiency"
 
     Returns a Dataset with
 

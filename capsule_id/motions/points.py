@@ -1,7 +1,7 @@
-"""What a sweep is made of: points, and what is seen of each of them.
+"""The points of a sweep, and the columns of their settled motions.
 
-A *point* is one set of leaves with one initial state. A lane of the engine is the same to the last bit whatever batch
-it stands in, so how points are cut into blocks, and who computes these, cannot be seen in the result.
+A *point* is one set of leaves with one initial state. A lane of the engine is the same to the last bit in every
+batch, so the result does not depend on the blocks or on the worker that computes them.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from capsule_id.physics.model import CapsuleParameters, Excitation, Initial
 
 Columns = dict[str, np.ndarray]  # name -> (points, ...)
 
-# What is seen of a motion: unit and meaning.
+# Columns of a settled motion: unit and meaning.
 SEEN = {
     "x_rel": ("m", "X1 - X2 at the drive's phase at the start of a period"),
     "rate": ("m/s", "Y1 - Y2 at the drive's phase at the start of a period"),
@@ -75,12 +75,12 @@ def points_of(
         leaves["Omega"] = 2.0 * np.pi * leaves.pop("f")
     p = CapsuleParameters(**{**vars(p), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "capsule"}})
     e = Excitation(**{**vars(e), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "drive"}})
-    (lanes, _), _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
+    lanes, _, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
     return Points(*lanes)
 
 
 def columns_of(points: Points, settling: Settling) -> Columns:
-    """Everything seen of the settled motions, by the names of ``SEEN``."""
+    """All columns of the settled motions, by the names of ``SEEN``."""
     return columns(settle(points.p, points.e, points.initial, settling), points)
 
 

@@ -1,8 +1,8 @@
 """The settled motion in one line: period, direction, contacts, mean velocity, and the paper's label P-<n>-<F|B|S>-<m>.
 
-march over the dropped and the observed periods -> Poincaré section -> period -> what each period holds -> Settled
+simulate the dropped and the observed periods -> Poincaré section -> period -> contacts and work of periods -> Settled
 
-``response`` is the question about single motions; sweeps and maps ask ``settle`` for everything that was seen.
+``response`` returns the label of a motion; ``settle`` returns its Poincaré section too, for sweeps and maps.
 """
 
 from dataclasses import dataclass, fields
@@ -16,11 +16,12 @@ from capsule_id.motions.lyapunov import largest_exponent
 from capsule_id.motions.periods import observe
 from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
 from capsule_id.physics.exact.engine import kernel
+from capsule_id.physics.friction import FrictionLaw, friction_law
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Excitation, Initial, Status
 
-# Excitation periods left out, and looked at.
+# Excitation periods left out, and observed.
 DROPPED, OBSERVED = 300, 48
-# The longest period that is looked for, in excitation periods, where at least REPEATS times as many are observed.
+# Longest period searched for, in excitation periods; at least REPEATS times as many must be observed.
 LONGEST, REPEATS = 16, 3
 # Two points of the Poincaré section are the same within these (m, m/s), and within this part of the motion's size.
 SAME_POSITION, SAME_VELOCITY, SAME_RELATIVE = 1e-7, 1e-4, 1e-3
@@ -32,9 +33,9 @@ EXPONENT_PERIODS = 100
 
 @dataclass(frozen=True)
 class Settling:
-    """How motions are settled and looked at.
+    """How motions are settled and observed.
 
-    dropped, observed : excitation periods left out, and looked at; the longest period looked for is the least of 16
+    dropped, observed : excitation periods left out, and observed; the longest period searched for is the least of 16
         and a third of ``observed``
     merge_contacts : s; contacts parted by less than this count as one (0, the default: every closing counts)
     exponent_periods : periods over which the Lyapunov exponent of an aperiodic motion is a mean, 0 to leave it out
@@ -108,7 +109,12 @@ class Settled(Response):
 
 
 def response(
-    p: CapsuleParameters, e: Excitation, *, settling: Settling = SETTLING, max_steps: int | None = None
+    p: CapsuleParameters,
+    e: Excitation,
+    *,
+    settling: Settling = SETTLING,
+    max_steps: int | None = None,
+    friction: FrictionLaw | None = None,
 ) -> Response:
     """Settled motion from rest: 300 excitation periods dropped, 48 observed.
 
@@ -117,18 +123,19 @@ def response(
     p, e : parameters and drive; any leaf may carry a batch axis (batch,). Omega must be positive.
     settling : other numbers of periods, the rule for micro-contacts
     max_steps : bound on the steps of a lane, in the place of that of ``settling``
+    friction : a law in place of eq. (1), see ``simulate``; leaves () or (batch,)
 
     Raises
     ------
     InputError
         Traced values (a label is a string), Omega not positive, shapes that do not agree.
     """
-    if is_traced((p, e)):
+    if is_traced((p, e, friction)):
         raise InputError("response needs concrete values", "a traced value", "call it outside of jit, vmap and jvp")
-    _, batched = lanes_of((p, e), np.zeros(1))
+    _, _, batched = lanes_of((p, e, friction), np.zeros(1))
     if max_steps is not None:
         settling = Settling(**{**vars(settling), "max_steps": max_steps})
-    seen = settle(p, e, settling=settling)
+    seen = settle(p, e, settling=settling, friction=friction)
     columns = (getattr(seen, field.name) for field in fields(Response))
     return Response(*(column if batched else column[0].item() for column in columns))
 
@@ -139,6 +146,7 @@ def settle(
     initial: Initial | None = None,
     settling: Settling = SETTLING,
     width: int = CHUNK,
+    friction: FrictionLaw | None = None,
 ) -> Settled:
     """Settled motions of a batch (a single motion is a batch of one), from ``initial`` or from rest.
 
@@ -147,14 +155,16 @@ def settle(
     p, e : as in ``response``, concrete
     initial : (X1, Y1, X2, Y2), each () or (batch,); default at rest at the origin
     width : lanes of one call of the engine, see ``run_lanes``
+    friction : a law in place of eq. (1), see ``simulate``; leaves () or (batch,)
 
     Raises
     ------
     InputError
         Omega not positive, a merging time that would take in whole periods, shapes that do not agree.
     """
-    lanes, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
-    (p, e, initial), _ = lanes
+    given = (p, e, friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
+    (p, e, friction, initial), _, _ = lanes_of(given, np.zeros(1))
+    law = friction_law(p, friction)
     if not np.all(np.asarray(e.Omega) > 0.0):
         wrong = np.asarray(e.Omega)[~(np.asarray(e.Omega) > 0.0)][0]
         raise InputError("Omega must be positive", str(wrong), "a response needs a period: use simulate")
@@ -167,9 +177,9 @@ def settle(
     section = T[:, None] * np.arange(settling.dropped - before, settling.dropped + settling.observed + 1)
     # The start comes first, which the section begins with where (almost) nothing is dropped.
     times = np.concatenate([np.zeros((len(T), 1)), section], axis=1) if settling.dropped > 1 else section
-    run = run_lanes(kernel(settling.max_steps), ((p, e, initial), times), batched=True, width=width)
+    run = run_lanes(kernel(settling.max_steps), (p, e, law, initial), times, batched=True, width=width)
     states = np.stack([np.asarray(x)[:, -section.shape[1] :] for x in (run.X1, run.Y1, run.X2, run.Y2)])
-    seen = observe(p, e, section, states, settling.merge_contacts, settling.max_steps, width)
+    seen = observe(p, e, law, section, states, settling.merge_contacts, settling.max_steps, width)
     states, closings = states[:, :, before:], seen.closings[:, before:]
     status = np.maximum(np.asarray(run.status), seen.status)
     found = [_describe(states[:, i], 2.0 * np.pi / T[i], closings[i], int(status[i])) for i in range(len(T))]
@@ -177,19 +187,24 @@ def settle(
     X1, Y1, X2, Y2 = states
     velocity = (X2[:, -1] - X2[:, 0]) / (settling.observed * T)
     work = np.where(np.isfinite(velocity), seen.work[:, before:].mean(axis=1), np.nan)
-    exponent = exponents(p, e, tuple(states[:, :, -1]), label == "aperiodic", settling)
+    exponent = exponents(p, e, tuple(states[:, :, -1]), label == "aperiodic", settling, friction)
     columns = (label, period, direction, per_period, velocity, status, work, exponent)
     return Settled(*columns, x_rel=X1 - X2, rate=Y1 - Y2, Y2=Y2)
 
 
 def exponents(
-    p: CapsuleParameters, e: Excitation, ends: tuple[np.ndarray, ...], chosen: np.ndarray, settling: Settling
+    p: CapsuleParameters,
+    e: Excitation,
+    ends: tuple[np.ndarray, ...],
+    chosen: np.ndarray,
+    settling: Settling,
+    friction: FrictionLaw | None = None,
 ) -> np.ndarray:
     """(lanes,) 1/s: Lyapunov exponents of lanes from the states ``ends`` where ``chosen`` (lanes,), NaN elsewhere."""
     found = np.full(len(chosen), np.nan)
     if settling.exponent_periods and chosen.any():
-        p, e, (X1, Y1, X2, Y2) = jax.tree.map(lambda leaf: leaf[chosen], (p, e, ends))
-        rates = largest_exponent(p, e, (X1, Y1, X2, Y2), settling.exponent_periods, settling.max_steps)
+        p, e, friction, (X1, Y1, X2, Y2) = jax.tree.map(lambda leaf: leaf[chosen], (p, e, friction, ends))
+        rates = largest_exponent(p, e, (X1, Y1, X2, Y2), settling.exponent_periods, settling.max_steps, friction)
         found[chosen] = rates.exponent
     return found
 
@@ -213,8 +228,8 @@ def _describe(state: np.ndarray, Omega: float, contacts: np.ndarray, status: int
 def period_of(x_rel: np.ndarray, rate: np.ndarray, Omega: float) -> int:
     """Period in excitation periods of points (n,) of the Poincaré section (m, m/s); 0 if they do not repeat.
 
-    The tolerance is absolute, and for small motions relative to the largest distance from the origin. Looked for are
-    periods up to 16 which are observed three times.
+    The tolerance is absolute, and for small motions relative to the largest distance from the origin. Periods up to 16
+    are searched for that are observed three times.
     """
     scale = SAME_RELATIVE * float(np.max(np.hypot(x_rel, rate / Omega)))
     for n in range(1, min(LONGEST, (len(x_rel) - 1) // REPEATS) + 1):

@@ -1,7 +1,9 @@
 """The physics of the vibro-impact capsule: knows nothing of data.
 
-model.py     CapsuleParameters, Excitation -> simulate -> Trajectory
-exact/       the event-driven stick-slip-contact engine        smooth/    the smoothed-Heaviside model
-batches.py   one lane axis, chunks of lanes over threads       energy.py  where the drive's work goes
-forces.py    the forces, exact and smoothed                    leaves.py  unit and meaning of every quantity
+model.py     CapsuleParameters, a drive, times -> simulate -> Trajectory
+friction.py  friction laws, the stick-slip rule, the slide to rest     drive.py   the force on the rod
+contacts.py  the support spring                                        forces.py  rod to capsule, accelerometer
+exact/       the event-driven stick-slip-contact engine                smooth/    the smoothed-Heaviside model
+energy.py    energy balance of a run                                   grazing.py the load where contacts begin
+series.py    polynomials of a Taylor step                              batches.py one lane axis, chunks on threads
 """

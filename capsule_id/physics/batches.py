@@ -1,15 +1,16 @@
 """One lane axis for everything: broadcasting, chunks of lanes, threads.
 
-An engine works on lanes: every leaf (L,), times (L, n). Whatever the user gives is broadcast to that form; a concrete
+An engine works on lanes: every leaf (L,), times (L, n). The user's arguments are broadcast to that form. A concrete
 batch is then split into chunks of CHUNK lanes which run from as many threads as there are cores. Every chunk is
 padded to full width, so that a lane is always computed by the same program, and its result is the same to the last bit
-wherever in whichever batch it stands. Traced values are never split.
+whichever batch it stands in. Traced values are never split.
 """
 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from types import ModuleType
 from typing import Any, TypeVar
 
 import jax
@@ -21,10 +22,17 @@ from numpy.typing import ArrayLike
 from capsule_id.errors import InputError
 
 Tree = TypeVar("Tree")
-Lanes = tuple[Any, jax.Array | np.ndarray]  # (pytree of (L,) leaves, times (L, n))
+Result = TypeVar("Result")
+Leaf = float | np.ndarray | jax.Array  # a number, or one number per lane: shape () or (batch,)
+Times = jax.Array | np.ndarray
 
-# Lanes of one call: enough to fill the vector units, few enough for the second-level cache.
+# Lanes per call of an engine: enough to fill the vector units, few enough for the second-level cache.
 CHUNK = 64
+
+
+def array_module(*values: object) -> ModuleType:
+    """``jax.numpy`` if one of ``values`` is a JAX array, else ``numpy``: formulas that serve both use it."""
+    return jnp if any(isinstance(value, jax.Array) for value in values) else np
 
 
 def is_traced(tree: object) -> bool:
@@ -32,8 +40,8 @@ def is_traced(tree: object) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def lanes_of(tree: object, times: ArrayLike) -> tuple[Lanes, bool]:
-    """Broadcast leaves () or (batch,) and times (n,) or (batch, n) to one lane axis; also says whether there was one.
+def lanes_of(tree: Tree, times: ArrayLike) -> tuple[Tree, Times, bool]:
+    """(tree, times, whether a batch axis was given): leaves () or (batch,) become (L,), times (n,) become (L, n).
 
     Raises
     ------
@@ -68,24 +76,25 @@ def lanes_of(tree: object, times: ArrayLike) -> tuple[Lanes, bool]:
     if lanes == 0:
         raise InputError("a batch must hold at least one lane", "length 0", "leave the call out")
     spread = [xp.broadcast_to(leaf, (lanes,)) for leaf in leaves]
-    return (jax.tree.unflatten(structure, spread), xp.broadcast_to(grid, (lanes, grid.shape[-1]))), batched
+    return jax.tree.unflatten(structure, spread), xp.broadcast_to(grid, (lanes, grid.shape[-1])), batched
 
 
-def run_lanes(kernel: Callable[..., Tree], lanes: Lanes, batched: bool, width: int = CHUNK) -> Tree:
-    """Run ``kernel(p, e, times, initial)`` on lanes from ``lanes_of``; drops the lane axis where none was given.
+def run_lanes(
+    kernel: Callable[..., Result], tree: tuple[Any, ...], times: Times, batched: bool, width: int = CHUNK
+) -> Result:
+    """Run ``kernel(*tree, times)`` on lanes from ``lanes_of``; drop the lane axis where ``batched`` is false.
 
     width : lanes of one call; another width is another program, whose results may differ in the last bit
     """
-    (p, e, initial), times = lanes
     if not batched:
-        return jax.tree.map(lambda leaf: leaf[0], kernel(p, e, times, initial))
+        return jax.tree.map(lambda leaf: leaf[0], kernel(*tree, times))
     size = times.shape[0]
-    if is_traced(lanes):
-        return kernel(p, e, times, initial)
+    if is_traced((tree, times)):
+        return kernel(*tree, times)
     chunks = [np.minimum(np.arange(start, start + width), size - 1) for start in range(0, size, width)]
 
-    def run(index: np.ndarray) -> Tree:
-        return jax.block_until_ready(kernel(*jax.tree.map(lambda leaf: leaf[index], (p, e, times, initial))))
+    def run(index: np.ndarray) -> Result:
+        return jax.block_until_ready(kernel(*jax.tree.map(lambda leaf: leaf[index], (*tree, times))))
 
     results = [run(chunks[0])] if len(chunks) == 1 else list(pool().map(run, chunks))
     return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate([np.asarray(x) for x in parts])[:size]), *results)

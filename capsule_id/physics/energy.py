@@ -1,4 +1,4 @@
-"""Energy balance of a run: what the drive puts in is stored, or lost in damper and friction.
+"""Energy balance of a run: the work of the drive is stored, or lost in damper and friction.
 
 The steps' polynomials are kept, and the powers are integrated over each step by Gauss-Legendre quadrature: nothing of
 the engine's own recursion is used, so the balance checks series, events and changes of mode at once.
@@ -13,10 +13,13 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import lanes_of
+from capsule_id.physics.contacts import support
+from capsule_id.physics.drive import Drive
 from capsule_id.physics.exact.dense import values_of
-from capsule_id.physics.exact.engine import march, start
-from capsule_id.physics.exact.taylor import rig_of
-from capsule_id.physics.model import CapsuleParameters, Excitation, Initial, Status
+from capsule_id.physics.exact.engine import initial_lanes, march
+from capsule_id.physics.exact.taylor import constants_of
+from capsule_id.physics.friction import FrictionLaw, friction_law, sliding_friction
+from capsule_id.physics.model import CapsuleParameters, Initial, Status
 
 # Quadrature nodes per step: exact for the square of a velocity polynomial of degree 12.
 NODES = 16
@@ -47,13 +50,16 @@ class EnergyBalance:
 
 def energy_balance(
     p: CapsuleParameters,
-    e: Excitation,
+    e: Drive,
     span: tuple[float, float],
     initial: Initial | None = None,
     *,
+    friction: FrictionLaw | None = None,
     max_steps: int = 20_000,
 ) -> EnergyBalance:
     """Energy balance of the exact model over span = (begin, end), s; leaves () or (batch,).
+
+    friction : a law in place of the capsule's own, see ``simulate``
 
     Keeps every step: 240 bytes times max_steps times lanes of memory.
 
@@ -62,9 +68,10 @@ def energy_balance(
     InputError
         A lane that does not run to the end (status in the message), shapes that do not agree.
     """
-    given = (p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
-    ((p, e, begun), times), batched = lanes_of(given, np.asarray(span))
-    rows, starts, status = jax.device_get(_recorded(max_steps, p, e, times, begun))
+    given = (p, e, friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
+    (p, e, friction, begun), times, batched = lanes_of(given, np.asarray(span))
+    law = friction_law(p, friction)
+    rows, starts, status = jax.device_get(_recorded(max_steps, p, e, law, begun, times))
     if not all(Status(int(code)).usable for code in status):
         worst = Status(int(status.max()))
         raise InputError("every lane must run to the end of the span", worst.name, worst.sentence)
@@ -75,37 +82,35 @@ def energy_balance(
     node, weight = np.polynomial.legendre.leggauss(NODES)
     t = begins[..., None] + half[..., None] * (1.0 + node)
     _, Y1, _, Y2 = (np.asarray(x) for x in values_of(jnp.asarray(rows[..., None]), jnp.asarray(t)))
-    m1, m2, _, _, c, mu, v_s, _, g, P_d, Omega, phase = (
-        np.asarray(x)[:, None] for x in (*vars(p).values(), *vars(e).values())
-    )
+    columns_e, columns_law = jax.tree.map(lambda leaf: np.asarray(leaf)[:, None], (e, law))
 
     def total(power: np.ndarray) -> np.ndarray:
         return np.sum(power * weight * half[..., None], axis=(0, 2))
 
-    F_b = mu * (m1 + m2) * g
-    drive = total(P_d * np.cos(Omega * t + phase) * Y1)
-    damper = total(c * (Y1 - Y2) ** 2)
-    friction = total(0.5 * F_b * (1.0 + np.exp(-np.abs(Y2) / v_s)) * np.abs(Y2))
+    work = total(columns_e.force(t) * Y1)
+    damper = total(np.asarray(p.c)[:, None] * (Y1 - Y2) ** 2)
+    rubbed = total(np.asarray(sliding_friction(columns_law, np.sign(Y2), Y2)) * Y2)
     last = rows[:, np.maximum(taken.sum(axis=0) - 1, 0), np.arange(len(status))]
     end = values_of(jnp.asarray(last), jnp.asarray(times[:, 1]))
     change = _stored(p, *(np.asarray(x) for x in end)) - _stored(p, *(np.asarray(x) for x in begun))
-    fields = (drive, damper, friction, change, status)
+    fields = (work, damper, rubbed, change, status)
     return EnergyBalance(*(fields if batched else (x[0] for x in fields)))
 
 
 def _stored(p: CapsuleParameters, X1: np.ndarray, Y1: np.ndarray, X2: np.ndarray, Y2: np.ndarray) -> np.ndarray:
-    m1, m2, k1, k2, _, _, _, G, _ = (np.asarray(x) for x in vars(p).values())
     r = X1 - X2
-    return 0.5 * (m1 * Y1**2 + m2 * Y2**2 + k1 * r**2 + k2 * np.maximum(r - G, 0.0) ** 2)
+    # The support's energy k2 (r - G)^2 / 2 is its force times half the penetration.
+    support_energy = 0.5 * support(p.k2, p.G, r) * (r - p.G)
+    return 0.5 * (p.m1 * Y1**2 + p.m2 * Y2**2 + p.k1 * r**2) + support_energy
 
 
 @partial(jax.jit, static_argnums=0)
 def _recorded(
-    max_steps: int, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial
+    max_steps: int, p: CapsuleParameters, e: Drive, law: FrictionLaw, initial: Initial, times: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """(rows (max_steps, WIDTH, L), starts (max_steps, L), status (L,)) of all steps of a run."""
-    rig = rig_of(p, e)
+    constants = constants_of(p, e, law)
     begin, end = jnp.asarray(times[:, 0]), jnp.asarray(times[:, 1])
-    lanes = start(rig, begin, end, initial)
-    lanes, rows, starts = march(rig, end, jnp.full(end.shape, max_steps), lanes, max_steps)
+    lanes = initial_lanes(p, constants, begin, end, initial)
+    lanes, rows, starts = march(constants, end, jnp.full(end.shape, max_steps), lanes, max_steps)
     return rows, starts, lanes.status

@@ -13,14 +13,21 @@ State (X1, Y1, X2, Y2): absolute position and velocity of the rod (m1) and of th
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import reduce
+from operator import and_
 from typing import TYPE_CHECKING, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
-from capsule_id.physics.batches import lanes_of, run_lanes
+from capsule_id.parameters import CAPSULE_LEAVES, TABLE
+from capsule_id.physics.batches import Leaf, lanes_of, run_lanes
+from capsule_id.physics.drive import Drive
+from capsule_id.physics.drive import Excitation as Excitation
+from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
 from capsule_id.precision import require_float64
 
 if TYPE_CHECKING:
@@ -28,11 +35,12 @@ if TYPE_CHECKING:
 
 require_float64()
 
-Leaf = float | np.ndarray | jax.Array  # a number, or one number per lane: shape () or (batch,)
 Initial = tuple[Leaf, Leaf, Leaf, Leaf]
 
 # Bound on the steps of one lane: 348 periods of the busiest reference motion need 45,000.
 MAX_STEPS = 100_000
+# Leaves of the capsule that a friction law of its own replaces.
+_OWN_FRICTION = frozenset(row.symbol for row in CoulombStribeck.parameters)
 
 
 @jax.tree_util.register_dataclass
@@ -57,14 +65,29 @@ class CapsuleParameters:
     g: Leaf = 9.81
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Excitation:
-    """The drive P_d cos(Omega t + phase) on the rod: P_d in N, Omega in rad/s, phase in rad; leaves () or (batch,)."""
+def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:
+    """(L,) bool: every leaf (L,) is finite and of the sign that its row of the parameter table admits.
 
-    P_d: Leaf
-    Omega: Leaf
-    phase: Leaf = 0.0
+    The break-away forces are N >= 0 too. mu and v_s are judged where they are leaves of the law.
+    """
+    own = tuple(row for symbol, row in CAPSULE_LEAVES.items() if symbol not in _OWN_FRICTION)
+    leaves = [
+        (row, getattr(owner, row.symbol))
+        for owner, rows in ((p, own), (e, e.parameters), (law, law.parameters))
+        for row in rows
+    ]
+    still = jnp.zeros_like(jnp.asarray(p.m1))
+    leaves += [(TABLE["mu"], threshold(still)) for threshold in (law.forward, law.backward)]
+    return reduce(and_, (row.admits(jnp.asarray(leaf)) for row, leaf in leaves))
+
+
+def _signs() -> str:
+    """The rule of ``admissible`` in words."""
+    positive, not_negative = (
+        ", ".join(symbol for symbol, row in CAPSULE_LEAVES.items() if row.sign == sign)
+        for sign in ("positive", "not negative")
+    )
+    return f"{positive} > 0; {not_negative} >= 0"
 
 
 class Status(IntEnum):
@@ -90,7 +113,7 @@ class Status(IntEnum):
 _SENTENCES = {
     Status.OK: "The run is complete.",
     Status.GRAZING: (
-        "The run is complete, but an event was met at (almost) zero rate: the motion grazes, "
+        "The run is complete, but an event happens at (almost) zero rate: the motion grazes, "
         "and derivatives through that event do not exist or are unreliable."
     ),
     Status.TOO_MANY_STEPS: (
@@ -99,7 +122,7 @@ _SENTENCES = {
     ),
     Status.INVALID: (
         "The run was not started: a parameter, the excitation, a time or the initial state is not finite or not "
-        "admissible (m1, m2, v_s > 0; k1, k2, c, mu, g, G >= 0); all samples are NaN."
+        f"admissible ({_signs()}); all samples are NaN."
     ),
     Status.NOT_FINITE: "The run left the range of floating-point numbers; the samples after that point are NaN.",
 }
@@ -143,13 +166,14 @@ class Trajectory:
 
 def simulate(
     p: CapsuleParameters,
-    e: Excitation,
+    e: Drive,
     times: ArrayLike,
     initial: Initial | None = None,
     model: Literal["exact", "smooth"] = "exact",
     semantics: Literal["stick-slip", "eq2"] = "stick-slip",
     smoothing: "Smoothing | None" = None,
     *,
+    friction: FrictionLaw | None = None,
     max_steps: int = MAX_STEPS,
 ) -> Trajectory:
     """Motion of the capsule at the given times.
@@ -162,15 +186,17 @@ def simulate(
     model : "exact" (event-driven) or "smooth" (smoothed Heavisides)
     semantics : "stick-slip", or "eq2" (eq. (2) to the letter; smooth model only, for comparison)
     smoothing : widths of the smooth model; default the certified ones
+    friction : a friction law in place of eq. (1); it replaces mu, v_s and the normal force of p. Leaves () or (batch,)
     max_steps : bound on the steps of a lane, after which it is given up with ``Status.TOO_MANY_STEPS``
 
-    Works under ``jit`` and ``vmap`` and is differentiable in forward mode in every float leaf. Concrete batches are
-    split into chunks of lanes which run on all cores; under a transformation the batch stays whole.
+    The number of parameters follows the public contract. Works under ``jit`` and ``vmap`` and is differentiable in
+    forward mode in every float leaf, those of ``friction`` included; the smooth model in reverse mode too. Concrete
+    batches are split into chunks of lanes that run on all cores; under a transformation the batch stays whole.
 
-    The engines behind it, ``exact.kernel(max_steps)`` and ``smooth.kernel(smoothing, semantics, max_steps)``
-    (``smoothing`` possibly None: certified widths), return a jitted function ``(p, e, times, initial) -> Trajectory``
-    of lanes: every leaf (L,), times (L, n), fields (L, n) and (L,), status and counters int32, the first sample equal
-    to ``initial``, NaN only in lanes whose status is not ``usable``. Status, not an exception, tells of bad values.
+    The engines, ``exact.kernel(max_steps)`` and ``smooth.kernel(smoothing, semantics, max_steps)``, return a function
+    ``(p, e, law, initial, times) -> Trajectory`` of lanes: every leaf (L,), times (L, n), fields (L, n) and (L,),
+    status and counters int32. Samples are NaN only in lanes whose status is not ``usable``. Bad values give a status,
+    not an exception.
 
     Raises
     ------
@@ -190,11 +216,12 @@ def simulate(
         )
     if model == "exact" and smoothing is not None:
         raise InputError("the exact model has no smoothing", repr(smoothing), 'leave it out or use model="smooth"')
-    lanes, batched = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), times)
+    (p, e, friction, initial), grid, batched = lanes_of((p, e, friction, initial or (0.0, 0.0, 0.0, 0.0)), times)
+    lanes = (p, e, friction_law(p, friction), initial)
     if model == "exact":
         from capsule_id.physics.exact import engine as exact
 
-        return run_lanes(exact.kernel(max_steps), lanes, batched)
+        return run_lanes(exact.kernel(max_steps), lanes, grid, batched)
     from capsule_id.physics.smooth import engine as smooth
 
-    return run_lanes(smooth.kernel(smoothing, semantics, max_steps), lanes, batched)
+    return run_lanes(smooth.kernel(smoothing, semantics, max_steps), lanes, grid, batched)

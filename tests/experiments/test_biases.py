@@ -8,9 +8,10 @@ from capsule_id.experiments import make_experiments, paper_estimates
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.friction_curve import slide_distance
+from capsule_id.experiments.friction_curve import unit_law
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.friction import slide_distance
 from capsule_id.rig.model import Rig
 
 TIME = np.arange(1000) / 2000.0  # s
@@ -50,7 +51,7 @@ def full_record_bias(noise: float, count: int = 40) -> tuple[float, float]:
 def surface() -> Rig:
     """Four tilts and five pushes without noise, their reading errors stated."""
     angle = np.full(4, np.arctan(MU))
-    distance = slide_distance(SPEEDS, MU, V_S, bench.G, np)
+    distance = slide_distance(unit_law(MU, V_S), 1.0 / bench.G, SPEEDS)
     tilts = bench.table("static_friction", [bench.column("angle", angle, 1e-3)])
     pushes = bench.table(
         "dynamic_friction", [bench.column("speed", SPEEDS, 1e-4), bench.column("distance", distance, 1e-5)]
@@ -85,7 +86,7 @@ def biases() -> dict[str, float]:
 
 def push_bias(speed: float) -> float:
     """mu_d = v^2/(2 g d) of an exact slide, against eq. (1) at the speed of the push."""
-    distance = slide_distance(np.array([speed]), MU, V_S, bench.G, np)[0]
+    distance = slide_distance(unit_law(MU, V_S), 1.0 / bench.G, np.array([speed]))[0]
     return speed**2 / (2.0 * bench.G * distance) / (0.5 * MU * (1.0 + np.exp(-speed / V_S))) - 1.0
 
 

@@ -13,8 +13,9 @@ from capsule_id.experiments.capsule_bench import CapsuleDecay, CapsulePushes
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.free_vibration.checks import check_free_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.friction_curve import slide_distance
+from capsule_id.experiments.friction_curve import unit_law
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity, Table
 from tests.experiments import bench
@@ -101,7 +102,7 @@ def test_a_ringing_rod_shortens_the_slide() -> None:
     """By 11 % at 0.1 m/s and 3 % at 0.2 m/s; a rod that is stiff to its capsule is a locked one."""
     e = CapsulePushes(pushes("capsule"), bench.rig())
     np.testing.assert_allclose(np.asarray(e.slide(TRUTH, np)), e.distance, rtol=1e-7)
-    locked = np.asarray(slide_distance(SPEEDS, MU, V_S, bench.G, np))
+    locked = slide_distance(unit_law(MU, V_S), 1.0 / bench.G, SPEEDS)
     assert np.round(100.0 * (e.distance / locked - 1.0)[:2]).tolist() == [-11.0, -3.0]
     stiff = np.asarray(e.slide(TRUTH | {"k1": 1e7, "c": 1e3}, np))
     np.testing.assert_allclose(stiff, locked, rtol=1e-4)

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.checks.context import Fitted
@@ -26,7 +27,6 @@ from capsule_id.inference.target import log_posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig, Table
-from capsule_id.api import read_rig
 from capsule_id.synthetic import synthesize
 from capsule_id.views import Comparison, Finding, NoteTable
 from tests.experiments import bench

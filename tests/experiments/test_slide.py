@@ -6,7 +6,8 @@ import pytest
 from bench import G
 from scipy import integrate, special
 
-from capsule_id.experiments.friction_curve import friction_coefficient, paper_friction_fit, slide_distance
+from capsule_id.experiments.friction_curve import paper_friction_fit, unit_law
+from capsule_id.physics.friction import slide_distance
 
 MU, V_S = 0.66, 0.30
 RATIOS = np.geomspace(1e-3, 50.0, 25)  # v / v_s
@@ -27,7 +28,9 @@ def by_dilogarithm(speed: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_slide_by_quadrature(xp: object) -> None:
     expected = [by_quadrature(v) for v in RATIOS * V_S]
-    np.testing.assert_allclose(slide_distance(RATIOS * V_S, MU, V_S, G, xp), expected, rtol=1e-12)  # type: ignore[arg-type]
+    np.testing.assert_allclose(
+        slide_distance(unit_law(MU, V_S), 1.0 / G, xp.asarray(RATIOS * V_S)), expected, rtol=1e-12
+    )  # type: ignore[arg-type]
 
 
 def test_slide_by_dilogarithm() -> None:
@@ -35,22 +38,23 @@ def test_slide_by_dilogarithm() -> None:
     speed = RATIOS * V_S
     scale = 2.0 * V_S**2 / (G * MU)
     np.testing.assert_allclose(
-        slide_distance(speed, MU, V_S, G, np), by_dilogarithm(speed), rtol=1e-12, atol=4e-15 * scale
+        slide_distance(unit_law(MU, V_S), 1.0 / G, speed), by_dilogarithm(speed), rtol=1e-12, atol=4e-15 * scale
     )
 
 
 def test_limits() -> None:
     """A slow push sees mu all the way, a fast one mu/2 but for a fixed start."""
-    slow, fast = slide_distance(np.array([1e-6 * V_S, 1e4 * V_S]), MU, V_S, G, np)
+    slow, fast = slide_distance(unit_law(MU, V_S), 1.0 / G, np.array([1e-6 * V_S, 1e4 * V_S]))
     assert slow == pytest.approx((1e-6 * V_S) ** 2 / (2.0 * G * MU), rel=1e-6)
     assert fast == pytest.approx((1e4 * V_S) ** 2 / (G * MU), rel=1e-6)
-    assert friction_coefficient(0.0, MU, V_S, np) == MU
-    assert friction_coefficient(-0.2, MU, V_S, np) == friction_coefficient(0.2, MU, V_S, np)
+    law = unit_law(MU, V_S)
+    assert law.forward(0.0) == MU
+    assert law.backward(0.2) == law.forward(0.2) == pytest.approx(0.5 * MU * (1.0 + np.exp(-0.2 / V_S)), rel=1e-15)
 
 
 def test_paper_fit_recovers_its_own_curve() -> None:
     speed = np.array([0.0, 0.0, 0.1, 0.3, 0.5])
-    fit = paper_friction_fit(speed, friction_coefficient(speed, MU, V_S, np))
+    fit = paper_friction_fit(speed, unit_law(MU, V_S).forward(speed))
     assert fit["mu"] == pytest.approx(MU, rel=1e-7)
     assert fit["v_s"] == pytest.approx(V_S, rel=1e-6)
     assert paper_friction_fit(np.zeros(2), np.array([0.6, 0.7])) == {"mu": pytest.approx(0.65)}

@@ -7,7 +7,8 @@ import pytest
 
 from capsule_id.physics.exact import engine as exact
 from capsule_id.physics.exact.events import GAP, NONE, VELOCITY
-from capsule_id.physics.exact.taylor import Mode, Motion, Rig, State
+from capsule_id.physics.exact.taylor import CapsuleState, Constants, Mode, StepSeries
+from capsule_id.physics.friction import friction_law
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
 from tests.capsule_cases import Cases, states_of
 
@@ -72,8 +73,8 @@ def test_without_the_event_correction_the_friction_derivative_is_wrong(
     """The negative control; the support spring's force is continuous, so its derivative survives."""
 
     def uncorrected(
-        rig: Rig, mode: Mode, motion: Motion, s: jax.Array, at: State, kind: jax.Array
-    ) -> tuple[State, jax.Array]:
+        constants: Constants, mode: Mode, step: StepSeries, s: jax.Array, at: CapsuleState, kind: jax.Array
+    ) -> tuple[CapsuleState, jax.Array]:
         held = jax.lax.stop_gradient(at)
         d, v = jnp.where(kind == GAP, at.d - held.d, at.d), jnp.where(kind == VELOCITY, at.v - held.v, at.v)
         return at._replace(d=d, v=v), kind == NONE - 1
@@ -84,14 +85,16 @@ def test_without_the_event_correction_the_friction_derivative_is_wrong(
         lane[5], lane[3] = mu_and_k2[:1], mu_and_k2[1:]
         p, e = CapsuleParameters(*lane[:9]), Excitation(*lane[9:])
         zero, end = jnp.zeros(1), jnp.full(1, 1.5 * T)
-        t = exact.run(p, e, jnp.linspace(0.0, end, 7).T, end, (zero, zero, zero, zero), jnp.full(1, 10_000))
+        t = exact.run(
+            p, e, friction_law(p), (zero, zero, zero, zero), jnp.linspace(0.0, end, 7).T, end, jnp.full(1, 10_000)
+        )
         return jnp.stack([t.X1[0], t.X2[0]])
 
     point = jnp.array([0.66, 59410.0])
     states = jax.jit(at_rest)
     states(point)
     right = np.asarray(jax.jit(jax.jacfwd(at_rest))(point))
-    monkeypatch.setattr(exact, "met", uncorrected)
+    monkeypatch.setattr(exact, "correct", uncorrected)
     wrong = np.asarray(jax.jit(jax.jacfwd(lambda x: at_rest(x)))(point))
     h = 1e-6 * np.asarray(point)
     differences = np.stack(

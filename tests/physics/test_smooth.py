@@ -1,7 +1,9 @@
 """The smoothed model against the exact one: bias, order of the smoothing, samples, failures, semantics."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,11 +11,14 @@ from scipy.integrate import solve_ivp
 
 from capsule_id.errors import InputError
 from capsule_id.motions.bias import bias_against_width, smoothing_bias
-from capsule_id.physics import forces
+from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import CHUNK
+from capsule_id.physics.contacts import support_smooth
+from capsule_id.physics.friction import friction_law
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
 from capsule_id.physics.smooth import engine as smooth
 from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.physics.smooth.steps import smooth_abs
 from tests.capsule_cases import Cases, states_of
 
 # So small a tolerance that the solver's error does not show beside the smoothing.
@@ -58,13 +63,12 @@ def test_order_of_the_smoothing(cases: Cases) -> None:
     assert 1.6 < penetration.slope < 2.4
 
 
-def _tanh_field(theta: smooth.Theta, friction: smooth.Friction) -> smooth.Field:
-    p, e, widths = theta
-    law = friction(p)
+def _tanh_field(system: smooth.System) -> smooth.Field:
+    p, e, law, widths = system
 
     def field(t: jnp.ndarray, r: jnp.ndarray, Y1: jnp.ndarray, Y2: jnp.ndarray) -> tuple[jnp.ndarray, ...]:
-        f = p.k1 * r + p.c * (Y1 - Y2) + forces.support_smooth(p.k2, p.G, r, widths.penetration)
-        held = law.forward(forces.smooth_abs(Y2, widths.velocity)) * jnp.tanh(Y2 / widths.velocity)
+        f = p.k1 * r + p.c * (Y1 - Y2) + support_smooth(p.k2, p.G, r, widths.penetration)
+        held = law.forward(smooth_abs(Y2, widths.velocity)) * jnp.tanh(Y2 / widths.velocity)
         return (e.P_d * jnp.cos(e.Omega * t + e.phase) - f) / p.m1, Y2, (f - held) / p.m2
 
     return field
@@ -116,8 +120,8 @@ def test_eq2_freezes_a_sliding_capsule(cases: Cases) -> None:
 
 def test_smooth_field_against_scipy(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_30")
-    theta = (p, e, Smoothing(velocity=1e-3, penetration=1e-5, rounding=0.05))
-    field = smooth.stick_slip_field(theta, forces.CoulombStribeck.of)
+    widths = Smoothing(velocity=1e-3, penetration=1e-5, rounding=0.05)
+    field = smooth.stick_slip_field((p, e, friction_law(p), widths))
 
     def rate(t: float, y: np.ndarray) -> list[float]:
         a1, v2, a2 = field(jnp.asarray(t), jnp.asarray(y[0] - y[2]), jnp.asarray(y[1]), jnp.asarray(y[3]))
@@ -125,7 +129,7 @@ def test_smooth_field_against_scipy(cases: Cases) -> None:
 
     times = np.linspace(0.0, 0.12 * T, 12)
     expected = solve_ivp(rate, (0.0, times[-1]), np.zeros(4), "LSODA", times, rtol=1e-9, atol=1e-11).y.T
-    actual = states_of(simulate(p, e, times, model="smooth", smoothing=replace(theta[2], tolerance=1e-9)))
+    actual = states_of(simulate(p, e, times, model="smooth", smoothing=replace(widths, tolerance=1e-9)))
     assert np.abs(actual - expected)[:, [0, 2]].max() < 3e-9
     assert np.abs(actual - expected)[:, [1, 3]].max() < 1e-6
 
@@ -197,29 +201,38 @@ def test_rest_without_drive_stays(cases: Cases) -> None:
     np.testing.assert_array_equal(states_of(t), 0.0)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class _Viscous:
-    """Resistance b |Y2| + F: not among the package's laws."""
+    """Resistance F + b |Y2|: not among the package's laws."""
+
+    b: float
+
+    parameters: ClassVar[tuple[Parameter, ...]] = (Parameter("b", "N s/m", "viscous friction", "b"),)
 
     def forward(self, speed: jnp.ndarray) -> jnp.ndarray:
-        return 1.0 + 4.0 * speed
+        return 1.0 + self.b * speed
 
     backward = forward
-
-
-def _viscous(_: CapsuleParameters) -> _Viscous:
-    return _Viscous()
 
 
 def test_a_law_of_ones_own_needs_no_change_of_the_engine() -> None:
     # The rod moves with the capsule (rigid spring at rest length): m v' = -(F + b v), in closed form.
     m, v0 = 0.64, 0.4
-    lane = [np.array([x]) for x in (0.11, 0.53, 1e7, 0.0, 1e3, 0.5, 0.3, 1.0, 9.81)]
-    rest = np.array([0.0])
-    times = np.array([[0.0, 0.02, 0.05]])
-    run = smooth.kernel(Smoothing(tolerance=1e-7), friction=_viscous)
-    t = run(CapsuleParameters(*lane), Excitation(rest, rest, rest), times, (rest, rest + v0, rest, rest + v0))
-    expected = (v0 + 0.25) * np.exp(-4.0 / m * times) - 0.25
-    np.testing.assert_allclose(t.Y2, expected, rtol=2e-4)
+    p = CapsuleParameters(0.11, 0.53, 1e7, 0.0, 1e3, mu=np.nan, v_s=np.nan, G=1.0)
+    times, start = np.array([0.0, 0.02, 0.05]), (0.0, v0, 0.0, v0)
+
+    def Y2(b: float) -> jnp.ndarray:
+        drive, widths = Excitation(0.0, 0.0), Smoothing(tolerance=1e-7)
+        return simulate(p, drive, times, start, model="smooth", smoothing=widths, friction=_Viscous(b)).Y2
+
+    def closed_form(b: float) -> np.ndarray:
+        return (v0 + 1.0 / b) * np.exp(-b / m * times) - 1.0 / b
+
+    np.testing.assert_allclose(Y2(4.0), closed_form(4.0), rtol=2e-4)
+    slope = (closed_form(4.0 + 1e-4) - closed_form(4.0 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(jax.jacfwd(Y2)(4.0), slope, rtol=2e-3, atol=1e-7)
+    assert jax.grad(lambda b: Y2(b)[-1])(4.0) == pytest.approx(slope[-1], rel=2e-3)
 
 
 def test_bias_is_data(cases: Cases) -> None:

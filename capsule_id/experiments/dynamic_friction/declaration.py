@@ -58,10 +58,11 @@ def pushes(
     The surface's mu scatters by ``surface_scatter`` (relative) from push to push. Each argument is one quantity of the
     protocol, so there are more than six.
     """
-    from capsule_id.experiments.friction_curve import slide_distance
+    from capsule_id.experiments.friction_curve import unit_law
+    from capsule_id.physics.friction import slide_distance
 
     surface = mu * (1.0 + surface_scatter * rng.standard_normal(len(speeds)))
-    distance = np.asarray(slide_distance(speeds, 1.0, v_s, g, np)) / surface
+    distance = slide_distance(unit_law(1.0, v_s), 1.0 / g, speeds) / surface
     return {
         "speed [m/s]": speeds + speed_sd * rng.standard_normal(len(speeds)),
         "distance [mm]": 1e3 * (distance + distance_sd * rng.standard_normal(len(speeds))),

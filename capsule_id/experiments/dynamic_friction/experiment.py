@@ -7,9 +7,10 @@ import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
-from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient, slide_distance
+from capsule_id.experiments.friction_curve import FrictionExperiment, unit_law
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import parameter
+from capsule_id.physics.friction import slide_distance
 from capsule_id.rig.model import Rig, Table
 
 
@@ -42,9 +43,9 @@ class DynamicFriction(FrictionExperiment):
         return self.distance
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        mu, v_s, g = theta["mu"], theta["v_s"], theta["g"]
-        distance = slide_distance(self.speed, mu, v_s, g, xp)
-        slope = self.speed / (g * friction_coefficient(self.speed, mu, v_s, xp))
+        law, g = unit_law(theta["mu"], theta["v_s"]), theta["g"]
+        distance = slide_distance(law, 1.0 / g, self.speed)
+        slope = self.speed / (g * law.forward(self.speed))
         variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
         return (Misfit(self.distance - distance, variance, distance, no_design(self.n, xp)),)
 

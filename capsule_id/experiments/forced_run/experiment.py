@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,6 +32,7 @@ from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_gr
 from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, innovations
+from capsule_id.physics.forces import rod_acceleration
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.records.view import view_record
@@ -221,10 +223,8 @@ class ForcedRun(CapsuleForward):
         run = self.motion(theta, xp)
         x_rel, rate = xp.asarray(run.X1 - run.X2), xp.asarray(run.Y1 - run.Y2)
 
-        def column(leaf: Any) -> Any:
-            return xp.asarray(leaf)[..., None]
-
-        drive = xp.cos(self.Omega * self.time + column(e.phase))
+        # A batch axis of the leaves stands before the samples.
+        p, e, I_d = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], (p, e, theta.get("I_d", 0.0)))
         seen: list[Any] = []
         for name in self.channels:
             if name == "x_rel":
@@ -232,10 +232,9 @@ class ForcedRun(CapsuleForward):
             elif name == "x_capsule":
                 seen.append(xp.asarray(run.X2))
             elif name == "acceleration_rod":
-                spring = column(p.k1) * x_rel + column(p.k2) * xp.maximum(x_rel - column(p.G), 0.0)
-                seen.append((column(e.P_d) * drive - spring - column(p.c) * rate) / column(p.m1))
+                seen.append(rod_acceleration(p, e, self.time, x_rel, rate))
             else:
-                seen.append(column(theta["I_d"]) * drive)
+                seen.append(I_d * e.cosine(self.time))
         return seen
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
@@ -279,7 +278,7 @@ class ForcedRun(CapsuleForward):
             view = view_record(self.table, K=theta["K"] if self.driven_by_current else None)
         except InputError:
             return None
-        return RunRecord(self.label, view, np.asarray(e.P_d * np.cos(self.Omega * self.time + e.phase)))
+        return RunRecord(self.label, view, np.asarray(e.force(self.time)))
 
     def records(self, theta: ValuesBySymbol) -> list[tuple[str, np.ndarray]]:
         scaled = self.scaled(theta, np)[: len(self.channels)]

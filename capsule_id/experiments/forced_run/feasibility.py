@@ -13,7 +13,10 @@ from scipy.integrate import solve_ivp
 
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.forced_run.start import harmonic
+from capsule_id.physics.forces import rod_acceleration, rod_on_capsule
+from capsule_id.physics.friction import normal_force
 from capsule_id.physics.grazing import grazing_load
+from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
@@ -76,7 +79,7 @@ def feasibility(
     """
     drive = conditions or stated_conditions(table, theta.get("K", np.nan))
     reached, touches = held_rod(theta, drive)
-    F_b = theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"]
+    F_b = theta["mu"] * normal_force(theta["m1"], theta["m2"], theta["g"])
     without_contact = drive.P_d / float(grazing_load(theta["m1"], theta["k1"], theta["c"], 1.0, drive.Omega))
     grazing = float(grazing_load(theta["m1"], theta["k1"], theta["c"], drive.G, drive.Omega))
     linear_force = without_contact * float(np.hypot(theta["k1"], theta["c"] * drive.Omega))
@@ -103,13 +106,12 @@ def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, b
     A capsule at rest stays there while |f| <= F_b, so this is exact for the question whether it sets off.
     """
     m1, k1, c, k2 = (float(theta[name]) for name in ("m1", "k1", "c", "k2"))
-
-    def force(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return k1 * x + c * y + k2 * np.maximum(x - drive.G, 0.0)
+    held = CapsuleParameters(m1, np.inf, k1, k2, c, mu=np.inf, v_s=np.inf, G=drive.G)
+    e = Excitation(drive.P_d, drive.Omega)
 
     def rate(t: float, state: np.ndarray) -> list[float]:
         x, y = state
-        return [y, float(drive.P_d * np.cos(drive.Omega * t) - force(x, y)) / m1]
+        return [y, float(rod_acceleration(held, e, t, x, y))]
 
     period = 2.0 * np.pi / drive.Omega
     # The drive begins at its peak: once a slow one's start has died out, nothing larger comes.
@@ -117,7 +119,7 @@ def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, b
     touch = max(0.25 * contact_time(m1, float("inf"), k2), span / HELD_STEPS)
     step = min(period / 40.0, touch)
     run = solve_ivp(rate, (0.0, span), [0.0, 0.0], "LSODA", rtol=HELD_TOLERANCE, atol=1e-10, max_step=step)
-    return float(np.max(np.abs(force(*run.y)))), bool(np.max(run.y[0]) >= drive.G)
+    return float(np.max(np.abs(rod_on_capsule(held, *run.y)))), bool(np.max(run.y[0]) >= drive.G)
 
 
 def contact_time(m1: float, m2: float, k2: float) -> float:

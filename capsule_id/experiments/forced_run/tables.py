@@ -8,6 +8,7 @@ import pandas as pd
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted
+from capsule_id.physics.friction import normal_force
 from capsule_id.records.label import measured_motion
 from capsule_id.views import NoteTable
 
@@ -41,7 +42,7 @@ def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
     m1, m2, k1, k2, c, mu, v_s, G, g = (
         float(getattr(p, name)) for name in ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")
     )
-    Omega0, F_b = np.sqrt(k1 / m1), mu * (m1 + m2) * g
+    Omega0, F_b = np.sqrt(k1 / m1), mu * normal_force(m1, m2, g)
     length, of = F_b / k1, run.label
     return {
         "Omega0, rad/s": Omega0,

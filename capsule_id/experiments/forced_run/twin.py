@@ -9,6 +9,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.declaration import RUN_SPRINGS
 from capsule_id.experiments.kind import Twin, TwinTable, Values
 from capsule_id.parameters import QUANTILE_975
+from capsule_id.physics.forces import rod_acceleration
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, status_message
 
 
@@ -114,9 +115,8 @@ def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, 
     T = np.array([2.0 * np.pi / run.Omega for run in runs])
     time = np.arange(SAMPLES) / RATE
     start = (cuts * T)[:, None]
-    shared = {name: parameters[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
     k2 = np.array([parameters[f"k2[{run.spring}]"] for run in runs])
-    p = CapsuleParameters(**shared, k2=k2, G=np.array([run.G for run in runs]))
+    p = _capsule(parameters, k2, np.array([run.G for run in runs]))
     e = Excitation(np.array([run.P_d for run in runs]), np.array([run.Omega for run in runs]))
     t = simulate(p, e, np.concatenate([np.zeros_like(start), start + time], axis=1))
     if not all(Status(int(code)).usable for code in np.asarray(t.status)):
@@ -126,6 +126,11 @@ def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, 
         _measure(rng, parameters, run, time, state, 2.0 * np.pi * (cut % 1.0))
         for rng, run, state, cut in zip(generators, runs, states, cuts, strict=True)
     ]
+
+
+def _capsule(parameters: Mapping[str, float], k2: float | np.ndarray, G: float | np.ndarray) -> CapsuleParameters:
+    shared = {name: parameters[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
+    return CapsuleParameters(**shared, k2=k2, G=G)
 
 
 def _measure(
@@ -138,15 +143,14 @@ def _measure(
 ) -> SyntheticRun:
     """One run through its sensors: state (4, n) is the exact motion from the cut on."""
     X1, Y1, X2, Y2 = state
-    x_rel, drive = X1 - X2, np.cos(run.Omega * time + phase)
-    contact = parameters[f"k2[{run.spring}]"] * np.maximum(x_rel - run.G, 0.0)
-    force = parameters["k1"] * x_rel + parameters["c"] * (Y1 - Y2) + contact
+    x_rel, e = X1 - X2, Excitation(run.P_d, run.Omega, phase)
+    p = _capsule(parameters, parameters[f"k2[{run.spring}]"], run.G)
     amplitude = run.P_d / parameters["K"]
     exact = {
         "x_rel": x_rel,
         "x_capsule": X2 - X2[0],
-        "acceleration_rod": (run.P_d * drive - force) / parameters["m1"],
-        "current": amplitude * drive,
+        "acceleration_rod": rod_acceleration(p, e, time, x_rel, Y1 - Y2),
+        "current": amplitude * e.cosine(time),
     }
     offsets = {name: float(sd * rng.standard_normal()) for name, sd in OFFSET_SD.items()}
     stated_gap = run.G + GAP_SD * float(rng.standard_normal())

@@ -10,6 +10,7 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.free_vibration.decrement import equilibrium
+from capsule_id.physics.friction import normal_force
 from capsule_id.views import Finding
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def check_free_decay(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fi
     for e in records:
         if e.table.settings.capsule == "free" and "mu" in theta and "m2" in theta:
             force = e.largest_force(theta)
-            threshold = float(theta["mu"] * (theta["m1"] + theta["m2"]) * theta["g"])
+            threshold = float(theta["mu"] * normal_force(theta["m1"], theta["m2"], theta["g"]))
             if force > threshold:
                 text = (
                     f"{e.label}: a free capsule stays at rest while |f| <= F_b = {threshold:.3g} N; the record "

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.friction_curve import FrictionExperiment, friction_coefficient
+from capsule_id.experiments.friction_curve import FrictionExperiment, unit_law
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.sliding_friction.declaration import SLIDING_SCATTER
 from capsule_id.parameters import parameter
+from capsule_id.physics.friction import normal_force
 from capsule_id.rig.model import Rig, Table
 
 
@@ -49,11 +50,11 @@ class SlidingFriction(FrictionExperiment):
         return self.values
 
     def _weight(self, theta: ValuesBySymbol) -> Any:
-        return (theta["m1"] + theta["m2"]) * theta["g"] if self.quantity == "force" else 1.0
+        return normal_force(theta["m1"], theta["m2"], theta["g"]) if self.quantity == "force" else 1.0
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         mu, v_s, weight = theta["mu"], theta["v_s"], self._weight(theta)
-        predicted = weight * friction_coefficient(self.speed, mu, v_s, xp)
+        predicted = weight * unit_law(mu, v_s).forward(self.speed)
         slope = -0.5 * weight * mu * xp.exp(-self.speed / v_s) / v_s
         variance = self.values_sd**2 + (slope * self.speed_sd) ** 2
         return (Misfit(self.values - predicted, variance, predicted, no_design(self.n, xp)),)
@@ -65,7 +66,7 @@ class SlidingFriction(FrictionExperiment):
         m1, m2 = self.rig.m1, self.rig.m2
         assert m1 is not None, "the schema asks for both masses beside a sliding force"
         assert m2 is not None, "the schema asks for both masses beside a sliding force"
-        return self.speed, self.values / ((m1.value + m2.value) * self.rig.g.value)
+        return self.speed, self.values / normal_force(m1.value, m2.value, self.rig.g.value)
 
     def starts(self) -> dict[str, Start]:
         speed, coefficient = self.paper_points()

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from capsule_id.physics.exact.taylor import ORDER, Motion, State, horner, mean
+from capsule_id.physics.exact.taylor import CapsuleState, StepSeries
 from capsule_id.physics.model import Initial
+from capsule_id.physics.series import DEGREE, horner, mean
 
-WIDTH = 4 + 2 * (ORDER + 1)
+WIDTH = 4 + 2 * (DEGREE + 1)
 # Samples of a lane read off at once.
 WINDOW = 64
 
@@ -34,14 +35,14 @@ def samples_at(times: jax.Array, initial: Initial, valid: jax.Array) -> Samples:
     return Samples(padded, values.at[:, :, 0].set(first), jnp.ones(L, jnp.int32))
 
 
-def row_of(state: State, motion: Motion) -> jax.Array:
+def row_of(state: CapsuleState, step: StepSeries) -> jax.Array:
     """(WIDTH, L): the step's polynomial."""
-    return jnp.stack([state.t, motion.h, state.r, state.X2, *motion.w, *motion.v])
+    return jnp.stack([state.t, step.h, state.r, state.X2, *step.w, *step.v])
 
 
 def values_of(row: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """(X1, Y1, X2, Y2) at t from rows (WIDTH, ...)."""
-    w, v = list(row[4 : 5 + ORDER]), list(row[5 + ORDER :])
+    w, v = list(row[4 : 5 + DEGREE]), list(row[5 + DEGREE :])
     s = (t - row[0]) / row[1]
     r, X2 = row[2] + (t - row[0]) * mean(w, s), row[3] + (t - row[0]) * mean(v, s)
     Y2 = horner(v, s)

@@ -1,7 +1,7 @@
 """Changes of mode: where on a step the first one lies, and which mode follows.
 
 In a mode three functions must stay >= 0: the gap's (d in contact, -d out of it) and, while sliding, the velocity in the
-mode's direction, or, while stuck, F_b - f and F_b + f. All are linear in the state, so they are polynomials in s.
+mode's direction, or, while stuck, F_forward - f and F_backward + f. All are linear in the state, so they are polynomials in s.
 """
 
 from typing import NamedTuple
@@ -9,21 +9,23 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from capsule_id.physics.exact.taylor import Mode, Motion, Rig, Series, State, horner, size
+from capsule_id.physics.exact.taylor import CapsuleState, Constants, Mode, StepSeries, rod_force, size
+from capsule_id.physics.friction import sliding_friction
+from capsule_id.physics.series import Series, horner
 
 # Kinds of events.
 NONE, GAP, VELOCITY, UPPER, LOWER = 0, 1, 2, 3, 4
 # The march arrives when its next leap is this small a part of the step, or, at a root that is crossed at a definite
-# rate, when a leap below SURE_LEAP agrees with Newton's to SURE_AGREEMENT: the correction in ``met`` does the rest.
+# rate, when a leap below SURE_LEAP agrees with Newton's to SURE_AGREEMENT: the correction in ``correct`` does the rest.
 LEAP_TOLERANCE = 1e-9
 SURE_LEAP, SURE_AGREEMENT = 1e-3, 1e-4
 # Leaps on one step. Where they do not suffice (a root closely missed) the step ends early, with nothing lost.
 MAX_LEAPS = 100
-# An event is met at a fraction of the step no smaller than this, so that time always goes on; ``met`` steps back.
+# An event is met at a fraction of the step no smaller than this, so that time always goes on; ``correct`` steps back.
 SMALLEST_FRACTION = 1e-9
 # Coefficients of an event function below this part of its size are rounding, where only their sign would matter.
 ROUNDING_NOISE = 1e-14
-# |f| within this many roundings of F_b counts as at the threshold; the rate of |f| then decides.
+# |f| within this many roundings of the break-away force counts as at the threshold; the rate of |f| then decides.
 THRESHOLD_ROUNDINGS = 16.0
 
 
@@ -82,7 +84,7 @@ def _sure(p0: jax.Array, p1: jax.Array, tau: jax.Array) -> jax.Array:
 
 
 def first_event(
-    rig: Rig, mode: Mode, motion: Motion, s_end: jax.Array, active: jax.Array
+    constants: Constants, mode: Mode, step: StepSeries, s_end: jax.Array, active: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """(s, kind): where the step ends and why; s = s_end and NONE if nothing happens before.
 
@@ -90,11 +92,13 @@ def first_event(
     step, so no root can be passed, double ones included.
     """
     sliding = mode.sigma != 0.0
-    level = jnp.where(sliding, 0.0, rig.F_b)
-    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in motion.d], s_end), jnp.zeros_like(level), s_end)
-    speed = _divided([mode.sigma * x for x in motion.v], s_end)
-    # While stuck F_b - f and F_b + f, while sliding sigma Y2, written as level + sign * p.
-    other = _watched([jnp.where(sliding, a, -b) for a, b in zip(speed, motion.f, strict=True)], level, s_end)
+    middle = 0.5 * (constants.F_forward - constants.F_backward)
+    level = jnp.where(sliding, 0.0, 0.5 * (constants.F_forward + constants.F_backward))
+    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in step.d], s_end), jnp.zeros_like(level), s_end)
+    speed = _divided([mode.sigma * x for x in step.v], s_end)
+    # While stuck level - (f - middle) and level + (f - middle), while sliding sigma Y2, written as level + sign * p.
+    force = [step.f[0] - middle, *step.f[1:]]
+    other = _watched([jnp.where(sliding, a, -b) for a, b in zip(speed, force, strict=True)], level, s_end)
     base = level / other.scale
 
     def leap(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -124,32 +128,37 @@ def first_event(
     return jnp.clip(s, SMALLEST_FRACTION * s_end, s_end), kind
 
 
-def motion_at(rig: Rig, state: State, contact: jax.Array, onset: jax.Array) -> jax.Array:
-    """(L,) sigma of the mode that follows from a state: the sign of v or, where v = 0, what |f| and its rate tell.
+def motion_at(constants: Constants, state: CapsuleState, contact: jax.Array, kind: jax.Array) -> jax.Array:
+    """(L,) sigma of the mode that follows from a state: the sign of v or, where v = 0, that of f if it breaks away.
 
-    onset : (L,) bool, the state is at the threshold |f| = F_b of a capsule at rest whatever rounding says
+    kind : (L,) the event; after UPPER or LOWER f is at the threshold of a capsule at rest, whatever rounding says
     """
-    F_b, k2 = rig.F_b, jnp.where(contact, rig.k2, 0.0)
-    spring, damper, support = rig.k1 * state.r, rig.c * state.w, k2 * state.d
+    k2 = jnp.where(contact, constants.k2, 0.0)
+    spring, damper, support = constants.k1 * state.r, constants.c * state.w, k2 * state.d
     f = spring + damper + support
-    f_rate = (rig.k1 + k2) * state.w + rig.c * (rig.P_d * state.C - f) / rig.m1
-    tolerance = (
-        (jnp.abs(spring) + jnp.abs(damper) + jnp.abs(support) + F_b) * THRESHOLD_ROUNDINGS * jnp.finfo(float).eps
-    )
-    at_threshold = onset | (jnp.abs(jnp.abs(f) - F_b) <= tolerance)
-    slips = jnp.where(at_threshold, f * f_rate > 0.0, jnp.abs(f) > F_b)
+    drive = constants.drive.value(state.drive)
+    f_rate = (constants.k1 + k2) * state.w + constants.c * (drive - f) / constants.m1
+    onset = (kind == UPPER) | (kind == LOWER)
+    side = jnp.where(onset, jnp.where(kind == UPPER, 1.0, -1.0), jnp.sign(f))
+    threshold = jnp.where(side < 0.0, constants.F_backward, constants.F_forward)
+    size_of_forces = jnp.abs(spring) + jnp.abs(damper) + jnp.abs(support) + threshold
+    tolerance = size_of_forces * THRESHOLD_ROUNDINGS * jnp.finfo(float).eps
+    at_threshold = onset | (jnp.abs(jnp.abs(f) - threshold) <= tolerance)
+    slips = jnp.where(at_threshold, side * f_rate > 0.0, jnp.abs(f) > threshold)
     # Without friction nothing ever sticks, and a force of zero leaves the direction to its rate, then to the drive's.
-    later = jnp.where(f_rate != 0.0, jnp.sign(f_rate), jnp.where(state.C < 0.0, -1.0, 1.0))
-    direction = jnp.where((F_b == 0.0) & (jnp.abs(f) <= tolerance), later, jnp.sign(f))
-    sigma = jnp.where(slips | (F_b == 0.0), direction, 0.0)
+    free = (constants.F_forward == 0.0) & (constants.F_backward == 0.0)
+    later = jnp.where(f_rate != 0.0, jnp.sign(f_rate), jnp.where(drive < 0.0, -1.0, 1.0))
+    direction = jnp.where(free & (jnp.abs(f) <= tolerance), later, side)
+    sigma = jnp.where(slips | free, direction, 0.0)
     return jnp.where(state.v != 0.0, jnp.sign(state.v), sigma)
 
 
-def mode_at(rig: Rig, state: State) -> Mode:
+def mode_at(constants: Constants, state: CapsuleState) -> Mode:
     """The mode that any state begins in: signs of d, v and, where they are 0, of their first rate that is not."""
     meeting = (state.d > 0.0) | ((state.d == 0.0) & (state.w > 0.0))
-    sigma = motion_at(rig, state, meeting, jnp.zeros(state.d.shape, bool))
-    f = rig.k1 * state.r + rig.c * state.w
-    w_rate = (rig.P_d * state.C - f) / rig.m1 - jnp.where(sigma != 0.0, (f - sigma * rig.F_b) / rig.m2, 0.0)
-    touching = (state.d == 0.0) & (state.w == 0.0) & (w_rate > 0.0)
+    sigma = motion_at(constants, state, meeting, jnp.full(state.d.shape, NONE))
+    f = rod_force(constants, state, jnp.zeros_like(meeting))
+    drive = constants.drive.value(state.drive)
+    a2 = jnp.where(sigma != 0.0, (f - sliding_friction(constants.law, sigma, state.v)) / constants.m2, 0.0)
+    touching = (state.d == 0.0) & (state.w == 0.0) & ((drive - f) / constants.m1 - a2 > 0.0)
     return Mode(meeting | touching, sigma)

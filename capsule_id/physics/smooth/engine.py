@@ -4,7 +4,7 @@
     m2 Y2' = f - friction(Y2, f),           X1' = Y1,  X2' = Y2                       semantics "stick-slip"
     m2 Y2' = gate(f) (f - F_s(Y2)),         X1' = Y1,  X2' = gate(f) Y2               semantics "eq2"
 
-"stick-slip" switches in velocity and force (``forces.friction_smooth``) and tends to the exact model as the widths go
+"stick-slip" switches in velocity and force (``friction_smooth``) and tends to the exact model as the widths go
 to zero. "eq2" switches in force alone, as eq. (2) is printed; it tends to a sliding mode on |f| = F_b, a different
 motion, and is offered so that the difference can be shown.
 """
@@ -17,24 +17,27 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from capsule_id.physics import forces
-from capsule_id.physics.forces import Array, CoulombStribeck, FrictionLaw
-from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Excitation, Initial, Trajectory
+from capsule_id.physics.contacts import support_smooth
+from capsule_id.physics.drive import Drive
+from capsule_id.physics.forces import spring_and_damper
+from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Trajectory, admissible
+from capsule_id.physics.smooth.friction import breakaway, force_gate, friction_smooth
 from capsule_id.physics.smooth.march import Problem
 from capsule_id.physics.smooth.march_tangents import differentiable_run
 from capsule_id.physics.smooth.rosenbrock import Field
+from capsule_id.physics.smooth.steps import Array, smooth_abs, smooth_heaviside
 from capsule_id.precision import require_float64
 
 require_float64()
 
 Semantics = Literal["stick-slip", "eq2"]
-Friction = Callable[[CapsuleParameters], FrictionLaw]
 # First step, as a fraction of the fastest time scale known before the run.
 FIRST_STEP = 0.05
 # A step never spans more than this angle of the drive (rad), so that no pair of stages can alias it.
 DRIVE_ANGLE = 0.5
-# (p, e, smoothing): what the field depends on, so what a derivative can be taken in.
-Theta = tuple[CapsuleParameters, Excitation, "Smoothing"]
+# (p, e, law, smoothing): what the field depends on, so what a derivative can be taken in.
+System = tuple[CapsuleParameters, Drive, FrictionLaw, "Smoothing"]
 
 
 @jax.tree_util.register_dataclass
@@ -58,86 +61,83 @@ class Smoothing:
     tolerance: Array = 2e-5
 
 
-def stick_slip_field(theta: Theta, friction: Friction) -> Field:
+def stick_slip_field(system: System) -> Field:
     """The field whose limit is the exact model."""
-    p, e, widths = theta
-    law = friction(p)
-    F_b = forces.breakaway(law)
+    p, e, law, widths = system
+    F_b = breakaway(law)
 
     def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         f = _rod_on_capsule(p, widths, r, Y1 - Y2)
-        held = forces.friction_smooth(law, F_b, Y2, f, (widths.velocity, widths.rounding))
-        return (_drive(e, t) - f) / p.m1, Y2, (f - held) / p.m2
+        held = friction_smooth(law, F_b, Y2, f, (widths.velocity, widths.rounding))
+        return (e.force(t) - f) / p.m1, Y2, (f - held) / p.m2
 
     return field
 
 
-def eq2_field(theta: Theta, friction: Friction) -> Field:
+def eq2_field(system: System) -> Field:
     """The field of eq. (2) to the letter, with its force gate smoothed over ``rounding``: for comparison only."""
-    p, e, widths = theta
-    law = friction(p)
-    F_b = forces.breakaway(law)
+    p, e, law, widths = system
+    F_b = breakaway(law)
 
     def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         f = _rod_on_capsule(p, widths, r, Y1 - Y2)
-        gate = forces.force_gate(law, F_b, f, widths.rounding)
-        forth = forces.smooth_heaviside(Y2, widths.velocity)
-        speed = forces.smooth_abs(Y2, widths.velocity)
+        gate = force_gate(law, F_b, f, widths.rounding)
+        forth = smooth_heaviside(Y2, widths.velocity)
+        speed = smooth_abs(Y2, widths.velocity)
         sliding = forth * law.forward(speed) - (1.0 - forth) * law.backward(speed)
-        return (_drive(e, t) - f) / p.m1, gate * Y2, gate * (f - sliding) / p.m2
+        return (e.force(t) - f) / p.m1, gate * Y2, gate * (f - sliding) / p.m2
 
     return field
 
 
-def _drive(e: Excitation, t: jax.Array) -> jax.Array:
-    return jnp.asarray(e.P_d) * jnp.cos(e.Omega * t + e.phase)
+def _rod_on_capsule(p: CapsuleParameters, widths: Smoothing, r: jax.Array, w: jax.Array) -> jax.Array:
+    k2, G = jnp.asarray(p.k2), jnp.asarray(p.G)
+    return spring_and_damper(p, r, w) + support_smooth(k2, G, r, widths.penetration)
 
 
-def _rod_on_capsule(p: CapsuleParameters, widths: Smoothing, r: jax.Array, v: jax.Array) -> jax.Array:
-    k1, c, k2, G = (jnp.asarray(leaf) for leaf in (p.k1, p.c, p.k2, p.G))
-    return forces.spring(k1, r) + forces.damper(c, v) + forces.support_smooth(k2, G, r, widths.penetration)
-
-
-def _valid(theta: Theta) -> jax.Array:
-    p, e, widths = theta
-    positive = (p.m1, p.m2, p.v_s, widths.velocity, widths.penetration, widths.rounding, widths.tolerance)
-    not_negative = (p.k1, p.k2, p.c, p.mu, p.g, p.G)
-    ok = jnp.isfinite(e.P_d) & jnp.isfinite(e.Omega) & jnp.isfinite(e.phase)
-    for leaf in positive:
-        ok = ok & jnp.isfinite(leaf) & (jnp.asarray(leaf) > 0.0)
-    for leaf in not_negative:
-        ok = ok & jnp.isfinite(leaf) & (jnp.asarray(leaf) >= 0.0)
+def _valid(system: System) -> jax.Array:
+    p, e, law, widths = system
+    ok = admissible(p, e, law)
+    for width in vars(widths).values():
+        ok = ok & jnp.isfinite(width) & (width > 0.0)
     return ok
 
 
-def _problem(theta: Theta, semantics: Semantics, friction: Friction) -> Problem:
-    p, e, widths = theta
+def _problem(system: System, semantics: Semantics) -> Problem:
+    p, e, law, widths = system
     lightness = 1.0 / p.m1 + 1.0 / p.m2
-    # Rates of springs, damper, drive and Stribeck curve, 1/s; the switch's own rate needs no small first step.
-    fastest = jnp.sqrt((p.k1 + p.k2) * lightness) + p.c * lightness + jnp.abs(e.Omega) + p.g / p.v_s
+    # Rates of springs, damper, drive and friction, 1/s; the switch's own rate needs no small first step.
+    resistance, slope = jax.jvp(law.forward, (jnp.zeros_like(p.m1),), (jnp.ones_like(p.m1),))
+    friction_rate = 2.0 * p.g * jnp.abs(slope) / jnp.where(resistance > 0.0, resistance, jnp.inf)
+    fastest = jnp.sqrt((p.k1 + p.k2) * lightness) + p.c * lightness + e.rate() + friction_rate
     return Problem(
-        field=(stick_slip_field if semantics == "stick-slip" else eq2_field)(theta, friction),
+        field=(stick_slip_field if semantics == "stick-slip" else eq2_field)(system),
         gap=jnp.asarray(p.G),
         first=FIRST_STEP / fastest,
-        longest=DRIVE_ANGLE / jnp.abs(e.Omega),
+        longest=DRIVE_ANGLE / e.rate(),
         floors=(jnp.asarray(widths.velocity), jnp.asarray(widths.penetration)),
         tolerance=jnp.asarray(widths.tolerance),
-        valid=_valid(theta),
+        valid=_valid(system),
     )
 
 
 @lru_cache(maxsize=32)
-def _compiled(semantics: Semantics, max_steps: int, friction: Friction) -> Callable[..., Trajectory]:
-    march = differentiable_run(partial(_problem, semantics=semantics, friction=friction), max_steps)
+def _compiled(semantics: Semantics, max_steps: int) -> Callable[..., Trajectory]:
+    march = differentiable_run(partial(_problem, semantics=semantics), max_steps)
 
     @jax.jit
     def lanes(
-        smoothing: Smoothing, p: CapsuleParameters, e: Excitation, times: jax.Array, initial: Initial
+        smoothing: Smoothing,
+        p: CapsuleParameters,
+        e: Drive,
+        law: FrictionLaw,
+        initial: Initial,
+        times: jax.Array,
     ) -> Trajectory:
         shape = times.shape[:1]
-        theta = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), shape), (p, e, smoothing))
+        system = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), shape), (p, e, law, smoothing))
         times = jnp.asarray(times, float)
-        record = march(theta, times, jnp.stack(initial))
+        record = march(system, times, jnp.stack(initial))
         X1, Y1, X2, Y2 = record.samples
         none = jnp.zeros_like(record.steps)
         return Trajectory(times, X1, Y1, X2, Y2, record.closings, record.status, record.steps, none)
@@ -146,15 +146,11 @@ def _compiled(semantics: Semantics, max_steps: int, friction: Friction) -> Calla
 
 
 def kernel(
-    smoothing: Smoothing | None = None,
-    semantics: Semantics = "stick-slip",
-    max_steps: int = MAX_STEPS,
-    friction: Friction = CoulombStribeck.of,
+    smoothing: Smoothing | None = None, semantics: Semantics = "stick-slip", max_steps: int = MAX_STEPS
 ) -> Callable[..., Trajectory]:
-    """The smoothed engine on lanes: ``(p, e, times, initial) -> Trajectory``, see ``model.simulate``.
+    """The smoothed engine on lanes: ``(p, e, law, initial, times) -> Trajectory``, see ``model.simulate``.
 
     smoothing : widths, default the certified ones; they are traced, so that new widths need no compilation
     max_steps : bound on the steps that a lane may try
-    friction : from the parameters to a friction law; a function at module level, so that it compiles once
     """
-    return partial(_compiled(semantics, max_steps, friction), smoothing or Smoothing())
+    return partial(_compiled(semantics, max_steps), smoothing or Smoothing())

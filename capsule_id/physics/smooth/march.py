@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from capsule_id.physics.model import Status
-from capsule_id.physics.smooth.rosenbrock import Field, State, step, step_factor
+from capsule_id.physics.smooth.rosenbrock import Field, StateArray, step, step_factor
 
 # Steps between two interpolations of samples: one or two segments hold ten periods; 64 lanes of them fill 5 MB.
-SEGMENT = 2048
+STEPS_PER_SEGMENT = 2048
 # A lane whose step is rejected as not finite below this fraction of its time cannot be saved by a smaller step.
 _LEAST_STEP = 1e-13
 
@@ -33,14 +33,14 @@ class Problem(NamedTuple):
     valid: jax.Array  # bool: whether the lane may start
 
 
-Build = Callable[[Any], Problem]  # from theta, the pytree in which a run is differentiated
+Build = Callable[[Any], Problem]  # from system, the pytree in which a run is differentiated
 
 
-class Lanes(NamedTuple):
+class MarchState(NamedTuple):
     """Where every lane stands: y is (4, L), the others (L,)."""
 
     t: jax.Array
-    y: State
+    y: StateArray
     h: jax.Array
     speed: jax.Array  # largest |velocity| so far: the scale of the error in velocity
     stretch: jax.Array  # largest |r| so far: the scale of the error in r
@@ -58,23 +58,23 @@ class Record(NamedTuple):
     status: jax.Array
 
 
-def _grown(speed: jax.Array, stretch: jax.Array, y: State) -> tuple[jax.Array, jax.Array]:
+def _grown(speed: jax.Array, stretch: jax.Array, y: StateArray) -> tuple[jax.Array, jax.Array]:
     largest = jnp.maximum(jnp.abs(y[1]), jnp.abs(y[3]))
     return jnp.maximum(speed, largest), jnp.maximum(stretch, jnp.abs(y[0] - y[2]))
 
 
-def start(problem: Problem, times: jax.Array, y: State) -> Lanes:
-    """Lanes at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
+def initial_lanes(problem: Problem, times: jax.Array, y: StateArray) -> MarchState:
+    """MarchState at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
     t = times[:, 0]
     floors = [jnp.broadcast_to(floor, t.shape) for floor in problem.floors]
     speed, stretch = _grown(floors[0], floors[1], y)
     finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(y), axis=0)
     status = jnp.where(finite & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
     zero = jnp.zeros(t.shape, jnp.int32)
-    return Lanes(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, zero, status)
+    return MarchState(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, zero, status)
 
 
-def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> Lanes:
+def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int) -> MarchState:
     """Try one step in every lane that is still running."""
     t, y = lanes.t, lanes.y
     active = (t < end) & (lanes.status == Status.OK)
@@ -96,7 +96,7 @@ def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> 
     hopeless = active & ~jnp.isfinite(error) & (h < _LEAST_STEP * (jnp.abs(t) + jnp.abs(end)))
     status = jnp.where(hopeless, Status.NOT_FINITE, lanes.status)
     status = jnp.where(active & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
-    return Lanes(
+    return MarchState(
         t=t_new,
         y=jnp.where(accepted, y_new, y),
         h=jnp.where(active, h_next, lanes.h),
@@ -108,31 +108,31 @@ def _advance(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int) -> 
     )
 
 
-def running(end: jax.Array, lanes: Lanes) -> jax.Array:
+def running(end: jax.Array, lanes: MarchState) -> jax.Array:
     """Whether any lane has to go on."""
     return jnp.any((lanes.t < end) & (lanes.status == Status.OK))
 
 
 def segment(
     build: Build,
-    theta: Any,
+    system: Any,
     end: jax.Array,
-    lanes: Lanes,
+    lanes: MarchState,
     max_steps: int,
     length: int,
-) -> tuple[jax.Array, Lanes]:
+) -> tuple[jax.Array, MarchState]:
     """Try up to ``length`` steps; the rows (t, X1, Y1, X2, Y2) on the way, and where the lanes then stand.
 
-    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of theta is (L,). Under ``jax.vmap`` the
+    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of system is (L,). Under ``jax.vmap`` the
     new axis joins the lanes: batching the loop itself would copy all rows in every step.
     """
 
     @jax.custom_batching.custom_vmap
-    def march(theta: Any, end: jax.Array, lanes: Lanes) -> tuple[jax.Array, Lanes]:
-        return _segment(build(theta), end, lanes, max_steps, length)
+    def march(system: Any, end: jax.Array, lanes: MarchState) -> tuple[jax.Array, MarchState]:
+        return _segment(build(system), end, lanes, max_steps, length)
 
     @march.def_vmap
-    def _(size: int, batched: Any, *inputs: Any) -> tuple[Any, Any]:
+    def _(size: int, batched: Any, *given: Any) -> tuple[Any, Any]:
         def join(leaf: jax.Array, has_axis: bool) -> jax.Array:
             leaf = leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
             leaf = jnp.moveaxis(leaf, 0, -2)
@@ -141,24 +141,26 @@ def segment(
         def split(leaf: jax.Array) -> jax.Array:
             return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], size, -1), -2, 0)
 
-        theta, end, lanes = jax.tree.map(join, inputs, tuple(batched))
-        result = jax.tree.map(split, segment(build, theta, end, lanes, max_steps, length))
+        system, end, lanes = jax.tree.map(join, given, tuple(batched))
+        result = jax.tree.map(split, segment(build, system, end, lanes, max_steps, length))
         return result, jax.tree.map(lambda _: True, result)
 
-    return march(theta, end, lanes)
+    return march(system, end, lanes)
 
 
-def _segment(problem: Problem, end: jax.Array, lanes: Lanes, max_steps: int, length: int) -> tuple[jax.Array, Lanes]:
-    def put(rows: jax.Array, i: jax.Array, lanes: Lanes) -> jax.Array:
+def _segment(
+    problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int, length: int
+) -> tuple[jax.Array, MarchState]:
+    def put(rows: jax.Array, i: jax.Array, lanes: MarchState) -> jax.Array:
         row = jnp.concatenate([lanes.t[None], lanes.y])
         return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
 
-    def body(carry: tuple[jax.Array, jax.Array, Lanes]) -> tuple[jax.Array, jax.Array, Lanes]:
+    def body(carry: tuple[jax.Array, jax.Array, MarchState]) -> tuple[jax.Array, jax.Array, MarchState]:
         i, rows, lanes = carry
         lanes = _advance(problem, end, lanes, max_steps)
         return i + 1, put(rows, i + 1, lanes), lanes
 
-    def more(carry: tuple[jax.Array, jax.Array, Lanes]) -> jax.Array:
+    def more(carry: tuple[jax.Array, jax.Array, MarchState]) -> jax.Array:
         return (carry[0] < length) & running(end, carry[2])
 
     rows = put(jnp.full((length + 1, 5, *end.shape), jnp.inf), jnp.int32(0), lanes)
@@ -193,23 +195,23 @@ def _interpolate(t: jax.Array, y: jax.Array, V2: jax.Array, times: jax.Array) ->
 def interpolate(field: Field, t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
     """States (4, L, n) at ``times`` (L, n), from rows t (N, L) and y (N, 4, L) of a march through ``field``."""
     V2 = field(t, y[:, 0] - y[:, 2], y[:, 1], y[:, 3])[1]
-    # Lanes stand last in rows, first in times: rows are written by lane, times are searched by lane.
+    # MarchState stand last in rows, first in times: rows are written by lane, times are searched by lane.
     return jax.vmap(_interpolate, in_axes=(1, 2, 1, 0), out_axes=1)(t, y, V2, times)
 
 
-def inside(rows: jax.Array, lanes: Lanes, times: jax.Array) -> jax.Array:
+def inside(rows: jax.Array, lanes: MarchState, times: jax.Array) -> jax.Array:
     """Which samples (L, n) fall into the segment that led to ``lanes``."""
     return (times > rows[0, 0][:, None]) & (times <= lanes.t[:, None])
 
 
-def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) -> Record:
+def run(build: Build, system: Any, times: jax.Array, y: StateArray, max_steps: int) -> Record:
     """March all lanes from times[:, 0] to times[:, -1]; samples after a lane's failure are NaN. No derivatives."""
     end = times[:, -1]
-    problem = build(theta)
-    lanes = start(problem, times, y)
+    problem = build(system)
+    lanes = initial_lanes(problem, times, y)
 
-    def body(carry: tuple[Lanes, jax.Array]) -> tuple[Lanes, jax.Array]:
-        rows, lanes = segment(build, theta, end, carry[0], max_steps, SEGMENT)
+    def body(carry: tuple[MarchState, jax.Array]) -> tuple[MarchState, jax.Array]:
+        rows, lanes = segment(build, system, end, carry[0], max_steps, STEPS_PER_SEGMENT)
         return lanes, jnp.where(
             inside(rows, lanes, times), interpolate(problem.field, rows[:, 0], rows[:, 1:], times), carry[1]
         )
@@ -222,34 +224,34 @@ def run(build: Build, theta: Any, times: jax.Array, y: State, max_steps: int) ->
 
 def checkpoints(
     build: Build,
-    theta: Any,
+    system: Any,
     times: jax.Array,
-    y: State,
+    y: StateArray,
     max_steps: int,
     length: int,
-) -> tuple[jax.Array, Lanes]:
+) -> tuple[jax.Array, MarchState]:
     """The number of segments of a run, and the lanes at the start of each, (segments, L) each. No derivatives."""
     end = times[:, -1]
-    lanes = start(build(theta), times, y)
+    lanes = initial_lanes(build(system), times, y)
     store = jax.tree.map(lambda leaf: jnp.zeros((-(-max_steps // length), *leaf.shape), leaf.dtype), lanes)
 
-    def body(carry: tuple[jax.Array, Lanes, Lanes]) -> tuple[jax.Array, Lanes, Lanes]:
+    def body(carry: tuple[jax.Array, MarchState, MarchState]) -> tuple[jax.Array, MarchState, MarchState]:
         k, lanes, store = carry
         store = jax.tree.map(lambda rows, leaf: rows.at[k].set(leaf), store, lanes)
-        return k + 1, segment(build, theta, end, lanes, max_steps, length)[1], store
+        return k + 1, segment(build, system, end, lanes, max_steps, length)[1], store
 
     count, _, store = jax.lax.while_loop(lambda c: running(end, c[1]), body, (jnp.int32(0), lanes, store))
     return count, store
 
 
-def replay(problem: Problem, y: State, t: jax.Array, times: jax.Array) -> tuple[State, jax.Array]:
+def replay(problem: Problem, y: StateArray, t: jax.Array, times: jax.Array) -> tuple[StateArray, jax.Array]:
     """One segment on its known grid: state at its end and samples (4, L, n); differentiable in the problem and y.
 
     t : (steps + 1, L), the times of the tried steps; no step where the time did not grow.
     """
 
     @jax.checkpoint
-    def one(y: State, span: tuple[jax.Array, jax.Array]) -> tuple[State, State]:
+    def one(y: StateArray, span: tuple[jax.Array, jax.Array]) -> tuple[StateArray, StateArray]:
         t, h = span
         taken = jnp.isfinite(h) & (h > 0.0)
         y = jnp.where(taken, step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)

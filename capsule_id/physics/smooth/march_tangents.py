@@ -18,21 +18,21 @@ import jax.numpy as jnp
 
 from capsule_id.physics.smooth.march import (
     Build,
-    Lanes,
+    MarchState,
     Record,
     checkpoints,
+    initial_lanes,
     inside,
     replay,
     run,
     running,
     segment,
-    start,
 )
-from capsule_id.physics.smooth.rosenbrock import State, derivative
+from capsule_id.physics.smooth.rosenbrock import StateArray, derivative
 
-# Steps per checkpoint: the sweeps hold that many states at a time, and at most that many idle steps at the end.
-SEGMENT = 256
-Tangent = tuple[Any, State]  # of (theta, initial state)
+# The sweeps hold that many states at a time, and at most that many idle steps at the end.
+STEPS_PER_CHECKPOINT = 256
+Tangent = tuple[Any, StateArray]  # of (system, initial state)
 
 
 @jax.custom_jvp
@@ -47,44 +47,46 @@ def _refuse(_primals: tuple[Any], _tangents: tuple[Any]) -> Any:
 
 def _tangent_maps(
     build: Build,
-    inputs: tuple[Any, jax.Array, State],
+    inputs: tuple[Any, jax.Array, StateArray],
     max_steps: int,
 ) -> tuple[Callable[[Tangent], jax.Array], Callable[[jax.Array], Tangent]]:
-    """The linear map from tangents of (theta, initial state) to those of the samples (4, L, n), and its transpose."""
-    theta, times, y = inputs
+    """The linear map from tangents of (system, initial state) to those of the samples (4, L, n), and its transpose."""
+    system, times, y = inputs
     end = times[:, -1]
 
-    def piece(begin: Lanes) -> tuple[Callable[[Any, State], tuple[State, jax.Array]], Lanes, jax.Array]:
-        """The segment from ``begin`` as a function of (theta, state there), its end, and which samples it holds."""
-        rows, lanes = segment(build, theta, end, begin, max_steps, SEGMENT)
+    def piece(
+        begin: MarchState,
+    ) -> tuple[Callable[[Any, StateArray], tuple[StateArray, jax.Array]], MarchState, jax.Array]:
+        """The segment from ``begin`` as a function of (system, state there), its end, and which samples it holds."""
+        rows, lanes = segment(build, system, end, begin, max_steps, STEPS_PER_CHECKPOINT)
         return lambda a, b: replay(build(a), b, rows[:, 0], times), lanes, inside(rows, lanes, times)
 
     def forward(tangent: Tangent) -> jax.Array:
-        def body(carry: tuple[Lanes, State, jax.Array]) -> tuple[Lanes, State, jax.Array]:
+        def body(carry: tuple[MarchState, StateArray, jax.Array]) -> tuple[MarchState, StateArray, jax.Array]:
             lanes, d_y, out = carry
             function, after, held = piece(lanes)
-            d_y, d_samples = jax.jvp(function, (theta, lanes.y), (tangent[0], d_y))[1]
+            d_y, d_samples = jax.jvp(function, (system, lanes.y), (tangent[0], d_y))[1]
             return after, d_y, jnp.where(held, d_samples, out)
 
         first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(tangent[1])
-        carry = (start(build(theta), times, y), tangent[1], first)
+        carry = (initial_lanes(build(system), times, y), tangent[1], first)
         return jax.lax.while_loop(lambda c: running(end, c[0]), body, carry)[2]
 
     def backward(cotangent: jax.Array) -> Tangent:
-        count, store = checkpoints(build, theta, times, y, max_steps, SEGMENT)
+        count, store = checkpoints(build, system, times, y, max_steps, STEPS_PER_CHECKPOINT)
 
-        def body(carry: tuple[jax.Array, Any, State]) -> tuple[jax.Array, Any, State]:
-            k, c_theta, c_y = carry
+        def body(carry: tuple[jax.Array, Any, StateArray]) -> tuple[jax.Array, Any, StateArray]:
+            k, c_system, c_y = carry
             begin = jax.tree.map(lambda rows: rows[k - 1], store)
             function, _, held = piece(begin)
-            more, c_y = jax.vjp(function, theta, begin.y)[1]((c_y, jnp.where(held, cotangent, 0.0)))
-            return k - 1, jax.tree.map(jnp.add, c_theta, more), c_y
+            more, c_y = jax.vjp(function, system, begin.y)[1]((c_y, jnp.where(held, cotangent, 0.0)))
+            return k - 1, jax.tree.map(jnp.add, c_system, more), c_y
 
-        none = jax.tree.map(jnp.zeros_like, (theta, y))
-        _, c_theta, c_y = jax.lax.while_loop(lambda c: c[0] > 0, body, (count, *none))
+        none = jax.tree.map(jnp.zeros_like, (system, y))
+        _, c_system, c_y = jax.lax.while_loop(lambda c: c[0] > 0, body, (count, *none))
         # A lane that has failed has NaN cotangents at samples that no segment holds.
         poison = jnp.where(jnp.any(jnp.isnan(cotangent), axis=(0, 2)), jnp.nan, 0.0)
-        return jax.tree.map(lambda leaf: leaf + poison, (c_theta, c_y + cotangent[:, :, 0]))
+        return jax.tree.map(lambda leaf: leaf + poison, (c_system, c_y + cotangent[:, :, 0]))
 
     return forward, backward
 
@@ -95,7 +97,7 @@ def _apply_linear(
     """``forward(tangent)``, transposed by ``backward``.
 
     JAX's carrier of a linear map with a transpose of one's own that also batches is ``custom_linear_solve``: the
-    solution of [[1, 0], [-T, 1]] (u, v) = (tangent, 0) is (tangent, T tangent). Its ``matvec`` is consulted only for
+    solution of [[1, 0], [-T, 1]] (u, v) = (tangent, 0) is (tangent, T tangent). Its ``matvec`` is used only for
     derivatives of the matrix, so for second derivatives, which ``_first_order_only`` refuses; the identity stands in.
     """
 
@@ -113,28 +115,30 @@ def _apply_linear(
     return jax.lax.custom_linear_solve(lambda u: u, right_hand_side, solve, transposed)[1]
 
 
-def differentiable_run(build: Build, max_steps: int) -> Callable[[Any, jax.Array, State], Record]:
-    """``march.run`` with first derivatives in theta, times and the initial state, forward and reverse mode.
+def differentiable_run(build: Build, max_steps: int) -> Callable[[Any, jax.Array, StateArray], Record]:
+    """``march.run`` with first derivatives in system, times and the initial state, forward and reverse mode.
 
     A lane that fails has NaN derivatives wherever its samples are NaN.
     """
 
     @jax.custom_jvp
-    def function(theta: Any, times: jax.Array, y: State) -> Record:
-        return run(build, theta, times, y, max_steps)
+    def function(system: Any, times: jax.Array, y: StateArray) -> Record:
+        return run(build, system, times, y, max_steps)
 
     @function.defjvp
-    def _(primals: tuple[Any, jax.Array, State], tangents: tuple[Any, jax.Array, State]) -> tuple[Record, Record]:
+    def _(
+        primals: tuple[Any, jax.Array, StateArray], tangents: tuple[Any, jax.Array, StateArray]
+    ) -> tuple[Record, Record]:
         record = function(*primals)
-        theta, times, y = _first_order_only(primals)
-        d_theta, d_times, d_y = tangents
+        system, times, y = _first_order_only(primals)
+        d_system, d_times, d_y = tangents
         samples = _first_order_only(record.samples)
-        field = build(jax.tree.map(lambda leaf: leaf[..., None], theta)).field
+        field = build(jax.tree.map(lambda leaf: leaf[..., None], system)).field
         rate = derivative(field, times, samples)
         # A later start from the same state is the same start from a state moved back along the field.
         d_y = d_y - rate[:, :, 0] * d_times[:, 0]
-        forward, backward = _tangent_maps(build, (theta, times, y), max_steps)
-        d_samples = _apply_linear(forward, backward, (d_theta, d_y), samples) + rate * d_times
+        forward, backward = _tangent_maps(build, (system, times, y), max_steps)
+        d_samples = _apply_linear(forward, backward, (d_system, d_y), samples) + rate * d_times
         d_samples = d_samples * jnp.where(jnp.isfinite(samples), 1.0, jnp.nan)
         counts = [jnp.zeros(leaf.shape, jax.dtypes.float0) for leaf in record[1:]]
         return record, Record(d_samples, *counts)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-State = jax.Array  # (4, L): X1, Y1, X2, Y2 of L lanes, m and m/s
+StateArray = jax.Array  # (4, L): X1, Y1, X2, Y2 of L lanes, m and m/s
 # (t, r, Y1, Y2) -> (Y1', X2', Y2'): the field depends on the positions through r = X1 - X2 alone, and X1' = Y1.
 Field = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
 
@@ -22,13 +22,15 @@ _GAMMA = 0.5
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 5.0
 
 
-def derivative(field: Field, t: jax.Array, y: State) -> State:
+def derivative(field: Field, t: jax.Array, y: StateArray) -> StateArray:
     """dy/dt, (4, L)."""
     Y1_rate, X2_rate, Y2_rate = field(t, y[0] - y[2], y[1], y[3])
     return jnp.stack([y[1], Y1_rate, X2_rate, Y2_rate])
 
 
-def _stage_solver(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[Callable[[State], State], State]:
+def _stage_solver(
+    field: Field, t: jax.Array, y: StateArray, h: jax.Array
+) -> tuple[Callable[[StateArray], StateArray], StateArray]:
     """Solver of (1 / (gamma h) - J) u = b with the exact Jacobian J at (t, y), and the partial derivative in time."""
     at = (t, y[0] - y[2], y[1], y[3])
     directions = tuple(jnp.broadcast_to(row[:, None], (4, *t.shape)) for row in jnp.eye(4))
@@ -42,7 +44,7 @@ def _stage_solver(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[C
     m21, m22 = -b_1 - b_r * r_1, d - b_2 - b_r * r_2
     determinant = m11 * m22 - m12 * m21
 
-    def solve(b: State) -> State:
+    def solve(b: StateArray) -> StateArray:
         r_0 = (b[0] - b[2]) * r_inverse
         c1, c2 = b[1] + a_r * r_0, b[3] + b_r * r_0
         u1, u2 = (m22 * c1 - m12 * c2) / determinant, (m11 * c2 - m21 * c1) / determinant
@@ -52,8 +54,8 @@ def _stage_solver(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[C
     return solve, jnp.stack([jnp.zeros_like(t), a_t, q_t, b_t])
 
 
-def step(field: Field, t: jax.Array, y: State, h: jax.Array) -> tuple[State, State]:
-    """State at t + h and its error estimate, (4, L) each.
+def step(field: Field, t: jax.Array, y: StateArray, h: jax.Array) -> tuple[StateArray, StateArray]:
+    """StateArray at t + h and its error estimate, (4, L) each.
 
     RODAS3 (Sandu et al. 1997, "Benchmarking stiff ODE solvers for atmospheric chemistry problems II"): four stages,
     three evaluations of the field, order 3 with an embedded method of order 2, both stiffly accurate and L-stable:

@@ -12,6 +12,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
+from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.static_friction.declaration import TILT_SD
 from capsule_id.inference.target.log_posterior import LogPosterior

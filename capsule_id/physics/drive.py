@@ -1,0 +1,146 @@
+"""The drive on the rod: the force at any time, and what a Taylor step needs of it.
+
+A drive is a frozen pytree with the methods of ``Drive``; both engines, the energy balance and the sensors use nothing
+else. Its ``parameters`` are the rows of the parameter table that name its leaves and state what they admit.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from capsule_id.parameters import DRIVE_LEAVES, Parameter
+from capsule_id.physics.batches import Leaf, array_module
+from capsule_id.physics.series import Series
+from capsule_id.precision import require_float64
+
+require_float64()
+
+
+class Drive(Protocol):
+    """A force on the rod as a function of time, analytic in time.
+
+    A drive that switches also needs the next switching time after t: ``exact.engine.take_step`` then ends a step there.
+    """
+
+    parameters: ClassVar[tuple[Parameter, ...]]
+
+    def force(self, t: Any) -> Any:
+        """Force in N at the times t, s; leaves and t broadcast; NumPy and JAX."""
+        ...
+
+    def rate(self) -> jax.Array:
+        """(L,) 1/s, how fast the force changes: it bounds the first guess of a step."""
+        ...
+
+    def state(self, t: jax.Array) -> tuple[jax.Array, ...]:
+        """What the exact engine carries along at the time t (L,); every entry (L,)."""
+        ...
+
+    def value(self, state: tuple[jax.Array, ...]) -> jax.Array:
+        """(L,) force in N in this state."""
+        ...
+
+    def shifted(self, state: tuple[jax.Array, ...], dt: jax.Array) -> tuple[jax.Array, ...]:
+        """First-order change of the state over dt (L,), s: it carries the tangent of an event's time."""
+        ...
+
+    def series(self, state: tuple[jax.Array, ...], h: jax.Array, order: int) -> Series:
+        """Coefficients 0 .. order - 1 of the force in N, in the scaled time s = (t - t0)/h."""
+        ...
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Excitation:
+    """The drive P_d cos(Omega t + phase) on the rod: P_d in N, Omega in rad/s, phase in rad; leaves () or (batch,)."""
+
+    P_d: Leaf
+    Omega: Leaf
+    phase: Leaf = 0.0
+
+    parameters: ClassVar[tuple[Parameter, ...]] = tuple(DRIVE_LEAVES.values())
+
+    def cosine(self, t: Any) -> Any:
+        """cos(Omega t + phase) at the times t, s."""
+        angle = self.Omega * t + self.phase
+        return array_module(angle).cos(angle)
+
+    def force(self, t: Any) -> Any:
+        """P_d cos(Omega t + phase), N."""
+        return self.P_d * self.cosine(t)
+
+    def rate(self) -> jax.Array:
+        """|Omega|."""
+        return jnp.abs(self.Omega)
+
+    def state(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Cosine and sine of the drive's angle."""
+        return cos_sin(self.Omega * t + self.phase)
+
+    def value(self, state: tuple[jax.Array, ...]) -> jax.Array:
+        """P_d cos(Omega t + phase), N."""
+        return jnp.asarray(self.P_d * state[0])
+
+    def shifted(self, state: tuple[jax.Array, ...], dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The change of cosine and sine over dt, to first order."""
+        cosine, sine = jax.lax.stop_gradient(state)
+        angle = jax.lax.stop_gradient(self.Omega) * dt
+        return state[0] - sine * angle, state[1] + cosine * angle
+
+    def series(self, state: tuple[jax.Array, ...], h: jax.Array, order: int) -> Series:
+        """The coefficients follow from D'' = -Omega^2 D."""
+        _, sine = state
+        angle = jnp.asarray(self.Omega * h)
+        turn = -(angle**2)
+        D: Series = [self.value(state), jnp.asarray(-self.P_d * angle * sine)]
+        for k in range(2, order):
+            D.append(D[k - 2] * turn * (1.0 / (k * (k - 1))))
+        return D
+
+
+# pi/2 in two parts, the first with 33 bits so that its multiples are exact; sine and cosine on |x| <= pi/4 (fdlibm).
+_HALF_PI = (1.57079632673412561417, 6.07710050650619224932e-11)
+_SINE = (
+    1.58969099521155010221e-10,
+    -2.50507602534068634195e-08,
+    2.75573137070700676789e-06,
+    -1.98412698298579493134e-04,
+    8.33333333332248946124e-03,
+    -1.66666666666666324348e-01,
+)
+_COSINE = (
+    -1.13596475577881948265e-11,
+    2.08757232129817482790e-09,
+    -2.75573143513906633035e-07,
+    2.48015872894767294178e-05,
+    -1.38888888888741095749e-03,
+    4.16666666666666019037e-02,
+)
+
+
+@jax.custom_jvp
+def cos_sin(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(cos x, sin x) to 2 ulp for |x| < 1e5; XLA's own cannot be vectorised on a CPU and cost a fifth of a step."""
+    q = jnp.round(x * (2.0 / jnp.pi))
+    y = (x - q * _HALF_PI[0]) - q * _HALF_PI[1]
+    z = y * y
+    sine, cosine = jnp.full_like(z, _SINE[0]), jnp.full_like(z, _COSINE[0])
+    for S, C in zip(_SINE[1:], _COSINE[1:], strict=True):
+        sine, cosine = sine * z + S, cosine * z + C
+    sine, cosine = y + y * z * sine, 1.0 - 0.5 * z + z * z * cosine
+    quadrant = q - 4.0 * jnp.floor(0.25 * q)
+    odd = (quadrant == 1.0) | (quadrant == 3.0)
+    c = jnp.where(odd, sine, cosine) * jnp.where((quadrant == 1.0) | (quadrant == 2.0), -1.0, 1.0)
+    s = jnp.where(odd, cosine, sine) * jnp.where(quadrant >= 2.0, -1.0, 1.0)
+    one = c * c + s * s
+    return c / one, s / one
+
+
+@cos_sin.defjvp
+def _cos_sin_jvp(
+    primals: tuple[jax.Array], tangents: tuple[jax.Array]
+) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    c, s = cos_sin(primals[0])
+    return (c, s), (-s * tangents[0], c * tangents[0])

@@ -1,0 +1,134 @@
+"""Friction between capsule and ground: the law of sliding resistance, the stick-slip rule, the slide to rest.
+
+A friction law is a class with the methods of ``FrictionLaw``. ``simulate(p, e, times, friction=law)`` takes any such
+law, in both engines; nothing else has to be changed. Forces in N, velocities in m/s, masses in kg.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.parameters import TABLE, Parameter
+from capsule_id.physics.batches import Leaf, array_module
+from capsule_id.physics.series import FrictionSeries, Series, divide
+from capsule_id.precision import require_float64
+
+if TYPE_CHECKING:
+    from capsule_id.physics.model import CapsuleParameters
+
+require_float64()
+
+# Gauss-Legendre nodes on (0, 1) for a slide. 48 give 1e-12 relative up to v = 50 v_s (tests: the dilogarithm).
+_POINTS, _HALF_WEIGHTS = np.polynomial.legendre.leggauss(48)
+_NODES, _WEIGHTS = 0.5 * (_POINTS + 1.0), 0.5 * _HALF_WEIGHTS
+
+
+class FrictionLaw(Protocol):
+    """The resistance of the ground, N >= 0, at a sliding speed >= 0, m/s: a frozen pytree without internal state.
+
+    Both methods work elementwise and are analytic on speed >= 0. The value at speed 0 is the break-away force. Leaves
+    are () or (batch,); ``parameters`` has one row per leaf, with the leaf's name as its symbol.
+
+    A law may have a method ``series(sigma, v, breakaway) -> FrictionSeries``, its own Taylor recursion. It is optional
+    and only saves time: without it the exact engine takes the law's derivatives from automatic differentiation.
+    sigma (L,) is the direction, v (L,) m/s the velocity; breakaway are forward(0) and backward(0), each (L,).
+    """
+
+    parameters: ClassVar[tuple[Parameter, ...]]
+
+    def forward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards positive X2, N."""
+        ...
+
+    def backward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards negative X2, N."""
+        ...
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class CoulombStribeck:
+    """The paper's eq. (1): mu/2 (1 + exp(-|Y2| / v_s)) N, both ways; mu in 1, N in N, v_s in m/s.
+
+    At speed 0: F_b = mu N with slope -F_b / (2 v_s). At infinite speed: F_b / 2 with slope 0. With N = 1 N the value
+    is the friction coefficient.
+    """
+
+    mu: Leaf
+    N: Leaf
+    v_s: Leaf
+
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        TABLE["mu"],
+        Parameter("N", "N", "normal force of capsule and rod on the ground", "N", sign="not negative", sampled=False),
+        TABLE["v_s"],
+    )
+
+    def forward(self, speed: Any) -> Any:
+        """Resistance at ``speed``, N; NumPy and JAX."""
+        ratio = -speed / self.v_s
+        return 0.5 * self.mu * self.N * (1.0 + array_module(ratio).exp(ratio))
+
+    def backward(self, speed: Any) -> Any:
+        """Resistance at ``speed``, N: the same both ways."""
+        return self.forward(speed)
+
+    def series(self, sigma: jax.Array, v: jax.Array, breakaway: tuple[jax.Array, jax.Array]) -> FrictionSeries:
+        """Friction along a step: u = exp(-sigma v/v_s) obeys u' = -sigma v' u / v_s, one Cauchy product per order."""
+        sliding = sigma != 0.0
+        half = sigma * (0.5 * breakaway[0])
+        v_s = jnp.where(sliding, -sigma * self.v_s, jnp.inf)
+        u = [jnp.exp(-sigma * v / self.v_s)]
+
+        def rate(acceleration: jax.Array, mass: jax.Array) -> jax.Array:
+            del mass
+            return jnp.where(sliding, u[0] * jnp.abs(acceleration) / self.v_s, 0.0)
+
+        def extend(v: Series) -> jax.Array:
+            k = len(v) - 1
+            product = sum((j * v[j] * u[k - j] for j in range(2, k + 1)), v[1] * u[k - 1])
+            u.append(divide(product, k * v_s))
+            return half * u[k]
+
+        return FrictionSeries(half * (1.0 + u[0]), rate, extend)
+
+
+def normal_force(m1: Any, m2: Any, g: Any) -> Any:
+    """N = (m1 + m2) g, N."""
+    return (m1 + m2) * g
+
+
+def friction_law(p: "CapsuleParameters", friction: FrictionLaw | None = None) -> FrictionLaw:
+    """``friction``, or eq. (1) with the capsule's mu, v_s and weight."""
+    return CoulombStribeck(p.mu, normal_force(p.m1, p.m2, p.g), p.v_s) if friction is None else friction
+
+
+def sliding_friction(law: FrictionLaw, sigma: Any, v: Any) -> jax.Array:
+    """Friction in N with the sign of the direction sigma (+1, -1; 0 gives 0) at the velocity v, m/s."""
+    speed = sigma * v
+    return sigma * jnp.where(sigma < 0.0, law.backward(speed), law.forward(speed))
+
+
+def friction(law: FrictionLaw, Y2: Leaf, f: Leaf) -> jax.Array:
+    """Exact stick-slip rule: the force of the ground on the capsule, N, so that m2 X2'' = f - friction.
+
+    Sliding (Y2 != 0): the law's resistance with the sign of Y2, whatever f.
+    At rest (Y2 = 0): f itself while -backward(0) <= f <= forward(0), so that the capsule stays; else the threshold,
+    so that it sets off in the direction of f.
+    """
+    Y2, f = jnp.asarray(Y2), jnp.asarray(f)
+    still = jnp.zeros_like(Y2)
+    held = jnp.clip(f, -law.backward(still), law.forward(still))
+    return jnp.where(Y2 == 0.0, held, sliding_friction(law, jnp.sign(Y2), Y2))
+
+
+def slide_distance(law: FrictionLaw, mass: Any, speed: Any) -> Any:
+    """Distance, m, of a forward slide from ``speed`` (n,) to rest: the integral of mass u du / forward(u) over 0..speed.
+
+    mass : the sliding mass, kg; the law's leaves are (), NumPy or JAX
+    """
+    u = speed[:, None] * _NODES
+    return mass * speed * ((u / law.forward(u)) @ _WEIGHTS)
