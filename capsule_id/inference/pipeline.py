@@ -72,6 +72,7 @@ def fit_rig(
     findings += [*stage.findings, *_check_together(setting, bench)]
     rng = np.random.default_rng(seeds[2])
     draws = _draws(target, posterior)
+    p_values = {e.label: e.predictive_p([e.local(d) for d in draws], rng) for e in experiments}
     tables = _tables(rig, target, point, posterior, experiments)
     return Result(
         rig=rig,
@@ -80,11 +81,11 @@ def fit_rig(
         point_fit=point,
         posterior=posterior,
         findings=tuple(findings),
-        comparisons=_comparisons(experiments, values, draws, flagged, rng),
+        comparisons=_comparisons(experiments, values, draws, flagged, p_values),
         notes=(
             *run_notes(target, point, posterior, bench, draws),
             *make_notes(setting, findings, flagged, seeds[0]),
-            *_predictive(experiments, draws, rng),
+            *_predictive(experiments, p_values),
         ),
         provenance=_provenance(rig, seed, which),
         groups=_groups(target, experiments, posterior, rng),
@@ -122,10 +123,9 @@ def _comparisons(
     values: Mapping[str, float],
     draws: list[dict[str, float]],
     flagged: Mapping[str, list[int]],
-    rng: np.random.Generator,
+    p_values: Mapping[str, float | None],
 ) -> tuple[Comparison, ...]:
     """Panels with flagged rows marked and predictive p-values filled in."""
-    by_label = {e.label: e for e in experiments}
     panels = []
     for panel in compare(experiments, values, draws):
         points = []
@@ -133,19 +133,15 @@ def _comparisons(
             mask = np.zeros(len(part.x), dtype=bool)
             mask[flagged.get(part.label, [])] = True
             points.append(replace(part, flagged=mask))
-        own = by_label.get(panel.label)
-        p = None if own is None else own.predictive_p([own.local(d) for d in draws], rng)
-        panels.append(replace(panel, points=tuple(points), predictive_p=p))
+        panels.append(replace(panel, points=tuple(points), predictive_p=p_values.get(panel.label)))
     return tuple(panels)
 
 
-def _predictive(
-    experiments: Sequence[Experiment], draws: list[dict[str, float]], rng: np.random.Generator
-) -> list[NoteTable]:
-    """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
-    if not draws:
+def _predictive(experiments: Sequence[Experiment], p_values: Mapping[str, float | None]) -> list[NoteTable]:
+    """Posterior predictive p-value of every experiment, those on the shared friction panel included; [] without draws."""
+    rows = {e.label: (e.kind, e.n, p_values[e.label]) for e in experiments if p_values[e.label] is not None}
+    if not rows:
         return []
-    rows = {e.label: (e.kind, e.n, e.predictive_p([e.local(d) for d in draws], rng)) for e in experiments}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"]).rename_axis("experiment")
     caption = (
         "Chance that a replicate would miss the model by more than the readings do (chi-square discrepancy). Near 0: the "
