@@ -7,11 +7,11 @@ which carries its own digest; the file that emcee writes is never trusted after 
 
 import hashlib
 import time
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-import emcee
 import h5py
+
+from capsule_id.inference.sampling.ensemble import OpenBackend
 
 #: Seconds between two copies.
 SAVE_EVERY = 5.0
@@ -46,9 +46,9 @@ class ChainStore:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def backend(self, name: str) -> emcee.backends.HDFBackend:
-        """Where an ensemble puts its draws."""
-        return _OpenBackend(self._file, name)
+    def backend(self, name: str) -> OpenBackend:
+        """The store of one ensemble's draws."""
+        return OpenBackend(self._file, name)
 
     def between_draws(self) -> None:
         """Copy the file, if the last copy is old enough; to be called while emcee is not writing."""
@@ -63,15 +63,3 @@ class ChainStore:
         temporary.write_bytes(hashlib.sha256(content).digest() + content)
         temporary.replace(self._copy)
         self._next = time.monotonic() + SAVE_EVERY
-
-
-class _OpenBackend(emcee.backends.HDFBackend):
-    """emcee's backend opens its file six times a step; this one keeps it open."""
-
-    def __init__(self, file: h5py.File, name: str) -> None:
-        super().__init__(file.filename, name)
-        self._file = file
-
-    def open(self, mode: str = "r") -> AbstractContextManager[h5py.File]:
-        del mode
-        return nullcontext(self._file)
