@@ -4,7 +4,7 @@ import argparse
 
 from capsule_id.console import say
 from capsule_id.errors import InputError
-from capsule_id.records.text import describe_run, run_warning
+from capsule_id.records.run_description import describe_run, run_warning
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.lint import lint
 from capsule_id.rig.model import Rig, Table

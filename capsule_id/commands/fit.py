@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     # Heavy rooms only now: a wrong folder is answered at once.
     from capsule_id.experiments import make_experiments
     from capsule_id.inference.pipeline import PACKAGES, fit_rig, package_versions
-    from capsule_id.report.text import table_text
+    from capsule_id.report.console_table import table_text
     from capsule_id.report.write import write_result
 
     make_experiments(rig, args.experiments)

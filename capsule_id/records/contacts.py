@@ -34,7 +34,7 @@ _LAW = 5  # unknowns of the linear law
 
 
 @dataclass(frozen=True)
-class Line:
+class ImpactLine:
     """The impact line: x_rel where contacts begin and its sd, m (sensor zero included); scatter of x_rel about it."""
 
     value: float
@@ -49,7 +49,7 @@ class Contacts:
     count : contacts per period of the motion, None where the evidence disagrees
     spikes : counts by ``SPIKE_LEVELS``, () without acceleration
     crossings : counts by ``CROSSING_LEVELS`` at the impact line less 2 of its sd, at it, and at it plus 2 sd
-    gap_seen : the impact line where the record shows it, None where there are too few spikes: then it is the stated gap
+    impact_line : the impact line where the record shows it, None where there are too few spikes: then it is the stated gap
     duration : of the shortest contact, s, None without contacts
     agreeing, cycles : periods of the motion counted singly with the same result, and all that were counted
     reason : why there is no count, or ""
@@ -58,7 +58,7 @@ class Contacts:
     count: int | None
     spikes: tuple[int, ...]
     crossings: tuple[int, ...]
-    gap_seen: Line | None
+    impact_line: ImpactLine | None
     duration: float | None
     agreeing: int
     cycles: int
@@ -103,7 +103,7 @@ def find_contacts(cycle: Cycle) -> Contacts:
     """Count the contacts of a record whose motion has the period ``cycle.period``."""
     push = _push(cycle)
     seen = _impact_line(cycle, push)
-    line = seen or Line(cycle.gap, cycle.gap_sd, cycle.noise_sd)
+    line = seen or ImpactLine(cycle.gap, cycle.gap_sd, cycle.noise_sd)
     single = cycle.x_rel - line.value
     mean, sd = cycle.mean(cycle.x_rel)
     above = [(mean - line.value - shift * line.sd) / (sd * line.scatter) for shift in _LINE_ERRORS]
@@ -188,7 +188,7 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     return below & (distance > _WIDE * _drive(cycle))
 
 
-def _impact_line(cycle: Cycle, push: _Push | None) -> Line | None:
+def _impact_line(cycle: Cycle, push: _Push | None) -> ImpactLine | None:
     """Where the spikes vanish, by regression of x_rel on them."""
     if push is None:
         return None
@@ -210,7 +210,7 @@ def _impact_line(cycle: Cycle, push: _Push | None) -> Line | None:
     residual = x_rel - slope * force - value
     regression_sd = np.std(residual) * np.sqrt((1.0 + force.mean() ** 2 / variance) / count)
     scatter = max(float(np.std(residual / sd)), cycle.noise_sd)
-    return Line(value, float(np.hypot(regression_sd, slope * shared_sd)), scatter)
+    return ImpactLine(value, float(np.hypot(regression_sd, slope * shared_sd)), scatter)
 
 
 def _single_cycles(

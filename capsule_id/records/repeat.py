@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.stats import norm
+
+from capsule_id.records.noise import noise_level
 
 LONGEST = 16  # as ``response`` of the model has it
 #: A repeat leaves at most this share of the motion's rms beyond the noise ...
@@ -20,9 +21,10 @@ FEWEST_PERIODS = 4
 FEWEST_OVERLAP = 2  # periods of the drive that a comparison rests on
 _ERRORS = 5.0  # standard errors of the mean square that count as no more than noise
 _EDGE = 5  # samples at the end where the spline knows one side only
-_ORDER = 6
-_ORDER_GAIN = 30.397368307141327  # sqrt(binomial(12, 6)): sixth differences of unit white noise
-_NOISE_VARIANCE = 12.0  # relative variance of noise_of()**2, times the number of samples (a test measures it)
+_DIFFERENCES = 6  # order of the differences that no motion survives
+_NOISE_VARIANCE = (
+    12.0  # relative variance of that noise level squared, times the number of samples (a test measures it)
+)
 _KERNEL = 30  # half-length of the impulse that shows the spline's gain for noise
 
 
@@ -48,15 +50,6 @@ class Repeat:
     reason: str = ""
 
 
-def noise_of(values: np.ndarray, floor: float = 0.0) -> float:
-    """sd of the white noise on an evenly sampled record (n,), by the median of its sixth differences, at least ``floor``.
-
-    The median leaves out what contacts, a small part of the time, put into them.
-    """
-    differences = np.abs(np.diff(values, _ORDER))
-    return max(float(np.median(differences) / norm.ppf(0.75) / _ORDER_GAIN), floor)
-
-
 def find_period(time: np.ndarray, x_rel: np.ndarray, T: float, floor: float = 0.0) -> Repeat:
     """Smallest number n of drive periods T after which x_rel repeats within its noise.
 
@@ -74,7 +67,7 @@ def find_period(time: np.ndarray, x_rel: np.ndarray, T: float, floor: float = 0.
     """
     step = (time[-1] - time[0]) / (len(time) - 1)
     periods = len(time) * step / T
-    noise_sd = noise_of(x_rel, floor)
+    noise_sd = max(noise_level(x_rel, _DIFFERENCES), floor)
     motion = float(np.sqrt(max(np.var(x_rel) - noise_sd**2, 0.0)))
     spline = CubicSpline(time, x_rel)
     ratios, seen, repeats = [], [], []

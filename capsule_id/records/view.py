@@ -10,8 +10,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from capsule_id.errors import InputError
-from capsule_id.records.columns import stated_gap
 from capsule_id.records.label import MeasuredMotion, measured_motion
+from capsule_id.records.stated_settings import stated_gap
 from capsule_id.rig.filters import gain, sampling_step, savitzky_golay
 from capsule_id.rig.model import Table
 
@@ -98,7 +98,7 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
         section_x_rel=CubicSpline(time, x_rel)(section),
         section_rate=CubicSpline(time, rate)(section),
         gap=stated_gap(table).value,
-        gap_seen=contacts.gap_seen.value if contacts and contacts.gap_seen else None,
+        gap_seen=contacts.impact_line.value if contacts and contacts.impact_line else None,
         force=K * (table["current"] - evidence.drive.offset) if K is not None and evidence.drive else None,
         samples=samples,
         at_drive=_gains(f, step, samples),

@@ -121,7 +121,7 @@ def factor_to_si(unit: str, si: str) -> float:
         raise UnitError(
             f"unit must have the dimension of {si}" if si != "1" else "unit must be 1 (a pure number)", remedy
         )
-    return float(factor)
+    return float(factor)  # pyright: ignore[reportArgumentType]  (pint types every number as Number)
 
 
 def scale(values: Values, factor: float) -> Values:

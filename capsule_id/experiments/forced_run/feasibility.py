@@ -11,6 +11,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from capsule_id.physics.grazing import grazing_load
+from capsule_id.records.tone import tone_at
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.views import Finding
 
@@ -46,15 +47,8 @@ def drive_of(table: Table, K: float) -> Drive:
     if Omega is None:
         Omega = 2.0 * np.pi * float(table.settings["f"])  # type: ignore[arg-type]
     Omega = float(Omega)  # type: ignore[arg-type]
-    P_d = stated.value if isinstance(stated, Quantity) else K * _amplitude(table["time"], table["current"], Omega)
+    P_d = stated.value if isinstance(stated, Quantity) else K * tone_at(table["time"], table["current"], Omega)[0]
     return Drive(Omega, P_d, gap.value)
-
-
-def _amplitude(time: np.ndarray, values: np.ndarray, Omega: float) -> float:
-    """Amplitude of ``values`` (n,) at Omega by least squares, an offset beside it."""
-    design = np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones(len(time))], axis=1)
-    coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
-    return float(np.hypot(coefficients[0], coefficients[1]))
 
 
 def feasibility(table: Table, theta: Mapping[str, float], note: str = "") -> list[Finding]:

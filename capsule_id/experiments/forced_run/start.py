@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from capsule_id.experiments.free_vibration.decrement import noise_level
+from capsule_id.records.noise import noise_level
+from capsule_id.records.tone import tone_at
 
 #: Samples of the polynomials through the start of the record: a straight line tells whether the capsule moves, a
 #: parabola where the rod is and how fast.
@@ -53,14 +54,14 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
     channels : by column name, (n,) each, SI; at least one
     Omega : of the drive, rad/s
     """
-    noise = {name: max(_noise(y), 1e-5 * float(np.ptp(y)), 1e-12) for name, y in channels.items()}
+    noise = {name: max(noise_level(y), 1e-5 * float(np.ptp(y)), 1e-12) for name, y in channels.items()}
     amplitude, phase = float("nan"), 0.0
     if "current" in channels:
-        amplitude, phase = harmonic(time, channels["current"], Omega)
+        amplitude, phase, _ = tone_at(time, channels["current"], Omega)
     elif "x_rel" in channels:
         ratio = Omega / ROD_FREQUENCY
         lag = np.arctan2(2.0 * ROD_DAMPING * ratio, 1.0 - ratio**2)
-        phase = _wrap(harmonic(time, channels["x_rel"], Omega)[1] + lag)
+        phase = _wrap(tone_at(time, channels["x_rel"], Omega)[1] + lag)
     x_rel = rate = 0.0
     if "x_rel" in channels:
         x_rel, rate = _polynomial(time, channels["x_rel"], PARABOLA_SAMPLES, 2)[0]
@@ -78,20 +79,6 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
         if abs(slope) > MOVING * factor * noise["x_capsule"]:
             capsule_rate, kind = slope, "moving"
     return RunStart(kind, x_rel, rate, capsule_rate, length, amplitude, phase, noise)  # type: ignore[arg-type]
-
-
-def _noise(values: np.ndarray) -> float:
-    """sd of white noise from third differences, by their median: a contact or a stop spoils few of them."""
-    if len(values) < 8:
-        return noise_level(values)
-    return float(np.median(np.abs(np.diff(values, 3)))) / (0.6745 * np.sqrt(20.0))
-
-
-def harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> tuple[float, float]:
-    """Amplitude and phase, rad, of amplitude cos(Omega t + phase) + offset by least squares."""
-    design = np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones(len(time))], axis=1)
-    cosine, sine, _ = np.linalg.lstsq(design, values, rcond=None)[0]
-    return float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine))
 
 
 def _polynomial(time: np.ndarray, values: np.ndarray, samples: int, order: int) -> tuple[tuple[float, float], float]:

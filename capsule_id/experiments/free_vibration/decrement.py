@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from capsule_id.records.noise import noise_level
+
 #: A peak counts while it stands out of the noise by this many standard deviations.
 PEAK_NOISE_RATIO = 4.0
 #: ... and by this part of the record's range, so that a noiseless tail does not count.
@@ -32,11 +34,6 @@ class Decrement:
     delta: float
     k1: float
     c: float
-
-
-def noise_level(values: np.ndarray) -> float:
-    """Noise sd from third differences, which a well-sampled decay leaves small: median |d3| / (0.6745 sqrt(20))."""
-    return float(np.median(np.abs(np.diff(values, 3))) / (0.6745 * np.sqrt(20.0)))
 
 
 def equilibrium(values: np.ndarray) -> float:

@@ -18,10 +18,11 @@ from capsule_id.experiments.free_vibration.decay_models import (
 )
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
 from capsule_id.experiments.free_vibration.decay_trend import describe_trend
-from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement, noise_level
+from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.windows import decay_window

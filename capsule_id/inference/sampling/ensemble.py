@@ -87,4 +87,4 @@ class OpenBackend(emcee.backends.HDFBackend):
 
     def last_state(self) -> emcee.State | None:
         """The state after the last stored draw; None without one."""
-        return self.get_last_sample() if self.initialized and self.iteration > 0 else None
+        return self.get_last_sample() if self.initialized and self.iteration else None

@@ -5,8 +5,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from capsule_id.inference.result import Result
-from capsule_id.report.columns import sampled_columns
 from capsule_id.report.figures.style import CYCLE, SMALL, TEXT, new_figure
+from capsule_id.report.sampled_parameters import sampled_parameters
 
 # Enough to see drift, few enough to see lines.
 _POINTS, _WALKERS = 120, 2
@@ -20,7 +20,7 @@ def traces(result: Result) -> Figure:
     ValueError
         If nothing was sampled.
     """
-    columns = sampled_columns(result)
+    columns = sampled_parameters(result)
     n = len(columns.names)
     rows = (n + 1) // 2
     height = 0.8 + 1.15 * rows

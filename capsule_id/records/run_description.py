@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 from capsule_id.errors import InputError
-from capsule_id.records.drive import Harmonic
 from capsule_id.records.label import Evidence, MeasuredMotion, measured_motion
+from capsule_id.records.tone import Harmonic
 from capsule_id.records.view import ORDER, view_record
 from capsule_id.rig.model import Table
 
@@ -46,8 +46,8 @@ def _evidence(motion: MeasuredMotion) -> Iterator[str]:
         if repeat.period:
             excess = repeat.ratios[repeat.period - 1]
             yield f"repeats after {repeat.period}, mean square {excess:.2f} of the noise's"
-    if evidence.progress:
-        yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.progress.velocity_sd:.2g} mm/s"
+    if evidence.mean_velocity:
+        yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.mean_velocity.velocity_sd:.2g} mm/s"
     if evidence.contacts:
         contacts = evidence.contacts
         spikes = "/".join(map(str, contacts.spikes)) or "not recorded"

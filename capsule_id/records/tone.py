@@ -15,7 +15,7 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from capsule_id.errors import InputError
-from capsule_id.records.columns import stated_Omega
+from capsule_id.records.stated_settings import stated_Omega
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.model import Table
 
@@ -53,7 +53,7 @@ class Harmonic:
         return self.refuted and off > OMEGA_SHARE * self.stated_Omega
 
 
-def drive_of(table: Table) -> Harmonic | None:
+def recorded_drive(table: Table) -> Harmonic | None:
     """The tone of the recorded current (A), or None where the table has no current."""
     return fit_harmonic(table["time"], table["current"], stated_Omega(table)) if "current" in table.columns else None
 
@@ -88,6 +88,22 @@ def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic
         if left - less > _threshold(len(time)) * less:
             found, left = other, less
     return _describe(time, values, found, Omega)
+
+
+def tone_at(time: np.ndarray, values: np.ndarray, Omega: float) -> tuple[float, float, float]:
+    """Least-squares tone of a known frequency: (amplitude, phase, offset) of amplitude cos(Omega t + phase) + offset.
+
+    Parameters
+    ----------
+    time, values : (n,) s and any unit
+    Omega : rad/s
+
+    Returns
+    -------
+    amplitude and offset in the unit of ``values``, phase in rad, in (-pi, pi]
+    """
+    cosine, sine, offset = np.linalg.lstsq(_design(time, Omega), values)[0]
+    return float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine)), float(offset)
 
 
 def _design(time: np.ndarray, Omega: float) -> np.ndarray:
@@ -130,30 +146,17 @@ def _refine(time: np.ndarray, values: np.ndarray, guess: float) -> tuple[float, 
 
 def _describe(time: np.ndarray, values: np.ndarray, Omega: float, stated: float) -> Harmonic:
     """The tone at ``Omega`` with the standard errors of all four unknowns together."""
-    design = _design(time, Omega)
-    cosine, sine, offset = np.linalg.lstsq(design, values)[0]
-    amplitude, phase = float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine))
+    amplitude, phase, offset = tone_at(time, values, Omega)
     angle = Omega * time + phase
     slope = -amplitude * np.sin(angle)
     jacobian = np.stack([np.cos(angle), slope, slope * time, np.ones_like(time)], axis=1)
     scale = np.linalg.norm(jacobian, axis=0)
-    left = float(np.sum((values - design @ [cosine, sine, offset]) ** 2))
+    left = float(np.sum((values - amplitude * np.cos(angle) - offset) ** 2))
     noise_sd = float(np.sqrt(left / (len(time) - 4)))
     refuted = _misfit(time, values, stated) - left > _threshold(len(time)) * left
     errors = noise_sd * np.sqrt(_variances(jacobian / scale)) / scale
     sd = [float(error) for error in errors]
-    return Harmonic(
-        Omega,
-        sd[2],
-        amplitude,
-        sd[0],
-        phase,
-        sd[1],
-        float(offset),
-        noise_sd,
-        stated,
-        refuted,
-    )
+    return Harmonic(Omega, sd[2], amplitude, sd[0], phase, sd[1], offset, noise_sd, stated, refuted)
 
 
 def _variances(jacobian: np.ndarray) -> np.ndarray:

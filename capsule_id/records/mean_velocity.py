@@ -14,7 +14,7 @@ _READINGS_EACH = 4  # at least this many readings per unknown
 
 
 @dataclass(frozen=True)
-class Progress:
+class MeanVelocity:
     """Mean velocity of the capsule, m/s, its standard error, and "F", "B", "S", or None where it cannot be told."""
 
     velocity: float
@@ -23,7 +23,7 @@ class Progress:
     reason: str = ""
 
 
-def progress_of(time: np.ndarray, x_capsule: np.ndarray, T: float, period: int | None) -> Progress:
+def fit_mean_velocity(time: np.ndarray, x_capsule: np.ndarray, T: float, period: int | None) -> MeanVelocity:
     """Mean velocity over the record.
 
     With a known period n of the motion: the slope of a straight line plus harmonics of 1/(n T), by least squares; its
@@ -43,11 +43,11 @@ def progress_of(time: np.ndarray, x_capsule: np.ndarray, T: float, period: int |
     margin = norm.ppf(0.5 + CONFIDENCE / 2.0) * sd * T
     advance = velocity * T
     if np.isfinite(margin) and abs(advance) - margin > STANDING:
-        return Progress(velocity, sd, "F" if advance > 0.0 else "B")
+        return MeanVelocity(velocity, sd, "F" if advance > 0.0 else "B")
     if np.isfinite(margin) and abs(advance) + margin < STANDING:
-        return Progress(velocity, sd, "S")
+        return MeanVelocity(velocity, sd, "S")
     reason = f"direction: advance {1e6 * advance:.3g} ± {1e6 * sd * T:.2g} um per period, standing is below 0.1 um"
-    return Progress(velocity, sd, None, reason)
+    return MeanVelocity(velocity, sd, None, reason)
 
 
 def _line(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]:

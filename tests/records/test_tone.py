@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.records.drive import Harmonic, fit_harmonic
+from capsule_id.records.tone import Harmonic, fit_harmonic
 
 TIME = np.arange(2000) / 1000.0
 OMEGA, AMPLITUDE, PHASE, OFFSET, NOISE_SD = 34.56, 2.0, -1.1, 0.02, 5e-3
