@@ -116,8 +116,11 @@ def _noted(rig: Rig, before: Lanes, after: Lanes, motion: Motion, merge: jax.Arr
 def _work(rig: Rig, state: State, motion: Motion, t: jax.Array) -> jax.Array:
     """(L,) J: work of the drive over the step from ``state`` to the time t, by Gauss-Legendre quadrature."""
     dt = t - state.t
-    since = jnp.asarray(_NODE)[:, None] * dt
-    s = since / motion.h
-    Y1 = horner(motion.w, s) + horner(motion.v, s)
-    cosine, _ = cos_sin(rig.Omega * (state.t + since) + rig.phase)
-    return dt * rig.P_d * jnp.sum(_WEIGHT[:, None] * cosine * Y1, axis=0)
+
+    def power_per_amplitude(node: jax.Array) -> jax.Array:
+        since = node * dt
+        s = since / motion.h
+        cosine, _ = cos_sin(rig.Omega * (state.t + since) + rig.phase)
+        return cosine * (horner(motion.w, s) + horner(motion.v, s))
+
+    return dt * rig.P_d * jnp.sum(_WEIGHT[:, None] * jax.vmap(power_per_amplitude)(jnp.asarray(_NODE)), axis=0)
