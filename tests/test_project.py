@@ -1,4 +1,4 @@
-"""The house: style, types, layers, sizes, and nothing in the settings that means nothing."""
+"""The repository: style, types, layers, sizes, and settings that all have an effect."""
 
 import ast
 import os

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from capsule_id.console import OnProgress
 from capsule_id.experiments import compare, make_experiments, paper_estimates
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import ForcedRun
@@ -17,7 +18,7 @@ from capsule_id.inference.checks.run_checks import check_agreement, check_runs
 from capsule_id.inference.checks.verdict import informed, run_checks
 from capsule_id.inference.fit.point_stage import BenchFit, fit_points
 from capsule_id.inference.result import PointFit, Posterior, Result
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, Progress, sample
+from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, sample
 from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.tables.run_notes import run_notes, run_records
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -40,7 +41,7 @@ def fit_rig(
     which: str = "all",
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> Result:
     """Fit ``rig``.
 

@@ -1,9 +1,9 @@
-"""Contacts between rod and support spring, seen twice: in the acceleration of the rod and in x_rel.
+"""Contacts between rod and support spring, counted in the acceleration of the rod and in x_rel.
 
 Acceleration. Out of contact the rod obeys a linear law, acceleration = b0 + b1 x_rel + b2 rate + b3 cos(Omega t) +
 b4 sin(Omega t). It is fitted to the samples that are clear of the gap; where the acceleration falls short of it, the
-spring pushes back: a spike. x_rel. It exceeds the gap; sensor zero and stated gap are only known to some tens of um, so
-that the line is taken where the spikes vanish, if there are any.
+spring pushes back: a spike. x_rel. It exceeds the gap. Sensor zero and stated gap are known to some tens of um only, so
+the impact line is placed where the spikes vanish, if there are any.
 
 Both are counted on the record folded onto one period of the motion, with two levels (``SPIKE_LEVELS``,
 ``CROSSING_LEVELS``, in standard errors): a contact begins above the higher and ends below the lower one. The count holds
@@ -44,7 +44,7 @@ class ImpactLine:
 
 @dataclass(frozen=True)
 class Contacts:
-    """What was counted over one period of the motion.
+    """Contacts over one period of the motion.
 
     count : contacts per period of the motion, None where the evidence disagrees
     spikes : counts by ``SPIKE_LEVELS``, () without acceleration
@@ -194,14 +194,14 @@ def _impact_line(cycle: Cycle, push: _Push | None) -> ImpactLine | None:
         return None
     (force, sd), (x_rel, _) = cycle.mean(push.shortfall), cycle.mean(cycle.x_rel)
     deep = force > _IN_CONTACT * sd * push.sd
-    # a mean over an edge of a contact is no reading of a contact: half a sampling step more on either side
+    # a mean over an edge of a contact is biased: drop half a sampling step more on either side
     touching = np.all([np.roll(deep, shift) for shift in range(-_GRID // 2, _GRID // 2 + 1)], axis=0)
     count = touching.sum() / _GRID
     if count < _LINE_SAMPLES:
         return None
     shared_sd = float(np.mean(cycle.mean(push.shared_sd)[0][touching]))
     force, x_rel, sd = force[touching], x_rel[touching], sd[touching]
-    # noise in the regressor flattens a regression; its variance is known and comes off
+    # noise in the regressor flattens a regression: subtract its known variance
     variance = float(np.var(force) - np.mean(sd**2) * push.sd**2)
     if variance <= 0.0:
         return None

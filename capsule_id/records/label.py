@@ -1,6 +1,6 @@
 """The motion of a record in the paper's words, P-<n>-<F|B|S>-<m>, with the evidence, or "undecided" with the reason.
 
-drive -> period by repeat -> mean_velocity -> contacts on the folded record -> label
+drive -> period by repeat -> mean velocity -> contacts on the folded record -> label
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ UNDECIDED = "undecided"
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a label rests on; None where the channels for it were not recorded.
+    """Evidence for a label; None where the channels for it were not recorded.
 
     drive : the tone of the current            Omega : rad/s, of the current, else of x_rel, else as stated
     repeat, mean_velocity, contacts : as they were found            reasons : why the label is undecided, () where it is not
@@ -84,7 +84,7 @@ def _cycle(table: Table, Omega: float, period: float, noise_sd: float) -> Cycle:
 def _label(
     repeat: Repeat | None, velocity: MeanVelocity | None, contacts: Contacts | None
 ) -> tuple[str, tuple[str, ...]]:
-    """The label and, where it is "undecided", all that stands in its way."""
+    """The label and, where it is "undecided", the reasons."""
     if repeat is None:
         return UNDECIDED, ("x_rel was not recorded",)
     if repeat.period is None:

@@ -3,12 +3,13 @@
 import math
 
 import numpy as np
+from jaxtyping import Num
 
 #: Median of |z| for a standard normal z.
 NORMAL_QUARTILE = 0.6745
 
 
-def noise_level(values: np.ndarray, order: int = 3) -> float:
+def noise_level(values: Num[np.ndarray, " n"], order: int = 3) -> float:
     """Standard deviation of the white noise on an evenly sampled record, by the median of its differences.
 
     Differencing removes a smooth motion, and the median leaves out contacts and stops, which take a small part of the

@@ -1,4 +1,4 @@
-"""A recorded run in a few lines: label with evidence, drive, filter."""
+"""Description of a recorded run in a few lines of text: label with evidence, drive, filter."""
 
 from collections.abc import Iterator
 
@@ -28,7 +28,7 @@ def describe_run(table: Table) -> list[str]:
 
 
 def run_warning(table: Table) -> str | None:
-    """What to mind about the drive of a ``forced_run``: a stated frequency that the current does not have."""
+    """A warning where the stated frequency of a ``forced_run`` differs from that of its current; else None."""
     drive = measured_motion(table).evidence.drive
     if drive is None or not drive.disagrees:
         return None

@@ -1,4 +1,4 @@
-"""A record made ready for looking at: filtered, differentiated, cut at the drive's phase; as the paper's Figs. 4, 9, 12.
+"""A record prepared for figures: filtered, differentiated, sampled at the drive's phase (the paper's Figs. 4, 9, 12).
 
 For pictures and starting values only. Likelihoods use the raw channels.
 """
@@ -25,7 +25,7 @@ MULTIPLE = 5.0
 
 @dataclass(frozen=True)
 class Gains:
-    """What the filter leaves of a motion at some frequency f, Hz: of x_rel and of its rate (1: everything)."""
+    """Gains of the filter at frequency f, Hz: of x_rel and of its rate, 1."""
 
     f: float
     smoothing: float
@@ -107,7 +107,7 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
 
 
 def _window(f: float, step: float, most: int) -> int:
-    """Samples of the longest window, at least the shortest, that leaves the rate at f Hz alone."""
+    """Samples of the longest window, at least the shortest, that passes the rate at f Hz."""
     samples = SHORTEST_WINDOW
     while samples + 2 <= most and gain(f * step, samples + 2, ORDER, 1) >= PASSED:
         samples += 2

@@ -48,7 +48,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
 
 
 def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
-    """Narrow pictures first: they stand in pairs, and a wide one between them would leave a hole."""
+    """Narrow pictures first: they go in pairs, and a wide one between them leaves a gap."""
     return sorted((picture for picture in pictures if picture.section == name), key=lambda picture: picture.wide)
 
 

@@ -9,16 +9,22 @@ Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. S
 """
 
 import numpy as np
+from jaxtyping import Float, Num
 from numpy.polynomial import legendre
 
 from capsule_id.errors import InputError
+
+#: Samples of one channel, or their times.
+Record = Num[np.ndarray, " n"]
 
 JITTER = 0.01  # of a sampling step: samples this near to an even grid count as evenly spaced
 PASSED = 0.99  # gain that `choose_window` keeps at the dominant frequency
 _ZERO_PADDING = 8  # the spectrum's grid is this much finer than 1 / duration
 
 
-def savitzky_golay(time: np.ndarray, values: np.ndarray, window: float, order: int, derivative: int = 0) -> np.ndarray:
+def savitzky_golay(
+    time: Record, values: Record, window: float, order: int, derivative: int = 0
+) -> Float[np.ndarray, " n"]:
     """Smooth a record, or differentiate it, by least-squares polynomials over a moving window.
 
     The first and last half windows are the values (or derivatives) of the polynomial fitted to the first and last whole
@@ -57,7 +63,7 @@ def savitzky_golay(time: np.ndarray, values: np.ndarray, window: float, order: i
     return np.concatenate(parts) / (max(half, 1) * step) ** derivative
 
 
-def sampling_step(time: np.ndarray) -> float:
+def sampling_step(time: Record) -> float:
     """The sampling step of an evenly spaced record, s.
 
     Parameters
@@ -113,7 +119,7 @@ def gain(frequency: np.ndarray | float, samples: int, order: int, derivative: in
     return np.divide(response, ideal, out=np.ones_like(response), where=ideal > 0.0)
 
 
-def choose_window(time: np.ndarray, values: np.ndarray, order: int) -> float:
+def choose_window(time: Record, values: Record, order: int) -> float:
     """The longest window that passes the dominant frequency, s.
 
     Rule (this package's own): the longest odd window whose gain at the record's dominant frequency is still at least
@@ -145,7 +151,7 @@ def choose_window(time: np.ndarray, values: np.ndarray, order: int) -> float:
     return samples * step
 
 
-def dominant_frequency(time: np.ndarray, values: np.ndarray) -> float:
+def dominant_frequency(time: Record, values: Record) -> float:
     """Frequency of the highest peak of the spectrum, Hz, the record's straight trend removed first.
 
     Parameters

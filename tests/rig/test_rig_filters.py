@@ -139,7 +139,7 @@ def test_window_in_samples() -> None:
         ({"time": np.array([0.0, 1, 2, 3, 4.02, 5])}, "a filter needs evenly spaced samples"),
         ({"time": np.array([0.0, 1, 2, 3, np.nan, 5])}, "a filter needs evenly spaced samples"),
         ({"time": np.array([0.0, 1, 2, 4, 8, 16])}, "a filter needs evenly spaced samples"),
-        ({"time": np.array([0.0])}, "a filter needs at least 2 samples"),
+        ({"time": np.array([0.0]), "values": np.array([0.0])}, "a filter needs at least 2 samples"),
         ({"window": 7.0}, "the window must fit into the record"),
         ({"order": 5}, "the window must hold more samples than the order"),
         ({"derivative": 3}, "derivative must lie between 0 and the order"),

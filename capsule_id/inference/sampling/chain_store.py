@@ -1,8 +1,8 @@
-"""Chains on disk that a kill at any moment cannot spoil.
+"""Chains on disk that stay readable when the process is killed at any moment.
 
 emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter), so a process that dies
-between two of them leaves a file that opens and is wrong. Runs are therefore taken up from a copy made between draws,
-which carries its own digest; the file that emcee writes is never trusted after an interruption.
+between two of them leaves a file that opens and is wrong. A resumed run therefore starts from a copy made between draws,
+which carries its own digest. The file that emcee writes is never read after an interruption.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def saved_copy(store: Path) -> Path:
-    """The copy of ``store`` that an interrupted run is taken up from."""
+    """The copy of ``store`` from which an interrupted run resumes."""
     return store.with_suffix(".saved")
 
 
@@ -28,7 +28,7 @@ class ChainStore:
 
     Parameters
     ----------
-    store : the file; whatever stands in it is replaced by the last copy, or removed where there is no sound one
+    store : the file; it is replaced by the last copy, or removed where no copy has a valid digest
     """
 
     def __init__(self, store: Path) -> None:

@@ -1,6 +1,6 @@
-"""emcee: independent ensembles, run until they agree or the budget is spent, saved while they run."""
+"""Sampling by independent emcee ensembles: run until they agree or the budget is spent, saved while they run."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from emcee import State
 
+from capsule_id.console import OnProgress
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling.chain_store import ChainStore
 from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
@@ -29,24 +30,22 @@ BURN_IN_IN_TAU = 8.0
 #: Walkers start this much wider than the Laplace approximation.
 OVERDISPERSION = 1.2
 DEFAULT_BUDGET = 20_000
-#: One draw is stored per this part of the pilot's autocorrelation time, but at least one per MAX_THIN steps: a short
-#: pilot knows that time only roughly.
+#: Stored draws per autocorrelation time of the pilot, and the most steps per stored draw: a short pilot knows that time
+#: only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
 #: Steps of the pilot's burn-in, half of which shapes the block proposal, and of the moves that it times.
 PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
-#: Name of the move that the pilot shapes by its own sample, how often it does so at most, and for how many steps.
+#: Name of the move that the pilot shapes by its own sample, the most adaptations, and the steps of each.
 ADAPTED, ADAPTATIONS, ADAPTING_STEPS = "adapted block independence + differential evolution", 4, 200
-#: The pilot looks no further once a move has an autocorrelation time, in steps, below this.
+#: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
-#: Other kinds of moves are tried only where no block proposal comes below this.
+#: Other kinds of moves are tried only where every block proposal stays above this, in steps.
 FAIR_TAU = 40.0
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """What the pilot run decides for the recorded one."""
+    """Move, thinning and burn-in of the recorded run, as the pilot run decides."""
 
     move: str
     moves: Moves
@@ -56,7 +55,7 @@ class Schedule:
 
 
 class Target(Protocol):
-    """What is sampled; see ``capsule_id.inference.target.marginal.MarginalPosterior``."""
+    """A density to sample; see ``capsule_id.inference.target.marginal.MarginalPosterior``."""
 
     names: tuple[str, ...]
     dimension: int
@@ -76,7 +75,7 @@ def sample(
     seed: int,
     budget: int = DEFAULT_BUDGET,
     store: Path | None = None,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> Posterior:
     """Sample the posterior with ``ENSEMBLES`` independent ensembles.
 
@@ -139,7 +138,7 @@ def _converged(draws: np.ndarray) -> bool:
 def pilot(target: Target, seed: int) -> Schedule:
     """Burn in one ensemble, then measure the autocorrelation time of candidate moves on it until one is good."""
     start = _initial(target, np.random.RandomState(seed))
-    # Independence from a density too wide by a fifth in each of thirty directions would hardly ever be accepted.
+    # In 30 dimensions a proposal that is 20 % too wide is almost never accepted: large blocks are not widened.
     wider = np.ones(target.dimension)
     wider[[i for block in target.blocks if len(block) < LARGE for i in block]] = OVERDISPERSION
     rough = block_move(target.blocks, target.centre, target.covariance * np.outer(wider, wider))
@@ -147,9 +146,8 @@ def pilot(target: Target, seed: int) -> Schedule:
     sample = ensemble.chain[PILOT_BURN_IN // 2 :].reshape(-1, target.dimension)
     measured, moves = {}, dict(candidates(sample, target.blocks, target.centre, target.covariance))
     first, *others = moves
-    # The most promising one first, briefly; where it is not good, for longer; then moves shaped by what was found so far,
-    # again and again: a posterior with kinks is not where and what the curvature at its maximum says. The rest is tried
-    # where none of these will do.
+    # The most promising move runs first, briefly, then for longer. Moves shaped by the sample so far follow: a posterior
+    # with kinks differs from the Laplace approximation. The other moves are the last resort.
     plan = [(first, PILOT_STEPS), (first, LONG_PILOT_STEPS), *[(ADAPTED, ADAPTING_STEPS)] * ADAPTATIONS]
     for name, steps in [*plan, *((name, LONG_PILOT_STEPS) for name in others)]:
         if name in others and min(measured.values()) < FAIR_TAU:
@@ -189,7 +187,7 @@ def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend
 
 
 def _initial(target: Target, random: np.random.RandomState) -> State:
-    """Walkers from the widened Laplace approximation, every one where the posterior is not zero."""
+    """Walkers from the widened Laplace approximation, each at a finite log-posterior."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
     root = OVERDISPERSION * np.linalg.cholesky(target.covariance)
     u = target.centre + random.standard_normal((walkers, target.dimension)) @ root.T

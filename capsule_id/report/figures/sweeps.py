@@ -1,6 +1,6 @@
 """Bifurcation diagrams: Poincaré section, mean velocity, labels, and measured runs beside them.
 
-Datasets come from ``capsule.sweep`` in SI; an ``AxisUnit`` says in what unit a quantity is drawn. Direction has a
+Datasets come from ``motions.sweep`` in SI; an ``AxisUnit`` says in what unit a quantity is drawn. Direction has a
 colour everywhere: blue forward, vermilion backward, grey standing.
 """
 
@@ -161,7 +161,7 @@ def _draw_measured(
 
 
 def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:
-    """The first branch's labels over the ranges of values that have them, where there is room."""
+    """The first branch's labels over the ranges of values that have them, where the range is wide enough."""
     if len(x) < 2:
         return
     order = np.argsort(x)

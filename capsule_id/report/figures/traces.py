@@ -1,4 +1,4 @@
-"""Traces of the sample, to be looked at for drift and for ensembles that disagree."""
+"""Traces of the sample: they show drift, and ensembles that disagree."""
 
 import numpy as np
 from matplotlib.figure import Figure
