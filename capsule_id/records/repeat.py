@@ -83,7 +83,7 @@ def find_period(time: Record, x_rel: Record, T: float, floor: float = 0.0) -> Re
         excess = float(np.mean(difference**2) - noise)
         ratios.append(excess / noise + 1.0 if noise > 0.0 else np.inf)
         seen.append(float(np.sqrt(bound)))
-        repeats.append(excess <= max(bound, (SAME * motion) ** 2))
+        repeats.append(bool(excess <= max(bound, (SAME * motion) ** 2)))
     return _judge(repeats, Repeat(None, float(periods), np.array(ratios), max(seen, default=None), motion, noise_sd))
 
 
