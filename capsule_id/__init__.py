@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from capsule_id.api import Fit as Fit
     from capsule_id.api import fit as fit
     from capsule_id.api import read_rig as read_rig
@@ -55,11 +56,15 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from its room when it is first asked for."""
+    """Import a public name from its module on first use; the version is that of the installed distribution."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("capsule-id")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+    return sorted([*globals(), *_HOME, "__version__"])

@@ -9,8 +9,10 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from capsule_id import console
 from capsule_id.commands import bifurcate, check, fit, init, report, simulate, synthesize
@@ -67,10 +69,9 @@ def _run(
     except SystemExit as stop:
         console.finish()
         return int(stop.code or 0)
-    if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # what a user should know is a finding
     try:
-        with _interruptible():
+        with warnings.catch_warnings(), _interruptible():
+            warnings.showwarning = partial(_show_warning, program)
             return action(args)
     except InputError as error:
         print(error, file=sys.stderr)
@@ -81,6 +82,20 @@ def _run(
     except Exception as error:
         print(f"{program}: internal failure: {_one_line(error)}; {_save_traceback()}", file=sys.stderr)
         return INTERNAL
+
+
+def _show_warning(
+    program: str,
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """A warning as one line on standard error; Python's own filters decide which are shown (its signature)."""
+    place = f"{Path(filename).name}:{lineno}"
+    print(" ".join(f"{program}: warning: {category.__name__}: {message} ({place})".split()), file=sys.stderr)
 
 
 @contextmanager

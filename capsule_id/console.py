@@ -1,13 +1,17 @@
-"""Standard streams as they may be: closed, in another locale, or with a reader that has left."""
+"""Standard streams that may be closed, in another locale, or without a reader; and the type of progress callbacks."""
 
 import io
 import os
 import sys
+from collections.abc import Callable
+
+#: Called with (draws or points done, how many in all, the stage).
+OnProgress = Callable[[int, int, str], None]
 
 
 def prepare() -> None:
     """Give the command the streams that it lacks, and let it write any character."""
-    # What is opened first takes the number of the closed stream, which no data file then gets by chance.
+    # Opening the null device first takes the number of the closed stream, so no data file gets it.
     if sys.stdin is None:
         sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
     if sys.stdout is None:
@@ -19,7 +23,7 @@ def prepare() -> None:
 
 
 def say(text: str) -> None:
-    """Print to standard output at once; a reader who has heard enough (``| head``) is no failure."""
+    """Print to standard output at once; a closed reader (``| head``) is no failure."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -27,7 +31,7 @@ def say(text: str) -> None:
 
 
 def finish() -> None:
-    """Write out what is left; the interpreter would complain if its last flush failed."""
+    """Flush standard output; otherwise the interpreter reports a failed last flush."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -1,9 +1,9 @@
-"""The one exception that means "the input is at fault", with the place, the rule, the value and the remedy."""
+"""The exception for bad input: it names the place, the rule, the value found and the remedy."""
 
 from pathlib import Path
 
 
-class InputError(Exception):
+class InputError(ValueError):
     """Bad input: the command prints it as one line and ends with exit code 2.
 
     Parameters

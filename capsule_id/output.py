@@ -1,4 +1,4 @@
-"""Where results go: work in progress stands in ``DIR.partial`` and becomes ``DIR`` by one rename."""
+"""Output directories: work in progress lies in ``DIR.partial`` and becomes ``DIR`` by one rename."""
 
 import fcntl
 import json
@@ -13,7 +13,7 @@ from capsule_id.errors import InputError
 #: Everything that a result directory may hold; a directory with anything else in it is not replaced.
 CONTENTS = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})
 STATE, CHAINS, LOCK = "state.json", "chains.h5", "lock"
-#: What an unfinished run keeps beside them.
+#: Further files of an unfinished run.
 SCRATCH = frozenset({STATE, "state.new", CHAINS, "chains.saved", "chains.saved-new", LOCK})
 PARTIAL, OLD = ".partial", ".partial.old"
 

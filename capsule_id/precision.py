@@ -1,4 +1,4 @@
-"""Double precision for JAX, switched on once, by whichever room computes first."""
+"""Double precision for JAX, switched on by every module that computes with JAX."""
 
 import jax
 import jax.numpy as jnp

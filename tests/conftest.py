@@ -1,15 +1,23 @@
-"""One cache of compiled programs for all processes of a test run (workers, commands, kernels of notebooks); fixtures."""
+"""Settings of JAX for all processes of a test run (workers, commands, kernels of notebooks), and fixtures.
+
+Compiled programs are kept in one cache. The shapes and types that ``CHECKED`` modules annotate hold for every call.
+"""
 
 import os
 import shutil
 import tempfile
 
 import pytest
+from jaxtyping import install_import_hook
 
 from tests.capsule_cases import Cases, read_cases
 
 #: Programs that take longer than this to compile, s, are kept.
 WORTH_KEEPING = "0.3"
+
+#: Modules whose annotations are checked at run time; the hook must stand before their first import.
+CHECKED = ("capsule_id.records", "capsule_id.rig.filters", "capsule_id.inference.sampling.diagnostics")
+install_import_hook(CHECKED, "beartype.beartype")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -1,4 +1,4 @@
-"""The house: style, types, layers, sizes, and nothing in the settings that means nothing."""
+"""The repository: style, types, layers, sizes, and settings that all have an effect."""
 
 import ast
 import os
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import capsule_id
 from tests.cli_tools import ROOT
 
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -72,26 +73,41 @@ def test_every_path_of_the_settings_exists() -> None:
         assert function in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
 
 
-def test_every_layer_is_a_room_and_every_room_has_a_layer() -> None:
+def test_the_layers_are_the_modules_and_packages_of_the_top_level() -> None:
     (contract,) = SETTINGS["tool"]["importlinter"]["contracts"]
     layers = {name.strip("() ") for layer in contract["layers"] for name in layer.split("|")}
-    rooms = {
+    present = {
         f"capsule_id.{path.stem}"
         for path in (ROOT / "capsule_id").iterdir()
         if (path.suffix == ".py" and path.stem != "__init__") or (path / "__init__.py").exists()
     }
-    assert rooms <= layers
+    assert layers == present
 
 
-def test_every_dependency_is_imported() -> None:
-    """A requirement that nothing imports is a dead setting."""
+def test_dependencies_are_what_is_imported() -> None:
+    """Every requirement is imported, and every import from outside the standard library is a requirement."""
     text = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "capsule_id").rglob("*.py"))
-    imported = set(re.findall(r"^\s*(?:import|from) (\w+)", text, re.MULTILINE))
-    # xarray writes through h5netcdf, emcee through h5py; neither needs an import of ours.
+    found = {
+        name.partition(".")[0]
+        for path in (ROOT / "capsule_id").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [each.name for each in node.names])
+    }
+    imported = {"pillow" if name == "PIL" else name for name in found - sys.stdlib_module_names - {"capsule_id"}}
+    # xarray writes through h5netcdf: it needs no import of ours.
     imported |= {"h5netcdf"} if 'engine="h5netcdf"' in text else set()
-    imported |= {"h5py"} if "HDFBackend" in text else set()
-    required = {re.split(r"[<>=\[]", line)[0] for line in SETTINGS["project"]["dependencies"]}
+    required, maps = (
+        {re.split(r"[<>=\[]", line)[0] for line in lines}
+        for lines in (SETTINGS["project"]["dependencies"], SETTINGS["project"]["optional-dependencies"]["maps"])
+    )
     assert required - imported == set()
+    assert imported - required == maps
+
+
+def test_the_package_states_its_version_and_its_types() -> None:
+    assert capsule_id.__version__ == SETTINGS["project"]["version"]
+    assert (ROOT / "capsule_id" / "py.typed").is_file()
 
 
 def test_files_and_functions_are_short() -> None:

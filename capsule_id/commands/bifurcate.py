@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-    from capsule_id.report.figures.sweeps import MeasuredMotion
+    from capsule_id.report.figures.sweeps import MeasuredPoint
 
 # The setting of the paper's Fig. 6, unless the options say otherwise.
 DRIVEN = {**DEFAULTS, "G": 1e-3, "P_d": 4.0, "Omega": 34.56}
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def draw(
-    data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredMotion]" = (), synthetic: bool = False
+    data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredPoint]" = (), synthetic: bool = False
 ) -> "Figure":
     """The picture of what ``run`` has computed; measured runs are laid over a diagram, each with its own label."""
     from capsule_id.report.figures import bands as figures_bands
@@ -188,7 +188,7 @@ def _computed(
 
 def _measured(
     args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
-) -> "tuple[MeasuredMotion, ...]":
+) -> "tuple[MeasuredPoint, ...]":
     """The rig's forced runs with the settings of a diagram; what was left out is told on standard error."""
     from capsule_id.commands.measured_runs import Span, overlay
 

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         prefer_whole_loops()
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.inference.pipeline import PACKAGES, fit_rig, package_versions
-    from capsule_id.report.text import table_text
+    from capsule_id.report.console_table import table_text
     from capsule_id.report.write import write_result
 
     make_experiments(rig, args.experiments, kinds)

@@ -9,10 +9,10 @@ import numpy as np
 from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.rough_values import rough_values
 from capsule_id.parameters import SWEPT
-from capsule_id.records.columns import stated_gap, stated_Omega
-from capsule_id.records.drive import drive_of
 from capsule_id.records.label import measured_motion
-from capsule_id.report.figures.sweeps import MeasuredMotion
+from capsule_id.records.stated_settings import stated_gap, stated_Omega
+from capsule_id.records.tone import recorded_drive
+from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.rig.model import Quantity, Rig, Table
 
 #: A setting is the diagram's where it differs by no more than this share of it, or by this many of its own sds.
@@ -32,7 +32,7 @@ class Span(NamedTuple):
 class Overlay:
     """Runs with the settings of a diagram, and why the others have not: a phrase per run."""
 
-    motions: tuple[MeasuredMotion, ...]
+    motions: tuple[MeasuredPoint, ...]
     left_out: tuple[str, ...]
 
     def sentence(self) -> str:
@@ -70,7 +70,7 @@ def overlay(
     for table in rig.tables:
         if isinstance(table.settings, RunSettings):
             found = _motion(table, _settings(table, known), span, values, spring)
-            if isinstance(found, MeasuredMotion):
+            if isinstance(found, MeasuredPoint):
                 motions.append(found)
             else:
                 left_out.append(f"{table.label} ({found})")
@@ -83,7 +83,7 @@ def _motion(
     span: Span,
     values: Mapping[str, float],
     spring: str | None,
-) -> MeasuredMotion | str:
+) -> MeasuredPoint | str:
     """Where the run stands on the diagram, or why it does not."""
     swept = "Omega" if span.name == "f" else span.name
     if swept not in settings:
@@ -105,7 +105,7 @@ def _motion(
     motion = measured_motion(table)
     if not np.isfinite(motion.mean_velocity):
         return "x_capsule was not recorded"
-    return MeasuredMotion(value, motion.label, motion.mean_velocity)
+    return MeasuredPoint(value, motion.label, motion.mean_velocity)
 
 
 def _settings(table: Table[RunSettings], known: Callable[[str], Quantity]) -> dict[str, Quantity]:
@@ -116,7 +116,7 @@ def _settings(table: Table[RunSettings], known: Callable[[str], Quantity]) -> di
 
 def _load(table: Table[RunSettings], known: Callable[[str], Quantity]) -> Quantity:
     """P_d of a run, N."""
-    drive = drive_of(table)
+    drive = recorded_drive(table)
     if table.settings.P_d is not None:
         return table.settings.P_d
     assert drive is not None, "the reader requires P_d or the current"

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(rule, type(error).__name__, remedy, path) from error
     import pandas as pd
 
-    from capsule_id.report.text import table_text
+    from capsule_id.report.console_table import table_text
 
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
     lines = [table_text(frame, synthetic=bool(saved["synthetic"]), clean=clean)]

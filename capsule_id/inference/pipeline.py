@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from capsule_id.console import OnProgress
 from capsule_id.experiments import Choice, compare, make_experiments, paper_estimates
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import informed, run_checks
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.result import PointFit, Posterior, Result, RunRecord
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, Progress, sample
+from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, sample
 from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
@@ -37,7 +38,7 @@ def fit_rig(
     experiments: Choice = "all",
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> Result:
     """Fit ``rig``.
 

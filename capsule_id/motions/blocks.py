@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.motions.points import SEEN, Columns, Points, columns_of
 from capsule_id.motions.response import Settling
@@ -26,15 +27,13 @@ if TYPE_CHECKING:
 BLOCK = 256
 FINGERPRINT = "points.json"
 
-Progress = Callable[[int, int, str], None]  # points done, of how many, what is being done
-
 
 def compute(
     points: Points,
     settling: Settling,
     keep: Sequence[str] = tuple(SEEN),
     *,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     store: Path | None = None,
     client: "Client | None" = None,
     block: int = BLOCK,
@@ -104,7 +103,7 @@ def _on_cluster(client: "Client") -> Callable[..., Iterator[tuple[int, Columns]]
     return run
 
 
-def _report(progress: Progress | None, done: int, total: int) -> None:
+def _report(progress: OnProgress | None, done: int, total: int) -> None:
     if progress is not None:
         progress(done, total, "points")
 

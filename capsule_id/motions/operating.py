@@ -13,8 +13,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
-from capsule_id.motions.blocks import Progress, compute
+from capsule_id.motions.blocks import compute
 from capsule_id.motions.datasets import grid_of
 from capsule_id.motions.points import SEEN, SUMMARY, points_of
 from capsule_id.motions.response import SETTLING, Settling
@@ -37,7 +38,7 @@ def draws_diagram(
     values: ArrayLike,
     *,
     settling: Settling = SETTLING,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     store: "Path | None" = None,
     client: "Client | None" = None,
 ) -> xr.Dataset:

@@ -126,8 +126,11 @@ def _with_step(
 def _work(drive: Drive, state: CapsuleState, step: StepSeries, t: jax.Array) -> jax.Array:
     """(L,) J: work of the drive over the step from ``state`` to the time t, by Gauss-Legendre quadrature."""
     dt = t - state.t
-    since = jnp.asarray(_NODE)[:, None] * dt
-    s = since / step.h
-    Y1 = horner(step.w, s) + horner(step.v, s)
-    force = drive.value(drive.state(state.t + since))
-    return dt * jnp.sum(_WEIGHT[:, None] * force * Y1, axis=0)
+
+    def power(node: jax.Array) -> jax.Array:
+        since = node * dt
+        s = since / step.h
+        Y1 = horner(step.w, s) + horner(step.v, s)
+        return drive.value(drive.state(state.t + since)) * Y1
+
+    return dt * jnp.sum(_WEIGHT[:, None] * jax.vmap(power)(jnp.asarray(_NODE)), axis=0)

@@ -18,9 +18,10 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
+from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.motions.attractors import attractors_of
-from capsule_id.motions.blocks import BLOCK, Progress, compute
+from capsule_id.motions.blocks import BLOCK, compute
 from capsule_id.motions.datasets import (
     ATTRACTOR,
     ATTRACTORS,
@@ -50,7 +51,7 @@ def diagram(
     *,
     starts: Initial | None = None,
     settling: Settling = SETTLING,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> xr.Dataset:
     """Settled motions at all values at once, from rest or from each of several initial states.
 
@@ -88,7 +89,7 @@ def continuation(
     directions: Sequence[Literal["forward", "backward"]] = ("forward", "backward"),
     starts: Initial | None = None,
     settling: Settling = SETTLING,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> xr.Dataset:
     """Settled motions value by value, each from where the motion at the last value has ended.
 
@@ -136,7 +137,7 @@ def motion_map(
     over: Mapping[str, ArrayLike],
     *,
     settling: Settling = SETTLING,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     store: "Path | None" = None,
     client: "Client | None" = None,
     block: int = BLOCK,
@@ -168,7 +169,7 @@ def basins(
     Y2: float = 0.0,
     *,
     settling: Settling = SETTLING,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> xr.Dataset:
     """Which attractor every initial state (x_rel, rate, Y2), m and m/s, leads to, at one set of parameters.
 

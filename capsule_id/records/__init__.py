@@ -1,1 +1,1 @@
-"""A forced run looked at as the paper looks at it: drive, period, contacts, progress, phase plane. Knows no model."""
+"""Model-free analysis of a recorded forced run: drive, period, contacts, mean velocity, phase plane."""

@@ -1,9 +1,9 @@
-"""Contacts between rod and support spring, seen twice: in the acceleration of the rod and in x_rel.
+"""Contacts between rod and support spring, counted in the acceleration of the rod and in x_rel.
 
 Acceleration. Out of contact the rod obeys a linear law, acceleration = b0 + b1 x_rel + b2 rate + b3 cos(Omega t) +
 b4 sin(Omega t). It is fitted to the samples that are clear of the gap; where the acceleration falls short of it, the
-spring pushes back: a spike. x_rel. It exceeds the gap; sensor zero and stated gap are only known to some tens of um, so
-that the line is taken where the spikes vanish, if there are any.
+spring pushes back: a spike. x_rel. It exceeds the gap. Sensor zero and stated gap are known to some tens of um only, so
+the impact line is placed where the spikes vanish, if there are any.
 
 Both are counted on the record folded onto one period of the motion, with two levels (``SPIKE_LEVELS``,
 ``CROSSING_LEVELS``, in standard errors): a contact begins above the higher and ends below the lower one. The count holds
@@ -34,7 +34,7 @@ _LAW = 5  # unknowns of the linear law
 
 
 @dataclass(frozen=True)
-class Line:
+class ImpactLine:
     """The impact line: x_rel where contacts begin and its sd, m (sensor zero included); scatter of x_rel about it."""
 
     value: float
@@ -44,12 +44,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Contacts:
-    """What was counted over one period of the motion.
+    """Contacts over one period of the motion.
 
     count : contacts per period of the motion, None where the evidence disagrees
     spikes : counts by ``SPIKE_LEVELS``, () without acceleration
     crossings : counts by ``CROSSING_LEVELS`` at the impact line less 2 of its sd, at it, and at it plus 2 sd
-    gap_seen : the impact line where the record shows it, None where there are too few spikes: then it is the stated gap
+    impact_line : the impact line where the record shows it, None where there are too few spikes: then it is the stated gap
     duration : of the shortest contact, s, None without contacts
     agreeing, cycles : periods of the motion counted singly with the same result, and all that were counted
     reason : why there is no count, or ""
@@ -58,7 +58,7 @@ class Contacts:
     count: int | None
     spikes: tuple[int, ...]
     crossings: tuple[int, ...]
-    gap_seen: Line | None
+    impact_line: ImpactLine | None
     duration: float | None
     agreeing: int
     cycles: int
@@ -103,7 +103,7 @@ def find_contacts(cycle: Cycle) -> Contacts:
     """Count the contacts of a record whose motion has the period ``cycle.period``."""
     push = _push(cycle)
     seen = _impact_line(cycle, push)
-    line = seen or Line(cycle.gap, cycle.gap_sd, cycle.noise_sd)
+    line = seen or ImpactLine(cycle.gap, cycle.gap_sd, cycle.noise_sd)
     single = cycle.x_rel - line.value
     mean, sd = cycle.mean(cycle.x_rel)
     above = [(mean - line.value - shift * line.sd) / (sd * line.scatter) for shift in _LINE_ERRORS]
@@ -188,20 +188,20 @@ def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
     return below & (distance > _WIDE * _drive(cycle))
 
 
-def _impact_line(cycle: Cycle, push: _Push | None) -> Line | None:
+def _impact_line(cycle: Cycle, push: _Push | None) -> ImpactLine | None:
     """Where the spikes vanish, by regression of x_rel on them."""
     if push is None:
         return None
     (force, sd), (x_rel, _) = cycle.mean(push.shortfall), cycle.mean(cycle.x_rel)
     deep = force > _IN_CONTACT * sd * push.sd
-    # a mean over an edge of a contact is no reading of a contact: half a sampling step more on either side
+    # a mean over an edge of a contact is biased: drop half a sampling step more on either side
     touching = np.all([np.roll(deep, shift) for shift in range(-_GRID // 2, _GRID // 2 + 1)], axis=0)
     count = touching.sum() / _GRID
     if count < _LINE_SAMPLES:
         return None
     shared_sd = float(np.mean(cycle.mean(push.shared_sd)[0][touching]))
     force, x_rel, sd = force[touching], x_rel[touching], sd[touching]
-    # noise in the regressor flattens a regression; its variance is known and comes off
+    # noise in the regressor flattens a regression: subtract its known variance
     variance = float(np.var(force) - np.mean(sd**2) * push.sd**2)
     if variance <= 0.0:
         return None
@@ -210,7 +210,7 @@ def _impact_line(cycle: Cycle, push: _Push | None) -> Line | None:
     residual = x_rel - slope * force - value
     regression_sd = np.std(residual) * np.sqrt((1.0 + force.mean() ** 2 / variance) / count)
     scatter = max(float(np.std(residual / sd)), cycle.noise_sd)
-    return Line(value, float(np.hypot(regression_sd, slope * shared_sd)), scatter)
+    return ImpactLine(value, float(np.hypot(regression_sd, slope * shared_sd)), scatter)
 
 
 def _single_cycles(

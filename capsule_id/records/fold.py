@@ -6,20 +6,26 @@ The sampling step hardly ever divides the period, so that ten periods at 1 kHz a
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 
 @dataclass(frozen=True)
 class Local:
     """Local polynomials about some places (m,): value, rate per second, and their sd for unit noise."""
 
-    value: np.ndarray
-    rate: np.ndarray
-    sd: np.ndarray
-    rate_sd: np.ndarray
+    value: Float[np.ndarray, " m"]
+    rate: Float[np.ndarray, " m"]
+    sd: Float[np.ndarray, " m"]
+    rate_sd: Float[np.ndarray, " m"]
 
 
 def local_polynomials(
-    phase: np.ndarray, values: np.ndarray, period: float, places: np.ndarray, half_width: float, order: int
+    phase: Float[np.ndarray, " n"],
+    values: Float[np.ndarray, " n"],
+    period: float,
+    places: Float[np.ndarray, " m"],
+    half_width: float,
+    order: int,
 ) -> Local:
     """Least-squares polynomials over windows of a folded record, the folded Savitzky–Golay filter.
 
@@ -51,7 +57,7 @@ def local_polynomials(
     return Local(unknowns[:, 0], rate, np.sqrt(inverse[:, 0, 0]), rate_sd)
 
 
-def intervals_above(z: np.ndarray, low: float, high: float) -> list[tuple[int, int]]:
+def intervals_above(z: Float[np.ndarray, " n"], low: float, high: float) -> list[tuple[int, int]]:
     """Stretches of a cyclic sequence (n,) that begin above ``high`` and last until it has fallen below ``low``.
 
     Returns (first, length) of each, indices modulo n; a sequence that never falls below ``low`` is one stretch if it

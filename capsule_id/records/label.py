@@ -1,6 +1,6 @@
 """The motion of a record in the paper's words, P-<n>-<F|B|S>-<m>, with the evidence, or "undecided" with the reason.
 
-drive -> period by repeat -> progress -> contacts on the folded record -> label
+drive -> period by repeat -> mean velocity -> contacts on the folded record -> label
 """
 
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.records.columns import stated_gap, stated_Omega
 from capsule_id.records.contacts import Contacts, Cycle, find_contacts
-from capsule_id.records.drive import Harmonic, drive_of, fit_harmonic
-from capsule_id.records.progress import Progress, progress_of
+from capsule_id.records.mean_velocity import MeanVelocity, fit_mean_velocity
 from capsule_id.records.repeat import Repeat, find_period
+from capsule_id.records.stated_settings import stated_gap, stated_Omega
+from capsule_id.records.tone import Harmonic, fit_harmonic, recorded_drive
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Table
 
@@ -23,16 +23,16 @@ UNDECIDED = "undecided"
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a label rests on; None where the channels for it were not recorded.
+    """Evidence for a label; None where the channels for it were not recorded.
 
     drive : the tone of the current            Omega : rad/s, of the current, else of x_rel, else as stated
-    repeat, progress, contacts : as they were found            reasons : why the label is undecided, () where it is not
+    repeat, mean_velocity, contacts : as they were found            reasons : why the label is undecided, () where it is not
     """
 
     drive: Harmonic | None
     Omega: float
     repeat: Repeat | None
-    progress: Progress | None
+    mean_velocity: MeanVelocity | None
     contacts: Contacts | None
     reasons: tuple[str, ...]
 
@@ -56,7 +56,7 @@ def measured_motion(table: Table) -> MeasuredMotion:
     The label is of the record, not of a settled motion in theory: "P-1" says that it repeats within the noise.
     """
     time, columns = table["time"], table.columns
-    drive = drive_of(table)
+    drive = recorded_drive(table)
     Omega = drive.Omega if drive else stated_Omega(table)
     try:
         sampling_step(time)
@@ -68,11 +68,11 @@ def measured_motion(table: Table) -> MeasuredMotion:
     T = 2.0 * np.pi / Omega
     repeat = find_period(time, table["x_rel"], T, columns["x_rel"].reading_sd) if "x_rel" in columns else None
     period = repeat.period if repeat else None
-    progress = progress_of(time, table["x_capsule"], T, period) if "x_capsule" in columns else None
+    velocity = fit_mean_velocity(time, table["x_capsule"], T, period) if "x_capsule" in columns else None
     contacts = find_contacts(_cycle(table, Omega, period * T, repeat.noise_sd)) if repeat and period else None
-    velocity = progress.velocity if progress else float("nan")
-    label, reasons = _label(repeat, progress, contacts)
-    return MeasuredMotion(label, velocity, Evidence(drive, Omega, repeat, progress, contacts, reasons))
+    mean_velocity = velocity.velocity if velocity else float("nan")
+    label, reasons = _label(repeat, velocity, contacts)
+    return MeasuredMotion(label, mean_velocity, Evidence(drive, Omega, repeat, velocity, contacts, reasons))
 
 
 def _cycle(table: Table, Omega: float, period: float, noise_sd: float) -> Cycle:
@@ -81,17 +81,19 @@ def _cycle(table: Table, Omega: float, period: float, noise_sd: float) -> Cycle:
     return Cycle(table["time"], table["x_rel"], acceleration, Omega, period, gap.value, gap.sd, noise_sd)
 
 
-def _label(repeat: Repeat | None, progress: Progress | None, contacts: Contacts | None) -> tuple[str, tuple[str, ...]]:
-    """The label and, where it is "undecided", all that stands in its way."""
+def _label(
+    repeat: Repeat | None, velocity: MeanVelocity | None, contacts: Contacts | None
+) -> tuple[str, tuple[str, ...]]:
+    """The label and, where it is "undecided", the reasons."""
     if repeat is None:
         return UNDECIDED, ("x_rel was not recorded",)
     if repeat.period is None:
         return UNDECIDED, (repeat.reason,)
     if repeat.period == 0:
         return "aperiodic", ()
-    reasons = [part.reason for part in (progress, contacts) if part is not None and part.reason]
-    if progress is None:
+    reasons = [part.reason for part in (velocity, contacts) if part is not None and part.reason]
+    if velocity is None:
         reasons.append("x_capsule was not recorded")
-    if reasons or progress is None or contacts is None or contacts.count is None:
+    if reasons or velocity is None or contacts is None or contacts.count is None:
         return UNDECIDED, tuple(reasons)
-    return f"P-{repeat.period}-{progress.direction}-{Fraction(contacts.count, repeat.period)}", ()
+    return f"P-{repeat.period}-{velocity.direction}-{Fraction(contacts.count, repeat.period)}", ()

@@ -1,42 +1,45 @@
-"""Does the record repeat after n periods of the drive? Stroboscopic comparison, at all phases at once.
+"""Period of the motion in excitation periods, by comparing the record with itself n periods later.
 
 x_rel(t + n T) - x_rel(t) is noise alone where the motion has period n. The ratio of its mean square to that of the
-noise is compared with 1; the noise is known from the record's own sixth differences, which no motion survives.
+noise is compared with 1; the noise level comes from sixth differences, which remove every motion.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.stats import norm
 
-LONGEST = 16  # as ``response`` of the model has it
+from capsule_id.records.noise import noise_level
+from capsule_id.rig.filters import Record
+
+LONGEST = 16  # excitation periods; ``response`` uses the same bound
 #: A repeat leaves at most this share of the motion's rms beyond the noise ...
 SAME = 0.01
-#: ... and a record is clean enough to tell where a part of this share of the motion would have been seen.
+#: ... and a record is clean enough where a part of another period is visible from this share of the motion's rms.
 VISIBLE = 0.03
 #: The smallest period of motion that passes must be seen repeating over at least this many periods of the drive.
 FEWEST_PERIODS = 4
 FEWEST_OVERLAP = 2  # periods of the drive that a comparison rests on
 _ERRORS = 5.0  # standard errors of the mean square that count as no more than noise
 _EDGE = 5  # samples at the end where the spline knows one side only
-_ORDER = 6
-_ORDER_GAIN = 30.397368307141327  # sqrt(binomial(12, 6)): sixth differences of unit white noise
-_NOISE_VARIANCE = 12.0  # relative variance of noise_of()**2, times the number of samples (a test measures it)
+_DIFFERENCES = 6  # order of the differences that no motion survives
+_NOISE_VARIANCE = (
+    12.0  # relative variance of that noise level squared, times the number of samples (a test measures it)
+)
 _KERNEL = 30  # half-length of the impulse that shows the spline's gain for noise
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """What the comparison found.
+    """Result of the comparison.
 
-    period : in excitation periods; 0 where nothing repeats up to 16; None where the record cannot tell
+    period : in excitation periods; 0 where nothing repeats up to 16; None where the record is not conclusive
     periods : length of the record in excitation periods
     ratios : (N,) mean square of the difference after n = 1..N periods over that of the noise
-    visible : smallest rms of a part of the motion of another period that would have been seen, m (None: no comparison)
+    visible : smallest visible rms of a part of another period, m (None: no comparison)
     motion : rms of x_rel about its mean, noise taken off, m
     noise_sd : of x_rel, m
-    reason : why it cannot tell, or ""
+    reason : why it is not conclusive, or ""
     """
 
     period: int | None
@@ -48,16 +51,7 @@ class Repeat:
     reason: str = ""
 
 
-def noise_of(values: np.ndarray, floor: float = 0.0) -> float:
-    """sd of the white noise on an evenly sampled record (n,), by the median of its sixth differences, at least ``floor``.
-
-    The median leaves out what contacts, a small part of the time, put into them.
-    """
-    differences = np.abs(np.diff(values, _ORDER))
-    return max(float(np.median(differences) / norm.ppf(0.75) / _ORDER_GAIN), floor)
-
-
-def find_period(time: np.ndarray, x_rel: np.ndarray, T: float, floor: float = 0.0) -> Repeat:
+def find_period(time: Record, x_rel: Record, T: float, floor: float = 0.0) -> Repeat:
     """Smallest number n of drive periods T after which x_rel repeats within its noise.
 
     Parameters
@@ -68,13 +62,12 @@ def find_period(time: np.ndarray, x_rel: np.ndarray, T: float, floor: float = 0.
 
     Rule: n repeats where the mean square of the differences exceeds that of the noise by no more than 5 of its standard
     errors, or by less than 1 % of the motion's rms. The record must hold 2n periods and at least 4, and be clean enough
-    that a part of another period with 3 % of the motion's rms would have been seen; a smaller one, or chaos in as narrow
-    bands, passes for a repeat. "Nothing repeats" needs
-    comparisons up to n = 16, each over 2 periods or more.
+    that a part of another period with 3 % of the motion's rms is visible. A smaller part, or chaos in bands as narrow,
+    counts as a repeat. "Nothing repeats" needs comparisons up to n = 16, each over 2 periods or more.
     """
     step = (time[-1] - time[0]) / (len(time) - 1)
     periods = len(time) * step / T
-    noise_sd = noise_of(x_rel, floor)
+    noise_sd = max(noise_level(x_rel, _DIFFERENCES), floor)
     motion = float(np.sqrt(max(np.var(x_rel) - noise_sd**2, 0.0)))
     spline = CubicSpline(time, x_rel)
     ratios, seen, repeats = [], [], []
@@ -90,12 +83,12 @@ def find_period(time: np.ndarray, x_rel: np.ndarray, T: float, floor: float = 0.
         excess = float(np.mean(difference**2) - noise)
         ratios.append(excess / noise + 1.0 if noise > 0.0 else np.inf)
         seen.append(float(np.sqrt(bound)))
-        repeats.append(excess <= max(bound, (SAME * motion) ** 2))
+        repeats.append(bool(excess <= max(bound, (SAME * motion) ** 2)))
     return _judge(repeats, Repeat(None, float(periods), np.array(ratios), max(seen, default=None), motion, noise_sd))
 
 
 def _judge(repeats: list[bool], found: Repeat) -> Repeat:
-    """The period, or the reason why the record cannot tell."""
+    """The period, or the reason why the record is not conclusive."""
     period, reason = None, ""
     if found.periods < FEWEST_PERIODS:
         reason = f"the record holds {found.periods:.1f} periods of the drive, {FEWEST_PERIODS} are needed"

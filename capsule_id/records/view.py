@@ -1,4 +1,4 @@
-"""A record made ready for looking at: filtered, differentiated, cut at the drive's phase; as the paper's Figs. 4, 9, 12.
+"""A record prepared for figures: filtered, differentiated, sampled at the drive's phase (the paper's Figs. 4, 9, 12).
 
 For pictures and starting values only. Likelihoods use the raw channels.
 """
@@ -10,8 +10,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from capsule_id.errors import InputError
-from capsule_id.records.columns import stated_gap
 from capsule_id.records.label import MeasuredMotion, measured_motion
+from capsule_id.records.stated_settings import stated_gap
 from capsule_id.rig.filters import gain, sampling_step, savitzky_golay
 from capsule_id.rig.model import Table
 
@@ -25,7 +25,7 @@ MULTIPLE = 5.0
 
 @dataclass(frozen=True)
 class Gains:
-    """What the filter leaves of a motion at some frequency f, Hz: of x_rel and of its rate (1: everything)."""
+    """Gains of the filter at frequency f, Hz: of x_rel and of its rate, 1."""
 
     f: float
     smoothing: float
@@ -98,7 +98,7 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
         section_x_rel=CubicSpline(time, x_rel)(section),
         section_rate=CubicSpline(time, rate)(section),
         gap=stated_gap(table).value,
-        gap_seen=contacts.gap_seen.value if contacts and contacts.gap_seen else None,
+        gap_seen=contacts.impact_line.value if contacts and contacts.impact_line else None,
         force=K * (table["current"] - evidence.drive.offset) if K is not None and evidence.drive else None,
         samples=samples,
         at_drive=_gains(f, step, samples),
@@ -107,7 +107,7 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
 
 
 def _window(f: float, step: float, most: int) -> int:
-    """Samples of the longest window, at least the shortest, that leaves the rate at f Hz alone."""
+    """Samples of the longest window, at least the shortest, that passes the rate at f Hz."""
     samples = SHORTEST_WINDOW
     while samples + 2 <= most and gain(f * step, samples + 2, ORDER, 1) >= PASSED:
         samples += 2

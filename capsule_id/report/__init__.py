@@ -1,4 +1,4 @@
-"""What is shown: tables, figures, one HTML page and the files of a result. Renders only, computes nothing.
+"""Tables, figures, the HTML page and the files of a result. This package renders; it computes no result.
 
-Import the modules, not the package: ``text`` is free of matplotlib, xarray and jinja2.
+Import the modules, not the package: ``console_table`` is free of matplotlib, xarray and jinja2.
 """

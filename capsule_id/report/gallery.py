@@ -1,4 +1,4 @@
-"""All pictures of a result, drawn once: the page embeds the same bytes that stand in ``figures/``."""
+"""All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``."""
 
 import re
 from collections.abc import Iterable
@@ -44,7 +44,7 @@ class Picture:
 
     @property
     def wide(self) -> bool:
-        """Takes the whole width of the page."""
+        """Whether the picture takes the whole width of the page."""
         return self.width > _HALF_PAGE
 
 
@@ -98,7 +98,7 @@ def comparison_caption(item: Comparison) -> str:
     if item.residuals is not None:
         parts.append("Shaded: the range that holds 95 % of a good fit's residuals.")
     if any(points.flagged is not None and points.flagged.any() for points in item.points):
-        parts.append("Framed rows are named by a check; they take part in the fit like all others.")
+        parts.append("Framed rows are flagged by a check; they stay in the fit.")
     if item.predictive_p is not None:
         parts.append(f"Posterior predictive p = {item.predictive_p:.2g} (chi-square discrepancy).")
     return " ".join(parts)
@@ -124,7 +124,7 @@ def _comparison_name(item: Comparison) -> str:
 
 
 def _unique(names: Iterable[str]) -> list[str]:
-    """Number what would otherwise overwrite another picture (also on file systems that ignore case)."""
+    """Number names that would overwrite another picture (also on file systems that ignore case)."""
     taken = {"corner", "traces", "point_fit_starts"}
     unique = []
     for name in names:

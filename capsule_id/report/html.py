@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
 
 from capsule_id.inference.result import Result
 from capsule_id.report.gallery import Picture
@@ -30,7 +29,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"symbol": _symbol, "number": _number, "embed": _embed}
+    environment.filters |= {"symbol_parts": symbol_parts, "number": _number, "embed": _embed}
     return environment.get_template("report.html.j2").render(
         result=result,
         sections={name: _section(pictures, name) for name in ("measured", "sample", "point_fit")},
@@ -49,7 +48,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
 
 
 def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
-    """Narrow pictures first: they stand in pairs, and a wide one between them would leave a hole."""
+    """Narrow pictures first: they go in pairs, and a wide one between them leaves a gap."""
     return sorted((picture for picture in pictures if picture.section == name), key=lambda picture: picture.wide)
 
 
@@ -84,15 +83,6 @@ def _note(note: NoteTable) -> dict[str, object]:
         for index, row in zip(frame.index, frame.itertuples(index=False), strict=True)
     ]
     return {"title": note.title, "caption": note.caption, "header": header, "rows": rows}
-
-
-def _symbol(name: str) -> Markup:
-    """A parameter's name as the paper sets it; whatever stands in brackets is somebody's file name and is escaped."""
-    base, index, label = symbol_parts(name)
-    word = f"<code>{escape(base)}</code>" if len(base) > 1 else f"<var>{escape(base)}</var>"
-    small = f"<sub>{escape(index)}</sub>" if index else ""
-    behind = f' <span class="label">{escape(label)}</span>' if label else ""
-    return Markup(word + small + behind)
 
 
 def _number(value: object, form: str = ".5g") -> str:

@@ -116,10 +116,8 @@ def _families(arrays: Mapping[str, np.ndarray], units: Mapping[str, str]) -> xr.
             raise ValueError(f"{base} is used both alone and as a family: {', '.join(members)}; rename one of them")
         dimension = _DIMENSIONS.get(base, f"{base}_of")
         stacked = np.stack([arrays[name] for name in members], axis=-1)
-        each = [units.get(name, "") for name in members]
-        # One unit where all members share it, otherwise one per label in the order of the dimension.
-        unit = each[0] if len(set(each)) == 1 else each
-        variables[base] = xr.Variable(("chain", "draw", dimension), stacked, {"units": unit})
+        # A symbol has one unit, so the first member's holds for all.
+        variables[base] = xr.Variable(("chain", "draw", dimension), stacked, {"units": units.get(members[0], "")})
         coordinates[dimension] = [name[len(base) + 1 : -1] for name in members]
     return xr.Dataset(variables, coords=coordinates)
 

@@ -73,7 +73,7 @@ def _row(name: str, row: Mapping[Hashable, Any]) -> Row:
 
 
 def _informed(name: str, informed: object) -> str:
-    """A mass has its weighing for a prior: that the bench tests do not narrow it further is nothing to worry about."""
+    """Masses read "weighed": their prior is the weighing, so data that do not narrow it further are normal."""
     if informed is None or informed != informed:  # NaN
         return ""
     if informed:

@@ -1,4 +1,4 @@
-"""A result becomes files in a directory that already exists."""
+"""Write a result as files into an existing directory."""
 
 import json
 import math
@@ -23,7 +23,7 @@ def write_result(result: Result, directory: Path) -> None:
     Raises
     ------
     FileNotFoundError
-        If ``directory`` does not exist: making and naming it is the caller's business.
+        If ``directory`` does not exist: the caller makes and names it.
     """
     figures = directory / "figures"
     figures.mkdir(exist_ok=True)

@@ -17,7 +17,7 @@ from capsule_id.commands.progress import Progress
 from capsule_id.motions import sweep
 from capsule_id.motions.response import Settling, response
 from capsule_id.physics.model import CapsuleParameters, Excitation
-from capsule_id.report.figures.sweeps import MeasuredMotion
+from capsule_id.report.figures.sweeps import MeasuredPoint
 from tests.cli_tools import ROOT, listing, small_rig
 
 SHORT = ["--dropped", "20", "--observed", "6", "--quiet"]
@@ -139,7 +139,7 @@ def test_parameters_of_a_fitted_rig(capsys: pytest.CaptureFixture[str]) -> None:
 def test_measured_runs_are_laid_over_the_diagram() -> None:
     assert _run(*OVER, *SHORT) == 0
     axes = (command.Axis("k2", 5.0, 50.0, 4, "kN/m", 1e3),)
-    figure = command.draw(_opened("bifurcation-k2.nc"), axes, [MeasuredMotion(2e4, "P-1-F-2", 4e-4)])
+    figure = command.draw(_opened("bifurcation-k2.nc"), axes, [MeasuredPoint(2e4, "P-1-F-2", 4e-4)])
     lower = figure.axes[1]
     (run,) = [line for line in lower.lines if line.get_label() == "measured"]
     np.testing.assert_allclose(run.get_xydata(), [[20.0, 0.4]])

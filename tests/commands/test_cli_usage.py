@@ -207,3 +207,20 @@ def test_entry_points_are_installed() -> None:
 
 def _quoted(word: str) -> str:
     return "'" + word.replace("'", "'\\''") + "'"
+
+
+def test_a_warning_is_shown_as_one_line(tmp_path: Path) -> None:
+    """Numerical warnings reach the user; deprecations of the libraries do not."""
+    before = """\
+import warnings
+from capsule_id.commands import check
+def act(args):
+    warnings.warn("overflow\\nencountered", RuntimeWarning)
+    warnings.warn_explicit("old", DeprecationWarning, "lib.py", 1, module="lib")
+    return 0
+check.run = act
+"""
+    done = run("check", str(DATA), cwd=tmp_path, name="capsule_id", before=before)
+    assert (done.returncode, done.stdout) == (0, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("capsule-id: warning: RuntimeWarning: overflow encountered (")

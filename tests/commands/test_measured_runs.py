@@ -10,7 +10,7 @@ from capsule_id.api import read_rig
 from capsule_id.cli import capsule_id
 from capsule_id.commands import bifurcate
 from capsule_id.commands.measured_runs import Span, overlay
-from capsule_id.report.figures.sweeps import MeasuredMotion
+from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.synthetic import Truth, synthesize
 
 #: The paper's Fig. 10, of which runs 3 and 4 are synthesized; and near Fig. 6, of which run 1 is.
@@ -91,7 +91,7 @@ def test_the_command_draws_them(
     Path("results/rig").mkdir(parents=True)
     rows = {"parameters": {name: {"map": value} for name, value in FITTED.items()}}
     Path("results/rig/parameters.json").write_text(json.dumps(rows), encoding="utf-8")
-    drawn: list[MeasuredMotion] = []
+    drawn: list[MeasuredPoint] = []
     draw = bifurcate.draw
 
     def watch(*words: object, **options: object) -> object:

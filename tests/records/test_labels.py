@@ -41,10 +41,10 @@ def test_longer_periods_and_aperiodic_motions() -> None:
 def test_mean_velocities_are_those_of_the_model() -> None:
     for case in reference():
         motion = case.nominal
-        progress = motion.evidence.progress
-        assert progress is not None
+        velocity = motion.evidence.mean_velocity
+        assert velocity is not None
         # 2 s of a motion that is settled to some 1e-6 of its speed
-        assert abs(motion.mean_velocity - case.mean_velocity) < 4.0 * progress.velocity_sd + 1e-3 * abs(
+        assert abs(motion.mean_velocity - case.mean_velocity) < 4.0 * velocity.velocity_sd + 1e-3 * abs(
             case.mean_velocity
         ), case.name
 
@@ -53,9 +53,9 @@ def test_the_record_places_the_impact_line() -> None:
     pulls, off = [], []
     for case in reference():
         contacts, truth = case.nominal.evidence.contacts, case.run.truth
-        if contacts is not None and contacts.gap_seen is not None:
-            off.append(contacts.gap_seen.value - truth.G - truth.offsets["x_rel"])
-            pulls.append(off[-1] / contacts.gap_seen.sd)
+        if contacts is not None and contacts.impact_line is not None:
+            off.append(contacts.impact_line.value - truth.G - truth.offsets["x_rel"])
+            pulls.append(off[-1] / contacts.impact_line.sd)
     assert len(off) >= 20
     assert np.median(np.abs(off)) < 5e-6  # the stated gap is off by 20 um, and the zero of x_rel by as much
     assert np.max(np.abs(pulls)) < 4.0
@@ -101,7 +101,7 @@ def test_without_acceleration_the_stated_gap_has_to_do() -> None:
     contacts = case.motion(only=channels).evidence.contacts
     assert contacts is not None
     assert contacts.spikes == ()
-    assert contacts.gap_seen is None
+    assert contacts.impact_line is None
 
 
 def test_without_current_the_frequency_is_that_of_x_rel() -> None:

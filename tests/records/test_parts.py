@@ -1,11 +1,12 @@
-"""Period, progress and folding, each on signals made by hand."""
+"""Period, mean velocity and folding, each on signals made by hand."""
 
 import numpy as np
 import pytest
 
 from capsule_id.records.fold import intervals_above, local_polynomials
-from capsule_id.records.progress import STANDING, progress_of
-from capsule_id.records.repeat import find_period, noise_of
+from capsule_id.records.mean_velocity import STANDING, fit_mean_velocity
+from capsule_id.records.noise import noise_level
+from capsule_id.records.repeat import find_period
 
 TIME = np.arange(2000) / 1000.0
 T = 2.0 * np.pi / 73.58
@@ -59,10 +60,10 @@ def test_no_false_second_period_in_noise() -> None:
 
 
 def test_noise_estimate_and_its_stated_scatter() -> None:
-    squares = np.array([noise_of(motion(2) + noise(seed)) ** 2 for seed in range(1000)]) / NOISE_SD**2
+    squares = np.array([noise_level(motion(2) + noise(seed), 6) ** 2 for seed in range(1000)]) / NOISE_SD**2
     assert squares.mean() == pytest.approx(1.0, abs=0.02)
     assert squares.var() * len(TIME) == pytest.approx(12.0, rel=0.2)  # 1000 replicates: 4.5 %
-    assert noise_of(motion(2), floor=3e-6) == 3e-6
+    assert find_period(TIME, motion(2), T, floor=3e-6).noise_sd == 3e-6
 
 
 def stick_slip(velocity: float) -> np.ndarray:
@@ -74,7 +75,7 @@ def stick_slip(velocity: float) -> np.ndarray:
 
 def test_mean_velocity_and_its_standard_error() -> None:
     velocity = 0.6e-3
-    found = [progress_of(TIME, stick_slip(velocity) + noise(seed, 5e-6), T, 1) for seed in range(200)]
+    found = [fit_mean_velocity(TIME, stick_slip(velocity) + noise(seed, 5e-6), T, 1) for seed in range(200)]
     pulls = np.array([(p.velocity - velocity) / p.velocity_sd for p in found])
     # 200 replicates: standard errors 0.07 and 0.05; steps are no sum of harmonics, hence some more room for the mean
     assert abs(pulls.mean()) < 0.35
@@ -89,7 +90,7 @@ def test_mean_velocity_and_its_standard_error() -> None:
     [(5e-6, 5e-6, "F"), (-5e-6, 5e-6, "B"), (0.0, 5e-6, "S"), (STANDING, 5e-6, None), (2e-7, 1e-4, None)],
 )
 def test_direction(advance: float, noise_sd: float, direction: str | None) -> None:
-    found = [progress_of(TIME, stick_slip(advance / T) + noise(seed, noise_sd), T, 1) for seed in range(30)]
+    found = [fit_mean_velocity(TIME, stick_slip(advance / T) + noise(seed, noise_sd), T, 1) for seed in range(30)]
     decided = [p.direction for p in found]
     assert decided.count(direction) >= 27  # 99 % intervals
     assert all("direction" in p.reason for p in found if p.direction is None)
@@ -99,10 +100,10 @@ def test_without_a_period_the_advances_scatter() -> None:
     rng = np.random.default_rng(5)
     ends = np.concatenate([[0.0], np.cumsum(1e-5 + 2e-5 * rng.standard_normal(40))])
     wander = np.interp(TIME / 0.1, np.arange(41.0), ends)  # straight from period to period, corners on the samples
-    found = progress_of(TIME, wander, 0.1, None)
+    found = fit_mean_velocity(TIME, wander, 0.1, None)
     assert found.velocity == pytest.approx(ends[19] / 1.9, rel=1e-9)
     assert found.velocity_sd == pytest.approx(np.std(np.diff(ends[:20]), ddof=1) / np.sqrt(19.0) / 0.1, rel=1e-9)
-    one = progress_of(TIME[:150], wander[:150], 0.1, None)
+    one = fit_mean_velocity(TIME[:150], wander[:150], 0.1, None)
     assert one.direction is None
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.records.text import describe_run, run_warning
+from capsule_id.records.run_description import describe_run, run_warning
 from capsule_id.records.view import PASSED, RecordView, view_record
 from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
 from capsule_id.report.figures.style import new_figure, png

@@ -192,7 +192,7 @@ def test_synthetic_mark_changes_every_picture(result: Result, drawn: tuple[Pictu
 def test_no_pyplot_and_no_matplotlib_for_text() -> None:
     code = """
 import sys
-import capsule_id.report.text
+import capsule_id.report.console_table
 assert "matplotlib" not in sys.modules and "xarray" not in sys.modules
 import capsule_id.report.write
 assert "matplotlib.figure" in sys.modules

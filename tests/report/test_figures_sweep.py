@@ -9,7 +9,7 @@ from capsule_id.report.figures import maps as figures_map
 from capsule_id.report.figures import sweeps as figures_sweep
 from capsule_id.report.figures.motion_looks import label_classes, shown
 from capsule_id.report.figures.style import png
-from capsule_id.report.figures.sweeps import AxisUnit, MeasuredMotion
+from capsule_id.report.figures.sweeps import AxisUnit, MeasuredPoint
 
 UNITS = {"k2": AxisUnit("kN/m", 1e3)}
 
@@ -60,7 +60,7 @@ def test_many_branches_are_coloured_by_period() -> None:
 
 
 def test_velocity_is_marked_by_direction_with_labels_and_measured_runs() -> None:
-    measured = [MeasuredMotion(2500.0, "P-1-F-2", 1.5e-3)]
+    measured = [MeasuredPoint(2500.0, "P-1-F-2", 1.5e-3)]
     ax = figures_sweep.mean_velocity(_diagram(1), UNITS, measured)
     drawn = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in ax.lines}
     assert drawn["forward"] == ([4.0], [2.0])

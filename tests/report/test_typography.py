@@ -65,7 +65,7 @@ def test_decimal_prefix(unit: str, magnitude: float, factor: float, shown: str) 
         ("Omega", ("Ω", "", ""), "Ω"),
         ("P_d", ("P", "d", ""), "P_d"),
         ("k2[soft]", ("k", "2", "soft"), "k₂ soft"),
-        ("noise_sd[run_1]", ("noise_sd", "", "run_1"), "noise_sd run_1"),
+        ("noise_x_rel[run_1]", ("noise_x_rel", "", "run_1"), "noise_x_rel run_1"),
         ("tilt_sd", ("tilt_sd", "", ""), "tilt_sd"),
         ("k2[<b>$x$]", ("k", "2", "<b>$x$"), "k₂ <b>$x$"),
         ("2 odd[x", ("2 odd", "", "x"), "2 odd x"),

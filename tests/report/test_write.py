@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 
 from capsule_id.inference.result import Result
+from capsule_id.parameters import TABLE, symbol_of
 from capsule_id.report.netcdf import write_posterior
 from capsule_id.report.write import parameters_json, write_result
 from capsule_id.views import Finding
@@ -34,6 +35,13 @@ def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("results")
     write_result(result, path)
     return path
+
+
+def test_the_result_has_the_names_units_and_meanings_of_the_parameter_table(result: Result) -> None:
+    for frame, physical in ((result.summary, True), (result.nuisances, False)):
+        for name, row in frame.iterrows():
+            known = TABLE[symbol_of(str(name))]
+            assert (row["unit"], row["meaning"], physical) == (known.unit, known.meaning, known.physical), name
 
 
 def _strict(text: str) -> dict:
@@ -155,7 +163,7 @@ def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType
     assert posterior is not None
     ensembles, draws, walkers, _ = posterior.draws.shape
     assert dict(data.posterior.sizes) == {
-        "chain": ensembles * walkers, "draw": draws, "spring": 3, "noise_sd_of": 7,
+        "chain": ensembles * walkers, "draw": draws, "spring": 3, "noise_sd_of": 3, "scatter_of": 4,
     }  # fmt: skip
     np.testing.assert_array_equal(data.posterior["ensemble"], np.arange(ensembles * walkers) // walkers)
     assert all(variable.dtype == np.float64 for variable in data.posterior.data_vars.values())
@@ -175,14 +183,15 @@ def test_every_draw_is_in_its_place(folder: Path, result: Result) -> None:
             here = dict(zip(posterior.names, posterior.draws[e, draw, walker], strict=True))
             assert float(chain["k1"]) == here["k1"]
             assert float(chain["k2"].sel(spring="medium")) == here["k2[medium]"]
-            assert float(chain["noise_sd"].sel(noise_sd_of="motor_current")) == here["noise_sd[motor_current]"]
+            assert float(chain["scatter"].sel(scatter_of="motor_current")) == here["scatter[motor_current]"]
             assert float(chain["g"]) == 9.81
         assert data["g"].attrs == {"units": "m/s^2", "fixed": 1}
         assert "fixed" not in data["m1"].attrs
         assert data["k2"].dims == ("chain", "draw", "spring")
         assert list(data["spring"].values) == ["soft", "medium", "stiff"]
         assert data["k2"].attrs["units"] == "N/m"
-        assert list(data["noise_sd"].attrs["units"]) == ["m", "m", "m", "N", "N", "N", "N"]
+        assert data["noise_sd"].attrs["units"] == "m"
+        assert data["scatter"].attrs["units"] == "N"
     with xr.open_dataset(folder / "posterior.nc", group="sample_stats", engine="h5netcdf") as stats:
         assert float(stats["lp"].isel(chain=2 * walkers + 3, draw=5)) == posterior.lp[2, 5, 3]
         assert float(stats["acceptance"].isel(chain=walkers)) == posterior.acceptance[1, 0]

@@ -1,4 +1,4 @@
-"""Statistics of a recorded series: its noise, and whether its residuals are white."""
+"""Statistics of a recorded series: its autocorrelation, and whether its residuals are white."""
 
 import numpy as np
 from scipy import stats
@@ -7,14 +7,6 @@ from scipy import stats
 LEVEL = 0.002
 #: Lags of the whiteness test, and the shortest record per lag, samples.
 LAGS, SAMPLES_PER_LAG = 20, 5
-
-
-def noise_level(values: np.ndarray) -> float:
-    """Noise sd of (n,) values from third differences: median |d3| / (0.6745 sqrt(20)).
-
-    The motion of a well-sampled record leaves third differences small. A contact or a stop spoils few of them.
-    """
-    return float(np.median(np.abs(np.diff(values, 3))) / (0.6745 * np.sqrt(20.0)))
 
 
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from capsule_id.experiments.kind import Estimate, Kind, Twin, Values
 from capsule_id.parameters import Prior, nuisance, scatter
-from capsule_id.records.text import describe_run, run_warning
+from capsule_id.records.run_description import describe_run, run_warning
 from capsule_id.rig.domains import NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Settings, Table

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from capsule_id.experiments.checks.context import Fitted
-from capsule_id.experiments.forced_run.start import harmonic
 from capsule_id.physics.forces import rod_acceleration, rod_on_capsule
 from capsule_id.physics.friction import normal_force
 from capsule_id.physics.grazing import grazing_load
 from capsule_id.physics.model import CapsuleParameters, Excitation
+from capsule_id.records.tone import tone_at
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
@@ -50,7 +50,7 @@ class RunConditions:
 def stated_conditions(table: Table, K: float) -> RunConditions:
     """Of a forced run: P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
     Omega, stated = table.settings.angular_frequency, table.settings.P_d
-    P_d = K * harmonic(table["time"], table["current"], Omega)[0] if stated is None else stated.value
+    P_d = K * tone_at(table["time"], table["current"], Omega)[0] if stated is None else stated.value
     return RunConditions(Omega, P_d, table.settings.gap.value)
 
 

@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from capsule_id.experiments.checks.series import noise_level
+from capsule_id.records.noise import noise_level
+from capsule_id.records.tone import tone_at
 
 #: Samples of the polynomials through the start of the record: a straight line tells whether the capsule moves, a
 #: parabola where the rod is and how fast.
@@ -54,11 +55,11 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
     noise = {name: max(noise_level(y), 1e-5 * float(np.ptp(y)), 1e-12) for name, y in channels.items()}
     amplitude, phase = float("nan"), 0.0
     if "current" in channels:
-        amplitude, phase = harmonic(time, channels["current"], Omega)
+        amplitude, phase, _ = tone_at(time, channels["current"], Omega)
     elif "x_rel" in channels:
         ratio = Omega / ROD_FREQUENCY
         lag = np.arctan2(2.0 * ROD_DAMPING * ratio, 1.0 - ratio**2)
-        phase = _wrap(harmonic(time, channels["x_rel"], Omega)[1] + lag)
+        phase = _wrap(tone_at(time, channels["x_rel"], Omega)[1] + lag)
     x_rel = rate = 0.0
     if "x_rel" in channels:
         x_rel, rate = _polynomial(time, channels["x_rel"], PARABOLA_SAMPLES, 2)[0]
@@ -76,13 +77,6 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
         if abs(slope) > MOVING * factor * noise["x_capsule"]:
             capsule_rate, kind = slope, "moving"
     return RunStart(kind, x_rel, rate, capsule_rate, length, amplitude, phase, noise)  # type: ignore[arg-type]
-
-
-def harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> tuple[float, float]:
-    """Amplitude and phase, rad, of amplitude cos(Omega t + phase) + offset by least squares."""
-    design = np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones(len(time))], axis=1)
-    cosine, sine, _ = np.linalg.lstsq(design, values, rcond=None)[0]
-    return float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine))
 
 
 def _polynomial(time: np.ndarray, values: np.ndarray, samples: int, order: int) -> tuple[tuple[float, float], float]:

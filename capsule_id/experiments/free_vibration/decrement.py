@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capsule_id.experiments.checks.series import noise_level
+from capsule_id.records.noise import noise_level
 
 #: A peak counts while it stands out of the noise by this many standard deviations.
 PEAK_NOISE_RATIO = 4.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, band
-from capsule_id.experiments.checks.series import autocorrelation, noise_level
+from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.experiments.free_vibration.checks import check_free_decay, check_stiffness
 from capsule_id.experiments.free_vibration.decay_models import (
     STEP_PHASE,
@@ -26,6 +26,7 @@ from capsule_id.experiments.free_vibration.window import decay_window
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Points

@@ -1,17 +1,17 @@
-"""Chains on disk that a kill at any moment cannot spoil.
+"""Chains on disk that stay readable when the process is killed at any moment.
 
 emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter), so a process that dies
-between two of them leaves a file that opens and is wrong. Runs are therefore taken up from a copy made between draws,
-which carries its own digest; the file that emcee writes is never trusted after an interruption.
+between two of them leaves a file that opens and is wrong. A resumed run therefore starts from a copy made between draws,
+which carries its own digest. The file that emcee writes is never read after an interruption.
 """
 
 import hashlib
 import time
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-import emcee
 import h5py
+
+from capsule_id.inference.sampling.ensemble import OpenBackend
 
 #: Seconds between two copies.
 SAVE_EVERY = 5.0
@@ -19,7 +19,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def saved_copy(store: Path) -> Path:
-    """The copy of ``store`` that an interrupted run is taken up from."""
+    """The copy of ``store`` from which an interrupted run resumes."""
     return store.with_suffix(".saved")
 
 
@@ -28,7 +28,7 @@ class ChainStore:
 
     Parameters
     ----------
-    store : the file; whatever stands in it is replaced by the last copy, or removed where there is no sound one
+    store : the file; it is replaced by the last copy, or removed where no copy has a valid digest
     """
 
     def __init__(self, store: Path) -> None:
@@ -46,9 +46,9 @@ class ChainStore:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def backend(self, name: str) -> emcee.backends.HDFBackend:
-        """Where an ensemble puts its draws."""
-        return _OpenBackend(self._file, name)
+    def backend(self, name: str) -> OpenBackend:
+        """The store of one ensemble's draws."""
+        return OpenBackend(self._file, name)
 
     def between_draws(self) -> None:
         """Copy the file, if the last copy is old enough; to be called while emcee is not writing."""
@@ -63,15 +63,3 @@ class ChainStore:
         temporary.write_bytes(hashlib.sha256(content).digest() + content)
         temporary.replace(self._copy)
         self._next = time.monotonic() + SAVE_EVERY
-
-
-class _OpenBackend(emcee.backends.HDFBackend):
-    """emcee's backend opens its file six times a step; this one keeps it open."""
-
-    def __init__(self, file: h5py.File, name: str) -> None:
-        super().__init__(file.filename, name)
-        self._file = file
-
-    def open(self, mode: str = "r") -> AbstractContextManager[h5py.File]:
-        del mode
-        return nullcontext(self._file)

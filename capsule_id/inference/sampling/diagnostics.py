@@ -1,23 +1,27 @@
-"""Convergence of ensemble samplers. Walkers of one ensemble are not independent chains: ensembles are."""
+"""Convergence of ensemble samplers. Independent chains are whole ensembles, not the walkers of one."""
 
 import emcee
 import numpy as np
+from jaxtyping import Float
+
+#: Stored draws of independent ensembles.
+Draws = Float[np.ndarray, "ensemble draw walker d"]
 
 #: Autocorrelation times after which autocovariances are noise.
 WINDOW = 5.0
 
 
-def integrated_time(draws: np.ndarray) -> np.ndarray:
+def integrated_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
     """(ensemble, d) integrated autocorrelation time, in draws, of every ensemble: emcee's estimator, for the ESS.
 
-    NaN, not known, where a walker never moved (a budget of a few draws).
+    NaN where a walker never moved (a budget of a few draws).
     """
     with np.errstate(invalid="ignore"):
         return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
 
 
-def ensemble_time(draws: np.ndarray) -> np.ndarray:
-    """(ensemble, d) the same without emcee's bias in short chains: what decides whether a chain is long enough.
+def ensemble_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
+    """(ensemble, d) integrated autocorrelation time without emcee's bias in short chains: it decides on their length.
 
     Autocovariances are about the mean of the whole ensemble and averaged over its walkers. About each walker's own
     mean, as in emcee, tau comes out low by 10 tau/N of itself: by 20 % where N is just 50 tau (tested). The sum stops
@@ -37,7 +41,7 @@ def ensemble_time(draws: np.ndarray) -> np.ndarray:
     return np.take_along_axis(sums, np.argmax(enough, axis=1)[:, None], axis=1)[:, 0]
 
 
-def split_rhat(draws: np.ndarray) -> np.ndarray:
+def split_rhat(draws: Draws) -> Float[np.ndarray, " d"]:
     """(d,) split R-hat (Gelman et al., Bayesian Data Analysis, section 11.4) across independent ensembles.
 
     Each half of an ensemble, its walkers pooled, is one chain; ``draws`` (ensemble, draw, walker, d).
@@ -51,7 +55,7 @@ def split_rhat(draws: np.ndarray) -> np.ndarray:
     return np.sqrt(((n - 1) / n * within + between / n) / within)
 
 
-def effective_sample_size(draws: np.ndarray, tau: np.ndarray) -> np.ndarray:
+def effective_sample_size(draws: Draws, tau: Float[np.ndarray, "ensemble d"]) -> Float[np.ndarray, " d"]:
     """(d,) draws divided by the integrated autocorrelation time ``tau`` (ensemble, d), summed over ensembles.
 
     Never more than there are draws: the estimate of tau from a few draws may be 0.

@@ -1,17 +1,19 @@
-"""emcee: independent ensembles, run until they agree or the budget is spent, saved while they run."""
+"""Sampling by independent emcee ensembles: run until they agree or the budget is spent, saved while they run."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-import emcee
 import numpy as np
+from emcee import State
 
+from capsule_id.console import OnProgress
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling.chain_store import ChainStore
 from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
+from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import LARGE, Moves, block_move, candidates
 
 ENSEMBLES = 4
@@ -28,24 +30,22 @@ BURN_IN_IN_TAU = 8.0
 #: Walkers start this much wider than the Laplace approximation.
 OVERDISPERSION = 1.2
 DEFAULT_BUDGET = 20_000
-#: One draw is stored per this part of the pilot's autocorrelation time, but at least one per MAX_THIN steps: a short
-#: pilot knows that time only roughly.
+#: Stored draws per autocorrelation time of the pilot, and the most steps per stored draw: a short pilot knows that time
+#: only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
 #: Steps of the pilot's burn-in, half of which shapes the block proposal, and of the moves that it times.
 PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
-#: Name of the move that the pilot shapes by its own sample, how often it does so at most, and for how many steps.
+#: Name of the move that the pilot shapes by its own sample, the most adaptations, and the steps of each.
 ADAPTED, ADAPTATIONS, ADAPTING_STEPS = "adapted block independence + differential evolution", 4, 200
-#: The pilot looks no further once a move has an autocorrelation time, in steps, below this.
+#: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
-#: Other kinds of moves are tried only where no block proposal comes below this.
+#: Other kinds of moves are tried only where every block proposal stays above this, in steps.
 FAIR_TAU = 40.0
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """What the pilot run decides for the recorded one."""
+    """Move, thinning and burn-in of the recorded run, as the pilot run decides."""
 
     move: str
     moves: Moves
@@ -55,7 +55,7 @@ class Schedule:
 
 
 class Target(Protocol):
-    """What is sampled; see ``capsule_id.inference.target.marginal.MarginalPosterior``."""
+    """A density to sample; see ``capsule_id.inference.target.marginal.MarginalPosterior``."""
 
     names: tuple[str, ...]
     dimension: int
@@ -75,7 +75,7 @@ def sample(
     seed: int,
     budget: int = DEFAULT_BUDGET,
     store: Path | None = None,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> Posterior:
     """Sample the posterior with ``ENSEMBLES`` independent ensembles.
 
@@ -93,26 +93,26 @@ def sample(
     with nullcontext() if store is None else ChainStore(store) as chains:
         backends = [None if chains is None else chains.backend(f"ensemble_{i}") for i in range(ENSEMBLES)]
         samplers = [_sampler(target, schedule, *one) for one in zip(seeds, backends, strict=True)]
-        done = [sampler.iteration for sampler in samplers]
+        done = [sampler.stored for sampler in samplers]
         draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
         last = max(budget // schedule.thin, 2)
         for goal in _checks(last):
             if goal < last and min(done) > goal:
                 continue
             for i, sampler in enumerate(samplers):
-                for _ in _advance(sampler, goal - done[i], schedule.thin):
+                for _ in sampler.advance(goal - done[i], schedule.thin):
                     done[i] += 1
                     if chains is not None:
                         chains.between_draws()
                     report(sum(done), ENSEMBLES * goal, schedule.move)
-            located = np.stack([np.asarray(sampler.get_chain())[:goal] for sampler in samplers])
+            located = np.stack([sampler.chain[:goal] for sampler in samplers])
             if goal == last or _converged(located):
                 draws, lp = target.restore(located, restore_seed)
                 if _converged(draws):
                     break
         if chains is not None:
             chains.save()
-        acceptance = np.stack([sampler.backend.accepted / sampler.iteration for sampler in samplers])
+        acceptance = np.stack([sampler.acceptance for sampler in samplers])
     theta = target.theta(draws)
     return Posterior(
         names=target.names,
@@ -137,30 +137,26 @@ def _converged(draws: np.ndarray) -> bool:
 
 def pilot(target: Target, seed: int) -> Schedule:
     """Burn in one ensemble, then measure the autocorrelation time of candidate moves on it until one is good."""
-    random = np.random.RandomState(seed)
-    state: Any = emcee.State(_initial(target, random), random_state=random.get_state())
-    # Independence from a density too wide by a fifth in each of thirty directions would hardly ever be accepted.
+    start = _initial(target, np.random.RandomState(seed))
+    # In 30 dimensions a proposal that is 20 % too wide is almost never accepted: large blocks are not widened.
     wider = np.ones(target.dimension)
     wider[[i for block in target.blocks if len(block) < LARGE for i in block]] = OVERDISPERSION
     rough = block_move(target.blocks, target.centre, target.covariance * np.outer(wider, wider))
-    sampler = _ensemble(target, state.coords.shape[0], rough)
-    state = sampler.run_mcmc(state, PILOT_BURN_IN)
-    sample = np.asarray(sampler.get_chain(discard=PILOT_BURN_IN // 2, flat=True))
+    ensemble = Ensemble(target.parts, start, rough).run(PILOT_BURN_IN)
+    sample = ensemble.chain[PILOT_BURN_IN // 2 :].reshape(-1, target.dimension)
     measured, moves = {}, dict(candidates(sample, target.blocks, target.centre, target.covariance))
     first, *others = moves
-    # The most promising one first, briefly; where it is not good, for longer; then moves shaped by what was found so far,
-    # again and again: a posterior with kinks is not where and what the curvature at its maximum says. The rest is tried
-    # where none of these will do.
+    # The most promising move runs first, briefly, then for longer. Moves shaped by the sample so far follow: a posterior
+    # with kinks differs from the Laplace approximation. The other moves are the last resort.
     plan = [(first, PILOT_STEPS), (first, LONG_PILOT_STEPS), *[(ADAPTED, ADAPTING_STEPS)] * ADAPTATIONS]
     for name, steps in [*plan, *((name, LONG_PILOT_STEPS) for name in others)]:
         if name in others and min(measured.values()) < FAIR_TAU:
             break
         if name == ADAPTED:
-            found = np.asarray(sampler.get_chain(flat=True))
+            found = ensemble.chain.reshape(-1, target.dimension)
             moves[name] = block_move(target.blocks, np.mean(found, axis=0), np.atleast_2d(np.cov(found.T)))
-        sampler = _ensemble(target, state.coords.shape[0], moves[name])
-        state = sampler.run_mcmc(state, steps)
-        measured[name] = float(np.max(ensemble_time(np.asarray(sampler.get_chain())[None])))
+        ensemble = Ensemble(target.parts, ensemble.state, moves[name]).run(steps)
+        measured[name] = float(np.max(ensemble_time(ensemble.chain[None])))
         if measured[name] < GOOD_TAU:
             break
     best = min(measured, key=lambda name: measured[name])
@@ -178,49 +174,26 @@ def _checks(last: int) -> Iterator[int]:
     yield last
 
 
-def _advance(sampler: emcee.EnsembleSampler, missing: int, thin: int) -> Iterator[emcee.State]:
-    """Run until ``missing`` more draws are stored; every draw is saved as it is made."""
-    if missing > 0:
-        for state in sampler.sample(sampler._previous_state, iterations=missing, thin_by=thin, store=True):
-            # emcee keeps no state of a run that is iterated over: the next call would start from the same one again.
-            sampler._previous_state = state
-            yield state
-
-
-def _sampler(target: Target, schedule: Schedule, seed: int, backend: Any) -> emcee.EnsembleSampler:
+def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
     """One ensemble: burnt in from its own overdispersed start, or taken up where ``backend`` left it."""
-    random = np.random.RandomState(seed)
-    start = _initial(target, random)
-    if backend is not None and backend.initialized and backend.iteration > 0:
-        sampler = _ensemble(target, len(start), schedule.moves, backend)
-        sampler._previous_state = backend.get_last_sample()
-        return sampler
-    state = emcee.State(start, random_state=random.get_state())
-    state = _ensemble(target, len(start), schedule.moves).run_mcmc(state, schedule.burn_in, store=False)
+    last = None if backend is None else backend.last_state()
+    if last is not None:
+        return Ensemble(target.parts, last, schedule.moves, backend)
+    start = _initial(target, np.random.RandomState(seed))
+    burnt_in = Ensemble(target.parts, start, schedule.moves).run(schedule.burn_in, store=False).state
     if backend is not None:
-        backend.reset(len(start), target.dimension)
-    sampler = _ensemble(target, len(start), schedule.moves, backend)
-    sampler._previous_state = state
-    return sampler
+        backend.reset(*start.coords.shape)
+    return Ensemble(target.parts, burnt_in, schedule.moves, backend)
 
 
-def _ensemble(target: Target, walkers: int, moves: Moves, backend: Any = None) -> emcee.EnsembleSampler:
-    def log_density(v: np.ndarray) -> np.ndarray:
-        """(w, 1 + blocks): emcee keeps what follows the log-density as blobs, and ``BlockMove`` reads them."""
-        parts = target.parts(v)
-        return np.concatenate([np.sum(parts, axis=1, keepdims=True), parts], axis=1)
-
-    return emcee.EnsembleSampler(walkers, target.dimension, log_density, vectorize=True, moves=moves, backend=backend)
-
-
-def _initial(target: Target, random: np.random.RandomState) -> np.ndarray:
-    """(walkers, d) from the widened Laplace approximation, every one where the posterior is not zero."""
+def _initial(target: Target, random: np.random.RandomState) -> State:
+    """Walkers from the widened Laplace approximation, each at a finite log-posterior."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
     root = OVERDISPERSION * np.linalg.cholesky(target.covariance)
     u = target.centre + random.standard_normal((walkers, target.dimension)) @ root.T
     for _ in range(100):
         bad = ~np.all(np.isfinite(target.parts(u)), axis=1)
         if not bad.any():
-            return u
+            return initial_state(u, random)
         u[bad] = target.centre + random.standard_normal((int(bad.sum()), target.dimension)) @ root.T
     raise RuntimeError("no finite log-posterior near the point fit: the Laplace approximation does not hold there")

@@ -1,4 +1,4 @@
-"""Ensemble moves, and the candidates among which a pilot run chooses by measured autocorrelation time."""
+"""Ensemble moves; a pilot run chooses among them by measured autocorrelation time."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,11 +6,10 @@ from typing import Any
 import emcee
 import numpy as np
 
-#: Parameters from which on a block is large: forced runs tie all that they depend on together, and know it well.
+#: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well.
 LARGE = 9
-#: Degrees of freedom of the proposal for small and for large blocks, and the widths that it draws from by weight: close
-#: to the normal density of what is known well, with tails for what is known from four trials only. In many dimensions
-#: a little more of either is a proposal that is hardly ever accepted.
+#: Degrees of freedom of the proposal for small and for large blocks, and its widths with their weights. Small blocks may
+#: rest on four trials and need heavy tails. In many dimensions a heavier or wider proposal is almost never accepted.
 FEW, MANY = 6.0, 200.0
 WIDTHS, WEIGHTS = np.array([[1.0, 2.0, 4.0], [1.0, 1.15, 1.4]]), np.array([0.85, 0.1, 0.05])
 #: A parameter of a large block is proposed wider than the Laplace approximation where a pilot finds it wider by this
@@ -78,7 +77,7 @@ class BlockMove(emcee.moves.Move):
 
 
 def block_move(blocks: Sequence[np.ndarray], centre: np.ndarray, covariance: np.ndarray) -> Moves:
-    """Blocks, with one step in ten of differential evolution, which needs no shape to be known."""
+    """Block moves, with one step in ten of differential evolution, which needs no covariance."""
     return [(BlockMove(blocks, centre, covariance), 0.9), (emcee.moves.DEMove(), 0.1)]
 
 
@@ -89,10 +88,10 @@ def candidates(
 
     Parameters
     ----------
-    sample : (m, d) of the pilot's burnt-in ensemble: it shapes the proposal of small blocks
+    sample : (m, d) of the pilot's burnt-in ensemble, the mean and covariance of small blocks
     blocks : see ``MarginalPosterior.blocks``
-    centre, covariance : (d,), (d, d) the Laplace approximation: it gives large blocks their correlations, which a short
-        pilot does not know as well; it knows their widths, of parameters with heavy tails too
+    centre, covariance : (d,), (d, d) the Laplace approximation: the correlations of large blocks, which a short pilot
+        estimates badly; their widths come from the pilot where it finds them wider
     """
     shape, middle = np.atleast_2d(np.cov(sample.T)), np.median(sample, axis=0)
     for block in blocks:

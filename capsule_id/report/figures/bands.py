@@ -1,4 +1,4 @@
-"""What draws of the parameters say of the motions: probabilities, bands, best operating point."""
+"""Motions over draws of the parameters: probabilities, bands, best operating point."""
 
 from collections.abc import Mapping
 

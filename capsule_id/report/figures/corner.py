@@ -15,8 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from capsule_id.inference.result import Result
-from capsule_id.report.columns import Columns, sampled_columns
 from capsule_id.report.figures.style import BLACK, BLUE, GREY, PALE_BLUE, SMALL, TEXT, VERMILION, new_figure
+from capsule_id.report.sampled_parameters import SampledParameters, sampled_parameters
 from capsule_id.report.typography import fixed
 
 _BINS = 40
@@ -40,7 +40,7 @@ def corner(result: Result) -> Figure:
     ValueError
         If nothing was sampled.
     """
-    columns = sampled_columns(result)
+    columns = sampled_parameters(result)
     n = len(columns.names)
     panel = 2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
     # The key stands in the empty upper triangle, or above the panels where that is too small.
@@ -65,7 +65,7 @@ def corner(result: Result) -> Figure:
     return figure
 
 
-def _limits(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+def _limits(columns: SampledParameters) -> tuple[np.ndarray, np.ndarray]:
     """Ends of every panel's axis, (n,) each."""
     low, high = np.percentile(columns.draws.reshape(-1, len(columns.names)), _TAILS, axis=0)
     # A parameter that never moved (a frozen chain) still gets a panel of some width.
@@ -132,7 +132,7 @@ def _marks(ax: Axes, place: np.ndarray, color: str, marker: str, line: str) -> N
     ax.vlines(x, n - 1.0 - shown, n - 1.0 - shown + _SIDE, color=color, ls=line, lw=1.3, zorder=4)
 
 
-def _axes(ax: Axes, columns: Columns, low: np.ndarray, high: np.ndarray, panel: float) -> None:
+def _axes(ax: Axes, columns: SampledParameters, low: np.ndarray, high: np.ndarray, panel: float) -> None:
     """Ticks and labels along the bottom, and on the left from the second row on (a histogram has no y-axis).
 
     ``panel`` is the width of a cell in inches: text keeps its distance in inches whatever the size of the cells.

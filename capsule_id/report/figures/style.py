@@ -79,7 +79,7 @@ def make_room(ax: Axes) -> None:
 
 
 def mark(figure: Figure, text: str) -> None:
-    """A word in the corner that goes with the picture wherever it is copied."""
+    """Write a word into the corner of the picture itself, so that copies keep it."""
     figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=SMALL, color=VERMILION, fontweight="bold")
 
 
@@ -87,7 +87,7 @@ def png(figure: Figure) -> bytes:
     """The figure as PNG at 150 dpi, in a palette of its own; the same figure gives the same bytes."""
     canvas = FigureCanvasAgg(figure)
     with warnings.catch_warnings():
-        # A label in a script that the font lacks shows as boxes; that is no reason to fail or to talk to the user.
+        # A label in a script that the font lacks shows as boxes; the figure is still usable, so the user is not warned.
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         canvas.draw()
     pixels = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")

@@ -1,6 +1,6 @@
 """Bifurcation diagrams: Poincaré section, mean velocity, labels, and measured runs beside them.
 
-Datasets come from ``capsule.sweep`` in SI; an ``AxisUnit`` says in what unit a quantity is drawn. Direction has a
+Datasets come from ``motions.sweep`` in SI; an ``AxisUnit`` says in what unit a quantity is drawn. Direction has a
 colour everywhere: blue forward, vermilion backward, grey standing.
 """
 
@@ -56,7 +56,7 @@ class AxisUnit:
 
 
 @dataclass(frozen=True)
-class MeasuredMotion:
+class MeasuredPoint:
     """A measured forced run on a diagram: the swept value (SI), the label of its record, mean velocity in m/s."""
 
     value: float
@@ -67,7 +67,7 @@ class MeasuredMotion:
 def bifurcation(
     data: xr.Dataset,
     units: Mapping[str, AxisUnit] | None = None,
-    measured: Sequence[MeasuredMotion] = (),
+    measured: Sequence[MeasuredPoint] = (),
     title: str = "",
 ) -> Figure:
     """A Dataset over (branch, <quantity>): Poincaré section above, mean velocity and the motions' labels below."""
@@ -119,7 +119,7 @@ def poincare(data: xr.Dataset, units: Mapping[str, AxisUnit] | None = None, ax: 
 def mean_velocity(
     data: xr.Dataset,
     units: Mapping[str, AxisUnit] | None = None,
-    measured: Sequence[MeasuredMotion] = (),
+    measured: Sequence[MeasuredPoint] = (),
     ax: Axes | None = None,
 ) -> Axes:
     """Mean velocity against the swept quantity, marked by direction, with labels and measured runs."""
@@ -147,7 +147,7 @@ def mean_velocity(
 
 
 def _draw_measured(
-    ax: Axes, over: str, units: Mapping[str, AxisUnit] | None, measured: Sequence[MeasuredMotion]
+    ax: Axes, over: str, units: Mapping[str, AxisUnit] | None, measured: Sequence[MeasuredPoint]
 ) -> None:
     """Measured runs as the paper draws them, in red, each with the label of its own record."""
     factor = (units or {}).get(over, AxisUnit("")).factor
@@ -161,7 +161,7 @@ def _draw_measured(
 
 
 def _write_labels(ax: Axes, x: np.ndarray, label: np.ndarray) -> None:
-    """The first branch's labels over the ranges of values that have them, where there is room."""
+    """The first branch's labels over the ranges of values that have them, where the range is wide enough."""
     if len(x) < 2:
         return
     order = np.argsort(x)

@@ -1,12 +1,12 @@
-"""Traces of the sample, to be looked at for drift and for ensembles that disagree."""
+"""Traces of the sample: they show drift, and ensembles that disagree."""
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from capsule_id.inference.result import Result
-from capsule_id.report.columns import sampled_columns
 from capsule_id.report.figures.style import CYCLE, SMALL, TEXT, new_figure
+from capsule_id.report.sampled_parameters import sampled_parameters
 
 # Enough to see drift, few enough to see lines.
 _POINTS, _WALKERS = 120, 2
@@ -20,7 +20,7 @@ def traces(result: Result) -> Figure:
     ValueError
         If nothing was sampled.
     """
-    columns = sampled_columns(result)
+    columns = sampled_parameters(result)
     n = len(columns.names)
     rows = (n + 1) // 2
     height = 0.8 + 1.15 * rows

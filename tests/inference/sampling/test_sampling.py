@@ -1,11 +1,13 @@
 """The sampler on a Gaussian whose moments are known: z-tests in Monte Carlo standard errors, and what fails them."""
 
+import ast
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from capsule_id.inference.result import Posterior
+from capsule_id.inference.sampling import ensembles
 from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time
 from capsule_id.inference.sampling.ensembles import ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
 from tests.inference.stub import Gaussian
@@ -125,3 +127,15 @@ def test_progress_is_reported() -> None:
     assert seen[0] == (0, 1, "pilot")
     assert all(0 <= done <= goal for done, goal, _ in seen)
     assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
+
+
+def test_no_private_attribute_of_emcee_is_used() -> None:
+    """Names with a leading underscore are read from ``self`` only."""
+    found = [
+        f"{path.name}:{node.lineno}: {node.attr}"
+        for path in Path(ensembles.__file__).parent.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__")
+        if not (isinstance(node.value, ast.Name) and node.value.id == "self")
+    ]
+    assert found == []

@@ -1,11 +1,13 @@
-"""How the capsule gets on: mean velocity with its standard error, and the direction that follows from it."""
+"""Mean velocity of the capsule with its standard error, and the direction of its motion."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import norm
 
-#: A capsule that advances less than this per excitation period (m) stands still, as ``response`` of the model has it.
+from capsule_id.rig.filters import Record
+
+#: A capsule that advances less than this per excitation period (m) stands still; ``response`` uses the same bound.
 STANDING = 1e-7
 #: Both statements, "it moves" and "it stands", need this confidence.
 CONFIDENCE = 0.99
@@ -14,8 +16,8 @@ _READINGS_EACH = 4  # at least this many readings per unknown
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Mean velocity of the capsule, m/s, its standard error, and "F", "B", "S", or None where it cannot be told."""
+class MeanVelocity:
+    """Mean velocity of the capsule, m/s, its standard error, and "F", "B", "S", or None where the record is not conclusive."""
 
     velocity: float
     velocity_sd: float
@@ -23,7 +25,7 @@ class Progress:
     reason: str = ""
 
 
-def progress_of(time: np.ndarray, x_capsule: np.ndarray, T: float, period: int | None) -> Progress:
+def fit_mean_velocity(time: Record, x_capsule: Record, T: float, period: int | None) -> MeanVelocity:
     """Mean velocity over the record.
 
     With a known period n of the motion: the slope of a straight line plus harmonics of 1/(n T), by least squares; its
@@ -43,14 +45,14 @@ def progress_of(time: np.ndarray, x_capsule: np.ndarray, T: float, period: int |
     margin = norm.ppf(0.5 + CONFIDENCE / 2.0) * sd * T
     advance = velocity * T
     if np.isfinite(margin) and abs(advance) - margin > STANDING:
-        return Progress(velocity, sd, "F" if advance > 0.0 else "B")
+        return MeanVelocity(velocity, sd, "F" if advance > 0.0 else "B")
     if np.isfinite(margin) and abs(advance) + margin < STANDING:
-        return Progress(velocity, sd, "S")
+        return MeanVelocity(velocity, sd, "S")
     reason = f"direction: advance {1e6 * advance:.3g} ± {1e6 * sd * T:.2g} um per period, standing is below 0.1 um"
-    return Progress(velocity, sd, None, reason)
+    return MeanVelocity(velocity, sd, None, reason)
 
 
-def _line(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]:
+def _line(time: Record, values: Record, T: float) -> tuple[float, float]:
     """Slope and its standard error beside harmonics of 1/T."""
     step = (time[-1] - time[0]) / (len(time) - 1)
     most = min(_HARMONICS, int(0.5 * T / step) - 1, len(time) // (2 * _READINGS_EACH) - 1)
@@ -65,7 +67,7 @@ def _line(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]
     return float(slope @ coordinates), float(np.sqrt(variance) * np.linalg.norm(slope))
 
 
-def _advances(time: np.ndarray, values: np.ndarray, T: float) -> tuple[float, float]:
+def _advances(time: Record, values: Record, T: float) -> tuple[float, float]:
     """Mean advance over successive whole periods, per second, and its standard error."""
     count = int((time[-1] - time[0]) / T)
     if count < 1:

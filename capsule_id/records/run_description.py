@@ -1,10 +1,10 @@
-"""A recorded run in a few lines: label with evidence, drive, filter."""
+"""Description of a recorded run in a few lines of text: label with evidence, drive, filter."""
 
 from collections.abc import Iterator
 
 from capsule_id.errors import InputError
-from capsule_id.records.drive import Harmonic
 from capsule_id.records.label import Evidence, MeasuredMotion, measured_motion
+from capsule_id.records.tone import Harmonic
 from capsule_id.records.view import ORDER, view_record
 from capsule_id.rig.model import Table
 
@@ -28,7 +28,7 @@ def describe_run(table: Table) -> list[str]:
 
 
 def run_warning(table: Table) -> str | None:
-    """What to mind about the drive of a ``forced_run``: a stated frequency that the current does not have."""
+    """A warning where the stated frequency of a ``forced_run`` differs from that of its current; else None."""
     drive = measured_motion(table).evidence.drive
     if drive is None or not drive.disagrees:
         return None
@@ -46,8 +46,8 @@ def _evidence(motion: MeasuredMotion) -> Iterator[str]:
         if repeat.period:
             excess = repeat.ratios[repeat.period - 1]
             yield f"repeats after {repeat.period}, mean square {excess:.2f} of the noise's"
-    if evidence.progress:
-        yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.progress.velocity_sd:.2g} mm/s"
+    if evidence.mean_velocity:
+        yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.mean_velocity.velocity_sd:.2g} mm/s"
     if evidence.contacts:
         contacts = evidence.contacts
         spikes = "/".join(map(str, contacts.spikes)) or "not recorded"

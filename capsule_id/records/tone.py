@@ -15,12 +15,11 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from capsule_id.errors import InputError
-from capsule_id.records.columns import stated_Omega
-from capsule_id.rig.filters import dominant_frequency
+from capsule_id.records.stated_settings import stated_Omega
+from capsule_id.rig.filters import Record, dominant_frequency
 from capsule_id.rig.model import Table
 
-#: The stated frequency is wrong where the fitted one is better by as much as this many standard errors make of a long
-#: record, and off by this share.
+#: The stated frequency is wrong where the fit differs by this many standard errors and by this share.
 OMEGA_ERRORS, OMEGA_SHARE = 4.0, 1e-3
 FEWEST_SAMPLES = 8  # for five unknowns, the noise among them
 _SCAN = 1.5  # half-width of the search about a first guess, in 1 / duration: a peak of the spectrum is 1 wide
@@ -53,12 +52,12 @@ class Harmonic:
         return self.refuted and off > OMEGA_SHARE * self.stated_Omega
 
 
-def drive_of(table: Table) -> Harmonic | None:
+def recorded_drive(table: Table) -> Harmonic | None:
     """The tone of the recorded current (A), or None where the table has no current."""
     return fit_harmonic(table["time"], table["current"], stated_Omega(table)) if "current" in table.columns else None
 
 
-def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic:
+def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
     """Fit one tone; its frequency is searched about ``Omega`` and about the strongest peak of the spectrum.
 
     Parameters
@@ -76,7 +75,7 @@ def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic
         rule = f"a tone needs at least {FEWEST_SAMPLES} samples"
         raise InputError(rule, f"{len(time)}", "record for longer or faster")
     guesses = [Omega]
-    # an unevenly sampled record has only the stated frequency to start from
+    # The spectrum needs even sampling; otherwise the stated frequency is the only guess.
     with contextlib.suppress(InputError):
         strongest = 2.0 * np.pi * dominant_frequency(time, values)
         near = abs(strongest - Omega) < _width(time)
@@ -84,17 +83,33 @@ def fit_harmonic(time: np.ndarray, values: np.ndarray, Omega: float) -> Harmonic
     found, left = _refine(time, values, guesses[0])
     for guess in guesses[1:]:
         other, less = _refine(time, values, guess)
-        # A coarse record has the stated frequency and its alias in the spectrum alike: then the stated one is meant.
+        # In a coarse record the stated frequency and its alias fit equally well: prefer the stated one.
         if left - less > _threshold(len(time)) * less:
             found, left = other, less
     return _describe(time, values, found, Omega)
 
 
-def _design(time: np.ndarray, Omega: float) -> np.ndarray:
+def tone_at(time: Record, values: Record, Omega: float) -> tuple[float, float, float]:
+    """Least-squares tone of a known frequency: (amplitude, phase, offset) of amplitude cos(Omega t + phase) + offset.
+
+    Parameters
+    ----------
+    time, values : (n,) s and any unit
+    Omega : rad/s
+
+    Returns
+    -------
+    amplitude and offset in the unit of ``values``, phase in rad, in (-pi, pi]
+    """
+    cosine, sine, offset = np.linalg.lstsq(_design(time, Omega), values)[0]
+    return float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine)), float(offset)
+
+
+def _design(time: Record, Omega: float) -> np.ndarray:
     return np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones_like(time)], axis=1)
 
 
-def _misfit(time: np.ndarray, values: np.ndarray, Omega: float) -> float:
+def _misfit(time: Record, values: Record, Omega: float) -> float:
     """Sum of squares left by the best tone of this frequency."""
     design = _design(time, Omega)
     try:
@@ -110,12 +125,12 @@ def _threshold(samples: int) -> float:
     return float(stats.t.isf(stats.norm.sf(OMEGA_ERRORS), freedom) ** 2 / freedom)
 
 
-def _width(time: np.ndarray) -> float:
+def _width(time: Record) -> float:
     """Half-width of the search about a guess, rad/s."""
     return float(2.0 * np.pi * _SCAN / (time[-1] - time[0]))
 
 
-def _refine(time: np.ndarray, values: np.ndarray, guess: float) -> tuple[float, float]:
+def _refine(time: Record, values: Record, guess: float) -> tuple[float, float]:
     """(Omega, sum of squares) of the deepest minimum about ``guess``."""
     width = _width(time)
     grid = np.linspace(max(guess - width, 0.05 * guess), guess + width, _SCAN_POINTS)
@@ -128,32 +143,19 @@ def _refine(time: np.ndarray, values: np.ndarray, guess: float) -> tuple[float, 
     return float(found.x), float(found.fun)
 
 
-def _describe(time: np.ndarray, values: np.ndarray, Omega: float, stated: float) -> Harmonic:
+def _describe(time: Record, values: Record, Omega: float, stated: float) -> Harmonic:
     """The tone at ``Omega`` with the standard errors of all four unknowns together."""
-    design = _design(time, Omega)
-    cosine, sine, offset = np.linalg.lstsq(design, values)[0]
-    amplitude, phase = float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine))
+    amplitude, phase, offset = tone_at(time, values, Omega)
     angle = Omega * time + phase
     slope = -amplitude * np.sin(angle)
     jacobian = np.stack([np.cos(angle), slope, slope * time, np.ones_like(time)], axis=1)
     scale = np.linalg.norm(jacobian, axis=0)
-    left = float(np.sum((values - design @ [cosine, sine, offset]) ** 2))
+    left = float(np.sum((values - amplitude * np.cos(angle) - offset) ** 2))
     noise_sd = float(np.sqrt(left / (len(time) - 4)))
     refuted = _misfit(time, values, stated) - left > _threshold(len(time)) * left
     errors = noise_sd * np.sqrt(_variances(jacobian / scale)) / scale
     sd = [float(error) for error in errors]
-    return Harmonic(
-        Omega,
-        sd[2],
-        amplitude,
-        sd[0],
-        phase,
-        sd[1],
-        float(offset),
-        noise_sd,
-        stated,
-        refuted,
-    )
+    return Harmonic(Omega, sd[2], amplitude, sd[0], phase, sd[1], offset, noise_sd, stated, refuted)
 
 
 def _variances(jacobian: np.ndarray) -> np.ndarray:

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 from capsule_id.errors import InputError
-from capsule_id.records.drive import Harmonic, fit_harmonic
+from capsule_id.records.tone import Harmonic, fit_harmonic, tone_at
 
 TIME = np.arange(2000) / 1000.0
 OMEGA, AMPLITUDE, PHASE, OFFSET, NOISE_SD = 34.56, 2.0, -1.1, 0.02, 5e-3
@@ -101,3 +102,9 @@ def test_an_alias_is_not_taken_for_the_frequency() -> None:
     assert fit.Omega == pytest.approx(OMEGA, abs=5.0 * fit.Omega_sd)
     assert not fit.disagrees
     assert fit_harmonic(time, values, 8.0 * np.pi).disagrees
+
+
+def test_a_wrong_shape_is_refused_in_the_tests() -> None:
+    """The import hook of ``conftest.py`` is at work: without it this call would broadcast and return a number."""
+    with pytest.raises(TypeCheckError, match="values"):
+        tone_at(np.linspace(0.0, 1.0, 20), np.zeros((20, 1)), 30.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capsule_id.inference.result import Result
-from capsule_id.report.text import NOT_CLEAN, SYNTHETIC, WIDTH, table_text
+from capsule_id.report.console_table import NOT_CLEAN, SYNTHETIC, WIDTH, table_text
 
 
 def test_rows_in_order_and_aligned(result: Result) -> None:

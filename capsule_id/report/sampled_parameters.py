@@ -9,7 +9,7 @@ from capsule_id.report.typography import plain_symbol, prefix_for
 
 
 @dataclass(frozen=True)
-class Columns:
+class SampledParameters:
     """Sampled physical parameters, nuisances left out.
 
     Attributes
@@ -29,7 +29,7 @@ class Columns:
     posterior: Posterior
 
 
-def sampled_columns(result: Result) -> Columns:
+def sampled_parameters(result: Result) -> SampledParameters:
     """The columns of ``result``.
 
     Raises
@@ -45,7 +45,7 @@ def sampled_columns(result: Result) -> Columns:
     centre = summary["map"].to_numpy(float)
     display = [prefix_for(str(unit), float(value)) for unit, value in zip(summary["unit"], centre, strict=True)]
     scale = np.array([factor for factor, _ in display])
-    return Columns(
+    return SampledParameters(
         names=names,
         symbols=tuple(plain_symbol(name) for name in names),
         units=tuple(unit for _, unit in display),

@@ -1,0 +1,90 @@
+"""One emcee ensemble behind its public interface: it holds its own state, and is advanced draw by draw.
+
+emcee keeps the state of a run only in ``run_mcmc``. A run that is iterated over (so that every draw can be saved) must
+carry its state from call to call itself.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import emcee
+import h5py
+import numpy as np
+
+from capsule_id.inference.sampling.moves import Moves
+
+
+class Ensemble:
+    """Walkers that sample one log-density with given moves.
+
+    Parameters
+    ----------
+    parts : (w, d) -> (w, blocks), the log-density of each block; their sum is the log-density
+    state : where the walkers stand, with the state of their random numbers
+    moves : see ``capsule_id.inference.sampling.moves``
+    backend : where draws are stored; None: in memory
+    """
+
+    def __init__(
+        self, parts: Callable[[np.ndarray], np.ndarray], state: emcee.State, moves: Moves, backend: Any = None
+    ) -> None:
+        def log_density(v: np.ndarray) -> np.ndarray:
+            """(w, 1 + blocks): emcee keeps what follows the log-density as blobs, and ``BlockMove`` reads them."""
+            found = parts(v)
+            return np.concatenate([np.sum(found, axis=1, keepdims=True), found], axis=1)
+
+        walkers, dimension = state.coords.shape
+        self.state = state
+        self._sampler = emcee.EnsembleSampler(
+            walkers, dimension, log_density, vectorize=True, moves=moves, backend=backend
+        )
+
+    @property
+    def stored(self) -> int:
+        """Number of stored draws."""
+        return self._sampler.iteration
+
+    @property
+    def chain(self) -> np.ndarray:
+        """(draw, walker, d) the stored draws."""
+        return np.asarray(self._sampler.get_chain())
+
+    @property
+    def acceptance(self) -> np.ndarray:
+        """(walker,) share of accepted proposals among the stored draws."""
+        return self._sampler.backend.accepted / self._sampler.iteration
+
+    def advance(self, draws: int, thin: int = 1, store: bool = True) -> Iterator[None]:
+        """Make ``draws`` more draws of ``thin`` steps each; yields after each one, when it is stored."""
+        if draws > 0:
+            for state in self._sampler.sample(self.state, iterations=draws, thin_by=thin, store=store):
+                self.state = state
+                yield
+
+    def run(self, steps: int, store: bool = True) -> "Ensemble":
+        """Make ``steps`` steps; returns itself."""
+        for _ in self.advance(steps, store=store):
+            pass
+        return self
+
+
+def initial_state(positions: np.ndarray, random: np.random.RandomState) -> emcee.State:
+    """Walkers at ``positions`` (w, d), their random numbers those of ``random`` from its present state on."""
+    return emcee.State(positions, random_state=random.get_state())
+
+
+class OpenBackend(emcee.backends.HDFBackend):
+    """emcee's HDF5 backend on a file that stays open; emcee's own opens its file six times a step."""
+
+    def __init__(self, file: h5py.File, name: str) -> None:
+        super().__init__(file.filename, name)
+        self._file = file
+
+    def open(self, mode: str = "r") -> AbstractContextManager[h5py.File]:
+        del mode
+        return nullcontext(self._file)
+
+    def last_state(self) -> emcee.State | None:
+        """The state after the last stored draw; None without one."""
+        return self.get_last_sample() if self.initialized and self.iteration else None
