@@ -164,6 +164,19 @@ class Trajectory:
         return self.X1 - self.X2
 
 
+def _check_choices(model: str, semantics: str, smoothing: "Smoothing | None") -> None:
+    """Refuse unknown words, and what the exact model does not have."""
+    if model not in ("exact", "smooth"):
+        raise InputError('model must be "exact" or "smooth"', repr(model), "choose one of the two")
+    if semantics not in ("stick-slip", "eq2"):
+        raise InputError('semantics must be "stick-slip" or "eq2"', repr(semantics), "choose one of the two")
+    if model == "exact" and semantics == "eq2":
+        remedy = 'use model="smooth" for eq. (2) to the letter'
+        raise InputError("the exact model has stick-slip semantics only", 'semantics="eq2"', remedy)
+    if model == "exact" and smoothing is not None:
+        raise InputError("the exact model has no smoothing", repr(smoothing), 'leave it out or use model="smooth"')
+
+
 def simulate(
     p: CapsuleParameters,
     e: Drive,
@@ -204,18 +217,7 @@ def simulate(
         Unknown model or semantics, "eq2" or smoothing with the exact model, leaves whose shapes do not agree, times
         that do not increase.
     """
-    if model not in ("exact", "smooth"):
-        raise InputError('model must be "exact" or "smooth"', repr(model), "choose one of the two")
-    if semantics not in ("stick-slip", "eq2"):
-        raise InputError('semantics must be "stick-slip" or "eq2"', repr(semantics), "choose one of the two")
-    if model == "exact" and semantics == "eq2":
-        raise InputError(
-            "the exact model has stick-slip semantics only",
-            'semantics="eq2"',
-            'use model="smooth" for eq. (2) to the letter',
-        )
-    if model == "exact" and smoothing is not None:
-        raise InputError("the exact model has no smoothing", repr(smoothing), 'leave it out or use model="smooth"')
+    _check_choices(model, semantics, smoothing)
     (p, e, friction, initial), grid, batched = lanes_of((p, e, friction, initial or (0.0, 0.0, 0.0, 0.0)), times)
     lanes = (p, e, friction_law(p, friction), initial)
     if model == "exact":

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.result import Result
 from capsule_id.parameters import TABLE, symbol_of
 from capsule_id.report.netcdf import write_posterior
@@ -40,7 +41,7 @@ def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_result_has_the_names_units_and_meanings_of_the_parameter_table(result: Result) -> None:
     for frame, physical in ((result.summary, True), (result.nuisances, False)):
         for name, row in frame.iterrows():
-            known = TABLE[symbol_of(str(name))]
+            known = default_registry().parameters[symbol_of(str(name))]
             assert (row["unit"], row["meaning"], physical) == (known.unit, known.meaning, known.physical), name
 
 
