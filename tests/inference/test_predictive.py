@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from capsule_id.inference.pipeline import fit_rig
 from capsule_id.api import read_rig
+from capsule_id.inference.pipeline import fit_rig
 from tests.cli_tools import small_rig
 
 

@@ -15,7 +15,7 @@ import xarray as xr
 
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.result import Result
-from capsule_id.parameters import TABLE, symbol_of
+from capsule_id.parameters import symbol_of
 from capsule_id.report.netcdf import write_posterior
 from capsule_id.report.write import parameters_json, write_result
 from capsule_id.views import Finding
