@@ -1,12 +1,44 @@
 """capsule-id: system identification for the vibro-impact capsule.
 
-    rig folder -> Rig -> experiments -> log-posterior -> point fit -> emcee -> checks -> report
+The pipeline; each stage makes a frozen value for the next one:
 
-    rig = capsule_id.read_rig("data/")          # folder -> Rig: SI, checked, hashed
-    result = capsule_id.fit(rig, seed=0)        # Rig -> Result: point fit, posterior, findings
-    result.write("results/twin")                # Result -> parameters.json, posterior.nc, report.html
+    rig folder      rig.toml and its tables
+    Rig             what was measured, in SI, checked and hashed               read_rig
+    experiments     a value per table: model, residuals, paper's estimate      capsule_id.experiments
+    log-posterior   likelihoods of all experiments plus log-prior              capsule_id.inference.target
+    point fit       maximum of the posterior, standard errors                  capsule_id.inference.fit
+    posterior       draws of emcee, convergence diagnostics                    capsule_id.inference.sampling
+    checks          findings of level ok, warn or fail                         capsule_id.inference.checks
+    report          parameters.json, posterior.nc, report.html                 Fit.write
 
-The public names are imported on first use, so that ``import capsule_id`` is free of JAX.
+    rig = capsule_id.read_rig("data/")
+    result = capsule_id.fit(rig, seed=0)
+    result.write("results/twin")
+
+Glossary:
+
+    capsule, rod          outer mass m2 on the ground; inner mass m1, driven by the motor
+    x_rel                 X1 - X2, displacement of the rod relative to the capsule
+    gap                   distance G from the rod to the support spring
+    contact               interval with x_rel >= G
+    stick, slip           the capsule is at rest; the capsule slides
+    excitation period     2 pi / Omega, the period of the drive
+    initial condition     positions and velocities at the first sample
+    sampling rate         samples per second of a record, Hz
+    residual              measured value minus predicted value
+    noise level           standard deviation of the noise of one channel
+    scatter               standard deviation between repeated tests
+    standard error        standard deviation of an estimate
+    prior, posterior      distribution of the parameters before and after the data
+    credible interval     range that holds a parameter with a stated posterior probability
+    point fit             the maximum of the posterior
+    starting point        parameter values from which a search for the maximum starts
+    local maximum         a maximum of the posterior that is not the highest one
+    cost                  half the sum of squared standardised residuals
+    bench, run            tests of single parts; a record of the capsule under a drive
+    truth                 the parameters that computed a synthetic rig folder
+
+A public name is imported at its first use, so ``import capsule_id`` does not import JAX.
 """
 
 from importlib import import_module
@@ -33,7 +65,7 @@ if TYPE_CHECKING:
     from capsule_id.physics.smooth.engine import Smoothing as Smoothing
     from capsule_id.synthetic import synthesize as synthesize
 
-_HOME = {
+_MODULE_OF = {
     "CapsuleParameters": "capsule_id.physics.model",
     "continuation": "capsule_id.motions.sweep",
     "diagram": "capsule_id.motions.sweep",
@@ -54,6 +86,8 @@ _HOME = {
     "Trajectory": "capsule_id.physics.model",
 }
 
+__all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]  (the imports above declare the names)
+
 
 def __getattr__(name: str) -> Any:
     """Import a public name from its module on first use; the version is that of the installed distribution."""
@@ -61,10 +95,10 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("capsule-id")
-    if name not in _HOME:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    return getattr(import_module(_MODULE_OF[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME, "__version__"])
+    return sorted([*globals(), *_MODULE_OF, "__version__"])
