@@ -1,1 +1,1 @@
-"""Model-free analysis of a recorded forced run: drive, period, contacts, mean velocity, phase plane."""
+"""Analyses a recorded forced run without a model: drive, period, contacts, mean velocity, phase plane."""

@@ -1,14 +1,14 @@
-"""Contacts between rod and support spring, counted in the acceleration of the rod and in x_rel.
+"""Counts contacts between rod and support spring, in the acceleration of the rod and in x_rel.
 
 Acceleration. Out of contact the rod obeys a linear law, acceleration = b0 + b1 x_rel + b2 rate + b3 cos(Omega t) +
-b4 sin(Omega t). It is fitted to the samples that are clear of the gap; where the acceleration falls short of it, the
-spring pushes back: a spike. x_rel. It exceeds the gap. Sensor zero and stated gap are known to some tens of um only, so
-the impact line is placed where the spikes vanish, if there are any.
+b4 sin(Omega t). It is fitted to the samples far from contact. In contact the spring pushes the rod back,
+and the acceleration is below this law: a spike. x_rel exceeds the gap during a contact. Sensor zero and stated gap are
+known to some tens of um only. Where spikes exist, the impact line is the x_rel at which they vanish.
 
 Both are counted on the record folded onto one period of the motion, with two levels (``SPIKE_LEVELS``,
-``CROSSING_LEVELS``, in standard errors): a contact begins above the higher and ends below the lower one. The count holds
-where all pairs of levels and both kinds of evidence give the same number, and more than half of the single periods
-show it too.
+``CROSSING_LEVELS``, in standard errors): a contact begins above the higher and ends below the lower one. The count is
+accepted if all pairs of levels and both methods give the same number, and more than half of the single periods
+agree.
 """
 
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ from capsule_id.records.fold import intervals_above, local_polynomials
 
 SPIKE_LEVELS = ((1.5, 4.5), (2.0, 5.0), (2.5, 6.0))
 CROSSING_LEVELS = ((-1.0, 1.0), (-3.0, 1.0))
-_GRID = 8  # places per sample of the record, on the folded period
-_NARROW = 1.25  # samples, half-width for x_rel and its rate near a contact; cubic
-_POINTS = 9  # the narrow window holds at least about as many samples of the folded record
-_WIDE = 0.02  # of the period of the drive, half-width for the linear law: rates with little noise
-_CLEAR = 0.05  # of the travel of x_rel: this far below the gap counts as clear of it ...
-_CLEAR_SD = 5.0  # ... and as many sd of the stated gap
-_IN_CONTACT = 6.0  # standard errors of a spike that count for placing the impact line
-_LINE_ERRORS = (-2.0, 0.0, 2.0)  # sd of the impact line at which crossings are counted
-_LINE_SAMPLES = 2  # of the folded record in contact, for placing the line
-_FEWEST = 10  # samples per unknown of the linear law
-_SINGLE = 3  # samples whose mean is looked at where a single period is counted; a contact lasts longer
-_LAW = 5  # unknowns of the linear law
+_PLACES_PER_SAMPLE = 8  # grid points per sampling step, on the folded period
+_NARROW_HALF_WIDTH = 1.25  # samples, half-width of the cubic for x_rel and its rate near a contact
+_NARROW_SAMPLES = 9  # samples of the folded record in the narrow window, at least about this many
+_WIDE_HALF_WIDTH = 0.02  # of the excitation period, half-width for the linear law: rates with little noise
+_CLEARANCE_SHARE = 0.05  # of the range of x_rel: samples this far below the gap are clear of contact,
+_CLEARANCE_SDS = 5.0  # and this many sd of the stated gap below it
+_CONTACT_STANDARD_ERRORS = 6.0  # standard errors; larger spikes determine the impact line
+_IMPACT_LINE_SHIFTS = (-2.0, 0.0, 2.0)  # sd; crossings are counted at the impact line shifted by these
+_FEWEST_CONTACT_SAMPLES = 2  # of the folded record in contact, needed for the impact line
+_SAMPLES_PER_UNKNOWN = 10  # samples per unknown of the linear law
+_AVERAGED_SAMPLES = 3  # samples of the moving mean in single periods; a contact lasts longer
+_LINEAR_LAW_UNKNOWNS = 5  # unknowns of the linear law
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,10 @@ class Contacts:
     count : contacts per period of the motion, None where the evidence disagrees
     spikes : counts by ``SPIKE_LEVELS``, () without acceleration
     crossings : counts by ``CROSSING_LEVELS`` at the impact line less 2 of its sd, at it, and at it plus 2 sd
-    impact_line : the impact line where the record shows it, None where there are too few spikes: then it is the stated gap
+    impact_line : from the spikes; None where they are too few and the stated gap is used
     duration : of the shortest contact, s, None without contacts
-    agreeing, cycles : periods of the motion counted singly with the same result, and all that were counted
-    reason : why there is no count, or ""
+    agreeing, cycles : number of single periods with the same count, and number of single periods
+    reason : why the count is None, or ""
     """
 
     count: int | None
@@ -67,7 +67,7 @@ class Contacts:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A record to fold: channels (n,) SI, drive and gap. ``period``: of the motion, s. ``noise_sd``: of x_rel, m."""
+    """A record for folding: channels (n,) SI, drive and gap. ``period``: of the motion, s. ``noise_sd``: of x_rel, m."""
 
     time: np.ndarray
     x_rel: np.ndarray
@@ -91,22 +91,22 @@ class Cycle:
     @property
     def places(self) -> np.ndarray:
         """Grid on the folded period, s."""
-        return np.linspace(0.0, self.period, max(int(_GRID * self.period / self.step), 2), endpoint=False)
+        return np.linspace(0.0, self.period, max(int(_PLACES_PER_SAMPLE * self.period / self.step), 2), endpoint=False)
 
     def mean(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean over one sampling step at ``places``, which holds a sample of every cycle; and its sd for unit noise."""
+        """Mean over one sampling step at ``places``, with a sample of every cycle, and its sd for unit noise."""
         found = local_polynomials(self.phase, values, self.period, self.places, 0.5 * self.step, 0)
         return found.value, found.sd
 
 
 def find_contacts(cycle: Cycle) -> Contacts:
     """Count the contacts of a record whose motion has the period ``cycle.period``."""
-    push = _push(cycle)
+    push = _shortfall(cycle)
     seen = _impact_line(cycle, push)
     line = seen or ImpactLine(cycle.gap, cycle.gap_sd, cycle.noise_sd)
     single = cycle.x_rel - line.value
     mean, sd = cycle.mean(cycle.x_rel)
-    above = [(mean - line.value - shift * line.sd) / (sd * line.scatter) for shift in _LINE_ERRORS]
+    above = [(mean - line.value - shift * line.sd) / (sd * line.scatter) for shift in _IMPACT_LINE_SHIFTS]
     crossings = tuple(len(intervals_above(z, *levels)) for z in above for levels in CROSSING_LEVELS)
     if push is None:
         spikes, z, single, levels = (), above[len(above) // 2], single / cycle.noise_sd, CROSSING_LEVELS[-1]
@@ -116,12 +116,12 @@ def find_contacts(cycle: Cycle) -> Contacts:
         spikes = tuple(len(intervals_above(z, *pair)) for pair in SPIKE_LEVELS)
         single, levels = push.shortfall / np.hypot(push.sd, push.shared_sd), SPIKE_LEVELS[1]
     stretches = intervals_above(z, *levels)
-    single = np.convolve(single, np.full(_SINGLE, _SINGLE**-0.5), mode="same")
-    agreeing, cycles = _single_cycles(cycle, single, levels, stretches)
+    single = np.convolve(single, np.full(_AVERAGED_SAMPLES, _AVERAGED_SAMPLES**-0.5), mode="same")
+    agreeing, cycles = _agreeing_cycles(cycle, single, levels, stretches)
     counts = set(spikes + crossings)
     reason = ""
     if len(counts) > 1:
-        reason = f"contacts: spikes {_shown(spikes)}, crossings of the gap {_shown(crossings)}"
+        reason = f"contacts: spikes {_counts_text(spikes)}, crossings of the gap {_counts_text(crossings)}"
     elif 2 * agreeing <= cycles:
         reason = f"contacts: {agreeing} of {cycles} single periods show the {counts.pop()} of all together"
     count = None if reason else counts.pop()
@@ -129,79 +129,90 @@ def find_contacts(cycle: Cycle) -> Contacts:
     return Contacts(count, spikes, crossings, seen, shortest or None, agreeing, cycles, reason)
 
 
-def _shown(counts: tuple[int, ...]) -> str:
+def _counts_text(counts: tuple[int, ...]) -> str:
     return "/".join(str(n) for n in counts) or "not recorded"
 
 
 @dataclass(frozen=True)
-class _Push:
-    """What the acceleration falls short of the linear law by, (n,) m/s^2, the sd of its white noise, and (n,) that of the law
-    and of the smoothed x_rel in it, which neighbours and periods share."""
+class _Shortfall:
+    """Linear law minus acceleration.
+
+    shortfall : (n,) m/s^2
+    sd : of its white noise, m/s^2
+    shared_sd : (n,) m/s^2, from the law and the smoothed x_rel in it; neighbours and periods share this error
+    """
 
     shortfall: np.ndarray
     sd: float
     shared_sd: np.ndarray
 
 
-def _push(cycle: Cycle) -> _Push | None:
-    """The spring's push on the rod, None without an acceleration or without enough samples clear of the gap."""
+def _shortfall(cycle: Cycle) -> _Shortfall | None:
+    """Linear law minus acceleration; None without an acceleration or without enough samples clear of contact."""
     if cycle.acceleration is None:
         return None
     wide = local_polynomials(
-        cycle.phase, cycle.x_rel, cycle.period, cycle.phase, max(_NARROW * cycle.step, _WIDE * _drive(cycle)), 3
+        cycle.phase,
+        cycle.x_rel,
+        cycle.period,
+        cycle.phase,
+        max(_NARROW_HALF_WIDTH * cycle.step, _WIDE_HALF_WIDTH * _excitation_period(cycle)),
+        3,
     )
     clear = _clear_of_gap(cycle, wide.value)
-    if clear.sum() < _FEWEST * _LAW:
+    if clear.sum() < _SAMPLES_PER_UNKNOWN * _LINEAR_LAW_UNKNOWNS:
         return None
-    terms = _terms(cycle, wide.value, wide.rate)[clear]
+    terms = _linear_law_terms(cycle, wide.value, wide.rate)[clear]
     scale = np.linalg.norm(terms, axis=0)
     q, triangle = np.linalg.qr(terms / scale)
     law = np.linalg.solve(triangle, q.T @ cycle.acceleration[clear]) / scale
-    half = max(_NARROW, 0.5 * _POINTS * cycle.period / (len(cycle.time) * cycle.step)) * cycle.step
+    half = max(_NARROW_HALF_WIDTH, 0.5 * _NARROW_SAMPLES * cycle.period / (len(cycle.time) * cycle.step)) * cycle.step
     near = local_polynomials(cycle.phase, cycle.x_rel, cycle.period, cycle.phase, half, 3)
-    terms = _terms(cycle, near.value, near.rate)
+    terms = _linear_law_terms(cycle, near.value, near.rate)
     shortfall = terms @ law - cycle.acceleration
     sd = float(np.std(shortfall[clear]))
     of_law = sd * np.linalg.norm(np.linalg.solve(triangle.T, (terms / scale).T), axis=0)
     of_terms = cycle.noise_sd * np.hypot(law[1] * near.sd, law[2] * near.rate_sd)
-    return _Push(shortfall, sd, np.hypot(of_law, of_terms))
+    return _Shortfall(shortfall, sd, np.hypot(of_law, of_terms))
 
 
-def _drive(cycle: Cycle) -> float:
+def _excitation_period(cycle: Cycle) -> float:
     return 2.0 * np.pi / cycle.Omega
 
 
-def _terms(cycle: Cycle, x_rel: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def _linear_law_terms(cycle: Cycle, x_rel: np.ndarray, rate: np.ndarray) -> np.ndarray:
     angle = cycle.Omega * cycle.time
     return np.stack([np.ones_like(angle), x_rel, rate, np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _clear_of_gap(cycle: Cycle, x_rel: np.ndarray) -> np.ndarray:
-    """Samples well below the gap, and further from any other one than the wide window reaches: (n,) bool."""
-    below = x_rel < cycle.gap - max(_CLEAR_SD * cycle.gap_sd, _CLEAR * float(np.ptp(x_rel)))
+    """Which samples are well below the gap and have only such samples in the wide window: (n,) bool."""
+    below = x_rel < cycle.gap - max(_CLEARANCE_SDS * cycle.gap_sd, _CLEARANCE_SHARE * float(np.ptp(x_rel)))
     if below.all():
         return below
     other = np.sort(cycle.phase[~below])
     other = np.concatenate([other - cycle.period, other, other + cycle.period])
     after = np.searchsorted(other, cycle.phase).clip(1, len(other) - 1)
     distance = np.minimum(cycle.phase - other[after - 1], other[after] - cycle.phase)
-    return below & (distance > _WIDE * _drive(cycle))
+    return below & (distance > _WIDE_HALF_WIDTH * _excitation_period(cycle))
 
 
-def _impact_line(cycle: Cycle, push: _Push | None) -> ImpactLine | None:
-    """Where the spikes vanish, by regression of x_rel on them."""
+def _impact_line(cycle: Cycle, push: _Shortfall | None) -> ImpactLine | None:
+    """The x_rel at which the spikes vanish, by regression of x_rel on them."""
     if push is None:
         return None
     (force, sd), (x_rel, _) = cycle.mean(push.shortfall), cycle.mean(cycle.x_rel)
-    deep = force > _IN_CONTACT * sd * push.sd
-    # a mean over an edge of a contact is biased: drop half a sampling step more on either side
-    touching = np.all([np.roll(deep, shift) for shift in range(-_GRID // 2, _GRID // 2 + 1)], axis=0)
-    count = touching.sum() / _GRID
-    if count < _LINE_SAMPLES:
+    deep = force > _CONTACT_STANDARD_ERRORS * sd * push.sd
+    # A mean across an edge of a contact is biased: drop half a sampling step on either side.
+    touching = np.all(
+        [np.roll(deep, shift) for shift in range(-_PLACES_PER_SAMPLE // 2, _PLACES_PER_SAMPLE // 2 + 1)], axis=0
+    )
+    count = touching.sum() / _PLACES_PER_SAMPLE
+    if count < _FEWEST_CONTACT_SAMPLES:
         return None
     shared_sd = float(np.mean(cycle.mean(push.shared_sd)[0][touching]))
     force, x_rel, sd = force[touching], x_rel[touching], sd[touching]
-    # noise in the regressor flattens a regression: subtract its known variance
+    # Noise in the regressor reduces the slope: subtract its known variance.
     variance = float(np.var(force) - np.mean(sd**2) * push.sd**2)
     if variance <= 0.0:
         return None
@@ -213,10 +224,10 @@ def _impact_line(cycle: Cycle, push: _Push | None) -> ImpactLine | None:
     return ImpactLine(value, float(np.hypot(regression_sd, slope * shared_sd)), scatter)
 
 
-def _single_cycles(
+def _agreeing_cycles(
     cycle: Cycle, z: np.ndarray, levels: tuple[float, float], stretches: list[tuple[int, int]]
 ) -> tuple[int, int]:
-    """(cycles that show by themselves as many contacts as the folded record, cycles counted), cut far from contacts."""
+    """Number of single cycles with the contact count of the folded record, and number of cycles, cut far from contacts."""
     places = len(cycle.places)
     quiet = 0
     if stretches:

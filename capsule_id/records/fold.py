@@ -1,6 +1,6 @@
-"""A periodic record folded onto one period: every period adds its samples between those of the others.
+"""Folds a periodic record onto one period; the samples of each period lie between those of the others.
 
-The sampling step hardly ever divides the period, so that ten periods at 1 kHz are one period at 10 kHz.
+The sampling step rarely divides the period. Ten periods at 1 kHz then give one period at 10 kHz.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class Local:
-    """Local polynomials about some places (m,): value, rate per second, and their sd for unit noise."""
+    """Local polynomials at (m,) places: value, rate per second, and their sd for unit noise."""
 
     value: Float[np.ndarray, " m"]
     rate: Float[np.ndarray, " m"]
@@ -36,7 +36,7 @@ def local_polynomials(
     period : s
     places : (m,) s, where the polynomials are evaluated
     half_width : of the window, s; the window is half open and holds at least ``order`` + 1 different phases
-    order : of the polynomial; with 0 the value is a mean and there is no rate (zeros)
+    order : of the polynomial; with 0 the value is a mean and the rate is 0
     """
     sort = np.argsort(phase)
     axis = (phase[sort] + period * np.array([-1.0, 0.0, 1.0])[:, None]).ravel()
@@ -70,7 +70,7 @@ def intervals_above(z: Float[np.ndarray, " n"], low: float, high: float) -> list
         return [(0, len(z))]
     first = int(np.flatnonzero(state == 0)[0])
     turned = np.roll(state, -first)
-    # what lies between the levels goes on as it was
+    # Between the levels the last state stays.
     held = turned[np.maximum.accumulate(np.where(turned >= 0, np.arange(len(z)), 0))]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
     return [((int(a) + first) % len(z), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

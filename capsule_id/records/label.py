@@ -1,4 +1,4 @@
-"""The motion of a record in the paper's words, P-<n>-<F|B|S>-<m>, with the evidence, or "undecided" with the reason.
+"""Labels the motion of a record, P-<n>-<F|B|S>-<m> as in the paper, with evidence, or "undecided" with the reason.
 
 drive -> period by repeat -> mean velocity -> contacts on the folded record -> label
 """
@@ -25,8 +25,10 @@ UNDECIDED = "undecided"
 class Evidence:
     """Evidence for a label; None where the channels for it were not recorded.
 
-    drive : the tone of the current            Omega : rad/s, of the current, else of x_rel, else as stated
-    repeat, mean_velocity, contacts : as they were found            reasons : why the label is undecided, () where it is not
+    drive : the tone of the current
+    Omega : rad/s, of the current, else of x_rel, else as stated
+    repeat, mean_velocity, contacts : results of the single steps
+    reasons : why the label is undecided, () for a decided label
     """
 
     drive: Harmonic | None
@@ -38,8 +40,11 @@ class Evidence:
 
 
 class MeasuredMotion(NamedTuple):
-    """The label as ``response`` of the model writes it, or "undecided"; the capsule's mean velocity, m/s (NaN where
-    x_capsule was not recorded); and the evidence."""
+    """Label, mean velocity and evidence.
+
+    label : in the format of ``response``, or "undecided"
+    mean_velocity : of the capsule, m/s; NaN if x_capsule was not recorded
+    """
 
     label: str
     mean_velocity: float
@@ -53,7 +58,7 @@ def measured_motion(table: Table) -> MeasuredMotion:
     ----------
     table : a ``forced_run`` of a rig; period and contacts need x_rel, direction needs x_capsule
 
-    The label is of the record, not of a settled motion in theory: "P-1" says that it repeats within the noise.
+    The label describes the record, not a settled motion of the model: "P-1" means that it repeats within the noise.
     """
     time, columns = table["time"], table.columns
     drive = recorded_drive(table)

@@ -1,4 +1,4 @@
-"""Mean velocity of the capsule with its standard error, and the direction of its motion."""
+"""Estimates the mean velocity of the capsule, its standard error and the direction of motion."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,17 @@ from scipy.stats import norm
 
 from capsule_id.rig.filters import Record
 
-#: A capsule that advances less than this per excitation period (m) stands still; ``response`` uses the same bound.
-STANDING = 1e-7
-#: Both statements, "it moves" and "it stands", need this confidence.
+#: Largest advance per excitation period of a standing capsule, m; ``response`` uses the same bound.
+STANDING_ADVANCE = 1e-7
+#: Confidence of a decision, moving or standing.
 CONFIDENCE = 0.99
-_HARMONICS = 24  # of the motion's frequency that the periodic part of X2 may have
-_READINGS_EACH = 4  # at least this many readings per unknown
+_MOST_HARMONICS = 24  # of the motion's frequency in the periodic part of X2
+_SAMPLES_PER_UNKNOWN = 4  # at least
 
 
 @dataclass(frozen=True)
 class MeanVelocity:
-    """Mean velocity of the capsule, m/s, its standard error, and "F", "B", "S", or None where the record is not conclusive."""
+    """Mean velocity of the capsule, m/s, its standard error, and direction "F", "B", "S", or None with the reason."""
 
     velocity: float
     velocity_sd: float
@@ -41,21 +41,23 @@ def fit_mean_velocity(time: Record, x_capsule: Record, T: float, period: int | N
     T : period of the drive, s
     period : of the motion in excitation periods; None or 0 where there is none
     """
-    velocity, sd = _line(time, x_capsule, period * T) if period else _advances(time, x_capsule, T)
+    velocity, sd = (
+        _slope_with_harmonics(time, x_capsule, period * T) if period else _mean_of_advances(time, x_capsule, T)
+    )
     margin = norm.ppf(0.5 + CONFIDENCE / 2.0) * sd * T
     advance = velocity * T
-    if np.isfinite(margin) and abs(advance) - margin > STANDING:
+    if np.isfinite(margin) and abs(advance) - margin > STANDING_ADVANCE:
         return MeanVelocity(velocity, sd, "F" if advance > 0.0 else "B")
-    if np.isfinite(margin) and abs(advance) + margin < STANDING:
+    if np.isfinite(margin) and abs(advance) + margin < STANDING_ADVANCE:
         return MeanVelocity(velocity, sd, "S")
     reason = f"direction: advance {1e6 * advance:.3g} ± {1e6 * sd * T:.2g} um per period, standing is below 0.1 um"
     return MeanVelocity(velocity, sd, None, reason)
 
 
-def _line(time: Record, values: Record, T: float) -> tuple[float, float]:
+def _slope_with_harmonics(time: Record, values: Record, T: float) -> tuple[float, float]:
     """Slope and its standard error beside harmonics of 1/T."""
     step = (time[-1] - time[0]) / (len(time) - 1)
-    most = min(_HARMONICS, int(0.5 * T / step) - 1, len(time) // (2 * _READINGS_EACH) - 1)
+    most = min(_MOST_HARMONICS, int(0.5 * T / step) - 1, len(time) // (2 * _SAMPLES_PER_UNKNOWN) - 1)
     angle = 2.0 * np.pi / T * np.multiply.outer(time, np.arange(1, most + 1))
     middle = time - time.mean()
     design = np.concatenate([np.ones((len(time), 1)), middle[:, None], np.cos(angle), np.sin(angle)], axis=1)
@@ -67,7 +69,7 @@ def _line(time: Record, values: Record, T: float) -> tuple[float, float]:
     return float(slope @ coordinates), float(np.sqrt(variance) * np.linalg.norm(slope))
 
 
-def _advances(time: Record, values: Record, T: float) -> tuple[float, float]:
+def _mean_of_advances(time: Record, values: Record, T: float) -> tuple[float, float]:
     """Mean advance over successive whole periods, per second, and its standard error."""
     count = int((time[-1] - time[0]) / T)
     if count < 1:

@@ -1,4 +1,4 @@
-"""Noise level of a record from the record itself."""
+"""Estimates the noise level of a record from its differences."""
 
 import math
 
@@ -12,8 +12,8 @@ NORMAL_QUARTILE = 0.6745
 def noise_level(values: Num[np.ndarray, " n"], order: int = 3) -> float:
     """Standard deviation of the white noise on an evenly sampled record, by the median of its differences.
 
-    Differencing removes a smooth motion, and the median leaves out contacts and stops, which take a small part of the
-    time. Order 3 suits a well-sampled decay; order 6 leaves nothing of a forced motion.
+    Differencing removes a smooth motion. The median ignores contacts and stops, which take a small part of the time.
+    Order 3 suits a well-sampled decay; order 6 removes a forced motion too.
 
     Parameters
     ----------

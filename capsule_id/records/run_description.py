@@ -1,16 +1,16 @@
-"""Description of a recorded run in a few lines of text: label with evidence, drive, filter."""
+"""Describes a recorded run in a few lines of text: label with evidence, drive, filter."""
 
 from collections.abc import Iterator
 
 from capsule_id.errors import InputError
 from capsule_id.records.label import Evidence, MeasuredMotion, measured_motion
 from capsule_id.records.tone import Harmonic
-from capsule_id.records.view import ORDER, view_record
+from capsule_id.records.view import FILTER_ORDER, view_record
 from capsule_id.rig.model import Table
 
 
 def describe_run(table: Table) -> list[str]:
-    """Lines about a ``forced_run``, without its name in front."""
+    """Lines about a ``forced_run``, without its label."""
     motion = measured_motion(table)
     evidence = "; ".join(_evidence(motion))
     lines = [f"motion {motion.label} ({evidence})" if evidence else f"motion {motion.label}"]
@@ -24,11 +24,11 @@ def describe_run(table: Table) -> list[str]:
         return lines
     gains = [("drive", view.at_drive), *([("contacts", view.at_contact)] if view.at_contact else [])]
     passed = ", ".join(f"{g.smoothing:.3f} (rate {g.rate:.3f}) at {g.f:.3g} Hz, {name}" for name, g in gains)
-    return [*lines, f"Savitzky-Golay over {view.samples} samples, order {ORDER}: gain {passed}"]
+    return [*lines, f"Savitzky-Golay over {view.samples} samples, order {FILTER_ORDER}: gain {passed}"]
 
 
 def run_warning(table: Table) -> str | None:
-    """A warning where the stated frequency of a ``forced_run`` differs from that of its current; else None."""
+    """A warning if the stated frequency of a ``forced_run`` differs from that of its current, else None."""
     drive = measured_motion(table).evidence.drive
     if drive is None or not drive.disagrees:
         return None
@@ -45,7 +45,7 @@ def _evidence(motion: MeasuredMotion) -> Iterator[str]:
         yield f"{repeat.periods:.1f} periods of the drive, noise of x_rel {1e6 * repeat.noise_sd:.3g} um"
         if repeat.period:
             excess = repeat.ratios[repeat.period - 1]
-            yield f"repeats after {repeat.period}, mean square {excess:.2f} of the noise's"
+            yield f"repeats after {repeat.period}, mean square {excess:.2f} times that of the noise"
     if evidence.mean_velocity:
         yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.mean_velocity.velocity_sd:.2g} mm/s"
     if evidence.contacts:
@@ -54,7 +54,7 @@ def _evidence(motion: MeasuredMotion) -> Iterator[str]:
         crossings = "/".join(map(str, contacts.crossings))
         yield (
             f"contacts by spikes {spikes}, by crossings {crossings}, "
-            f"the same in {contacts.agreeing} of {contacts.cycles} single periods"
+            f"same count in {contacts.agreeing} of {contacts.cycles} single periods"
         )
 
 

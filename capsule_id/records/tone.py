@@ -1,4 +1,4 @@
-"""Frequency, amplitude and phase of the drive, from the recorded current by harmonic least squares.
+"""Estimates frequency, amplitude and phase of the drive from the recorded current by harmonic least squares.
 
     y(t) = A cos(Omega t + phase) + offset + white noise
 
@@ -19,11 +19,11 @@ from capsule_id.records.stated_settings import stated_Omega
 from capsule_id.rig.filters import Record, dominant_frequency
 from capsule_id.rig.model import Table
 
-#: The stated frequency is wrong where the fit differs by this many standard errors and by this share.
-OMEGA_ERRORS, OMEGA_SHARE = 4.0, 1e-3
-FEWEST_SAMPLES = 8  # for five unknowns, the noise among them
-_SCAN = 1.5  # half-width of the search about a first guess, in 1 / duration: a peak of the spectrum is 1 wide
-_SCAN_POINTS = 25
+#: The stated frequency is wrong if the fitted one differs by this many standard errors and by this fraction of it.
+OMEGA_STANDARD_ERRORS, OMEGA_RELATIVE_DIFFERENCE = 4.0, 1e-3
+FEWEST_SAMPLES = 8  # for five unknowns, including the noise level
+_SEARCH_HALF_WIDTH = 1.5  # about a first guess, in 1 / duration: a spectral peak is 1 wide
+_SEARCH_POINTS = 25
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Harmonic:
     """A fitted tone, SI: ``amplitude`` cos(``Omega`` t + ``phase``) + ``offset``, t the record's own time.
 
     ``_sd`` are standard errors; phase in (-pi, pi]; ``noise_sd`` of the residuals; ``stated_Omega`` as in the table;
-    ``refuted``: the tone of the stated frequency leaves more squares than noise explains.
+    ``refuted``: the tone of the stated frequency has a sum of squares larger than noise explains.
     """
 
     Omega: float
@@ -47,9 +47,9 @@ class Harmonic:
 
     @property
     def disagrees(self) -> bool:
-        """The stated frequency is not the recorded one: off by 4 standard errors and by one in a thousand."""
+        """Whether the stated frequency is wrong: off by 4 standard errors and by 0.1 %."""
         off = abs(self.Omega - self.stated_Omega)
-        return self.refuted and off > OMEGA_SHARE * self.stated_Omega
+        return self.refuted and off > OMEGA_RELATIVE_DIFFERENCE * self.stated_Omega
 
 
 def recorded_drive(table: Table) -> Harmonic | None:
@@ -58,11 +58,11 @@ def recorded_drive(table: Table) -> Harmonic | None:
 
 
 def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
-    """Fit one tone; its frequency is searched about ``Omega`` and about the strongest peak of the spectrum.
+    """Fit one tone. The search covers ``Omega`` and the strongest peak of the spectrum.
 
     Parameters
     ----------
-    time : (n,) s, increasing; the spectrum is looked at only where it is evenly spaced
+    time : (n,) s, increasing; the spectrum is used only if it is evenly spaced
     values : (n,)
     Omega : stated, rad/s
 
@@ -78,15 +78,15 @@ def fit_harmonic(time: Record, values: Record, Omega: float) -> Harmonic:
     # The spectrum needs even sampling; otherwise the stated frequency is the only guess.
     with contextlib.suppress(InputError):
         strongest = 2.0 * np.pi * dominant_frequency(time, values)
-        near = abs(strongest - Omega) < _width(time)
+        near = abs(strongest - Omega) < _search_half_width(time)
         guesses = [strongest] if near else [Omega, strongest]
     found, left = _refine(time, values, guesses[0])
     for guess in guesses[1:]:
         other, less = _refine(time, values, guess)
         # In a coarse record the stated frequency and its alias fit equally well: prefer the stated one.
-        if left - less > _threshold(len(time)) * less:
+        if left - less > _significant_reduction(len(time)) * less:
             found, left = other, less
-    return _describe(time, values, found, Omega)
+    return _harmonic_at(time, values, found, Omega)
 
 
 def tone_at(time: Record, values: Record, Omega: float) -> tuple[float, float, float]:
@@ -101,50 +101,53 @@ def tone_at(time: Record, values: Record, Omega: float) -> tuple[float, float, f
     -------
     amplitude and offset in the unit of ``values``, phase in rad, in (-pi, pi]
     """
-    cosine, sine, offset = np.linalg.lstsq(_design(time, Omega), values)[0]
+    cosine, sine, offset = np.linalg.lstsq(_tone_design(time, Omega), values)[0]
     return float(np.hypot(cosine, sine)), float(np.arctan2(-sine, cosine)), float(offset)
 
 
-def _design(time: Record, Omega: float) -> np.ndarray:
+def _tone_design(time: Record, Omega: float) -> np.ndarray:
     return np.stack([np.cos(Omega * time), np.sin(Omega * time), np.ones_like(time)], axis=1)
 
 
-def _misfit(time: Record, values: Record, Omega: float) -> float:
-    """Sum of squares left by the best tone of this frequency."""
-    design = _design(time, Omega)
+def _sum_of_squares(time: Record, values: Record, Omega: float) -> float:
+    """Sum of squared residuals of the best tone of this frequency."""
+    design = _tone_design(time, Omega)
     try:
         unknowns = np.linalg.solve(design.T @ design, design.T @ values)
-    except np.linalg.LinAlgError:  # far less than a period: the cosine is a constant
+    except np.linalg.LinAlgError:  # much less than a period: the cosine is constant
         unknowns = np.linalg.lstsq(design, values)[0]
     return float(np.sum((values - design @ unknowns) ** 2))
 
 
-def _threshold(samples: int) -> float:
-    """Gain in squares, as a share of what is left, that noise reaches as seldom as ``OMEGA_ERRORS`` standard errors."""
+def _significant_reduction(samples: int) -> float:
+    """Reduction of the sum of squares, relative to the rest, that is as rare as ``OMEGA_STANDARD_ERRORS``."""
     freedom = samples - 4
-    return float(stats.t.isf(stats.norm.sf(OMEGA_ERRORS), freedom) ** 2 / freedom)
+    return float(stats.t.isf(stats.norm.sf(OMEGA_STANDARD_ERRORS), freedom) ** 2 / freedom)
 
 
-def _width(time: Record) -> float:
+def _search_half_width(time: Record) -> float:
     """Half-width of the search about a guess, rad/s."""
-    return float(2.0 * np.pi * _SCAN / (time[-1] - time[0]))
+    return float(2.0 * np.pi * _SEARCH_HALF_WIDTH / (time[-1] - time[0]))
 
 
 def _refine(time: Record, values: Record, guess: float) -> tuple[float, float]:
-    """(Omega, sum of squares) of the deepest minimum about ``guess``."""
-    width = _width(time)
-    grid = np.linspace(max(guess - width, 0.05 * guess), guess + width, _SCAN_POINTS)
-    best = int(np.argmin([_misfit(time, values, Omega) for Omega in grid]))
+    """(Omega, sum of squares) of the lowest minimum near ``guess``."""
+    width = _search_half_width(time)
+    grid = np.linspace(max(guess - width, 0.05 * guess), guess + width, _SEARCH_POINTS)
+    best = int(np.argmin([_sum_of_squares(time, values, Omega) for Omega in grid]))
     step = grid[1] - grid[0]
     bounds = (max(grid[best] - step, 0.5 * grid[0]), grid[best] + step)
     found: Any = minimize_scalar(
-        lambda Omega: _misfit(time, values, Omega), bounds=bounds, method="bounded", options={"xatol": 1e-9 * guess}
+        lambda Omega: _sum_of_squares(time, values, Omega),
+        bounds=bounds,
+        method="bounded",
+        options={"xatol": 1e-9 * guess},
     )
     return float(found.x), float(found.fun)
 
 
-def _describe(time: Record, values: Record, Omega: float, stated: float) -> Harmonic:
-    """The tone at ``Omega`` with the standard errors of all four unknowns together."""
+def _harmonic_at(time: Record, values: Record, Omega: float, stated: float) -> Harmonic:
+    """The tone at ``Omega`` with the joint standard errors of all four unknowns."""
     amplitude, phase, offset = tone_at(time, values, Omega)
     angle = Omega * time + phase
     slope = -amplitude * np.sin(angle)
@@ -152,14 +155,14 @@ def _describe(time: Record, values: Record, Omega: float, stated: float) -> Harm
     scale = np.linalg.norm(jacobian, axis=0)
     left = float(np.sum((values - amplitude * np.cos(angle) - offset) ** 2))
     noise_sd = float(np.sqrt(left / (len(time) - 4)))
-    refuted = _misfit(time, values, stated) - left > _threshold(len(time)) * left
+    refuted = _sum_of_squares(time, values, stated) - left > _significant_reduction(len(time)) * left
     errors = noise_sd * np.sqrt(_variances(jacobian / scale)) / scale
     sd = [float(error) for error in errors]
     return Harmonic(Omega, sd[2], amplitude, sd[0], phase, sd[1], offset, noise_sd, stated, refuted)
 
 
 def _variances(jacobian: np.ndarray) -> np.ndarray:
-    """Diagonal of (J'J)^-1; infinite where a record of far less than a period cannot part the unknowns."""
+    """Diagonal of (J'J)^-1; infinite if the record is too short to separate the unknowns."""
     try:
         variances = np.diag(np.linalg.inv(jacobian.T @ jacobian))
     except np.linalg.LinAlgError:

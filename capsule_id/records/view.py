@@ -1,6 +1,6 @@
-"""A record prepared for figures: filtered, differentiated, sampled at the drive's phase (the paper's Figs. 4, 9, 12).
+"""Prepares a record for figures: filtered, differentiated, sampled at the drive's phase (the paper's Figs. 4, 9, 12).
 
-For pictures and starting values only. Likelihoods use the raw channels.
+For figures and starting points only. Likelihoods use the raw channels.
 """
 
 from collections.abc import Mapping
@@ -15,17 +15,17 @@ from capsule_id.records.stated_settings import stated_gap
 from capsule_id.rig.filters import gain, sampling_step, savitzky_golay
 from capsule_id.rig.model import Table
 
-ORDER = 3  # of the filter's polynomial
-SHORTEST_WINDOW = 5  # samples, the first that smooths at this order
-#: The filter's window is the longest that leaves this share of a rate at the contact frequency ...
-PASSED = 0.9
-#: ... or, in a record without contacts, at this multiple of the frequency of the drive.
-MULTIPLE = 5.0
+FILTER_ORDER = 3  # of the filter's polynomial
+SHORTEST_WINDOW = 5  # samples; a shorter window does not smooth at this order
+#: The window is the longest whose gain for a rate is at least this at the contact frequency,
+SMALLEST_RATE_GAIN = 0.9
+#: or, in a record without contacts, at this multiple of the excitation frequency.
+PASS_BAND_MULTIPLE = 5.0
 
 
 @dataclass(frozen=True)
 class Gains:
-    """Gains of the filter at frequency f, Hz: of x_rel and of its rate, 1."""
+    """Gains of the filter at frequency f, Hz, for x_rel and for its rate, 1."""
 
     f: float
     smoothing: float
@@ -34,14 +34,15 @@ class Gains:
 
 @dataclass(frozen=True)
 class RecordView:
-    """A record, SI.
+    """A prepared record, SI.
 
     time : (n,)
     channels : raw, (n,) by column name
     x_rel, rate : (n,) filtered, and its derivative
-    section_x_rel, section_rate : (m,) where the drive's phase is a multiple of 2 pi, half windows at the ends left out
-    gap : as stated        gap_seen : x_rel where contacts begin, None where the record does not show it
-    force : (n,) K times the current, its zero error taken off, N, None without current or K
+    section_x_rel, section_rate : (m,) where the drive's phase is a multiple of 2 pi, without half windows at the ends
+    gap : as stated
+    gap_seen : x_rel where contacts begin, None if the record does not determine it
+    force : (n,) K times the current without its offset, N, None without current or K
     samples : window of the filter
     at_drive, at_contact : the filter's gains; ``at_contact`` is None without contacts
     """
@@ -84,11 +85,11 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
     f = evidence.Omega / (2.0 * np.pi)
     contacts = evidence.contacts
     f_contact = 0.5 / contacts.duration if contacts and contacts.duration else None
-    samples = _window(f_contact or MULTIPLE * f, step, len(time))
-    x_rel, rate = (savitzky_golay(time, table["x_rel"], samples * step, ORDER, d) for d in (0, 1))
+    samples = _window_samples(f_contact or PASS_BAND_MULTIPLE * f, step, len(time))
+    x_rel, rate = (savitzky_golay(time, table["x_rel"], samples * step, FILTER_ORDER, d) for d in (0, 1))
     phase = evidence.drive.phase if evidence.drive else 0.0
     half = samples // 2
-    section = _section(time[half : len(time) - half], evidence.Omega, phase)
+    section = _section_times(time[half : len(time) - half], evidence.Omega, phase)
     return RecordView(
         label=motion.label,
         time=time,
@@ -106,19 +107,19 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
     )
 
 
-def _window(f: float, step: float, most: int) -> int:
-    """Samples of the longest window, at least the shortest, that passes the rate at f Hz."""
+def _window_samples(f: float, step: float, most: int) -> int:
+    """Samples of the longest window that passes the rate at f Hz, at least ``SHORTEST_WINDOW``."""
     samples = SHORTEST_WINDOW
-    while samples + 2 <= most and gain(f * step, samples + 2, ORDER, 1) >= PASSED:
+    while samples + 2 <= most and gain(f * step, samples + 2, FILTER_ORDER, 1) >= SMALLEST_RATE_GAIN:
         samples += 2
     return samples
 
 
 def _gains(f: float, step: float, samples: int) -> Gains:
-    return Gains(f, *(float(gain(f * step, samples, ORDER, d)) for d in (0, 1)))
+    return Gains(f, *(float(gain(f * step, samples, FILTER_ORDER, d)) for d in (0, 1)))
 
 
-def _section(time: np.ndarray, Omega: float, phase: float) -> np.ndarray:
+def _section_times(time: np.ndarray, Omega: float, phase: float) -> np.ndarray:
     """Times within the record at which Omega t + phase is a multiple of 2 pi."""
     first, last = ((Omega * t + phase) / (2.0 * np.pi) for t in (time[0], time[-1]))
     return (2.0 * np.pi * np.arange(np.ceil(first), np.floor(last) + 1.0) - phase) / Omega

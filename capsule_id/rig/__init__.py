@@ -1,1 +1,1 @@
-"""What was measured: a folder of tables becomes a ``Rig`` in SI units."""
+"""Reads what was measured: a rig folder becomes a ``Rig`` in SI units."""

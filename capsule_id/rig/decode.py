@@ -1,4 +1,4 @@
-"""Bytes of a text file, decoded; the place of the first byte that cannot be."""
+"""Decodes the bytes of a text file and locates the first byte that is not text."""
 
 import re
 from pathlib import Path
@@ -27,6 +27,6 @@ def decode(content: bytes, path: Path) -> str:
 
 
 def _place(content: bytes, offset: int) -> tuple[int, int]:
-    """1-based line and character of a byte; what precedes it on its line may be broken too."""
+    """1-based line and character of a byte; the bytes before it on its line may be invalid too."""
     lines = re.split(rb"\r\n?|\n", content[:offset])
     return len(lines), len(lines[-1].decode("utf-8", "replace")) + 1

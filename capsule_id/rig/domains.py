@@ -1,4 +1,4 @@
-"""Intervals that values must lie in."""
+"""Intervals of admissible values."""
 
 from dataclasses import dataclass
 from math import inf, pi
@@ -16,7 +16,7 @@ class Domain:
     low_allowed: bool = False
 
     def holds(self, values: np.ndarray | float) -> np.ndarray:
-        """Elementwise: inside?"""
+        """Whether each value lies inside, elementwise."""
         values = np.asarray(values)
         return ((values >= self.low) if self.low_allowed else (values > self.low)) & (values < self.high)
 

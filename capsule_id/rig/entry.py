@@ -1,4 +1,4 @@
-"""One ``[[experiment]]`` under check: its table, and the places that an error about it names."""
+"""One ``[[experiment]]`` during its check: its table, and the places for error lines."""
 
 from dataclasses import dataclass
 from typing import Generic
@@ -12,7 +12,7 @@ from capsule_id.rig.toml_document import KeyPath, TomlDocument
 
 @dataclass(frozen=True)
 class Entry(Generic[S]):
-    """What the rules of a kind look at.
+    """The argument of a kind's rules.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class Entry(Generic[S]):
     file: TableFile
 
     def error(self, key: str, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
-        """The error to raise about a setting, at its value (or key); ``key`` "": about the whole entry."""
+        """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
         path = (*self.path, key) if key else self.path
         return self.document.error(path, rule, value, remedy, of_key)
 

@@ -1,8 +1,8 @@
-"""Savitzky–Golay smoothing and derivatives, as the paper prepares its records.
+"""Savitzky–Golay smoothing and derivatives, the paper's preparation of its records.
 
-Filtered records serve the paper's estimators, pictures and starting values. Likelihoods use raw records: the filter
-removes most of the white noise and correlates the rest. A likelihood of independent errors then finds a noise level that
-is too small and intervals that are too short.
+Filtered records serve the paper's estimators, figures and starting points. Likelihoods use raw records. The filter
+removes most of the white noise and correlates the rest. A likelihood of independent errors would then give a noise level
+and intervals that are too small.
 
 Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. Schafer, IEEE Signal Process. Mag. 28(4),
 111 (2011).
@@ -17,9 +17,9 @@ from capsule_id.errors import InputError
 #: Samples of one channel, or their times.
 Record = Num[np.ndarray, " n"]
 
-JITTER = 0.01  # of a sampling step: samples this near to an even grid count as evenly spaced
-PASSED = 0.99  # gain that `choose_window` keeps at the dominant frequency
-_ZERO_PADDING = 8  # the spectrum's grid is this much finer than 1 / duration
+TIMING_TOLERANCE = 0.01  # largest distance from an even grid, in sampling steps, of evenly spaced samples
+SMALLEST_GAIN = 0.99  # smallest gain of `choose_window` at the dominant frequency
+_ZERO_PADDING = 8  # the frequency grid of the spectrum is 8 times finer than 1 / duration
 
 
 def savitzky_golay(
@@ -27,14 +27,14 @@ def savitzky_golay(
 ) -> Float[np.ndarray, " n"]:
     """Smooth a record, or differentiate it, by least-squares polynomials over a moving window.
 
-    The first and last half windows are the values (or derivatives) of the polynomial fitted to the first and last whole
-    window, so that polynomials up to ``order`` pass unchanged up to the very edges.
+    The first and last half windows take the values (or derivatives) of the polynomial fitted to the first and last whole
+    window. Polynomials up to ``order`` therefore pass unchanged up to the edges.
 
     Parameters
     ----------
     time : (n,) s, evenly spaced
     values : (n,)
-    window : s, used as the odd number of samples that comes nearest (see ``window_samples``)
+    window : s, rounded to the nearest odd number of samples (see ``window_samples``)
     order : of the polynomial
     derivative : 0 to smooth, 1 for the rate in values per second, ...
 
@@ -48,10 +48,8 @@ def savitzky_golay(
         If the samples are unevenly spaced, or the window holds too few or too many samples.
     """
     if not 0 <= derivative <= order:
-        remedy = "raise the order"
-        raise InputError(
-            "derivative must lie between 0 and the order of the filter", f"{derivative} of {order}", remedy
-        )
+        rule, value = "derivative must lie between 0 and the order of the filter", f"{derivative} of {order}"
+        raise InputError(rule, value, "raise the order")
     step = sampling_step(time)
     samples = window_samples(window, step)
     _check_window(samples, order, len(time))
@@ -73,13 +71,13 @@ def sampling_step(time: Record) -> float:
     Raises
     ------
     InputError
-        If a sample lies further than ``JITTER`` of a step from the even grid between the first and the last.
+        If a sample lies further than ``TIMING_TOLERANCE`` of a step from the even grid between the first and the last.
     """
     if len(time) < 2:
         raise InputError("a filter needs at least 2 samples", f"{len(time)}", "give a longer record")
     step = float(time[-1] - time[0]) / (len(time) - 1)
     offset = float(np.max(np.abs(time - time[0] - step * np.arange(len(time)))))
-    if not offset <= JITTER * step:
+    if not offset <= TIMING_TOLERANCE * step:
         steps = np.diff(time)
         value = f"steps from {steps.min():g} to {steps.max():g} s"
         raise InputError("a filter needs evenly spaced samples", value, "resample the record evenly, or export it raw")
@@ -87,7 +85,7 @@ def sampling_step(time: Record) -> float:
 
 
 def window_samples(window: float, step: float) -> int:
-    """The odd number of samples whose count times ``step`` comes nearest to ``window``, both in s."""
+    """The odd number of samples nearest to ``window / step``, both in s."""
     return 2 * max(0, round((window / step - 1.0) / 2.0)) + 1
 
 
@@ -105,7 +103,7 @@ def gain(frequency: np.ndarray | float, samples: int, order: int, derivative: in
 
     Returns
     -------
-    array of the shape of ``frequency``; real, since the filter is even or odd: it shifts no phase but by pi
+    real array of the shape of ``frequency``: the filter is even or odd, so a phase shift is 0 or pi
     """
     frequency = np.asarray(frequency, float)
     half = samples // 2
@@ -120,10 +118,9 @@ def gain(frequency: np.ndarray | float, samples: int, order: int, derivative: in
 
 
 def choose_window(time: Record, values: Record, order: int) -> float:
-    """The longest window that passes the dominant frequency, s.
+    """The longest odd window with a gain of at least ``SMALLEST_GAIN`` at the dominant frequency, s.
 
-    Rule (this package's own): the longest odd window whose gain at the record's dominant frequency is still at least
-    ``PASSED``. Longer windows remove more noise and more of the motion.
+    The rule is this package's own. Longer windows remove more noise and more of the motion.
 
     Parameters
     ----------
@@ -140,11 +137,11 @@ def choose_window(time: Record, values: Record, order: int) -> float:
     frequency = dominant_frequency(time, values) * step
     samples = order + 1 + order % 2
     _check_window(samples, order, len(time))
-    # the gain falls monotonically from 1 to the stop band, whose ripple stays far below 1: halve the interval
+    # Bisection: the gain falls monotonically from 1 to the stop band, whose ripple is far below 1.
     too_long = len(time) + 1 + len(time) % 2
     while too_long - samples > 2:
         middle = samples + 2 * ((too_long - samples) // 4)
-        if gain(frequency, middle, order) >= PASSED:
+        if gain(frequency, middle, order) >= SMALLEST_GAIN:
             samples = middle
         else:
             too_long = middle
@@ -152,7 +149,7 @@ def choose_window(time: Record, values: Record, order: int) -> float:
 
 
 def dominant_frequency(time: Record, values: Record) -> float:
-    """Frequency of the highest peak of the spectrum, Hz, the record's straight trend removed first.
+    """Frequency of the highest peak of the spectrum, Hz, after removal of the linear trend.
 
     Parameters
     ----------
@@ -169,17 +166,18 @@ def dominant_frequency(time: Record, values: Record) -> float:
     residual = values - np.polyval(np.polyfit(index, values, 1), index)
     length = _ZERO_PADDING * len(time)
     spectrum = np.abs(np.fft.rfft(residual, length))
-    # below 1 / duration a peak is only the rest of the trend
+    # Below 1 / duration a peak is a remainder of the trend.
     return float(np.fft.rfftfreq(length, step)[_ZERO_PADDING + int(np.argmax(spectrum[_ZERO_PADDING:]))])
 
 
 def _least_squares(samples: int, order: int, derivative: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least squares in Legendre polynomials of k/half, k = -half .. half: (q, triangle) of the design and the (samples,
-    order + 1) values of their derivatives.
+    """Least squares in Legendre polynomials of k/half, k = -half .. half.
 
-    ``scipy.signal.savgol_coeffs`` (1.17) solves in powers of k, which costs digits without a warning. At order 3, the order
-    in use, its smoothing weights are off by 2e-10 at 3001 samples and wholly wrong from 30,001 samples (a record of 0.6 s
-    at 51.2 kHz); at order 5 from 1001 samples. Tests show both. Legendre polynomials keep 14 digits at every length.
+    Returns q and triangle of the design, and the derivatives of the polynomials, (samples, order + 1).
+
+    ``scipy.signal.savgol_coeffs`` (1.17) solves in powers of k, which loses digits without a warning. At order 3, the order
+    in use, its smoothing weights are off by 2e-10 at 3001 samples and wrong from 30,001 samples (a record of 0.6 s at
+    51.2 kHz); at order 5 from 1001 samples. Tests show both. Legendre polynomials keep 14 digits at every length.
     """
     half = samples // 2
     place = (np.arange(samples) - half) / max(half, 1)
@@ -189,7 +187,7 @@ def _least_squares(samples: int, order: int, derivative: int) -> tuple[np.ndarra
 
 
 def _check_window(samples: int, order: int, available: int) -> None:
-    """A polynomial of ``order`` needs more samples than that, and the window must fit the record."""
+    """Refuse a window with no more samples than ``order``, or longer than the record."""
     if samples <= order:
         value = f"{samples} samples for order {order}"
         raise InputError(

@@ -1,4 +1,4 @@
-"""The frozen nouns of a rig folder. Everything is SI and float64; arrays are read-only."""
+"""Frozen values of a rig folder: SI units, float64, read-only arrays."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Quantity:
-    """A stated value with its standard deviation, SI; ``sd`` is 0 where the folder states none (then exact)."""
+    """A stated value with its standard deviation, SI. An ``sd`` of 0 means exact; it is the default."""
 
     value: float
     sd: float = 0.0
@@ -72,7 +72,7 @@ class Table(Generic[S]):
     file : path relative to the folder
     columns : by name
     settings : of its kind, checked, defaults filled in
-    rows : (n,) 1-based line number in the file of every row, read-only: how a finding names a row
+    rows : (n,) 1-based line number of every row in the file, read-only; findings name rows by it
     """
 
     kind: str

@@ -1,4 +1,4 @@
-"""A rig folder becomes a ``Rig``: ``rig.toml`` by the rules of the kinds, its tables in SI, then the rules between them."""
+"""Reads a rig folder into a ``Rig``: ``rig.toml`` by the rules of the kinds, tables in SI, rules between tables."""
 
 import hashlib
 import re
@@ -91,7 +91,7 @@ def _read_document(folder: Path) -> tuple[TomlDocument, str]:
             raise InputError("a rig folder must contain a file rig.toml", "none", remedy, path, 1, 1)
         if not path.resolve().is_relative_to(folder.resolve()):
             raise InputError(
-                "rig.toml must lie inside the folder, links followed", "a link", "copy it here", path, 1, 1
+                "rig.toml must lie inside the folder, links followed", "a link", "copy the file here", path, 1, 1
             )
         content = path.read_bytes()
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links
@@ -102,7 +102,7 @@ def _read_document(folder: Path) -> tuple[TomlDocument, str]:
 def _check_masses(
     document: TomlDocument, tables: Sequence[Table], kinds: Mapping[str, KindRule], stated: set[str]
 ) -> None:
-    """Masses that an experiment needs must be stated in [rig]."""
+    """Refuse an experiment whose masses [rig] does not state."""
     for index, table in enumerate(tables):
         for mass in kinds[table.kind].masses(table):
             if mass not in stated:
@@ -115,7 +115,7 @@ def _check_masses(
 def _read_priors(
     document: TomlDocument, tables: Sequence[Table], kinds: Mapping[str, KindRule]
 ) -> dict[str, PriorOverride]:
-    """``[prior]``."""
+    """The entries of ``[prior]``, by parameter name."""
     entries = read_table(document, ("prior",), document.data.get("prior", {}), "[prior]")
     rows = {symbol: row for symbol, row in parameter_rows(kinds).items() if row.prior_can_be_stated}
     known = ["k2[<spring>]" if symbol == "k2" else symbol for symbol in sorted(rows, key=lambda s: rows[s].scatter)]
@@ -133,10 +133,10 @@ def _read_priors(
 
 
 def _check_prior_of_spring(document: TomlDocument, path: KeyPath, spring: str, tables: Sequence[Table]) -> None:
-    """A prior of k2[spring] needs an experiment with that spring."""
+    """Refuse a prior of k2[spring] without an experiment with that spring."""
     springs = sorted({table.settings.spring for table in tables if getattr(table.settings, "spring", None)})
     if spring not in springs:
-        known = f"known springs: {' '.join(springs)}" if springs else "no experiment names a spring"
+        known = f"write one of {' '.join(springs)}" if springs else "remove it: no experiment names a spring"
         raise document.error(path, "a prior of k2 must name a spring of an experiment", spring, known, of_key=True)
 
 
@@ -182,7 +182,7 @@ def _read_experiment(
     file = read_table_file(document, (*path, "file"), name, kind)
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
     columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
-    _refuse_idle_reading_errors(document, path, entry, errors, file)
+    _refuse_reading_errors_without_column(document, path, entry, errors, file)
     table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows)
     for rule in kind.rules:
         rule(Entry(table, document, path, file))
@@ -210,7 +210,7 @@ def _with_reading_error(
     return Column(column.name, column.unit, column.to_display, column.values, stated["_sd"], stated["_resolution"])
 
 
-def _refuse_idle_reading_errors(
+def _refuse_reading_errors_without_column(
     document: TomlDocument, path: KeyPath, entry: dict[str, Any], keys: list[str], file: TableFile
 ) -> None:
     """Refuse reading errors of columns that the file does not have."""

@@ -1,4 +1,4 @@
-"""The types in which a kind of experiment states its columns, settings and rules. The reader knows these types only."""
+"""Types for the columns, settings and rules of a kind of experiment. The reader uses no other type of a kind."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -32,7 +32,7 @@ SHORTEST_RECORD = 8
 
 @dataclass(frozen=True)
 class ColumnRule:
-    """A column: its SI unit, its domain, and whether it must increase row by row or at least vary."""
+    """A column: SI unit, domain, and whether its values must increase from row to row or vary."""
 
     si: str
     domain: Domain = ANY
@@ -42,10 +42,10 @@ class ColumnRule:
 
 @runtime_checkable
 class SettingRule(Protocol):
-    """What a setting may be. A kind may bring a rule of its own: any object with this method."""
+    """Reads one setting. A kind may define its own rule: any object with this method."""
 
     def read(self, document: TomlDocument, path: KeyPath, value: object) -> object:
-        """The value at ``path`` of ``rig.toml`` as the settings hold it.
+        """The checked value at ``path`` of ``rig.toml``, as stored in the settings.
 
         Raises
         ------
@@ -57,7 +57,7 @@ class SettingRule(Protocol):
 
 @dataclass(frozen=True)
 class QuantityRule:
-    """``{ value = ..., unit = ... }``, read as an SI float; with ``has_sd`` it takes ``sd`` too: a ``Quantity``."""
+    """``{ value = ..., unit = ... }`` as an SI float; with ``has_sd`` also ``sd``, as a ``Quantity``."""
 
     si: str
     domain: Domain = POSITIVE
@@ -91,18 +91,18 @@ class NameRule:
 
 @dataclass(frozen=True, kw_only=True)
 class KindRule:
-    """What the reader must know of one kind of experiment.
+    """The properties of one kind of experiment that the reader uses.
 
     Attributes
     ----------
     name : as ``kind`` in ``rig.toml``
     columns : every column that the file may have
     sets : the file must have exactly one of these sets of columns
-    channels : of these it must have at least one, where the kind has channels
-    optional : of these it may have any
+    channels : columns of which the file must have at least one; () means no such rule
+    optional : columns that may be absent
     settings : the dataclass of the entry's settings. A field's type states its rule: ``Literal`` a choice,
         ``Annotated[type, rule]`` any other. A field with a default may be absent
-    rules : each raises an ``InputError`` where columns and settings do not go together
+    rules : each raises an ``InputError`` where columns and settings are inconsistent
     masses : the masses of [rig] that an experiment with this table needs
     parameters : rows of the parameters that only experiments of this kind have
     """
@@ -143,7 +143,7 @@ def _setting_rules(settings: type[Settings]) -> Mapping[str, SettingRule]:
 
 
 def _rule_of(name: str, hint: object) -> SettingRule:
-    """The rule that a field's type states."""
+    """The rule in the type of a field."""
     if get_origin(hint) is Annotated:
         for extra in get_args(hint)[1:]:
             if isinstance(extra, SettingRule):

@@ -1,4 +1,4 @@
-"""One table file of a rig folder: found inside the folder, read, hashed, its columns checked and turned into SI."""
+"""Reads one table file of a rig folder: path check, bytes, hash, columns in SI."""
 
 import hashlib
 from collections.abc import Mapping
@@ -19,14 +19,14 @@ from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 @dataclass(frozen=True)
 class TableFile:
-    """A table in SI, with the raw table for places.
+    """A table in SI, with the raw table for the places of cells.
 
     Attributes
     ----------
-    path : the file, as error lines name it
+    path : the file, for error lines
     sha256 : of the bytes read
     raw : the numbers as written
-    columns : by name, without reading errors yet
+    columns : by name, still without reading errors
     """
 
     path: Path
@@ -35,13 +35,13 @@ class TableFile:
     columns: Mapping[str, Column]
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
-        """The error to raise about a cell, or about the header of a column where ``row`` is None."""
+        """The error about a cell, or about the header of a column if ``row`` is None."""
         line, column = self.raw.place(row, self.raw.names.index(name))
         return InputError(rule, value, remedy, self.path, line, column)
 
 
-def locate(document: TomlDocument, path: KeyPath, name: str) -> Path:
-    """The file ``name`` of the folder, refused where it is not a regular file inside the folder.
+def table_path(document: TomlDocument, path: KeyPath, name: str) -> Path:
+    """The path of the table ``name``, a regular file inside the rig folder.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def locate(document: TomlDocument, path: KeyPath, name: str) -> Path:
         At the ``file`` key of ``rig.toml``.
     """
     folder = document.path.parent
-    remedy = "put the file into the rig folder and name it relative to that"
+    remedy = "put the file into the rig folder and write its path relative to that folder"
     if Path(name).is_absolute() or PureWindowsPath(name).drive or not name.isprintable():
         raise document.error(path, "file must be a path relative to the rig folder", shown(name), remedy)
     file = folder / name
@@ -78,7 +78,7 @@ def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: Kind
     InputError
         At the ``file`` key of ``rig.toml`` (at ``path``) or at a place in the table.
     """
-    file = locate(document, path, name)
+    file = table_path(document, path, name)
     try:
         content = file.read_bytes()
     except OSError as error:
@@ -93,7 +93,7 @@ def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: Kind
 
 
 def _check_names(table: TableFile, kind: KindRule) -> None:
-    """Only known columns, exactly one of the kind's sets of them, and a channel where it has channels."""
+    """Refuse unknown columns, a wrong set of columns, and a table without a channel where the kind has channels."""
     names = table.raw.names
     for name in names:
         if name not in kind.columns:
@@ -113,7 +113,7 @@ def _check_names(table: TableFile, kind: KindRule) -> None:
 
 
 def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
-    """Column ``index`` in SI, inside its domain, increasing or varying where it has to."""
+    """Column ``index`` in SI; its values obey ``rule``."""
     name, unit = table.raw.names[index], table.raw.units[index]
     try:
         factor = factor_to_si(unit, rule.si)
@@ -122,13 +122,12 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
     written = table.raw.values[:, index]
     with np.errstate(over="ignore"):
         values = scale(written, factor)
-    _refuse_first(
-        table, name, np.isfinite(values) & rule.domain.holds(values), f"{name} must {rule.domain.text}", "correct it"
-    )
+    valid = np.isfinite(values) & rule.domain.holds(values)
+    _raise_at_first_false(table, name, valid, f"{name} must {rule.domain.text}", "correct the value or delete the row")
     if rule.increasing:
         rises = np.concatenate([[True], np.diff(values) > 0.0])
-        _refuse_first(
-            table, name, rises, f"{name} must increase from row to row", "sort the rows, remove repeated ones"
+        _raise_at_first_false(
+            table, name, rises, f"{name} must increase from row to row", "sort the rows and delete repeated ones"
         )
     if rule.varies and len(values) > 1 and np.ptp(values) == 0.0:
         value = f"{written[0]:g} {unit} in every row"
@@ -139,7 +138,7 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
     return Column(name, unit, 1.0 / factor, values)
 
 
-def _refuse_first(table: TableFile, name: str, good: np.ndarray, rule: str, remedy: str) -> None:
+def _raise_at_first_false(table: TableFile, name: str, good: np.ndarray, rule: str, remedy: str) -> None:
     """Raise at the first row that is not ``good``."""
     if not good.all():
         row = int(np.argmin(good))

@@ -1,4 +1,4 @@
-"""``rig.toml`` with places: tomllib says what stands in the file, the scanner here says where."""
+"""``rig.toml`` with places: tomllib reads the values, a scanner finds their lines and columns."""
 
 import re
 import tomllib
@@ -22,12 +22,12 @@ _SPACES = re.compile(r"[ \t]*")
 
 @dataclass(frozen=True)
 class TomlDocument:
-    """A parsed TOML file that can say where each of its keys and values stands.
+    """A parsed TOML file with the place of each key and value.
 
     Attributes
     ----------
-    path : the file, as the user named it
-    data : what tomllib read
+    path : the file, as given by the user
+    data : the content as tomllib returns it
     keys, values : offset of every key and value by key path, e.g. ("experiment", 0, "kind")
     text : the file's text with ``\\n`` line ends
     """
@@ -49,7 +49,7 @@ class TomlDocument:
         return 1, 1
 
     def error(self, path: KeyPath, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
-        """The error to raise about the value (or key) at ``path``."""
+        """The error about the value (or key) at ``path``."""
         line, column = self.place(path, of_key)
         return InputError(rule, value, remedy, self.path, line, column)
 
@@ -83,7 +83,7 @@ def _line_and_column(text: str, offset: int) -> tuple[int, int]:
 
 
 class _Scanner:
-    """Walks a text that tomllib has accepted, so it need not check anything, only keep the places."""
+    """Records the places in a text that tomllib has accepted; it checks nothing."""
 
     def __init__(self, text: str) -> None:
         self.text, self.position = text, 0
@@ -92,7 +92,7 @@ class _Scanner:
         self.lengths: dict[KeyPath, int] = {}  # of arrays of tables
 
     def scan(self) -> None:
-        """Visit every statement: table header or key = value."""
+        """Read every statement: table header or key = value."""
         base: KeyPath = ()
         self.skip(_BLANK)
         while self.position < len(self.text):
@@ -103,7 +103,7 @@ class _Scanner:
             self.skip(_BLANK)
 
     def skip(self, pattern: re.Pattern[str]) -> str:
-        """Step over a match of ``pattern``, which may be empty; its text."""
+        """Move behind a match of ``pattern`` and return its text, which may be empty."""
         match = pattern.match(self.text, self.position)
         if match is None:
             return ""

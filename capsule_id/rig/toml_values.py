@@ -1,4 +1,4 @@
-"""The values of ``rig.toml``, one by one: type, unit, domain, then SI. A fault is named at its own line and column."""
+"""Reads single values of ``rig.toml``: type, unit, domain, SI. An error names the line and column of the value."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -12,11 +12,11 @@ from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 NAME_PATTERN = r"[A-Za-z0-9._-]+"
-_LONGEST_SHOWN = 60  # characters of a faulty value that an error line repeats
+_LONGEST_SHOWN = 60  # characters of a faulty value in an error line
 
 
 def shown(value: object) -> str:
-    """A faulty value as an error line repeats it: printable and short."""
+    """A faulty value for an error line: printable and short."""
     try:
         text = str(value).lower() if isinstance(value, bool) else repr(value)
     except ValueError:  # Python refuses to write integers of thousands of digits
@@ -25,7 +25,7 @@ def shown(value: object) -> str:
 
 
 def closest(word: str, known: Collection[str]) -> str | None:
-    """The one of ``known`` that ``word`` may be a slip of."""
+    """The word of ``known`` that is most similar to ``word``, None if no word is similar."""
     return next(iter(get_close_matches(word[:_LONGEST_SHOWN], known, n=1)), None)
 
 
@@ -56,7 +56,7 @@ def read_bool(document: TomlDocument, path: KeyPath, value: object) -> bool:
 
 
 def read_name(document: TomlDocument, path: KeyPath, value: object) -> str:
-    """A name; ``.`` and ``..`` are none, because results are written to a folder of that name."""
+    """A name. ``.`` and ``..`` are refused, because results are written to a folder of that name."""
     name = read_string(document, path, value)
     if not re.fullmatch(NAME_PATTERN, name) or not name.strip("."):
         rule = f"{path[-1]} must be a name of letters, digits, dot, underscore and hyphen"
@@ -137,7 +137,7 @@ def _read_scaled(
     except OverflowError:
         scaled = float("inf")
     if not isfinite(scaled):
-        raise document.error(place, f"{name} must be a finite number", shown(number), "correct it")
+        raise document.error(place, f"{name} must be a finite number", shown(number), "correct the value")
     if not domain.holds(scaled):
-        raise document.error(place, f"{name} must {domain.text}", shown(number), "correct it")
+        raise document.error(place, f"{name} must {domain.text}", shown(number), "correct the value")
     return scaled

@@ -1,8 +1,8 @@
-"""A written unit becomes one factor to SI, its dimension checked; inside the package every number is SI.
+"""Converts a written unit to a factor to SI and checks its dimension; inside the package every number is SI.
 
-pint parses and converts, on a registry of this file's own. pint's default registry takes 0.1 s to build, reads ``Ns`` as
-a plural of ``N``, and takes the radian for a pure number. Here the angle is a dimension, so rad/s and Hz never mix.
-A pattern admits only products of known symbols: pint alone also reads ``m,s`` as ms, and ``mms`` as mm.
+pint parses and converts, with the registry of this file. pint's default registry takes 0.1 s to build, reads ``Ns`` as
+a plural of ``N``, and treats the radian as a pure number. Here the angle is a dimension, so rad/s and Hz never mix.
+A pattern admits only products of known symbols: pint alone reads ``m,s`` as ms and ``mms`` as mm.
 """
 
 import re
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Values = TypeVar("Values", float, np.ndarray)
 
-# One line per unit that a rig folder may name: symbol -> definition.
+# The units of rig folders: symbol -> definition.
 _DEFINITIONS = {
     "m": "[length]",
     "s": "[time]",
@@ -56,7 +56,7 @@ _DEFINITIONS = {
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "⋅": "·"})
 _FACTOR = r"(?:[A-Za-z]+(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
 _GRAMMAR = re.compile(rf"{_FACTOR}(?:(?: ?[*/·] ?| ){_FACTOR})*")
-_LONGEST = 40  # characters; nothing sensible is longer
+_LONGEST = 40  # characters of a unit
 _EXAMPLES = {
     "m": "mm",
     "s": "ms",
@@ -76,7 +76,7 @@ _EXAMPLES = {
 
 
 class UnitError(ValueError):
-    """A unit that is unknown or of the wrong dimension; ``rule`` and ``remedy`` go into the user's error line."""
+    """A unit that is unknown or has the wrong dimension; ``rule`` and ``remedy`` are parts of the error line."""
 
     def __init__(self, rule: str, remedy: str) -> None:
         super().__init__(f"{rule}, {remedy}")
@@ -85,7 +85,7 @@ class UnitError(ValueError):
 
 @cache
 def _registry() -> "pint.UnitRegistry":
-    """The one registry, made when the first unit is read (importing pint costs more than reading a folder)."""
+    """The registry, made when the first unit is read: importing pint takes longer than reading a folder."""
     import pint
 
     registry = pint.UnitRegistry(None)  # pyright: ignore[reportArgumentType]  (None: an empty registry, by pint's manual)
@@ -96,11 +96,11 @@ def _registry() -> "pint.UnitRegistry":
 
 @cache
 def factor_to_si(unit: str, si: str) -> float:
-    """The number that turns a value in ``unit`` into one in the SI unit ``si``.
+    """The factor from ``unit`` to the SI unit ``si``.
 
     Parameters
     ----------
-    unit : as written by the user, e.g. ``kN/m``, ``N s/m``, ``m/s^2``, ``1``
+    unit : as written in the file, e.g. ``kN/m``, ``N s/m``, ``m/s^2``, ``1``
     si : the SI unit wanted, e.g. ``N/m``; ``1`` for a pure number
 
     Raises
@@ -125,6 +125,6 @@ def factor_to_si(unit: str, si: str) -> float:
 
 
 def scale(values: Values, factor: float) -> Values:
-    """``values * factor``; by division where 1/factor is whole, so that 9 ms and 0.009 s are the same float."""
+    """``values * factor``. It divides where 1/factor is whole, so that 9 ms and 0.009 s are the same float."""
     whole = round(1.0 / factor)
     return values / whole if whole > 1 and whole * factor == 1.0 else values * factor

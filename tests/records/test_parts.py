@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capsule_id.records.fold import intervals_above, local_polynomials
-from capsule_id.records.mean_velocity import STANDING, fit_mean_velocity
+from capsule_id.records.mean_velocity import STANDING_ADVANCE, fit_mean_velocity
 from capsule_id.records.noise import noise_level
 from capsule_id.records.repeat import find_period
 
@@ -87,7 +87,7 @@ def test_mean_velocity_and_its_standard_error() -> None:
 
 @pytest.mark.parametrize(
     ("advance", "noise_sd", "direction"),
-    [(5e-6, 5e-6, "F"), (-5e-6, 5e-6, "B"), (0.0, 5e-6, "S"), (STANDING, 5e-6, None), (2e-7, 1e-4, None)],
+    [(5e-6, 5e-6, "F"), (-5e-6, 5e-6, "B"), (0.0, 5e-6, "S"), (STANDING_ADVANCE, 5e-6, None), (2e-7, 1e-4, None)],
 )
 def test_direction(advance: float, noise_sd: float, direction: str | None) -> None:
     found = [fit_mean_velocity(TIME, stick_slip(advance / T) + noise(seed, noise_sd), T, 1) for seed in range(30)]

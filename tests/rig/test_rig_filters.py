@@ -6,8 +6,8 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import (
-    JITTER,
-    PASSED,
+    SMALLEST_GAIN,
+    TIMING_TOLERANCE,
     choose_window,
     dominant_frequency,
     gain,
@@ -99,7 +99,7 @@ def test_the_chosen_window_is_the_longest_that_passes_the_motion() -> None:
         window = choose_window(time, values, order)
         samples = window_samples(window, STEP)
         seen = dominant_frequency(time, values) * STEP
-        passing = [n for n in range(order + 1 + order % 2, 1000, 2) if gain(seen, n, order) >= PASSED]
+        passing = [n for n in range(order + 1 + order % 2, 1000, 2) if gain(seen, n, order) >= SMALLEST_GAIN]
         assert samples == passing[-1]
         assert passing == list(range(passing[0], samples + 2, 2))  # what lets the search halve
 
@@ -155,9 +155,9 @@ def test_refused(change: dict, rule: str) -> None:
 
 def test_jitter_below_the_stated_share_of_a_step_is_even_enough() -> None:
     time = STEP * np.arange(100)
-    time[50] += 0.9 * JITTER * STEP
+    time[50] += 0.9 * TIMING_TOLERANCE * STEP
     assert sampling_step(time) == pytest.approx(STEP, rel=1e-12)
-    time[50] += 0.2 * JITTER * STEP
+    time[50] += 0.2 * TIMING_TOLERANCE * STEP
     with pytest.raises(InputError, match="resample"):
         sampling_step(time)
 

@@ -1,4 +1,4 @@
-"""Readers of table files, by suffix. Each turns the bytes of a file into a ``RawTable``; units come later."""
+"""Readers of table files, by suffix. Each converts the bytes of a file to a ``RawTable`` in the file's units."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

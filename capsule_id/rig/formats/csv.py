@@ -1,9 +1,8 @@
-"""CSV tables: a header ``name [unit]`` per column, then a row of numbers per line.
+"""Reads CSV tables: a header ``name [unit]`` per column, then a row of numbers per line.
 
-Comma, semicolon or tab between cells; decimal point, or decimal comma where the cells are not separated by commas.
-The whole body is read by NumPy's C reader; only when that fails, or finds what no cell may contain, are the cells
-walked one by one to name the first fault. Places are 1-based: line of the file, and character in that line at which
-the cell begins.
+Cells are separated by comma, semicolon or tab. The decimal mark is a point, or a comma if commas do not separate cells.
+NumPy's C reader reads the whole body. If it fails, the cells are read one by one to locate the first fault. Places are
+1-based: the line of the file, and the character of that line at which the cell begins.
 """
 
 import io
@@ -18,9 +17,9 @@ from capsule_id.rig.formats.raw import RawTable
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_NUMBER_CHARACTERS = frozenset("0123456789+-eE \t\n")  # and the decimal mark
-_SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark must not pass for a decimal mark
-_LONGEST_QUOTED = 40  # characters of a faulty cell that an error line repeats
+_NUMBER_CHARACTERS = frozenset("0123456789+-eE \t\n")  # plus the decimal mark
+_SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
+_LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
 
 def read_csv(content: bytes, path: Path) -> RawTable:
@@ -56,12 +55,12 @@ def read_csv(content: bytes, path: Path) -> RawTable:
 
 
 def _lines(content: bytes, path: Path) -> list[str]:
-    """The file's lines without their ends; trailing blank lines dropped, a blank line elsewhere is a fault."""
+    """The lines without line ends. Trailing blank lines are dropped; another blank line is an error."""
     lines = decode(content, path).split("\n")
     while lines and not lines[-1].strip():
         lines.pop()
     if not lines:
-        remedy = "write a header `name [unit]` per column and a row per reading"
+        remedy = "write a header `name [unit]` per column and one row per reading"
         raise InputError("a table must not be empty", "no text at all", remedy, path, 1, 1)
     for number, line in enumerate(lines, 1):
         if not line.strip():
@@ -103,7 +102,7 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
 
 
 def _read_fast(body: str, delimiter: str, decimal: str, columns: int, rows: int) -> np.ndarray | None:
-    """The (rows, columns) numbers, or None where some cell or row is at fault."""
+    """The (rows, columns) numbers, or None if a cell or row is faulty."""
     if not frozenset(body) <= _NUMBER_CHARACTERS | {delimiter, decimal}:
         return None
     if decimal == ",":
@@ -116,7 +115,7 @@ def _read_fast(body: str, delimiter: str, decimal: str, columns: int, rows: int)
 
 
 def _read_cells(lines: list[str], delimiter: str, decimal: str, columns: int, path: Path) -> np.ndarray:
-    """The same numbers cell by cell; raises at the first fault."""
+    """The (rows, columns) numbers, read cell by cell; raises at the first fault."""
     values = np.empty((len(lines) - 1, columns))
     for row, line in enumerate(lines[1:]):
         cells = _cells(line, delimiter)
@@ -137,22 +136,22 @@ def _read_cells(lines: list[str], delimiter: str, decimal: str, columns: int, pa
 def _number(cell: str, decimal: str, path: Path, line: int, column: int) -> float:
     """One cell as a finite number."""
     if not cell:
-        remedy = "fill it, or remove the row"
+        remedy = "write a number or delete the row"
         raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
     written = cell.translate(_SWAP_MARKS) if decimal == "," else cell
     if _NUMBER.fullmatch(written) is None:
         if cell.lower().lstrip("+-") in ("nan", "inf", "infinity"):
-            raise InputError("a cell must be a finite number", cell, "remove the row", path, line, column)
+            raise InputError("a cell must be a finite number", cell, "delete the row", path, line, column)
         remedy = "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file"
         raise InputError("a cell must be a number", _shown(cell), remedy, path, line, column)
     value = float(written)
     if not np.isfinite(value):
-        remedy = "correct it: it is too large for a float64"
+        remedy = "write a smaller number: float64 ends at 1.8e308"
         raise InputError("a cell must be a finite number", _shown(cell), remedy, path, line, column)
     return value
 
 
 def _shown(cell: str) -> str:
-    """A faulty cell as an error line repeats it: printable and short."""
+    """A faulty cell for an error line: printable and short."""
     text = repr(cell)
     return text if len(text) <= _LONGEST_QUOTED else text[:_LONGEST_QUOTED] + "…"

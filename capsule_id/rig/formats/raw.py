@@ -1,4 +1,4 @@
-"""A table as its file states it: numbers in the file's own units, and where each of them stands."""
+"""A table as written: numbers in the units of the file, and the place of each cell."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class RawTable:
-    """What every reader of ``formats`` returns.
+    """The result of every reader in ``formats``.
 
     Attributes
     ----------
