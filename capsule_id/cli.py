@@ -1,4 +1,4 @@
-"""The two commands: parse, call, exit code. ``fit-params DATA`` fits; ``capsule-id`` does everything else."""
+"""Entry points of the two commands ``fit-params`` and ``capsule-id``: parse, call, exit code."""
 
 import argparse
 import signal
@@ -19,12 +19,12 @@ from capsule_id.commands import bifurcate, check, fit, init, report, simulate, s
 from capsule_id.errors import InputError
 
 BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
-_RESUME = "; --resume goes on from the saved state"
-_LONGEST_REASON = 300  # characters of an exception's message that the one line repeats
+_RESUME = "; --resume continues from the saved state"
+_LONGEST_MESSAGE = 300  # characters of an exception's message in the error line
 
 
 class _Parser(argparse.ArgumentParser):
-    """Wrong usage is one line on standard error and exit code 2."""
+    """Reports wrong usage in one line on standard error, with exit code 2."""
 
     def error(self, message: str) -> NoReturn:
         print(" ".join(f"{self.prog}: {message}; see {self.prog} --help".split()), file=sys.stderr)
@@ -40,14 +40,14 @@ def fit_params(arguments: Sequence[str] | None = None) -> int:
 
 def capsule_id(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``capsule-id``; returns the exit code."""
-    parser = _Parser(prog="capsule-id", description="Everything about a rig folder but its fit (see fit-params).")
+    parser = _Parser(prog="capsule-id", description="Make, check, simulate and report; fit-params fits.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
     for name, module, text in (
         ("init", init, "an empty rig folder with a commented rig.toml"),
-        ("check", check, "read and lint a rig folder"),
+        ("check", check, "check a rig folder and list problems before a fit"),
         ("synthesize", synthesize, "a rig folder with known truth"),
         ("simulate", simulate, "the capsule model: time histories and phase plane"),
-        ("bifurcate", bifurcate, "the motions of the model over one quantity or two: bifurcation diagrams and maps"),
+        ("bifurcate", bifurcate, "the settled motions over one quantity or two: bifurcation diagrams and maps"),
         ("report", report, "the parameter table and findings of a result"),
     ):
         sub = commands.add_parser(name, help=text, description=text)
@@ -62,7 +62,7 @@ def _run(
     action: Callable[[argparse.Namespace], int],
     arguments: Sequence[str] | None,
 ) -> int:
-    """Parse and act; every way to end becomes an exit code and at most one line on standard error."""
+    """Parse and act. Every end gives an exit code and at most one line on standard error."""
     console.prepare()
     try:
         args = parser.parse_args(arguments)
@@ -93,14 +93,14 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """A warning as one line on standard error; Python's own filters decide which are shown (its signature)."""
+    """Print a warning in one line on standard error. The signature is that of ``warnings.showwarning``."""
     place = f"{Path(filename).name}:{lineno}"
     print(" ".join(f"{program}: warning: {category.__name__}: {message} ({place})".split()), file=sys.stderr)
 
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM ends the block as Ctrl-C does; a second signal does not disturb the end that the first has begun."""
+    """SIGTERM ends the block like Ctrl-C. Later signals are ignored."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -123,11 +123,11 @@ def _interruptible() -> Iterator[None]:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_REASON]
+    return " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_MESSAGE]
 
 
 def _save_traceback() -> str:
-    """Where the traceback of the exception that is being handled was saved."""
+    """Save the traceback of the current exception and return a text with its place."""
     try:
         with tempfile.NamedTemporaryFile(
             "w", prefix="capsule-id-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"

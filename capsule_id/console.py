@@ -1,17 +1,17 @@
-"""Standard streams that may be closed, in another locale, or without a reader; and the type of progress callbacks."""
+"""Standard streams that may be closed or have another encoding; the type of progress callbacks."""
 
 import io
 import os
 import sys
 from collections.abc import Callable
 
-#: Called with (draws or points done, how many in all, the stage).
+#: Called with (number of draws or points done, total number, name of the stage).
 OnProgress = Callable[[int, int, str], None]
 
 
 def prepare() -> None:
-    """Give the command the streams that it lacks, and let it write any character."""
-    # Opening the null device first takes the number of the closed stream, so no data file gets it.
+    """Open missing standard streams, and make standard output accept any character."""
+    # The null device takes the number of a closed stream, so no data file gets this number.
     if sys.stdin is None:
         sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
     if sys.stdout is None:
@@ -23,7 +23,7 @@ def prepare() -> None:
 
 
 def say(text: str) -> None:
-    """Print to standard output at once; a closed reader (``| head``) is no failure."""
+    """Print to standard output and flush; a closed pipe (``| head``) is no error."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -31,7 +31,7 @@ def say(text: str) -> None:
 
 
 def finish() -> None:
-    """Flush standard output; otherwise the interpreter reports a failed last flush."""
+    """Flush standard output; otherwise the interpreter reports a failed flush at exit."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -1,17 +1,17 @@
-"""The exception for bad input: it names the place, the rule, the value found and the remedy."""
+"""The exception for bad input; it names place, rule, value and remedy."""
 
 from pathlib import Path
 
 
 class InputError(ValueError):
-    """Bad input: the command prints it as one line and ends with exit code 2.
+    """Bad input. A command prints it in one line and returns exit code 2.
 
     Parameters
     ----------
     rule : what must hold, e.g. "angle must lie between 0 and 90 deg"
     value : what was found instead, e.g. "95"
     remedy : what to do, e.g. "give the tilt angle at sliding"
-    file, line, column : where, as far as known (1-based)
+    file, line, column : the place, 1-based, as far as known
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Output directories: work in progress lies in ``DIR.partial`` and becomes ``DIR`` by one rename."""
+"""Output directories: an unfinished result is ``DIR.partial``; one rename makes it ``DIR``."""
 
 import fcntl
 import json
@@ -10,26 +10,26 @@ from pathlib import Path
 
 from capsule_id.errors import InputError
 
-#: Everything that a result directory may hold; a directory with anything else in it is not replaced.
-CONTENTS = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})
+#: Files of a result directory. A directory with another file is never replaced.
+RESULT_FILES = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})
 STATE, CHAINS, LOCK = "state.json", "chains.h5", "lock"
-#: Further files of an unfinished run.
-SCRATCH = frozenset({STATE, "state.new", CHAINS, "chains.saved", "chains.saved-new", LOCK})
+#: Additional files of an unfinished run.
+WORK_FILES = frozenset({STATE, "state.new", CHAINS, "chains.saved", "chains.saved-new", LOCK})
 PARTIAL, OLD = ".partial", ".partial.old"
 
 
-def partial_of(directory: Path) -> Path:
+def partial_directory(directory: Path) -> Path:
     """``DIR.partial`` beside ``DIR``."""
     return directory.with_name(directory.name + PARTIAL)
 
 
 def check_directory(directory: Path) -> None:
-    """Make sure that ``directory`` may be written: absent, empty, or a result of this program.
+    """Refuse ``directory`` unless it is absent, empty, or a result of this program.
 
     Raises
     ------
     InputError
-        If it is something else, which is never overwritten.
+        If it is something else; this is never overwritten.
     """
     rule, remedy = "the output directory must be new or a result of fit-params", "choose another --out"
     if directory.name in ("", "..") or directory.name.endswith((PARTIAL, OLD)):
@@ -43,7 +43,7 @@ def check_directory(directory: Path) -> None:
     except OSError as error:
         raise InputError("the output directory must be usable", str(error.strerror), remedy, directory) from None
     if names and not _is_result(directory):
-        foreign = sorted(names - CONTENTS - SCRATCH)
+        foreign = sorted(names - RESULT_FILES - WORK_FILES)
         raise InputError(rule, f"it holds {foreign[0]}" if foreign else "it is not one", remedy, directory)
 
 
@@ -56,8 +56,8 @@ def _check_parents(directory: Path, remedy: str) -> None:
 
 
 def _is_result(directory: Path) -> bool:
-    """This program wrote everything in ``directory``."""
-    if not {entry.name for entry in directory.iterdir()} <= CONTENTS | SCRATCH:
+    """Whether this program wrote every file of ``directory``."""
+    if not {entry.name for entry in directory.iterdir()} <= RESULT_FILES | WORK_FILES:
         return False
     try:
         text = (directory / "parameters.json").read_text(encoding="utf-8")
@@ -68,23 +68,22 @@ def _is_result(directory: Path) -> bool:
 
 @contextmanager
 def work_in_progress(directory: Path, fingerprint: Mapping[str, object], resume: bool) -> Iterator[Path]:
-    """``DIR.partial``, made or taken up, and locked until the block ends.
+    """``DIR.partial``, new or resumed, locked until the block ends.
 
-    An interrupted block leaves it for ``--resume``; one that ends in an ``InputError`` leaves nothing behind that it
-    has made.
+    An interrupted block keeps it for ``--resume``. A block that ends in an ``InputError`` removes what it has made.
 
     Parameters
     ----------
-    fingerprint : what the result depends on; a run is taken up only by one with the same
-    resume : go on from the saved state
+    fingerprint : the inputs of the result; only a run with the same fingerprint can resume
+    resume : continue from the saved state
 
     Raises
     ------
     InputError
-        If there is nothing to take up, the saved state belongs to other data, seed or versions, another run is at work
-        in it, or something else stands in its place.
+        If there is nothing to resume, the saved state has other data, seed or versions, another run uses it, or
+        ``DIR.partial`` is something else.
     """
-    partial = partial_of(directory)
+    partial = partial_directory(directory)
     try:
         _check_partial(partial, resume)
         _check_old(directory)
@@ -114,25 +113,25 @@ def work_in_progress(directory: Path, fingerprint: Mapping[str, object], resume:
 
 
 def _check_partial(partial: Path, resume: bool) -> None:
-    """Absent, or an unfinished run of this program."""
+    """Refuse a ``DIR.partial`` that is no unfinished run of this program."""
     if resume and not partial.exists():
-        raise InputError("--resume takes up an interrupted run", "there is none", "run without --resume", partial)
-    rule, remedy = "work in progress stands here", "move it away or choose another --out"
+        raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", partial)
+    rule, remedy = "DIR.partial must be unfinished work", "move it away or choose another --out"
     if partial.is_symlink() or (partial.exists() and not partial.is_dir()):
         raise InputError(rule, "it is a file or a link", remedy, partial)
     names = {entry.name for entry in partial.iterdir()} if partial.exists() else set()
-    foreign = sorted(names - CONTENTS - SCRATCH)
-    if foreign or (names and not names & SCRATCH):
+    foreign = sorted(names - RESULT_FILES - WORK_FILES)
+    if foreign or (names and not names & WORK_FILES):
         raise InputError(rule, f"it holds {(foreign or sorted(names))[0]}", remedy, partial)
 
 
 def _lock(lock: int, partial: Path) -> None:
-    """Take the lock, which ends with this process however it ends."""
-    rule, remedy = "one run at a time works on a directory", "wait, or choose another --out"
+    """Take the lock. The operating system releases it when this process ends."""
+    rule, remedy = "one run at a time writes to a directory", "wait, or choose another --out"
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InputError(rule, "another one does", remedy, partial) from None
+        raise InputError(rule, "another run is active", remedy, partial) from None
     except OSError:
         return  # a file system without locks
     try:
@@ -140,18 +139,18 @@ def _lock(lock: int, partial: Path) -> None:
     except FileNotFoundError:
         same = False
     if not same:
-        raise InputError(rule, "another one has just finished", remedy, partial)
+        raise InputError(rule, "another run has just finished", remedy, partial)
 
 
 def _check_old(directory: Path) -> None:
-    """``DIR.partial.old``, where an older result stands for the moment of its replacement, is free or holds one."""
+    """Refuse a ``DIR.partial.old`` that is no older result; a result lies there while it is replaced."""
     old = directory.with_name(directory.name + OLD)
     if old.is_symlink() or (old.exists() and not (old.is_dir() and _is_result(old))):
-        raise InputError("a replaced result stands here", "it is something else", "move it away", old)
+        raise InputError("DIR.partial.old must be an older result", "it is something else", "move it away", old)
 
 
 def _recover(directory: Path) -> None:
-    """Put back, or away, the older result of a run that died while it was being replaced."""
+    """Restore or remove the older result if a run died during its replacement."""
     old = directory.with_name(directory.name + OLD)
     if old.exists() and directory.exists():
         shutil.rmtree(old)
@@ -188,14 +187,14 @@ def _write_state(partial: Path, fingerprint: Mapping[str, object]) -> None:
 
 
 def publish(partial: Path, directory: Path) -> None:
-    """Rename the finished ``partial`` to ``directory``; an older result there is replaced.
+    """Rename the finished ``partial`` to ``directory``, replacing an older result.
 
-    What the run kept for itself is removed afterwards, so that it can be taken up until the rename.
+    The work files are removed after the rename, so that a run can resume until then.
     """
     old = directory.with_name(directory.name + OLD)
     if directory.exists():
         directory.rename(old)
     partial.rename(directory)
-    for name in SCRATCH:
+    for name in WORK_FILES:
         (directory / name).unlink(missing_ok=True)
     shutil.rmtree(old, ignore_errors=True)

@@ -1,9 +1,8 @@
-"""THE parameter table: symbol, unit, meaning, LaTeX label, default prior, sign, and which leaf of the model it is.
+"""The parameter table: symbol, unit, meaning, LaTeX label, default prior, sign, and leaf of the model.
 
-Priors, engines, command options, sweeps, axes, report and README read it. Parameters that only one kind of experiment
-has are declared with that kind (``capsule_id.experiments``). A parameter's *name* is its symbol, with a
-bracket where there is one per spring or per record: ``k2[soft]``, ``noise_sd[free_vibration_1]``. Positive parameters
-are sampled through their logarithm, the others as they are.
+Priors, engines, command options, sweeps, axes, report and README read it. A kind of experiment declares parameters of
+its own (``capsule_id.experiments``). The *name* of a parameter is its symbol; a bracket names the spring or record, as
+in ``k2[soft]`` or ``noise_sd[free_vibration_1]``. Positive parameters are sampled through their logarithm.
 """
 
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ QUANTILE_975 = NormalDist().inv_cdf(0.975)
 
 @dataclass(frozen=True)
 class Prior:
-    """A proper prior density that can be evaluated and sampled.
+    """A proper prior density.
 
     ``lognormal``: ``location`` the median, ``spread`` the factor. ``halfnormal``: ``spread`` the scale.
     ``positive_normal``: a weighing, mean and sd, restricted to positive values. ``normal``: mean and sd.
@@ -59,12 +58,12 @@ class Parameter:
 
     Attributes
     ----------
-    prior : the default; None: the experiment or the weighing supplies it
-    physical : a property of the rig; else a nuisance of one record or table
-    of : the spring's or the record's name, "" where there is none
-    leaf : whether it is a field of ``CapsuleParameters`` ("capsule") or of a drive ("drive")
-    sign : what the model admits
-    scatter : a standard deviation, absolute or relative: it scales residuals, it moves no prediction
+    prior : the default; None if the experiment or the weighing supplies it
+    physical : a property of the rig; otherwise a nuisance of one record or table
+    of : name of the spring or record, or ""
+    leaf : a field of ``CapsuleParameters`` ("capsule") or of a drive ("drive")
+    sign : the sign that the model admits
+    scatter : a standard deviation, absolute or relative; it scales residuals and changes no prediction
     sampled : False for constants, which a fit never samples
     table_1 : the paper's value (Table 1), SI
     """
@@ -97,22 +96,22 @@ class Parameter:
 
     @property
     def positive(self) -> bool:
-        """Sampled through its logarithm."""
+        """Whether it is sampled through its logarithm."""
         return self.prior is None or self.prior.kind != "normal"
 
     @property
     def prior_can_be_stated(self) -> bool:
-        """Whether ``[prior]`` in rig.toml may override the default: it needs one, and not that of an experiment."""
+        """Whether ``[prior]`` in rig.toml may override the default prior."""
         return self.prior is not None and self.prior.kind in ("lognormal", "halfnormal")
 
     def describe_prior(self) -> str:
-        """The default prior in one phrase, SI; "constant" where nothing is sampled."""
+        """The default prior in one phrase, SI; "constant" if it is not sampled."""
         if not self.sampled:
             return "constant"
         return "by the experiment" if self.prior is None else self.prior.describe()
 
     def admits(self, value: Any) -> Any:
-        """Elementwise: finite, and of the sign that the model admits; a number, a NumPy or a JAX array."""
+        """Whether ``value`` is finite and has an admissible sign, elementwise; number, NumPy or JAX array."""
         bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": value == value}[self.sign]
         return (abs(value) < np.inf) & bound
 
@@ -174,13 +173,13 @@ TABLE: Mapping[str, Parameter] = {
     )
 }  # fmt: skip
 
-#: Fields of ``CapsuleParameters``, of ``Excitation``, and both: the leaves of the model.
+#: The leaves of the model: fields of ``CapsuleParameters``, fields of ``Excitation``, and both.
 CAPSULE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "capsule"}
 DRIVE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "drive"}
 LEAVES: Mapping[str, Parameter] = {**CAPSULE_LEAVES, **DRIVE_LEAVES}
-#: What may be swept: every leaf, and the drive's frequency in Hz.
+#: Quantities of a sweep: every leaf, and the frequency of the drive in Hz.
 SWEPT: Mapping[str, Parameter] = {**LEAVES, "f": _drive("f", "Hz", "frequency of the drive", "f", sampled=False)}
-#: The paper's Table 1, SI: what it states.
+#: The values of the paper's Table 1, SI.
 TABLE_1: Mapping[str, float] = {s: row.table_1 for s, row in TABLE.items() if row.table_1 is not None}
 
 

@@ -1,16 +1,16 @@
-"""Double precision for JAX, switched on by every module that computes with JAX."""
+"""Switches JAX to double precision; every module that computes with JAX calls it."""
 
 import jax
 import jax.numpy as jnp
 
 
 def require_float64() -> None:
-    """Switch JAX to float64 and make sure that it took effect.
+    """Switch JAX to float64 and check the effect.
 
     Raises
     ------
     RuntimeError
-        If JAX still computes in float32 afterwards (for instance inside ``jax.enable_x64(False)``).
+        If JAX still computes in float32, for instance inside ``jax.enable_x64(False)``.
     """
     jax.config.update("jax_enable_x64", True)
     dtype = jnp.zeros(()).dtype

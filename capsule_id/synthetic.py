@@ -1,4 +1,4 @@
-"""A rig folder with known truth: a twin of the paper's rig (Table 1), measured by the paper's own protocol."""
+"""Writes rig folders with known truth: a twin of the paper's rig (Table 1), measured by the paper's protocol."""
 
 import json
 import re
@@ -17,7 +17,7 @@ from capsule_id.rig.toml_values import NAME_PATTERN
 
 @dataclass(frozen=True)
 class Truth:
-    """The parameters behind a synthetic rig, SI; the defaults are the paper's Table 1 and three of its springs."""
+    """The true parameters of a synthetic rig, SI. The defaults are Table 1 and three springs of the paper."""
 
     m1: float = TABLE_1["m1"]
     m2: float = TABLE_1["m2"]
@@ -28,32 +28,32 @@ class Truth:
     K: float = TABLE_1["K"]
     g: float = TABLE_1["g"]
     k2: Mapping[str, float] = field(default_factory=lambda: {"soft": 2420.0, "medium": 18960.0, "stiff": 56410.0})
-    #: Values that only kinds of installed packages have, by name.
+    #: Values of the kinds of installed packages, by name.
     others: Mapping[str, float] = field(default_factory=dict)
 
     def with_values(self, values: Mapping[str, float]) -> "Truth":
-        """The same with some parameters changed, by name (``k1``, ``k2[soft]``).
+        """A copy with other values, by name (``k1``, ``k2[soft]``).
 
         Raises
         ------
         InputError
-            If a name is no parameter of the twin, or a value is not positive.
+            If a name is not a parameter of the twin, or a value is not positive.
         """
         known = self.flat()
         for name, value in values.items():
             if name not in known:
-                raise InputError("--set takes a parameter of the twin", name, f"one of {', '.join(known)}")
+                raise InputError("--set takes a parameter of the twin", name, f"choose from {', '.join(known)}")
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(f"{name} must be positive and finite", f"{value:g}", "give an SI value above 0")
         return self._replaced(values)
 
     def with_kinds(self, kinds: Iterable[Kind]) -> "Truth":
-        """The same with the values that only ``kinds`` add, where it has none."""
+        """A copy with the additional values of ``kinds``; present values stay."""
         known = self.flat()
         return self._replaced({n: value for kind in kinds for n, value in kind.truth.items() if n not in known})
 
     def with_runs(self) -> "Truth":
-        """The same with the springs that only forced runs meet."""
+        """A copy with the springs that occur only in forced runs."""
         return self.with_kinds(kind for kind in default_registry().values() if not kind.bench)
 
     def flat(self) -> dict[str, float]:
@@ -63,14 +63,14 @@ class Truth:
         return {**values, **{f"k2[{name}]": value for name, value in springs.items()}, **others}
 
     def _replaced(self, values: Mapping[str, float]) -> "Truth":
-        """The same with these values, by name, changed or added."""
+        """A copy with these values, by name, changed or added."""
         springs = {name[len("k2[") : -1]: value for name, value in values.items() if name.startswith("k2[")}
         plain = {name: value for name, value in values.items() if not name.startswith("k2[")}
         own = {name: plain.pop(name) for name in asdict(self) if name in plain}
         return replace(self, k2={**self.k2, **springs}, others={**self.others, **plain}, **own)
 
 
-#: sds of the weighings, kg.
+#: Standard deviations of the weighings, kg.
 MASS_SD = {"m1": 0.2e-3, "m2": 0.5e-3}
 
 
@@ -82,21 +82,21 @@ def synthesize(
     runs: bool = False,
     registry: Registry | None = None,
 ) -> Truth:
-    """Write a rig folder measured on ``truth`` and, beside it, ``<folder>.truth.json``.
+    """Write a rig folder computed from ``truth`` and, beside it, ``<folder>.truth.json``.
 
     Parameters
     ----------
     folder : new or empty
-    seed : of every reading error; the bench's readings are the same with and without runs
-    truth : true parameters, by default the paper's
-    name : of the rig, by default the folder's
-    runs : add forced runs of the exact model, with the springs that only they meet
-    registry : the kinds to measure, by default all that have a twin
+    seed : of all reading errors; the bench readings do not depend on ``runs``
+    truth : true parameters (default: the paper's)
+    name : of the rig (default: the name of the folder)
+    runs : add forced runs of the exact model, with their additional springs
+    registry : the kinds to measure (default: all with a twin)
 
     Raises
     ------
     InputError
-        If ``folder`` exists and is not empty: nothing is overwritten.
+        If ``folder`` exists and is not empty; nothing is overwritten.
     """
     known_kinds = (registry or default_registry()).values()
     kinds = [kind for kind in known_kinds if kind.bench or runs]

@@ -1,1 +1,1 @@
-"""The subcommands of `capsule-id`, a file each: ``add_arguments(parser)`` and ``run(args) -> exit code``."""
+"""The commands, one file each: ``add_arguments(parser)`` and ``run(args) -> exit code``."""

@@ -1,4 +1,4 @@
-"""Parameters and drive of the capsule as options: the option itself, else a result of fit-params, else the paper's."""
+"""Parameters and drive as options. A value comes from the option, else from a result, else from the paper."""
 
 import argparse
 import json
@@ -11,34 +11,34 @@ from pathlib import Path
 from capsule_id.errors import InputError
 from capsule_id.parameters import LEAVES, TABLE_1
 
-# From the paper's Table 1; what is not here must be given.
+# From the paper's Table 1; other parameters have no default.
 DEFAULTS: Mapping[str, float] = {name: TABLE_1[name] for name in LEAVES if name in TABLE_1} | {"phase": 0.0}
 
-# Compiles the engines' loops as one function each, several times faster for a single run (internal to XLA's CPU part).
-WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+# XLA then compiles each loop of an engine as one function: a single run is several times faster. CPU only.
+XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 
 
 def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str, float] = DEFAULTS) -> None:
-    """An option per parameter, in SI, and those that take fitted values; numbers are read by ``capsule_values``."""
+    """Add an option per parameter, in SI, and the options for fitted values. ``capsule_values`` parses the numbers."""
     group = parser.add_argument_group("parameters", "plain numbers in SI units")
     for name, leaf in LEAVES.items():
         text = f"default {defaults[name]:g}" if name in defaults else "required"
         group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text})")
     group.add_argument(
-        "--result", metavar="DIR", type=Path, help="take the fitted parameters of a result of fit-params"
+        "--result", metavar="DIR", type=Path, help="result directory of fit-params, for its fitted parameters"
     )
-    group.add_argument("--spring", metavar="NAME", help="with --result: which support spring")
+    group.add_argument("--spring", metavar="NAME", help="support spring of --result")
 
 
 def capsule_values(
     args: argparse.Namespace, defaults: Mapping[str, float] = DEFAULTS, free: frozenset[str] = frozenset()
 ) -> dict[str, float]:
-    """Every parameter by symbol, SI; those of ``free`` need not be given (they get their default or 1).
+    """Every parameter by symbol, SI. Those of ``free`` are optional: their value is the default or 1.
 
     Raises
     ------
     InputError
-        One that is missing, no number or not admissible, a result that cannot be read.
+        If a value is missing, no number or not admissible, or the result cannot be read.
     """
     fitted = _fitted(args.result, args.spring) if args.result is not None else {}
     values = {}
@@ -57,12 +57,12 @@ def capsule_values(
 
 
 def _check_sign(name: str, value: float, place: str) -> None:
-    """What the model takes for a parameter (``Status.INVALID`` otherwise).
+    """Refuse a value that the model does not admit (``Status.INVALID``).
 
     Raises
     ------
     InputError
-        Too small a value; ``place`` says where it stands.
+        If the value is too small; ``place`` names its source.
     """
     row = LEAVES[name]
     if not row.admits(value):
@@ -77,7 +77,7 @@ def number(name: str, text: str) -> float:
     Raises
     ------
     InputError
-        If it is none.
+        If ``text`` is no finite number.
     """
     try:
         value = float(text)
@@ -88,31 +88,36 @@ def number(name: str, text: str) -> float:
     return value
 
 
-def prefer_whole_loops() -> None:
-    """Set XLA's option for this process, unless JAX already runs or the user has set options of that kind."""
+def set_loop_option() -> None:
+    """Set ``XLA_LOOP_OPTION`` for this process, unless JAX is imported or the user has set such options."""
     flags = os.environ.get("XLA_FLAGS", "")
     if "jax" not in sys.modules and "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {WHOLE_LOOPS}".strip()
+        os.environ["XLA_FLAGS"] = f"{flags} {XLA_LOOP_OPTION}".strip()
 
 
 def fitted_values(directory: Path) -> dict[str, float]:
-    """Fitted values (the most probable set) of DIR/parameters.json by name, SI.
+    """Fitted values (maximum of the posterior) of DIR/parameters.json by name, SI.
 
     Raises
     ------
     InputError
-        If it cannot be read.
+        If the file cannot be read.
     """
     file = directory / "parameters.json"
     try:
         table = json.loads(file.read_text(encoding="utf-8"))["parameters"]
         return {name: float(row["map"]) for name, row in table.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError("--result takes a result of fit-params", type(error).__name__, "check DIR", file) from None
+        raise InputError(
+            "--result takes a result of fit-params",
+            type(error).__name__,
+            "run fit-params first, or check the path",
+            file,
+        ) from None
 
 
 def _fitted(directory: Path, spring: str | None) -> dict[str, float]:
-    """Fitted values by symbol, k2 that of ``spring``."""
+    """Fitted values by symbol; k2 is that of ``spring``."""
     values = fitted_values(directory)
     springs = [name[3:-1] for name in values if name.startswith("k2[")]
     if spring is None and len(springs) == 1:

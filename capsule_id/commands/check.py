@@ -13,7 +13,7 @@ from capsule_id.rig.read import read_rig
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """DATA."""
+    """Add DATA."""
     parser.add_argument("data", metavar="DATA", help="rig folder, with its rig.toml")
 
 
@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        If the folder is no valid rig.
+        If the folder is not a valid rig.
     """
     kinds = default_registry()
     rig = read_rig(args.data, kinds)

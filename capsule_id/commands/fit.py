@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from capsule_id.commands.capsule_options import prefer_whole_loops
+from capsule_id.commands.capsule_options import set_loop_option
 from capsule_id.commands.progress import Progress
 from capsule_id.console import say
 from capsule_id.errors import InputError
@@ -17,26 +17,32 @@ DEFAULT_MAX_STEPS = 20_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """DATA and the options of INTERFACE."""
+    """Add DATA and the options."""
     parser.add_argument("data", metavar="DATA", help="rig folder, with its rig.toml")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default results/<rig name>)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="the same seed gives the same numbers")
-    parser.add_argument("--experiments", choices=CHOICES, default="all", help="which to fit")
-    parser.add_argument("--resume", action="store_true", help="go on from an interrupted run")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="result directory (default results/<rig name>)")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="random seed (default 0); the same seed gives the same numbers"
+    )
+    parser.add_argument("--experiments", choices=CHOICES, default="all", help="experiments to fit (default all)")
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted run")
     parser.add_argument("--no-sample", action="store_true", help="point fit only: no posterior, no intervals")
     parser.add_argument(
-        "--max-steps", type=int, default=DEFAULT_MAX_STEPS, metavar="N", help="emcee steps of an ensemble at most"
+        "--max-steps",
+        type=int,
+        default=DEFAULT_MAX_STEPS,
+        metavar="N",
+        help=f"most emcee steps per ensemble (default {DEFAULT_MAX_STEPS})",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit and write; 0 where the verdict is clean, 3 where it is not.
+    """Fit and write; return 0 for a clean verdict, else 3.
 
     Raises
     ------
     InputError
-        Bad input: nothing has been written then.
+        If the input is bad; then nothing is written.
     """
     if args.seed < 0:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
@@ -47,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     directory = args.out if args.out is not None else Path("results") / rig.name
     check_directory(directory)
     if args.experiments != "bench" and kinds.has_runs(rig):
-        prefer_whole_loops()
+        set_loop_option()
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.inference.pipeline import PACKAGES, fit_rig, package_versions
     from capsule_id.report.console_table import table_text

@@ -9,19 +9,19 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.rig.toml_values import NAME_PATTERN
 
-# Lines that begin with `#:` explain; every other `#` line is TOML to be used by removing its `# `.
+# Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
 HEAD = """\
-#: A rig folder: this file, and the tables that it names.
+#: A rig folder holds this file and the tables that it names.
 #: Lines that begin with `#:` explain. To use another line that begins with `#`, remove its `# `.
-#: A quantity is { value = ..., sd = ..., unit = "..." }; without sd the value counts as exact.
-#: A table is a CSV file: a header `name [unit]` per column, dimensionless [1], then a row of numbers per reading;
-#: comma, semicolon or tab between the cells; a decimal comma only with semicolon or tab.
-#: Every experiment takes three optional kinds of keys: label = "..." names it (default: its file without suffix,
-#: unique within the rig); <column>_sd states a reading error; <column>_resolution states a reading step.
+#: A quantity is { value = ..., sd = ..., unit = "..." }; without sd the value is exact.
+#: A table is a CSV file: a header `name [unit]` per column (dimensionless: [1]), then a row of numbers per reading.
+#: Comma, semicolon or tab separates the cells; a decimal comma needs semicolon or tab.
+#: Every experiment has three optional keys: label = "..." is its unique name (default: the file without suffix);
+#: <column>_sd states a reading error; <column>_resolution states a reading step.
 
 [rig]
 name = "@NAME@"
-#: true for synthetic data: then every table and the report say so
+#: true for synthetic data: every table and the report then show it
 # synthetic = false
 #: mass of the rod, needed for free vibrations, forced runs and sliding forces
 # m1 = { value = 0.110, sd = 0.0005, unit = "kg" }
@@ -29,9 +29,9 @@ name = "@NAME@"
 # m2 = { value = 0.530, sd = 0.001, unit = "kg" }
 # g = { value = 9.81, unit = "m/s^2" }
 
-#: What was known before the measurement. Default priors are broad. Log-normal priors (95 % within median/factor to
-#: median*factor): @LOGNORMAL@.
-#: Half-normal priors by scale: @HALFNORMAL@.
+#: Priors: knowledge from before the measurement. Default priors are broad.
+#: Log-normal, 95 % within median/factor to median*factor: @LOGNORMAL@.
+#: Half-normal, by scale: @HALFNORMAL@.
 # [prior]
 # k1 = { median = 1500, factor = 3, unit = "N/m" }
 # tilt_sd = { scale = 1, unit = "deg" }
@@ -48,8 +48,8 @@ def template(kinds: Registry, name: str) -> str:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """DIR."""
-    parser.add_argument("dir", metavar="DIR", help="folder to make; it may exist if it is empty")
+    """Add DIR."""
+    parser.add_argument("dir", metavar="DIR", help="new or empty folder")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        If DIR holds something already, is no folder, or cannot be written.
+        If DIR is not empty, is no folder, or cannot be written.
     """
     folder = Path(args.dir)
     try:

@@ -1,4 +1,4 @@
-"""The measured forced runs of a rig beside a diagram of the model: which have its settings, and where they stand on it."""
+"""Selects the measured forced runs of a rig for a diagram of the model: those with the settings of the diagram."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from capsule_id.records.tone import recorded_drive
 from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.rig.model import Quantity, Rig, Table
 
-#: A setting is the diagram's where it differs by no more than this share of it, or by this many of its own sds.
-SHARES: Mapping[str, float] = {"k2": 0.05, "G": 0.05, "P_d": 0.05, "Omega": 0.005}
-ERRORS = 3.0
+#: A setting agrees with the diagram within this relative difference, or within this many of its own sds.
+RELATIVE_TOLERANCE: Mapping[str, float] = {"k2": 0.05, "G": 0.05, "P_d": 0.05, "Omega": 0.005}
+TOLERANCE_SDS = 3.0
 
 
 class Span(NamedTuple):
-    """The range of a diagram: the quantity's symbol, its least and its largest value, SI (f in Hz)."""
+    """The range of a diagram: symbol, smallest and largest value, SI (f in Hz)."""
 
     name: str
     low: float
@@ -30,13 +30,13 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True)
 class Overlay:
-    """Runs with the settings of a diagram, and why the others have not: a phrase per run."""
+    """Runs with the settings of a diagram, and a reason for each other run."""
 
     motions: tuple[MeasuredPoint, ...]
     left_out: tuple[str, ...]
 
     def sentence(self) -> str:
-        """Both in one line."""
+        """Number of shown runs, and the other runs with reasons, in one line."""
         count = f"{len(self.motions)} of {len(self.motions) + len(self.left_out)} measured runs overlaid"
         return f"{count}; left out: {'; '.join(self.left_out)}" if self.left_out else count
 
@@ -48,28 +48,28 @@ def overlay(
 
     Parameters
     ----------
-    values : of the diagram by symbol, SI; that of the swept quantity is not looked at
-    fitted : fitted values by name (K, k2[<spring>]); what is missing is the paper's estimate, else the prior's median
-    spring : its name, where the diagram's k2 was taken by name; None compares stiffnesses
+    values : of the diagram by symbol, SI; that of the swept quantity is ignored
+    fitted : fitted values by name (K, k2[<spring>]); defaults are the paper's estimate, then the median of the prior
+    spring : its name, if the k2 of the diagram was chosen by name; None compares stiffnesses
 
-    A run agrees where k2, G, P_d and Omega, other than the swept one, lie within ``SHARES`` or ``ERRORS`` sds.
+    A run agrees if k2, G, P_d and Omega lie within ``RELATIVE_TOLERANCE`` or ``TOLERANCE_SDS`` sds; the swept one is free.
     P_d is the stated one, else K times the amplitude of the current.
     """
     estimate = rough_values(rig)
 
     def known(name: str) -> Quantity:
-        """As fitted, as the paper estimates it, or as the folder's prior has it: then ERRORS sds are its 95 % range."""
+        """The fitted value, the paper's estimate, or the stated prior: TOLERANCE_SDS sds are its 95 % range."""
         value, measured = (fitted[name], True) if name in fitted else estimate(name)
         prior = rig.priors.get(name)
         if measured or prior is None or prior.factor is None:
-            # a default prior, of a factor 1000, knows nothing worth comparing
+            # A default prior (factor 1000) is too broad for a comparison.
             return Quantity(value if measured else np.nan)
-        return Quantity(value, value * float(np.log(prior.factor)) / ERRORS)
+        return Quantity(value, value * float(np.log(prior.factor)) / TOLERANCE_SDS)
 
     motions, left_out = [], []
     for table in rig.tables:
         if isinstance(table.settings, RunSettings):
-            found = _motion(table, _settings(table, known), span, values, spring)
+            found = _point_or_reason(table, _settings(table, known), span, values, spring)
             if isinstance(found, MeasuredPoint):
                 motions.append(found)
             else:
@@ -77,17 +77,17 @@ def overlay(
     return Overlay(tuple(motions), tuple(left_out))
 
 
-def _motion(
+def _point_or_reason(
     table: Table[RunSettings],
     settings: Mapping[str, Quantity],
     span: Span,
     values: Mapping[str, float],
     spring: str | None,
 ) -> MeasuredPoint | str:
-    """Where the run stands on the diagram, or why it does not."""
+    """The run as a point of the diagram, or the reason for its omission."""
     swept = "Omega" if span.name == "f" else span.name
     if swept not in settings:
-        return f"{swept} is no setting of a run"
+        return f"{swept} is not a setting of a run"
     by_name = spring is not None and swept != "k2"
     if by_name and table.settings.spring != spring:
         return f"spring {table.settings.spring}, not {spring}"
@@ -96,12 +96,12 @@ def _motion(
             continue
         if np.isnan(quantity.value):
             return f"{name} is neither fitted nor stated"
-        allowed = max(SHARES[name] * abs(values[name]), ERRORS * quantity.sd)
+        allowed = max(RELATIVE_TOLERANCE[name] * abs(values[name]), TOLERANCE_SDS * quantity.sd)
         if name != swept and abs(quantity.value - values[name]) > allowed:
             return f"{name} = {quantity.value:.4g}, not {values[name]:.4g} {SWEPT[name].unit}"
     value = settings[swept].value / (2.0 * np.pi if span.name == "f" else 1.0)
     if not span.low <= value <= span.high:
-        return f"{span.name} = {value:.4g} {SWEPT[span.name].unit} is outside of the diagram"
+        return f"{span.name} = {value:.4g} {SWEPT[span.name].unit} is outside the diagram"
     motion = measured_motion(table)
     if not np.isfinite(motion.mean_velocity):
         return "x_capsule was not recorded"
@@ -109,12 +109,17 @@ def _motion(
 
 
 def _settings(table: Table[RunSettings], known: Callable[[str], Quantity]) -> dict[str, Quantity]:
-    """k2, G, P_d and Omega of a run, SI; NaN where nothing is known."""
+    """k2, G, P_d and Omega of a run, SI; NaN for an unknown value."""
     k2 = known(f"k2[{table.settings.spring}]")
-    return {"k2": k2, "G": stated_gap(table), "P_d": _load(table, known), "Omega": Quantity(stated_Omega(table))}
+    return {
+        "k2": k2,
+        "G": stated_gap(table),
+        "P_d": _drive_amplitude(table, known),
+        "Omega": Quantity(stated_Omega(table)),
+    }
 
 
-def _load(table: Table[RunSettings], known: Callable[[str], Quantity]) -> Quantity:
+def _drive_amplitude(table: Table[RunSettings], known: Callable[[str], Quantity]) -> Quantity:
     """P_d of a run, N."""
     drive = recorded_drive(table)
     if table.settings.P_d is not None:

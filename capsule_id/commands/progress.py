@@ -1,4 +1,4 @@
-"""Progress of long work on standard error."""
+"""Shows the progress of long computations on standard error."""
 
 import shutil
 import sys
@@ -9,7 +9,7 @@ TERMINAL_INTERVAL, FILE_INTERVAL = 0.1, 10.0
 
 
 class Progress:
-    """Stage, rate and time left on standard error: a bar on a terminal, a line now and then in a file."""
+    """Stage, rate and time left: a bar on a terminal, a line every ``FILE_INTERVAL`` in a file."""
 
     def __init__(self, enabled: bool, unit: str = "draw") -> None:
         self._enabled, self._unit = enabled, unit
@@ -24,7 +24,7 @@ class Progress:
         self._end_line()
 
     def __call__(self, done: int, total: int, stage: str) -> None:
-        """``done`` of ``total`` draws (or points) in ``stage``; a stage that cannot be counted has a total of 1."""
+        """Show ``done`` of ``total`` draws (or points) in ``stage``; a stage without a count has total 1."""
         if not self._enabled:
             return
         now = time.monotonic()
@@ -50,7 +50,7 @@ class Progress:
             sys.stderr.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
             sys.stderr.flush()
         except OSError:
-            self._enabled = False  # nobody reads
+            self._enabled = False  # the stream is closed
         self._open = self._terminal
 
     def _end_line(self) -> None:

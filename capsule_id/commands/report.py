@@ -1,4 +1,4 @@
-"""``capsule-id report DIR``: what a result says, read back from its parameters.json."""
+"""``capsule-id report DIR``: prints table and findings of a result from its parameters.json."""
 
 import argparse
 import json
@@ -10,12 +10,12 @@ from capsule_id.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """DIR."""
+    """Add DIR."""
     parser.add_argument("directory", metavar="DIR", type=Path, help="result directory of fit-params")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the parameter table and the findings; 0 where the verdict is clean, 3 where it is not.
+    """Print the parameter table and the findings; return 0 for a clean verdict, else 3.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _row(entry: dict[str, Any]) -> dict[str, Any]:
-    """One row of the parameter table; the standard error of the point fit is not in the file."""
+    """One row of the parameter table. The file has no standard error of the point fit."""
     lower, upper = entry["ci95"] or (None, None)
     numbers = {key: entry[key] for key in ("paper", "map", "mean", "sd", "median", "ess", "rhat")}
     values = {key: float("nan") if value is None else float(value) for key, value in numbers.items()}

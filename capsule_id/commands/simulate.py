@@ -1,4 +1,4 @@
-"""``capsule-id simulate``: one motion of the capsule as a table and as a picture."""
+"""``capsule-id simulate``: one motion of the capsule as a table and as a figure."""
 
 import argparse
 import math
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_values, number, prefer_whole_loops
+from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_values, number, set_loop_option
 from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVE_LEAVES
 
@@ -21,10 +21,10 @@ STATE = {"X1": "m", "Y1": "m/s", "X2": "m", "Y2": "m/s"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Parameters, drive, run, model, output; all numbers are read in ``run``, so that errors name rule and remedy."""
+    """Add the options. ``run`` parses all numbers, so that errors name rule and remedy."""
     add_capsule_arguments(parser)
     group = parser.add_argument_group("run")
-    group.add_argument("--periods", metavar="N", help="length in periods of the drive (default 20)")
+    group.add_argument("--periods", metavar="N", help="length in excitation periods (default 20)")
     group.add_argument("--duration", metavar="X", help="length in s, instead of --periods")
     group.add_argument("--samples", metavar="N", default="2000", help="number of samples (default 2000)")
     group.add_argument("--initial", nargs=4, metavar=tuple(STATE), help="state at the start, m and m/s (default: rest)")
@@ -35,17 +35,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         group.add_argument(f"--{name}", metavar="X", help=f"of the smoothed model, {unit} (default: certified)")
     group = parser.add_argument_group("output")
     group.add_argument("--out", metavar="FILE", type=Path, required=True, help="table: FILE.csv or FILE.nc (NetCDF)")
-    group.add_argument("--figure", metavar="FILE", type=Path, help="picture: FILE.png")
+    group.add_argument("--figure", metavar="FILE", type=Path, help="figure: FILE.png")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, write the table and the picture; 0.
+    """Simulate, write the table and the figure; 0.
 
     Raises
     ------
     InputError
-        A number that is missing, malformed or not admissible, a suffix that is not known, a file that cannot be
-        written, a run that cannot be completed.
+        If a number is missing, malformed or not admissible, a suffix is unknown, a file cannot be written, or the run
+        cannot be completed.
     """
     _check_suffix(args.out, (".csv", ".nc"))
     if args.figure is not None:
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
     X1, Y1, X2, Y2 = (number(name, text) for name, text in zip(STATE, args.initial or ["0"] * 4, strict=True))
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
-        raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "leave it out, or --model smooth")
-    prefer_whole_loops()
+        raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
+    set_loop_option()
     import numpy as np
 
     from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, status_message
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     e = Excitation(**{name: values[name] for name in DRIVE_LEAVES})
     grid = np.linspace(0.0, end, samples)
     section = _section(values["Omega"], end)
-    # Impacts are short: a picture needs more samples than a table may want.
+    # Impacts are short: the figure needs more samples than the table.
     drawn = np.linspace(0.0, end, PICTURE_SAMPLES) if args.figure is not None else section
     times = np.union1d(np.union1d(grid, section), drawn)
     smoothing = Smoothing(**widths) if args.model == "smooth" else None
@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 def _length(args: argparse.Namespace, Omega: float) -> tuple[float, int]:
     """End of the run in s and number of samples."""
     if args.periods is not None and args.duration is not None:
-        raise InputError("the length is given once", "--periods and --duration", "leave one out")
+        raise InputError("a run has one length", "--periods and --duration", "remove one of them")
     samples = number("samples", args.samples)
     if samples != int(samples) or samples < 2:
         raise InputError("--samples must be a whole number of at least 2", args.samples, "give e.g. 2000")
@@ -102,14 +102,14 @@ def _length(args: argparse.Namespace, Omega: float) -> tuple[float, int]:
         periods = args.periods or "20"
         end, text = 2.0 * math.pi / Omega * number("periods", periods), f"--periods {periods}"
     else:
-        raise InputError("without a drive frequency there is no period", f"Omega = {Omega:g}", "give --duration")
+        raise InputError("--periods needs Omega above 0", f"Omega = {Omega:g}", "give --duration")
     if not end > 0.0:
         raise InputError("the length must be positive", text, "give a positive number")
     return end, int(samples)
 
 
 def _section(Omega: float, end: float) -> "np.ndarray":
-    """Times at which the drive passes its phase at the start, within the run."""
+    """Times within the run at which the drive has its initial phase."""
     import numpy as np
 
     if Omega <= 0.0:
@@ -119,7 +119,7 @@ def _section(Omega: float, end: float) -> "np.ndarray":
 
 
 def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
-    """Time histories and phase plane; section: which samples stand at the drive's phase."""
+    """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     import numpy as np
 
     from capsule_id.report.figures.capsule import MotionView, motion
@@ -132,6 +132,6 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     if path.suffix not in suffixes:
-        raise InputError(f"the file must end in {' or '.join(suffixes)}", str(path), "change its name")
+        raise InputError(f"the file must end in {' or '.join(suffixes)}", str(path), "change the suffix")
     if not path.parent.is_dir():
-        raise InputError("the folder of the output must exist", str(path.parent), "make it first")
+        raise InputError("the folder of the output must exist", str(path.parent), "make the folder first")

@@ -1,4 +1,4 @@
-"""Where a sweep goes: FILE.nc and FILE.png, each complete or not there; finished blocks in FILE.nc.partial."""
+"""Writes a sweep: FILE.nc and FILE.png, each complete or absent; FILE.nc.partial holds finished blocks."""
 
 import os
 import shutil
@@ -11,38 +11,40 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-MARK = "points.json"  # stands in every store, see capsule/blocks.py
+STORE_FILE = "points.json"  # in every store, see motions/blocks.py
 
 
-def take_store(out: Path, resume: bool) -> Path:
-    """The folder for finished blocks, ``FILE.nc.partial``; what an earlier run has left there is taken up or removed.
+def prepare_store(out: Path, resume: bool) -> Path:
+    """The folder for finished blocks, ``FILE.nc.partial``. Blocks of an earlier run are kept (``resume``) or removed.
 
     Raises
     ------
     InputError
-        A name that does not end in .nc, a folder that cannot be written, something that is not ours in its place,
-        nothing to take up.
+        If the name does not end in .nc, the folder cannot be written or belongs to something else, or ``resume`` finds
+        no blocks.
     """
     if out.suffix != ".nc":
-        raise InputError("the output must end in .nc", str(out), "change its name")
+        raise InputError("the output must end in .nc", str(out), "change the suffix")
     if out.is_dir() or out.with_suffix(".png").is_dir():
         raise InputError("the output must be a file", f"{out} is a folder", "choose another --out")
     parent = next(path for path in out.absolute().parents if path.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise InputError("the folder of the output must be writable", f"{parent} is not", "choose another --out")
     store = out.with_name(out.name + ".partial")
-    if resume and not (store / MARK).is_file():
-        raise InputError("--resume takes up an interrupted run", "there is none", "run without --resume", store)
+    if resume and not (store / STORE_FILE).is_file():
+        raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)
     if store.exists() and not resume:
         names = {path.name for path in store.iterdir()} if store.is_dir() else set()
-        if not store.is_dir() or (names and MARK not in names):
-            raise InputError("work in progress stands here", "it is something else", "choose another --out", store)
+        if not store.is_dir() or (names and STORE_FILE not in names):
+            raise InputError(
+                "FILE.nc.partial must be unfinished work", "it is something else", "choose another --out", store
+            )
         shutil.rmtree(store)
     return store
 
 
 def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
-    """Write both files under other names beside their places, then rename them.
+    """Write both files under temporary names in the same folder, then rename them.
 
     Raises
     ------
@@ -67,5 +69,5 @@ def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
 
 
 def remove_store(store: Path) -> None:
-    """Remove the finished blocks once the files stand."""
+    """Remove the finished blocks."""
     shutil.rmtree(store, ignore_errors=True)

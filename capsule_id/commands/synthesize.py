@@ -1,4 +1,4 @@
-"""``capsule-id synthesize``: a rig folder with known truth."""
+"""``capsule-id synthesize``: writes a rig folder with known truth."""
 
 import argparse
 from pathlib import Path
@@ -8,9 +8,9 @@ from capsule_id.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """DIR --seed N --runs --set NAME=VALUE ..."""
-    parser.add_argument("directory", metavar="DIR", type=Path, help="new folder to write")
-    parser.add_argument("--seed", type=int, default=0, help="of the reading errors (default 0)")
+    """Add DIR and the options."""
+    parser.add_argument("directory", metavar="DIR", type=Path, help="new or empty folder")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the reading errors (default 0)")
     parser.add_argument("--name", help="name of the rig (default: the folder's)")
     parser.add_argument("--runs", action="store_true", help="add forced runs, computed with the exact model")
     parser.add_argument(
@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        If DIR exists, or a value cannot be set.
+        If DIR is not empty, or a value cannot be set.
     """
     if args.seed < 0:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
@@ -37,7 +37,9 @@ def run(args: argparse.Namespace) -> int:
         synthesize(args.directory, args.seed, truth, args.name, args.runs)
     except OSError as error:
         raise InputError("DIR must be writable", str(error.strerror), "name another one", args.directory) from None
-    say(f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and its truth beside it")
+    say(
+        f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and {args.directory.resolve().name}.truth.json beside it"
+    )
     return 0
 
 

@@ -159,7 +159,7 @@ def test_measured_runs_are_laid_over_the_diagram() -> None:
         ([*OVER, "--mu", "-0.1"], "mu must not be negative, --mu -0.1"),
         (["--over", "f", "--from", "1", "--to", "4"], "k2 (stiffness of the support spring) must be given"),
         ([*OVER, "--points", "1"], "--points must lie between 2 and"),
-        ([*OVER, "--k2", "2e4"], "k2 is varied"),
+        ([*OVER, "--k2", "2e4"], "a varied k2 has no fixed value, --k2 is given, remove --k2"),
         ([*OVER, "--with", "P_d"], "a second quantity needs its range"),
         ([*OVER, "--with-points", "3"], "--with-points belongs to a second quantity"),
         ([*OVER, "--with", "k2", "--with-from", "1", "--with-to", "2"], "two different quantities"),

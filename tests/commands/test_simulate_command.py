@@ -105,10 +105,10 @@ def test_outputs_must_have_a_known_suffix_and_a_folder(tmp_path: Path) -> None:
 def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options.sys, "modules", {})
     for before, after in (
-        ("", options.WHOLE_LOOPS),
-        ("--xla_a=1", f"--xla_a=1 {options.WHOLE_LOOPS}"),
+        ("", options.XLA_LOOP_OPTION),
+        ("--xla_a=1", f"--xla_a=1 {options.XLA_LOOP_OPTION}"),
         ("--xla_backend_extra_options=other", "--xla_backend_extra_options=other"),
     ):
         monkeypatch.setenv("XLA_FLAGS", before)
-        options.prefer_whole_loops()
+        options.set_loop_option()
         assert options.os.environ["XLA_FLAGS"] == after
