@@ -136,8 +136,8 @@ def _check_prior_of_spring(document: TomlDocument, path: KeyPath, spring: str, t
     """Refuse a prior of k2[spring] without an experiment with that spring."""
     springs = sorted({table.settings.spring for table in tables if getattr(table.settings, "spring", None)})
     if spring not in springs:
-        known = f"write {' or '.join(f'k2[{name}]' for name in springs)}" if springs else "remove it: no experiment names a spring"
-        raise document.error(path, "a prior of k2 must name a spring of an experiment", spring, known, of_key=True)
+        remedy = f"write {' or '.join(f'k2[{name}]' for name in springs)}" if springs else "remove it"
+        raise document.error(path, "a prior of k2 must name a spring of an experiment", spring, remedy, of_key=True)
 
 
 def _read_experiments(
