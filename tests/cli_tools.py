@@ -1,4 +1,4 @@
-"""Commands as a user calls them: in a process of their own, or in this one where the process does not matter."""
+"""Runs commands as a user does, in a separate process or in this one."""
 
 import os
 import shutil
@@ -20,12 +20,12 @@ sys.exit({name}())
 
 
 def argv(*words: str, name: str = "fit_params", before: str = "") -> list[str]:
-    """The command line of a command of this checkout; ``before`` is Python run ahead of it."""
+    """The command line of a command of this checkout; ``before`` is Python code that runs first."""
     return [sys.executable, "-c", before + CODE.format(name=name), *words]
 
 
 def environment(**changes: str | None) -> dict[str, str]:
-    """This process's environment with this checkout first, and ``changes``; None removes a variable."""
+    """The environment of this process with this checkout first, and ``changes``; None removes a variable."""
     merged = {**os.environ, "PYTHONPATH": str(ROOT), **changes}
     return {name: value for name, value in merged.items() if value is not None}
 
@@ -60,7 +60,7 @@ def small_rig(folder: Path, name: str = "small", tables: tuple[str, ...] = ("sta
 
 
 def listing(folder: Path) -> dict[str, bytes]:
-    """Everything below ``folder`` with its content."""
+    """All files below ``folder`` with their content."""
     return {
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"-"
         for path in sorted(folder.rglob("*"))

@@ -1,4 +1,4 @@
-"""Notebooks read, looked at and run, for the tests of them, which stand in two files: a worker takes a whole file."""
+"""Reads, inspects and runs notebooks. Their tests are in two files, because a worker takes a whole file."""
 
 import os
 import re
@@ -57,7 +57,7 @@ def ends_with_an_assertion(notebook: NotebookNode) -> bool:
 
 
 def shorten(notebook: NotebookNode, values: str) -> None:
-    """Put ``values`` into the cell of parameters; they must assign the names that stand there."""
+    """Put ``values`` into the cell of parameters; they must assign the same names."""
     (cell,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     assert values.split("=")[0] == cell.source.split("=")[0]
     cell.source = values
@@ -76,7 +76,7 @@ def execute(notebook: NotebookNode, folder: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def run_short(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A notebook with its study made smaller runs to the end, with all its figures and without a complaint."""
+    """A notebook with a smaller study runs to the end, with all figures and without warnings."""
     notebook = read(name)
     if name[:2] in SHORT:
         shorten(notebook, SHORT[name[:2]])
@@ -87,7 +87,7 @@ def run_short(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def compare_with_kept(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At full size: the same words, and the same numbers but for the last digits of another machine."""
+    """At full size the text is the same, and the numbers differ only in the last digits between machines."""
     notebook = read(name)
     expected = printed(notebook)
     execute(notebook, folder, monkeypatch)

@@ -1,4 +1,4 @@
-"""Bad input is a ``ValueError`` for Python callers, and one located line for readers."""
+"""Bad input is a ``ValueError`` in Python and one line with its place on the command line."""
 
 from pathlib import Path
 

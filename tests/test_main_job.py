@@ -1,4 +1,4 @@
-"""``fit-params data/``, as README tells it, and what its files say when they are read back."""
+"""``fit-params data/`` as in README; its files are read back and checked."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The notebooks: they run from a clean copy, end with an assertion, show a figure, and what they keep is not stale.
+"""The notebooks run from a clean copy, end with an assertion, show a figure, and their stored outputs are current.
 
 The chapters of odd number run here, the others in ``test_notebooks_even.py``.
 """
@@ -34,7 +34,7 @@ def test_the_chapters_are_numbered_and_small() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_a_notebook_keeps_is_whole(name: str) -> None:
-    """Every code cell was run, in order, once; none failed or complained; there are figures, and an assertion at the end."""
+    """Every code cell ran once, in order, without errors or warnings; there are figures and a final assertion."""
     notebook = read(name)
     assert [cell.execution_count for cell in code(notebook)] == list(range(1, len(code(notebook)) + 1))
     assert outputs(notebook, "error") == []
@@ -56,7 +56,7 @@ def test_kept_outputs_are_what_the_code_prints(name: str, tmp_path: Path, monkey
 
 
 def test_a_wrong_headline_would_be_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The negative control: the assertion of a last cell fails where the number is another one."""
+    """Negative control: the assertion of the last cell fails for another number."""
     notebook = read(NAMES[0])
     first, last = notebook.cells[0], code(notebook)[-1]
     assert ends_with_an_assertion(notebook)

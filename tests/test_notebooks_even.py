@@ -1,4 +1,4 @@
-"""The chapters of even number, see ``test_notebooks.py``: in a file of their own, which another worker takes."""
+"""The chapters of even number, see ``test_notebooks.py``; another worker takes this file."""
 
 from pathlib import Path
 

@@ -24,14 +24,14 @@ FORBIDDEN = [
 
 
 def tracked() -> list[Path]:
-    """Files that git knows, or would take."""
+    """Files that git tracks or does not ignore."""
     words = ["git", "-C", str(ROOT), "ls-files", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
     return [ROOT / name for name in listed if (ROOT / name).is_file()]
 
 
 def tool(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run a tool that stands beside the interpreter that runs the tests."""
+    """Run a tool from the folder of the interpreter."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     env = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "PYRIGHT_PYTHON_IGNORE_WARNINGS": "1"}
     program = str(Path(sys.executable).parent / words[0])
@@ -54,7 +54,7 @@ def test_tools_find_nothing(words: tuple[str, ...]) -> None:
 
 
 def test_tools_would_find_something(tmp_path: Path) -> None:
-    """The negative control: the same settings refuse a function without annotations and a wrong type."""
+    """Negative control: the same settings refuse a function without annotations and a wrong type."""
     (tmp_path / "bad.py").write_text('"""Bad."""\n\n\ndef half(x):\n    return x / 2\n\n\nn: int = "text"\n')
     config = str(ROOT / "pyproject.toml")
     assert "ANN" in tool("ruff", "check", "--no-cache", "--config", config, str(tmp_path)).stdout

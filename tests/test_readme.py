@@ -1,4 +1,4 @@
-"""README says what is so: its commands run, its tables are those of the package."""
+"""README is correct: its commands run, its tables are those of the package."""
 
 import re
 import subprocess
@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 
 
 def set_up_commands() -> list[list[str]]:
-    """The fenced commands of README's opening, each split at &&."""
+    """The two fenced commands at the start of README, each split at &&."""
     return [[part.strip() for part in block.split("&&")] for block in re.findall(r"```sh\n(.*?)\n```", README)[:2]]
 
 
@@ -39,7 +39,7 @@ def test_the_two_commands_set_up_and_run() -> None:
 
 
 def test_the_installed_command_reads_the_folder_that_readme_names(tmp_path: Path) -> None:
-    """The entry point itself; what it computes is looked at with the main job."""
+    """Tests the entry point; the main job tests its numbers."""
     (tmp_path / "data").symlink_to(DATA)
     command = set_up_commands()[0][-1].replace(".venv/bin", str(Path(sys.executable).parent))
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Forced runs of a synthetic rig: the bench stays as it is, and every channel follows from the truth file."""
+"""Forced runs of a synthetic rig: the bench tables do not change, and the truth file gives every channel."""
 
 import json
 import re
@@ -48,7 +48,7 @@ def test_the_bench_is_the_same_with_and_without_runs(folder: Path, tmp_path: Pat
 
 
 def test_the_channels_follow_from_the_truth(folder: Path) -> None:
-    """Independent route: start again from the state at the first sample; what is left is white noise as stated."""
+    """Independent check: simulate from the state at the first sample; the residuals are the stated white noise."""
     truth = known(folder)
     parameters = truth["parameters"]
     shared = {name: parameters[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
@@ -116,7 +116,7 @@ def test_a_spring_of_runs_alone_is_unknown_without_them() -> None:
 
 
 def test_data_is_what_the_command_writes(tmp_path: Path) -> None:
-    """data/README.md says how it was made; the bench part also without runs."""
+    """``data/`` is the output of the command in data/README.md."""
     text = (ROOT / "data" / "README.md").read_text(encoding="utf-8")
     runs = "--runs" in text
     synthesize(tmp_path / "data", 0, name="twin", runs=runs)

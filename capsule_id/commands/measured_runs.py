@@ -38,7 +38,7 @@ class Overlay:
     def sentence(self) -> str:
         """Number of shown runs, and the other runs with reasons, in one line."""
         count = f"{len(self.motions)} of {len(self.motions) + len(self.left_out)} measured runs overlaid"
-        return f"{count}; left out: {'; '.join(self.left_out)}" if self.left_out else count
+        return f"{count}; omitted: {'; '.join(self.left_out)}" if self.left_out else count
 
 
 def overlay(

@@ -17,7 +17,7 @@ class Entry(Generic[S]):
     Attributes
     ----------
     table : columns and settings, SI
-    document, path : ``rig.toml``, and where the entry stands in it
+    document, path : ``rig.toml``, and the key path of the entry
     file : the table as written
     """
 

@@ -94,7 +94,7 @@ def read_choice(document: TomlDocument, path: KeyPath, value: object, choices: S
 
 
 def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, is_scatter: bool) -> PriorOverride:
-    """``{ median, factor, unit }``, or ``{ scale, unit }`` for a scatter; the unit may be left out where it is 1."""
+    """``{ median, factor, unit }``, or ``{ scale, unit }`` for a scatter; a unit of 1 is optional."""
     keys = ("scale", "unit") if is_scatter else ("median", "factor", "unit")
     example = "{ " + ", ".join(f"{key} = ..." for key in keys[:-1]) + f', unit = "{si}" }}'
     entry = read_table(document, path, value, example)

@@ -1,4 +1,4 @@
-"""``capsule-id bifurcate``: files, units, maps that go on, bands, parameters of a rig, errors."""
+"""``capsule-id bifurcate``: files, units, resumed maps, bands, parameters of a rig, errors."""
 
 import argparse
 import json
@@ -81,7 +81,7 @@ def test_an_interrupted_map_is_taken_up_and_equals_the_whole_one(
     assert not Path("part.nc").exists()
     assert len(list(Path("part.nc.partial").glob("block_*"))) == 1
     monkeypatch.setattr(Progress, "__call__", plain)
-    # Another question is not answered from these blocks.
+    # Other settings do not reuse these blocks.
     assert _run(*OVER, *MAP, *SHORT, "--c", "4", "--out", "part.nc", "--resume") == 2
     assert "same points only" in capsys.readouterr().err
     assert _run(*OVER, *MAP, *SHORT, "--out", "part.nc", "--resume", "--scheduler", "threads") == 0
@@ -205,7 +205,7 @@ def test_progress_has_a_rate_and_the_time_left(capsys: pytest.CaptureFixture[str
 
 
 def test_the_commands_of_readme_are_understood() -> None:
-    """Parsed and checked as far as that goes without a rig that has been fitted."""
+    """The commands parse and pass the checks that need no fitted rig."""
     lines = re.findall(r"^capsule-id bifurcate (.*)$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert len(lines) >= 4
     parser = argparse.ArgumentParser()

@@ -1,4 +1,4 @@
-"""Where ``fit-params`` writes: what it refuses, what it replaces, and that it leaves nothing behind when it refuses."""
+"""The output directory of ``fit-params``: refused, replaced, and unchanged after a refusal."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def fake_result(directory: Path, mark: str = "old") -> Path:
-    """A directory that this program might have written."""
+    """A directory like one that this program has written."""
     directory.mkdir(parents=True)
     text = json.dumps({"mark": mark, "provenance": {"versions": {"capsule-id": "0"}}})
     (directory / "parameters.json").write_text(text)
@@ -35,7 +35,7 @@ def fake_result(directory: Path, mark: str = "old") -> Path:
 
 
 def fake_run(directory: Path, resume: bool = False, mark: str = "new") -> None:
-    """What ``fit-params`` does with its directory, without the fit."""
+    """The directory operations of ``fit-params`` without the fit."""
     check_directory(directory)
     with work_in_progress(directory, {"seed": 0}, resume) as partial:
         (partial / CHAINS).touch()
@@ -107,7 +107,7 @@ def test_what_is_replaced(here: Path, there: str) -> None:
 
 
 class Killed(BaseException):
-    """Stands for a kill: nothing catches it."""
+    """Simulates a kill: no handler catches it."""
 
 
 def die_at(patch: pytest.MonkeyPatch, moment: int) -> None:
@@ -131,7 +131,7 @@ def die_at(patch: pytest.MonkeyPatch, moment: int) -> None:
 def test_a_kill_between_the_steps_of_publishing(
     here: Path, monkeypatch: pytest.MonkeyPatch, moment: int, resume: bool
 ) -> None:
-    """DIR is then the old result, the new one or absent, never a half; and the next run sets everything right."""
+    """DIR is then the old result, the new one or absent, never incomplete; the next run repairs it."""
     old = fake_result(here / "out") / "parameters.json"
     with pytest.raises(Killed), work_in_progress(here / "out", {"seed": 0}, resume=False) as partial:  # noqa: PT012
         (partial / "parameters.json").write_text(old.read_text().replace("old", "new"))
@@ -185,7 +185,7 @@ def test_resume_needs_something_to_resume(here: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_point_fit_in_an_odd_place(here: Path) -> None:
-    """Odd paths, a current directory without results in it, a reader that leaves, an ASCII terminal: all at once."""
+    """Unusual paths, a current directory without results, a closed pipe and an ASCII terminal, all at once."""
     small_rig(here / "-mein Prüfstand")
     (here / "empty").mkdir()
     env = environment(PYTHONIOENCODING="ascii", HOME=None, MPLCONFIGDIR=None)

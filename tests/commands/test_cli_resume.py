@@ -1,4 +1,4 @@
-"""The same seed gives the same numbers, however often the run was interrupted or killed on the way."""
+"""The same seed gives the same numbers after any number of interruptions and kills."""
 
 import json
 import os
@@ -30,12 +30,12 @@ SHORT |= {"chain_store.SAVE_EVERY": 0.0}
 
 
 class Killed(BaseException):
-    """Stands for a kill: nothing catches it."""
+    """Simulates a kill: no handler catches it."""
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with ``rig`` and the result of a run that nothing disturbed."""
+    """A folder with ``rig`` and the result of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("uninterrupted")
     small_rig(folder / "rig")
     with pytest.MonkeyPatch.context() as patch:
@@ -59,7 +59,7 @@ def shorten(patch: pytest.MonkeyPatch) -> None:
 
 
 def die_in_progress(patch: pytest.MonkeyPatch, stage: str, draws: int, death: Callable[[], object]) -> None:
-    """``death()`` when the run reports that many draws in ``stage`` ("" for any)."""
+    """Raise ``death()`` when the run reports this number of draws in ``stage`` ("" for any)."""
 
     def call(self: Progress, done: int, total: int, text: str) -> None:
         if stage in text and done >= draws:
@@ -92,7 +92,7 @@ def test_another_seed_gives_other_numbers(here: Path) -> None:
 
 
 def test_an_ensemble_never_repeats_itself(here: Path) -> None:
-    """emcee restarts from the state it is given; what follows a check of convergence must go on from the last draw."""
+    """emcee restarts from the state it receives; after a convergence check it must continue from the last draw."""
     with xr.open_datatree(here / "whole" / "posterior.nc", engine="h5netcdf") as tree:
         mu = tree["posterior"]["mu"].to_numpy()
     assert mu.shape[1] > 2 * SHORT["ensembles.CHECK_EVERY"]
@@ -120,7 +120,7 @@ def test_interrupted_and_resumed(
 
 
 def test_killed_inside_emcee_and_spoilt_afterwards(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kill between coordinates and counter leaves a file that opens and is wrong: it is not believed."""
+    """A kill between coordinates and counter leaves a readable but wrong file; the run must not use it."""
     real = emcee.backends.HDFBackend.save_step
 
     def dying(self: emcee.backends.HDFBackend, state: emcee.State, accepted: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Exit codes and standard error of both commands, where no fit is needed to know them."""
+"""Exit codes and standard error of both commands, without a fit."""
 
 import os
 import shutil
@@ -166,7 +166,7 @@ def test_an_internal_failure_is_one_line(
 
 
 def test_commands_in_a_bare_surrounding(tmp_path: Path) -> None:
-    """No HOME, no locale, closed standard streams: the code stays right and nobody sees a traceback."""
+    """No HOME, no locale, closed standard streams: the exit code is right and no traceback appears."""
     small_rig(tmp_path / "rig ü")
     bare = environment(HOME=None, LC_ALL="C", LANG=None, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
     done = run("check", "rig ü", cwd=tmp_path, name="capsule_id", env=bare)

@@ -1,4 +1,4 @@
-"""Measured runs over a diagram: those with its settings, where they belong, and why the others are left out."""
+"""Measured runs on a diagram: the runs with its settings, their places, and the reasons for the others."""
 
 import json
 from pathlib import Path
@@ -39,7 +39,7 @@ def test_fig_10_shows_its_two_runs(folder: Path) -> None:
     # As tests/physics/exact_cases.json has them, fig10_Om_26.58 and fig10_Om_46; labels too.
     np.testing.assert_allclose([run.mean_velocity for run in found.motions], [8.345e-6, 2.71341e-4], atol=5e-7)
     said = found.sentence()
-    assert "2 of 4 measured runs overlaid; left out: run_1 (k2 = 1.896e+04, not 5.941e+04 N/m); run_2" in said
+    assert "2 of 4 measured runs overlaid; omitted: run_1 (k2 = 1.896e+04, not 5.941e+04 N/m); run_2" in said
     # The same in rad/s.
     turned = overlay(read_rig(folder), Span("Omega", 20.0, 60.0), FIG_10, FITTED)
     np.testing.assert_allclose([run.value for run in turned.motions], [26.58, 46.0], rtol=1e-12)
@@ -61,7 +61,7 @@ def test_another_setting_leaves_a_run_out(folder: Path, change: dict[str, float]
 
 
 def test_the_value_of_a_run_is_its_own(folder: Path) -> None:
-    """K times its current; the stiffness as fitted, or as the paper estimates it; the gap as stated."""
+    """P_d is K times the current; k2 is fitted or the paper's estimate; the gap is stated."""
     rig = read_rig(folder)
     (load,) = overlay(rig, Span("P_d", 1.0, 8.0), FIG_6, FITTED | {"K": 2.2}, "medium").motions
     assert load.value == pytest.approx(2.2 * _truth(folder, "run_1")["current_amplitude"], rel=1e-3)

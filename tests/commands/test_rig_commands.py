@@ -1,4 +1,4 @@
-"""capsule-id init and check."""
+"""``capsule-id init`` and ``capsule-id check``."""
 
 import argparse
 import math
@@ -25,7 +25,7 @@ def call(command: object, *words: str) -> int:
 
 
 def uncommented(text: str) -> str:
-    """The template with every `# ` removed that does not explain."""
+    """The template with all entries in use: every `# ` removed except in comments."""
     return re.sub(r"(?m)^# ", "", text)
 
 
@@ -131,7 +131,7 @@ def test_lint(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 
 
 def test_check_says_what_a_forced_run_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """The amplitude of the paper's Fig. 11 at its lower end; twice that is enough for contacts."""
+    """The smallest amplitude of the paper's Fig. 11 gives no contact; twice that does."""
     drive = RIG_TOML.replace("34.56", "73.58")
     low = findings(write_folder(tmp_path / "low", drive.replace("value = 4.0", "value = 0.6")), capsys)
     assert [line for line in low if line.startswith("run_01:") and "says nothing of k2" in line]

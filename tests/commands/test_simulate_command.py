@@ -1,4 +1,4 @@
-"""``capsule-id simulate``: tables, picture, errors."""
+"""``capsule-id simulate``: tables, figure, errors."""
 
 import argparse
 import csv
@@ -82,7 +82,10 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
         ([*DRIVE, "--semantics", "eq2"], "stick-slip semantics only"),
         ([*DRIVE, "--samples", "1"], "at least 2"),
         ([*DRIVE, "--periods", "-1"], "length must be positive"),
-        ([*DRIVE, "--periods", "1", "--duration", "1"], "a run has one length, --periods and --duration, remove one of them"),
+        (
+            [*DRIVE, "--periods", "1", "--duration", "1"],
+            "a run has one length, --periods and --duration, remove one of them",
+        ),
         ([*DRIVE, "--Omega", "0"], "--periods needs Omega above 0, Omega = 0, give --duration"),
         ([*DRIVE, "--m1", "-1"], "m1 must be positive"),
     ],

@@ -1,4 +1,4 @@
-"""Recorded runs with known labels: the reference cases and motions of longer period, measured by the synthetic rig."""
+"""Recorded runs with known labels: the reference cases and motions of longer period, with synthetic noise."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,11 +40,11 @@ class Known:
 
     @cached_property
     def nominal(self) -> MeasuredMotion:
-        """What the whole record says."""
+        """The measured motion of the whole record."""
         return self.motion()
 
     def motion(self, factor: float = 1.0, **changes: object) -> MeasuredMotion:
-        """What the record says with ``factor`` times the rig's noise, or less of it, or other settings."""
+        """The measured motion with ``factor`` times the rig's noise, a shorter record, or other settings."""
         return measured_motion(table_of(noisier(self.run, factor, len(self.name)), **changes))  # type: ignore[arg-type]
 
 

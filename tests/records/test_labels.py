@@ -1,4 +1,4 @@
-"""The label of a record is the model's, or "undecided": never another one."""
+"""The label of a record is that of the model, or "undecided"; it is never wrong."""
 
 from collections.abc import Callable
 
@@ -131,7 +131,7 @@ def test_uneven_sampling_is_a_reason() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("cases", "share"), [(reference, 0.99), (longer, 0.97)])
 def test_labels_under_growing_noise(cases: Callable[[], tuple[Known, ...]], share: float) -> None:
-    """Four noises of each case and level. Chaos in narrow bands about a cycle of two hides in three times the noise."""
+    """Four noise realisations of each case and level. Three times the noise hides chaos in narrow bands about period two."""
     outcome = []
     for case in cases():
         for factor in (1.2, 1.5, 2.0, 3.0, 5.0):

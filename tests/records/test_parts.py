@@ -1,4 +1,4 @@
-"""Period, mean velocity and folding, each on signals made by hand."""
+"""Period, mean velocity and folding on constructed signals."""
 
 import numpy as np
 import pytest
@@ -42,8 +42,8 @@ def test_a_long_period_needs_two_of_them() -> None:
     assert "repeats after 13" in found.reason
 
 
-def test_noise_decides_what_can_be_told() -> None:
-    """The statement "nothing of another period" comes with how much of it would have shown; and that much does show."""
+def test_noise_limits_the_visible_part() -> None:
+    """``visible`` states the smallest visible part of another period; a part of this size is detected."""
     quiet = find_period(TIME, motion(1) + noise(2), T)
     assert quiet.visible is not None
     assert quiet.visible < 0.02 * quiet.motion
@@ -67,7 +67,7 @@ def test_noise_estimate_and_its_stated_scatter() -> None:
 
 
 def stick_slip(velocity: float) -> np.ndarray:
-    """A capsule that slips during a fifth of every period, and stands still else."""
+    """A capsule that slips during a fifth of every period and sticks otherwise."""
     cycles = TIME / T
     slip = np.clip((cycles % 1.0) / 0.2, 0.0, 1.0)
     return velocity * T * (np.floor(cycles) + 0.5 - 0.5 * np.cos(np.pi * slip))
@@ -77,10 +77,10 @@ def test_mean_velocity_and_its_standard_error() -> None:
     velocity = 0.6e-3
     found = [fit_mean_velocity(TIME, stick_slip(velocity) + noise(seed, 5e-6), T, 1) for seed in range(200)]
     pulls = np.array([(p.velocity - velocity) / p.velocity_sd for p in found])
-    # 200 replicates: standard errors 0.07 and 0.05; steps are no sum of harmonics, hence some more room for the mean
+    # 200 replicates: standard errors 0.07 and 0.05; steps are no sum of harmonics, hence a wider bound for the mean
     assert abs(pulls.mean()) < 0.35
     assert np.std(pulls) == pytest.approx(1.0, abs=0.17)
-    # negative control: a straight line alone takes the steps for noise, and states too large an error
+    # negative control: a straight line alone treats the steps as noise and states too large an error
     line_sd = np.std(stick_slip(velocity) - velocity * TIME) / np.sqrt(len(TIME)) / np.std(TIME)
     assert np.mean([p.velocity_sd for p in found]) < 0.6 * line_sd
 
@@ -151,7 +151,7 @@ def test_stretches_between_two_levels(z: list[float], stretches: list[tuple[int,
 
 
 def test_a_record_coarser_than_the_drive_is_undecided() -> None:
-    """Fewer than two samples a period: no overlap is left beside the spline's edges."""
+    """With fewer than two samples per period only the edges of the spline are left."""
     time = np.arange(14) * 0.15
     found = find_period(time, np.cos(34.56 * time), 2.0 * np.pi / 34.56)
     assert found.period is None

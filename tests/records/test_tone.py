@@ -49,7 +49,7 @@ def test_the_scatter_is_at_the_cramer_rao_bound(replicates: list[Harmonic]) -> N
 
 
 def test_a_known_frequency_would_understate_the_phase(replicates: list[Harmonic]) -> None:
-    """Negative control of the pulls: the bound without the frequency among the unknowns is half as large."""
+    """Negative control of the pulls: with a known frequency the bound is half as large."""
     known = NOISE_SD / AMPLITUDE * np.sqrt(2.0 / len(TIME))
     assert np.std([(fit.phase - PHASE) / known for fit in replicates]) > 1.7
 
@@ -94,7 +94,7 @@ def test_a_record_of_far_less_than_a_period_does_not_refute_the_stated_frequency
         assert not fit.disagrees
 
 
-def test_an_alias_is_not_taken_for_the_frequency() -> None:
+def test_an_alias_does_not_replace_the_stated_frequency() -> None:
     """5.5 Hz read at 20/3 Hz looks like 1.17 Hz; the same record refutes 4 Hz."""
     time = np.arange(30) * 0.15
     values = tone(np.random.default_rng(0), time)
@@ -105,6 +105,6 @@ def test_an_alias_is_not_taken_for_the_frequency() -> None:
 
 
 def test_a_wrong_shape_is_refused_in_the_tests() -> None:
-    """The import hook of ``conftest.py`` is at work: without it this call would broadcast and return a number."""
+    """The import hook of ``conftest.py`` checks shapes: without it this call broadcasts and returns a number."""
     with pytest.raises(TypeCheckError, match="values"):
         tone_at(np.linspace(0.0, 1.0, 20), np.zeros((20, 1)), 30.0)

@@ -1,4 +1,4 @@
-"""What is shown of a record: filter, Poincaré points, force; pictures; the lines of ``capsule-id check``."""
+"""The view of a record: filter, Poincaré points, force; figures; the lines of ``capsule-id check``."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Helpers of the fault tables: where the fault was seen, against where the mark stands."""
+"""Helpers of the fault tables: compare the reported place with that of the mark."""
 
 from pathlib import Path
 

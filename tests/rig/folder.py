@@ -1,4 +1,4 @@
-"""A valid rig folder to write, and to spoil: the example of the interface, every kind once, every key once."""
+"""A valid rig folder for tests, with every kind and every key once."""
 
 from pathlib import Path
 
@@ -82,7 +82,7 @@ TABLES = {
 
 
 def write_folder(folder: Path, rig_toml: str = RIG_TOML, tables: dict[str, str | bytes] | None = None) -> Path:
-    """Write ``rig.toml`` and every table of ``TABLES``, those of ``tables`` instead where given; the folder."""
+    """Write ``rig.toml`` and the tables ``TABLES``, replaced by those of ``tables``; return the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "rig.toml").write_text(rig_toml, encoding="utf-8")
     for name, content in {**TABLES, **(tables or {})}.items():

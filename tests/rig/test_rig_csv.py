@@ -1,4 +1,4 @@
-"""CSV dialects: what goes out comes back bit by bit, whatever the dialect."""
+"""CSV dialects: written numbers are read back bit by bit in every dialect."""
 
 import itertools
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_round_trip(delimiter: str, decimal: str, ending: str, mark: str, column
     header = delimiter.join(f'"c{i} [mm]"' if i % 2 else f" c{i}  [ N/m ] " for i in range(columns))
     rows = [delimiter.join(repr(float(cell)).replace(".", decimal) for cell in row) for row in values]
     if columns == 1 and decimal == ",":
-        # Nothing in the file tells that a lone header would be followed by semicolons: the comma separates cells.
+        # A single header gives no evidence of semicolons: the comma separates cells.
         with pytest.raises(InputError, match="a row must have 1 cells"):
             read_csv(ending.join([mark + header, *rows]).encode(), Path("t.csv"))
         return

@@ -1,4 +1,4 @@
-"""Savitzky–Golay filters: exact on polynomials, gain as measured on cosines, and why likelihoods use raw records."""
+"""Savitzky–Golay filters: exact on polynomials, gain on cosines, and the reason for raw records in likelihoods."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_gain_is_what_the_filter_does_to_cosines(samples: int, order: int) -> No
 
 @pytest.mark.parametrize(("samples", "order"), [(5, 2), (21, 2), (21, 4), (51, 3)])
 def test_gain_of_derivatives_is_what_the_filter_does_to_waves(samples: int, order: int) -> None:
-    """Beside the true derivative of cos(2 pi f k + 0.7), which is neither even nor odd."""
+    """Compare with the true derivative of cos(2 pi f k + 0.7), which is neither even nor odd."""
     time = STEP * np.arange(401)
     for derivative in (1, 2):
         for frequency in (0.004, 0.02, 0.1, 0.37):
@@ -83,7 +83,7 @@ def test_long_windows_keep_their_digits_where_powers_lose_them() -> None:
 
 
 def test_scipy_loses_the_order_in_use_on_very_long_windows() -> None:
-    """Why the filter is not SciPy's: order 3, 30,001 samples, a parabola."""
+    """SciPy's filter fails on a parabola at order 3 and 30,001 samples."""
     t = np.linspace(-1.0, 1.0, 30_001)
     parabola = 1.0 + t**2
     assert abs(savitzky_golay(STEP * np.arange(30_001), parabola, 30_001 * STEP, 3)[15_000] - 1.0) < 1e-12

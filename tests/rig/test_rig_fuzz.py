@@ -1,4 +1,4 @@
-"""Spoiled at random, a rig folder still reads or is refused with a place; nothing else may happen."""
+"""A rig folder with random faults is either read or refused with a place; nothing else happens."""
 
 import random
 import re
@@ -80,7 +80,7 @@ def spoil(content: bytes, chance: random.Random) -> bytes:
 
 
 def outcome(folder: Path) -> InputError | None:
-    """None where the folder reads."""
+    """The fault, or None if the folder is valid."""
     try:
         read_rig(folder)
     except InputError as error:

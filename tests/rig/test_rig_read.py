@@ -1,4 +1,4 @@
-"""What a valid rig folder becomes."""
+"""Reading a valid rig folder."""
 
 import dataclasses
 import hashlib

@@ -1,4 +1,4 @@
-"""Every fault of a table: its full place, its rule, on one line. The mark ‸ stands where the place must be."""
+"""Every fault of a table gives its full place and rule in one line. The mark ‸ is the expected place."""
 
 from pathlib import Path
 

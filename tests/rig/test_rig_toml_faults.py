@@ -1,4 +1,4 @@
-"""Every fault of rig.toml: its full place, its rule, on one line. The mark ‸ stands where the place must be."""
+"""Every fault of rig.toml gives its full place and rule in one line. The mark ‸ is the expected place."""
 
 import os
 from pathlib import Path
@@ -158,7 +158,7 @@ TOML_FAULTS_ELSEWHERE = [
 
 @pytest.fixture
 def parent(tmp_path: Path) -> Path:
-    """A folder beside and inside which links lead out of the rig."""
+    """A folder with links inside and beside the rig that lead outside."""
     rig = tmp_path / "rig"
     rig.mkdir()
     (tmp_path / "outside.csv").write_text(TABLES["free_vibration_1.csv"])
@@ -222,7 +222,7 @@ def test_a_file_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     read_bytes = Path.read_bytes
 
     def refuse(path: Path) -> bytes:
-        """As the system does for another user's file; tests may run as root, whom nothing is refused."""
+        """Refuse like the system for a file of another user; root may read every file."""
         if path.name == name:
             raise PermissionError(13, "Permission denied")
         return read_bytes(path)

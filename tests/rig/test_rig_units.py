@@ -1,4 +1,4 @@
-"""Units against hand-written factors; the traps that a units library sets by default."""
+"""Units against hand-written factors, and wrong readings that a units library accepts by default."""
 
 import math
 
