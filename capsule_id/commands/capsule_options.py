@@ -124,6 +124,7 @@ def _fitted(directory: Path, spring: str | None) -> dict[str, float]:
         spring = springs[0]
     if spring is not None:
         if spring not in springs:
-            raise InputError("--spring must be a fitted one", spring, f"choose from {', '.join(springs) or 'none'}")
+            remedy = f"choose from {', '.join(springs)}" if springs else "give --k2 instead"
+            raise InputError("--spring must be a fitted spring", spring, remedy)
         values["k2"] = values[f"k2[{spring}]"]
     return {name: value for name, value in values.items() if name in LEAVES}

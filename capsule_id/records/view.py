@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from capsule_id.errors import InputError
 from capsule_id.records.label import MeasuredMotion, measured_motion
 from capsule_id.records.stated_settings import stated_gap
-from capsule_id.rig.filters import gain, sampling_step, savitzky_golay
+from capsule_id.rig.filters import filter_gain, sampling_step, savitzky_golay
 from capsule_id.rig.model import Table
 
 FILTER_ORDER = 3  # of the filter's polynomial
@@ -110,13 +110,13 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
 def _window_samples(f: float, step: float, most: int) -> int:
     """Samples of the longest window that passes the rate at f Hz, at least ``SHORTEST_WINDOW``."""
     samples = SHORTEST_WINDOW
-    while samples + 2 <= most and gain(f * step, samples + 2, FILTER_ORDER, 1) >= SMALLEST_RATE_GAIN:
+    while samples + 2 <= most and filter_gain(f * step, samples + 2, FILTER_ORDER, 1) >= SMALLEST_RATE_GAIN:
         samples += 2
     return samples
 
 
 def _gains(f: float, step: float, samples: int) -> Gains:
-    return Gains(f, *(float(gain(f * step, samples, FILTER_ORDER, d)) for d in (0, 1)))
+    return Gains(f, *(float(filter_gain(f * step, samples, FILTER_ORDER, d)) for d in (0, 1)))
 
 
 def _section_times(time: np.ndarray, Omega: float, phase: float) -> np.ndarray:

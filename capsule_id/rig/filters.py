@@ -89,7 +89,7 @@ def window_samples(window: float, step: float) -> int:
     return 2 * max(0, round((window / step - 1.0) / 2.0)) + 1
 
 
-def gain(frequency: np.ndarray | float, samples: int, order: int, derivative: int = 0) -> np.ndarray:
+def filter_gain(frequency: np.ndarray | float, samples: int, order: int, derivative: int = 0) -> np.ndarray:
     """Gain of the filter away from the edges, from its coefficients: response over ideal response.
 
     Smoothing: the sum of c_k cos(2 pi f k). Derivative of order d: the response over (2 pi f)^d. Both are 1 at f = 0.
@@ -141,7 +141,7 @@ def choose_window(time: Record, values: Record, order: int) -> float:
     too_long = len(time) + 1 + len(time) % 2
     while too_long - samples > 2:
         middle = samples + 2 * ((too_long - samples) // 4)
-        if gain(frequency, middle, order) >= SMALLEST_GAIN:
+        if filter_gain(frequency, middle, order) >= SMALLEST_GAIN:
             samples = middle
         else:
             too_long = middle

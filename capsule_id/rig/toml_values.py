@@ -41,8 +41,10 @@ def refuse_unknown_keys(document: TomlDocument, path: KeyPath, entry: dict[str, 
 
 def read_string(document: TomlDocument, path: KeyPath, value: object) -> str:
     """A non-empty string."""
-    if not isinstance(value, str) or not value:
+    if not isinstance(value, str):
         raise document.error(path, f"{path[-1]} must be a string", shown(value), 'write it in quotes: "..."')
+    if not value:
+        raise document.error(path, f"{path[-1]} must not be empty", '""', "write a word between the quotes")
     return value
 
 
@@ -112,7 +114,7 @@ def _read_unit(document: TomlDocument, path: KeyPath, entry: dict[str, Any], si:
     """The factor of the entry's unit to SI."""
     if "unit" not in entry:
         raise document.error(
-            path, f"{path[-1]} must have a unit", shown(entry), f'add unit = "{si}" or another unit of it'
+            path, f"{path[-1]} must have a unit", shown(entry), f'add unit = "{si}" or an equivalent unit'
         )
     unit = read_string(document, (*path, "unit"), entry["unit"])
     try:

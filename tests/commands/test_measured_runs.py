@@ -76,10 +76,10 @@ def test_the_value_of_a_run_is_its_own(folder: Path) -> None:
     assert overlay(rig, Span("G", 0.0, 2e-3), FIG_6 | {"Omega": 34.8}, FITTED).motions == ()
 
 
-def test_what_cannot_be_laid_over_is_told(folder: Path) -> None:
+def test_the_sentence_gives_reasons_for_omitted_runs(folder: Path) -> None:
     rig = read_rig(folder)
-    assert "f = 4.23 Hz is outside of the diagram" in overlay(rig, Span("f", 5.0, 9.0), FIG_10, FITTED).sentence()
-    assert "mu is no setting of a run" in overlay(rig, Span("mu", 0.1, 0.9), FIG_10, FITTED).sentence()
+    assert "f = 4.23 Hz is outside the diagram" in overlay(rig, Span("f", 5.0, 9.0), FIG_10, FITTED).sentence()
+    assert "mu is not a setting of a run" in overlay(rig, Span("mu", 0.1, 0.9), FIG_10, FITTED).sentence()
     by_name = overlay(rig, F, FIG_10, FITTED, "stiff")
     assert "run_3 (spring hard, not stiff)" in by_name.sentence()
 

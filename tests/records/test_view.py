@@ -11,7 +11,7 @@ from capsule_id.records.run_description import describe_run, run_warning
 from capsule_id.records.view import SMALLEST_RATE_GAIN, RecordView, view_record
 from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
 from capsule_id.report.figures.style import new_figure, png
-from capsule_id.rig.filters import gain
+from capsule_id.rig.filters import filter_gain
 from tests.records.runs import Known, noisier, reference, table_of
 
 STEP = 1e-3
@@ -29,7 +29,7 @@ def view(case: Known) -> RecordView:
 
 def test_the_window_is_the_longest_that_leaves_contacts_alone(view: RecordView) -> None:
     assert view.at_contact is not None
-    assert view.at_contact.rate >= SMALLEST_RATE_GAIN > gain(view.at_contact.f * STEP, view.samples + 2, 3, 1)
+    assert view.at_contact.rate >= SMALLEST_RATE_GAIN > filter_gain(view.at_contact.f * STEP, view.samples + 2, 3, 1)
     assert view.at_drive.rate > 0.999
     # Half a period of the frequency of the contacts is a contact: 4.5 ms by the model's k2 and masses
     m = 0.11 * 0.53 / 0.64

@@ -10,7 +10,7 @@ from capsule_id.rig.filters import (
     TIMING_TOLERANCE,
     choose_window,
     dominant_frequency,
-    gain,
+    filter_gain,
     sampling_step,
     savitzky_golay,
     window_samples,
@@ -47,8 +47,8 @@ def test_gain_is_what_the_filter_does_to_cosines(samples: int, order: int) -> No
     for frequency in (0.0, 0.004, 0.02, 0.1, 0.37, 0.5):
         cosine = np.cos(2.0 * np.pi * frequency * (np.arange(401) - 200))
         filtered = savitzky_golay(time, cosine, samples * STEP, order)
-        assert filtered[200] == pytest.approx(float(gain(frequency, samples, order)), abs=1e-12)
-    assert gain(np.array([0.0, 0.0]), samples, order) == pytest.approx([1.0, 1.0], abs=1e-14)
+        assert filtered[200] == pytest.approx(float(filter_gain(frequency, samples, order)), abs=1e-12)
+    assert filter_gain(np.array([0.0, 0.0]), samples, order) == pytest.approx([1.0, 1.0], abs=1e-14)
 
 
 @pytest.mark.parametrize(("samples", "order"), [(5, 2), (21, 2), (21, 4), (51, 3)])
@@ -60,8 +60,8 @@ def test_gain_of_derivatives_is_what_the_filter_does_to_waves(samples: int, orde
             angle = 2.0 * np.pi * frequency * (np.arange(401) - 200) + 0.7
             filtered = savitzky_golay(time, np.cos(angle), samples * STEP, order, derivative)[200]
             true = (2.0 * np.pi * frequency / STEP) ** derivative * np.cos(0.7 + 0.5 * np.pi * derivative)
-            assert filtered / true == pytest.approx(float(gain(frequency, samples, order, derivative)), abs=1e-9)
-        assert gain(np.array([0.0, 1e-3]), samples, order, derivative) == pytest.approx([1.0, 1.0], abs=0.02)
+            assert filtered / true == pytest.approx(float(filter_gain(frequency, samples, order, derivative)), abs=1e-9)
+        assert filter_gain(np.array([0.0, 1e-3]), samples, order, derivative) == pytest.approx([1.0, 1.0], abs=0.02)
 
 
 @pytest.mark.parametrize(("samples", "order"), [(1, 0), (3, 0), (5, 4), (11, 2), (31, 3), (31, 4)])
@@ -99,7 +99,7 @@ def test_the_chosen_window_is_the_longest_that_passes_the_motion() -> None:
         window = choose_window(time, values, order)
         samples = window_samples(window, STEP)
         seen = dominant_frequency(time, values) * STEP
-        passing = [n for n in range(order + 1 + order % 2, 1000, 2) if gain(seen, n, order) >= SMALLEST_GAIN]
+        passing = [n for n in range(order + 1 + order % 2, 1000, 2) if filter_gain(seen, n, order) >= SMALLEST_GAIN]
         assert samples == passing[-1]
         assert passing == list(range(passing[0], samples + 2, 2))  # what lets the search halve
 
