@@ -130,5 +130,5 @@ def slide_distance(law: FrictionLaw, mass: Any, speed: Any) -> Any:
 
     mass : the sliding mass, kg; the law's leaves are (), NumPy or JAX
     """
-    u = speed[:, None] * _NODES
+    u = speed[:, None] * _NODES[None]
     return mass * speed * ((u / law.forward(u)) @ _WEIGHTS)

@@ -19,13 +19,15 @@ from scipy.optimize import minimize_scalar
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
-from capsule_id.inference.fit.least_squares import LeastSquaresFit, covariance, least_squares
+from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares
 from capsule_id.inference.fit.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
-TOLERANCE, MAX_STEPS = 1e-7, 80
+#: Of one descent: dimensionless tolerance and solver steps.
+SOLVER = Solver(tolerance=1e-7, max_steps=80, normal_equations=True, heavy=True)
 #: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
 ROUNDS, STILL = 8, 0.01
 #: Where a descent ends, every parameter alone is moved by these many standard deviations. A point whose log-posterior is
@@ -160,9 +162,7 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
     u, still, fit = start.copy(), False, None
     for _ in range(ROUNDS):
         residual = HeldResiduals(target, jnp.asarray(u))
-        fit = least_squares(
-            residual, u[located][None], tolerance=TOLERANCE, max_steps=MAX_STEPS, normal_equations=True, heavy=True
-        )
+        fit = least_squares(residual, u[located][None], SOLVER)
         if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
             return _End(u, fit, False, -np.inf)
         sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))

@@ -23,7 +23,7 @@ from capsule_id.inference.fit.joint_fit import (
     scatter_modes,
 )
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
-from capsule_id.inference.fit.least_squares import least_squares, linearised
+from capsule_id.inference.fit.least_squares import Solver, least_squares, linearised
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables.run_notes import smoothing_shift
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
@@ -77,7 +77,7 @@ def test_a_minimum_on_a_kink_is_one_unless_much_is_left_to_gain(pull: float, at_
     noise = np.random.default_rng(0).standard_normal(2500)
     noise += (pull - np.sum(noise) / 50.0) / 50.0
     residual = Partial(lambda noise, v: noise + jnp.abs(v[0]) / 50.0, jnp.asarray(noise))
-    fit = least_squares(residual, np.array([[3.0]]), heavy=True, normal_equations=True)
+    fit = least_squares(residual, np.array([[3.0]]), Solver(heavy=True, normal_equations=True))
     assert fit.x[0, 0] == pytest.approx(0.0, abs=1e-3)
     assert fit.stalled[0]
     assert _at_rest(fit) is at_rest
