@@ -18,7 +18,16 @@ from tests.capsule_cases import Cases, read_cases
 WORTH_KEEPING = "0.3"
 
 #: Modules whose annotations are checked at run time; the hook must stand before their first import.
-CHECKED = ("capsule_id.records", "capsule_id.rig.filters", "capsule_id.inference.sampling.diagnostics")
+CHECKED = (
+    "capsule_id.inference.fit.covariance",
+    "capsule_id.inference.fit.curvature",
+    "capsule_id.inference.sampling.diagnostics",
+    "capsule_id.inference.sampling.moves",
+    "capsule_id.inference.target.quadrature",
+    "capsule_id.physics.exact.dense",
+    "capsule_id.records",
+    "capsule_id.rig.filters",
+)
 install_import_hook(CHECKED, "beartype.beartype")
 
 # The variable reaches the processes that tests start; this process has imported JAX already.

@@ -16,7 +16,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 
-from capsule_id.inference.fit.covariance import Covariance, all_finite, column_space, covariance
+from capsule_id.inference.fit.covariance import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
 from capsule_id.inference.target.compiling import COMPILE, COMPILE_QUICKLY
 from capsule_id.precision import require_float64
 
@@ -146,7 +146,7 @@ def least_squares(
     )
 
 
-def _reason(result: optx.RESULTS, jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> str:
+def _reason(result: optx.RESULTS, jacobian: Jacobian, residuals: Residuals, rounding: float) -> str:
     """Why an end is none, "" where it is one."""
     reason = optx.RESULTS[result]
     if not all_finite(jacobian, residuals):
@@ -157,7 +157,7 @@ def _reason(result: optx.RESULTS, jacobian: np.ndarray, residuals: np.ndarray, r
     return reason
 
 
-def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> bool:
+def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bool:
     """The part of the residuals (n,) in the range of J (n, d) is small against the rest, or below ``rounding``."""
     left = column_space(jacobian)[0]
     tangential = float(np.linalg.norm(left.T @ residuals))
@@ -239,7 +239,7 @@ _PROGRAMS = {
 }
 
 
-def _effects(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     """As ``_scales``: every column of the Jacobian gets the same norm, which is then the unit of the residuals."""
     column_norm = np.linalg.norm(jacobian, axis=0)
     column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
@@ -249,7 +249,7 @@ def _effects(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float
     return scale, float(np.sqrt(FIRST_DAMPING)) * unit
 
 
-def _scales(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
     column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
     # Not finite: the solver will say so.
