@@ -127,7 +127,8 @@ class Misfit:
         variance = _variance(fixed, scale, scatter)
         own = variance
         if self.ordinate is not None:
-            own = _variance(*(xp.broadcast_to(x, (*leading, n)) for x in self.ordinate), scatter)
+            fixed, scale = (xp.broadcast_to(x, (*leading, n)) for x in self.ordinate)
+            own = _variance(fixed, scale, scatter)
         log_scale = -0.5 * xp.sum(xp.log(own), axis=-1)
         yy = xp.sum(raw**2 / variance, axis=-1)
         if self.design.shape[1] == 0:

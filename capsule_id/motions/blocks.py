@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 # Points of one block: seconds of work, a multiple of the lanes of one call.
 BLOCK = 256
+# File of a store that states which points its blocks belong to.
 FINGERPRINT = "points.json"
 
 
@@ -48,6 +49,8 @@ def compute(
     client : of a Dask cluster; the blocks of a worker that dies are computed again by others. Workers must
         have the same versions and XLA flags as each other, or the last bits of the blocks may differ.
     block : points of a block
+
+    Seven arguments: three state the points, the others are options by name.
 
     Raises
     ------
@@ -128,8 +131,8 @@ def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Seq
         except ValueError:
             theirs = None
         if theirs != json.loads(json.dumps(mine)):
-            remedy = "ask the same question as before, or remove the folder"
-            raise InputError("finished blocks are taken up for the same points only", "other points", remedy, store)
+            remedy = "repeat the command with the same points, or remove the folder"
+            raise InputError("finished blocks are reused for the same points only", "other points", remedy, store)
         return
     if any(store.iterdir()):
         raise InputError("a store is a new folder or one of this program", "it is neither", "name another one", store)

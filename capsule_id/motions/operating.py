@@ -50,6 +50,8 @@ def draws_diagram(
     over, values : the quantity that is varied, (n,), SI (f in Hz)
     store, client : see ``blocks.compute``
 
+    Eight arguments: four state the diagram, the others are options by name.
+
     Raises
     ------
     InputError

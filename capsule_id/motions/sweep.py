@@ -69,6 +69,8 @@ def diagram(
     over, values : the quantity that is varied (a leaf of p or e, or f) and its values (n,), SI (f in Hz)
     starts : (X1, Y1, X2, Y2), each (branches,): the initial states; default the one at rest
 
+    Seven arguments: four state the sweep, the others are options by name.
+
     Returns a Dataset over (branch, <over>[, section]) with the variables of ``points.MOTION_COLUMNS`` and, at each value, which
     branches have ended on the same attractor (``attractor``) and how many there are (``attractors``).
 
@@ -103,7 +105,7 @@ def continuation(
 
     A branch per direction (forward: in the order of ``values``) and initial state of its first value; all branches
     run side by side. A branch that fails at a value goes on from rest. The other arguments and the Dataset are as for
-    ``diagram``.
+    ``diagram``. Eight arguments: four state the sweep, the others are options by name.
 
     Raises
     ------
@@ -157,6 +159,8 @@ def motion_map(
     over : symbol -> values (n,), SI, of the two quantities (one will do)
     store, client, block : finished blocks on disk, Dask cluster, points of a block: see ``blocks.compute``
 
+    Eight arguments: three state the map, the others are options by name.
+
     Raises
     ------
     InputError
@@ -182,6 +186,7 @@ def basins(
     """Which attractor every initial state (x_rel, rate, Y2), m and m/s, leads to, at one set of parameters.
 
     A Dataset over (x_rel_0, rate_0) with the variables of ``points.SUMMARY``, ``attractor`` and ``attractors``.
+    Seven arguments: five state the initial states, the others are options by name.
 
     Raises
     ------
