@@ -120,14 +120,6 @@ def _lognormal(median: float, factor: float) -> Prior:
     return Prior("lognormal", median, factor)
 
 
-def _capsule(symbol: str, unit: str, meaning: str, latex: str, **others: object) -> Parameter:
-    return Parameter(symbol, unit, meaning, latex, leaf="capsule", **others)  # type: ignore[arg-type]
-
-
-def _drive(symbol: str, unit: str, meaning: str, latex: str, **others: object) -> Parameter:
-    return Parameter(symbol, unit, meaning, latex, leaf="drive", sign="any", **others)  # type: ignore[arg-type]
-
-
 def nuisance(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | None = None) -> Parameter:
     """A row for a nuisance of either sign; without ``prior`` the experiment supplies it."""
     return Parameter(symbol, unit, meaning, latex, prior, physical=False, sign="any")
@@ -141,29 +133,37 @@ def scatter(symbol: str, unit: str, meaning: str, latex: str, prior: Prior | Non
 TABLE: Mapping[str, Parameter] = {
     row.symbol: row
     for row in (
-        _capsule("m1", "kg", "mass of the rod", "m_1", table_1=0.110),
-        _capsule("m2", "kg", "mass of the capsule", "m_2", table_1=0.530),
-        _capsule(
-            "k1", "N/m", "stiffness between rod and capsule", "k_1", prior=_lognormal(1500.0, 1000.0),
-            sign="not negative", table_1=1420.0,
+        Parameter("m1", "kg", "mass of the rod", "m_1", leaf="capsule", table_1=0.110),
+        Parameter("m2", "kg", "mass of the capsule", "m_2", leaf="capsule", table_1=0.530),
+        Parameter(
+            "k1", "N/m", "stiffness between rod and capsule", "k_1", _lognormal(1500.0, 1000.0),
+            leaf="capsule", sign="not negative", table_1=1420.0,
         ),
-        _capsule(
-            "k2", "N/m", "stiffness of the support spring", "k_2", prior=_lognormal(20e3, 1000.0), sign="not negative"
+        Parameter(
+            "k2", "N/m", "stiffness of the support spring", "k_2", _lognormal(20e3, 1000.0),
+            leaf="capsule", sign="not negative",
         ),
-        _capsule(
-            "c", "N s/m", "viscous damping between rod and capsule", "c", prior=_lognormal(4.0, 1000.0),
-            sign="not negative", table_1=3.89,
+        Parameter(
+            "c", "N s/m", "viscous damping between rod and capsule", "c", _lognormal(4.0, 1000.0),
+            leaf="capsule", sign="not negative", table_1=3.89,
         ),
-        _capsule(
-            "mu", "1", "static friction coefficient, eq. (1)", r"\mu", prior=_lognormal(0.4, 5.0),
-            sign="not negative", table_1=0.66,
+        Parameter(
+            "mu", "1", "static friction coefficient, eq. (1)", r"\mu", _lognormal(0.4, 5.0),
+            leaf="capsule", sign="not negative", table_1=0.66,
         ),
-        _capsule("v_s", "m/s", "Stribeck velocity, eq. (1)", "v_s", prior=_lognormal(0.3, 10.0), table_1=0.30),
-        _capsule("G", "m", "gap between rod and support spring", "G", sign="not negative"),
-        _capsule("g", "m/s^2", "acceleration of gravity", "g", sign="not negative", sampled=False, table_1=9.81),
-        _drive("P_d", "N", "amplitude of the drive", "P_d"),
-        _drive("Omega", "rad/s", "angular frequency of the drive", r"\Omega", sampled=False),
-        _drive("phase", "rad", "phase of the drive", r"\varphi", physical=False),
+        Parameter(
+            "v_s", "m/s", "Stribeck velocity, eq. (1)", "v_s", _lognormal(0.3, 10.0), leaf="capsule", table_1=0.30
+        ),
+        Parameter("G", "m", "gap between rod and support spring", "G", leaf="capsule", sign="not negative"),
+        Parameter(
+            "g", "m/s^2", "acceleration of gravity", "g",
+            leaf="capsule", sign="not negative", sampled=False, table_1=9.81,
+        ),
+        Parameter("P_d", "N", "amplitude of the drive", "P_d", leaf="drive", sign="any"),
+        Parameter(
+            "Omega", "rad/s", "angular frequency of the drive", r"\Omega", leaf="drive", sign="any", sampled=False
+        ),
+        Parameter("phase", "rad", "phase of the drive", r"\varphi", physical=False, leaf="drive", sign="any"),
         Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
@@ -178,7 +178,10 @@ CAPSULE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if
 DRIVE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "drive"}
 LEAVES: Mapping[str, Parameter] = {**CAPSULE_LEAVES, **DRIVE_LEAVES}
 #: Quantities of a sweep: every leaf, and the frequency of the drive in Hz.
-SWEPT: Mapping[str, Parameter] = {**LEAVES, "f": _drive("f", "Hz", "frequency of the drive", "f", sampled=False)}
+SWEPT: Mapping[str, Parameter] = {
+    **LEAVES,
+    "f": Parameter("f", "Hz", "frequency of the drive", "f", leaf="drive", sign="any", sampled=False),
+}
 #: The values of the paper's Table 1, SI.
 TABLE_1: Mapping[str, float] = {s: row.table_1 for s, row in TABLE.items() if row.table_1 is not None}
 

@@ -1,12 +1,14 @@
 """Settings of JAX for all processes of a test run (workers, commands, kernels of notebooks), and fixtures.
 
-Compiled programs are kept in one cache. The shapes and types that ``CHECKED`` modules annotate hold for every call.
+Compiled programs are kept in one cache. Arrays of different ranks are not broadcast against each other implicitly.
+The shapes and types that ``CHECKED`` modules annotate hold for every call.
 """
 
 import os
 import shutil
 import tempfile
 
+import jax
 import pytest
 from jaxtyping import install_import_hook
 
@@ -16,8 +18,21 @@ from tests.capsule_cases import Cases, read_cases
 WORTH_KEEPING = "0.3"
 
 #: Modules whose annotations are checked at run time; the hook must stand before their first import.
-CHECKED = ("capsule_id.records", "capsule_id.rig.filters", "capsule_id.inference.sampling.diagnostics")
+CHECKED = (
+    "capsule_id.inference.fit.covariance",
+    "capsule_id.inference.fit.curvature",
+    "capsule_id.inference.sampling.diagnostics",
+    "capsule_id.inference.sampling.moves",
+    "capsule_id.inference.target.quadrature",
+    "capsule_id.physics.exact.dense",
+    "capsule_id.records",
+    "capsule_id.rig.filters",
+)
 install_import_hook(CHECKED, "beartype.beartype")
+
+# The variable reaches the processes that tests start; this process has imported JAX already.
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -27,7 +27,7 @@ def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp
     aa : (..., p, p) A'A
     n : length of y
     """
-    rest, rows, log_det = yy, xp.eye(aa.shape[-1]) + aa, 0.0
+    rest, rows, log_det = yy, xp.broadcast_to(xp.eye(aa.shape[-1]), aa.shape) + aa, 0.0
     while rows.shape[-1]:
         pivot, first = rows[..., 0, 0], rows[..., 0, 1:]
         log_det, rest = log_det + xp.log(pivot), rest - ay[..., 0] ** 2 / pivot

@@ -77,7 +77,9 @@ class Moments:
         scatter = xp.asarray(scatter)
         v = _variance(self.fixed_variance, self.scale, scatter)
         own = v if self.ordinate is None else _variance(*self.ordinate, scatter)
-        ay, aa = self.ay / v[..., None], self.aa / v[..., None, None]
+        leading = (1,) * scatter.ndim
+        ay = xp.broadcast_to(self.ay, (*leading, *self.ay.shape)) / v[..., None]
+        aa = xp.broadcast_to(self.aa, (*leading, *self.aa.shape)) / v[..., None, None]
         return marginal_log_density(self.yy / v, ay, aa, self.n, xp) - 0.5 * self.n * xp.log(own)
 
 
@@ -119,16 +121,20 @@ class Misfit:
 
     def log_density(self, scatter: Any, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings at ``scatter`` (...), nuisances integrated out; (...)."""
-        scatter = xp.asarray(scatter)[..., None]
-        n, one = self.raw.shape[0], xp.ones(self.raw.shape[0])
-        variance = _variance(self.fixed_variance, self.scale, scatter) * one
-        own = variance if self.ordinate is None else _variance(*self.ordinate, scatter) * one
+        scatter, n = xp.asarray(scatter)[..., None], self.raw.shape[0]
+        leading = (1,) * (scatter.ndim - 1)
+        raw, fixed, scale = (xp.broadcast_to(x, (*leading, n)) for x in (self.raw, self.fixed_variance, self.scale))
+        variance = _variance(fixed, scale, scatter)
+        own = variance
+        if self.ordinate is not None:
+            fixed, scale = (xp.broadcast_to(x, (*leading, n)) for x in self.ordinate)
+            own = _variance(fixed, scale, scatter)
         log_scale = -0.5 * xp.sum(xp.log(own), axis=-1)
-        yy = xp.sum(self.raw**2 / variance, axis=-1)
+        yy = xp.sum(raw**2 / variance, axis=-1)
         if self.design.shape[1] == 0:
             return log_scale - 0.5 * (n * LOG_2PI + yy)
-        weighted = self.design / variance[..., None]
-        ay, aa = xp.sum(self.raw[:, None] * weighted, axis=-2), xp.swapaxes(weighted, -1, -2) @ self.design
+        weighted = xp.broadcast_to(self.design, (*leading, *self.design.shape)) / variance[..., None]
+        ay, aa = xp.sum(raw[..., None] * weighted, axis=-2), xp.swapaxes(weighted, -1, -2) @ self.design
         return marginal_log_density(yy, ay, aa, n, xp) + log_scale
 
 

@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from capsule_id.motions.points import Columns
+from capsule_id.motions.points import MotionColumns
 from capsule_id.motions.response import SAME_POSITION, SAME_VELOCITY
 
 # Two settled motions that are the same have come within this many times the tolerance of the section's repetition.
 SLACK = 10.0
 
 
-def attractors_of(columns: Columns) -> np.ndarray:
+def attractors_of(columns: MotionColumns) -> np.ndarray:
     """(n,) int32: number of the attractor of each of n motions *at one set of parameters*; -1 where the run failed.
 
-    columns : as ``points.columns_of``, of n motions
+    columns : as ``points.settled_columns``, of n motions
 
     Periodic motions are one attractor if their labels agree and the points of one period of their sections agree up
     to where they begin. Aperiodic motions count as one: their points, and the sign of a slow drift, cannot be matched.
@@ -33,7 +33,7 @@ def attractors_of(columns: Columns) -> np.ndarray:
     return numbers
 
 
-def _same_orbit(columns: Columns, i: int, j: int, period: int) -> bool:
+def _same_orbit(columns: MotionColumns, i: int, j: int, period: int) -> bool:
     """Whether the last ``period`` points of motions i and j are the same but for a shift along the orbit."""
     (x, x_other), (w, w_other) = ((columns[name][[i, j], -period:]) for name in ("x_rel", "rate"))
     return any(

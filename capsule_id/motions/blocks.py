@@ -17,7 +17,7 @@ import numpy as np
 
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
-from capsule_id.motions.points import SEEN, Columns, Points, columns_of
+from capsule_id.motions.points import MOTION_COLUMNS, MotionColumns, SweepPoints, settled_columns
 from capsule_id.motions.response import Settling
 
 if TYPE_CHECKING:
@@ -25,29 +25,32 @@ if TYPE_CHECKING:
 
 # Points of one block: seconds of work, a multiple of the lanes of one call.
 BLOCK = 256
+# File of a store that states which points its blocks belong to.
 FINGERPRINT = "points.json"
 
 
 def compute(
-    points: Points,
+    points: SweepPoints,
     settling: Settling,
-    keep: Sequence[str] = tuple(SEEN),
+    keep: Sequence[str] = tuple(MOTION_COLUMNS),
     *,
     progress: OnProgress | None = None,
     store: Path | None = None,
     client: "Client | None" = None,
     block: int = BLOCK,
-) -> Columns:
+) -> MotionColumns:
     """Settled motions of all points: columns (points, ...) by name.
 
     Parameters
     ----------
-    keep : the names of ``SEEN`` to return
+    keep : the names of ``MOTION_COLUMNS`` to return
     progress : called with the points done, their number, and the word "points"
     store : a folder, created if missing: finished blocks are saved there and read from there
     client : of a Dask cluster; the blocks of a worker that dies are computed again by others. Workers must
         have the same versions and XLA flags as each other, or the last bits of the blocks may differ.
     block : points of a block
+
+    Seven arguments: three state the points, the others are options by name.
 
     Raises
     ------
@@ -57,7 +60,7 @@ def compute(
     begins = range(0, points.size, block)
     if store is not None:
         _check_store(store, points, settling, keep, block)
-    parts: dict[int, Columns] = {}
+    parts: dict[int, MotionColumns] = {}
     for begin in begins:
         finished = _saved_block(store, begin)
         if finished is not None:
@@ -74,28 +77,28 @@ def compute(
     return {name: np.concatenate([parts[begin][name] for begin in begins]) for name in keep}
 
 
-def seen_of(points: Points, settling: Settling, keep: Sequence[str]) -> Columns:
+def settled_block(points: SweepPoints, settling: Settling, keep: Sequence[str]) -> MotionColumns:
     """One block: the named columns and the status."""
-    seen = columns_of(points, settling)
+    seen = settled_columns(points, settling)
     return {name: seen[name] for name in dict.fromkeys((*keep, "status"))}
 
 
 def _in_process(
-    points: Points, settling: Settling, keep: Sequence[str], missing: list[int], block: int
-) -> Iterator[tuple[int, Columns]]:
+    points: SweepPoints, settling: Settling, keep: Sequence[str], missing: list[int], block: int
+) -> Iterator[tuple[int, MotionColumns]]:
     for begin in missing:
-        yield begin, seen_of(points.part(begin, begin + block), settling, keep)
+        yield begin, settled_block(points.part(begin, begin + block), settling, keep)
 
 
-def _on_cluster(client: "Client") -> Callable[..., Iterator[tuple[int, Columns]]]:
+def _on_cluster(client: "Client") -> Callable[..., Iterator[tuple[int, MotionColumns]]]:
     from distributed import as_completed
 
     def run(
-        points: Points, settling: Settling, keep: Sequence[str], missing: list[int], block: int
-    ) -> Iterator[tuple[int, Columns]]:
+        points: SweepPoints, settling: Settling, keep: Sequence[str], missing: list[int], block: int
+    ) -> Iterator[tuple[int, MotionColumns]]:
         futures: dict[Any, int] = {}
         for begin in missing:
-            task = client.submit(seen_of, points.part(begin, begin + block), settling, keep, pure=False)
+            task = client.submit(settled_block, points.part(begin, begin + block), settling, keep, pure=False)
             futures[task] = begin
         for future, part in as_completed(list(futures), with_results=True):
             yield futures[future], part
@@ -108,7 +111,7 @@ def _report(progress: OnProgress | None, done: int, total: int) -> None:
         progress(done, total, "points")
 
 
-def _check_store(store: Path, points: Points, settling: Settling, keep: Sequence[str], block: int) -> None:
+def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Sequence[str], block: int) -> None:
     """Create the folder, or check that its blocks belong to these points."""
     leaves = hashlib.sha256()
     for leaf in jax.tree.leaves((points.p, points.e, points.initial)):
@@ -128,8 +131,8 @@ def _check_store(store: Path, points: Points, settling: Settling, keep: Sequence
         except ValueError:
             theirs = None
         if theirs != json.loads(json.dumps(mine)):
-            remedy = "ask the same question as before, or remove the folder"
-            raise InputError("finished blocks are taken up for the same points only", "other points", remedy, store)
+            remedy = "repeat the command with the same points, or remove the folder"
+            raise InputError("finished blocks are reused for the same points only", "other points", remedy, store)
         return
     if any(store.iterdir()):
         raise InputError("a store is a new folder or one of this program", "it is neither", "name another one", store)
@@ -140,7 +143,7 @@ def _file(store: Path, begin: int) -> Path:
     return store / f"block_{begin:09d}.npz"
 
 
-def _save_block(store: Path | None, begin: int, part: Columns) -> None:
+def _save_block(store: Path | None, begin: int, part: MotionColumns) -> None:
     if store is None:
         return
     new = store / "block.new"
@@ -149,7 +152,7 @@ def _save_block(store: Path | None, begin: int, part: Columns) -> None:
     new.replace(_file(store, begin))
 
 
-def _saved_block(store: Path | None, begin: int) -> Columns | None:
+def _saved_block(store: Path | None, begin: int) -> MotionColumns | None:
     """A saved block; None if there is none or it cannot be read."""
     if store is None or not _file(store, begin).exists():
         return None

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
 from capsule_id.motions.attractors import attractors_of
-from capsule_id.motions.points import SECTION, SEEN, SUMMARY, Columns
+from capsule_id.motions.points import MOTION_COLUMNS, SECTION, SUMMARY, MotionColumns
 from capsule_id.motions.response import Settling
 from capsule_id.parameters import SWEPT
 from capsule_id.physics.model import CapsuleParameters, Excitation
@@ -72,7 +72,7 @@ def provenance(
 
 
 def dataset_of(
-    seen: Columns,
+    seen: MotionColumns,
     grid: Mapping[str, np.ndarray],
     dims: tuple[str, ...],
     shape: tuple[int, ...],
@@ -81,7 +81,7 @@ def dataset_of(
     """Columns (points, ...) as variables over ``dims`` (and the section where a column has one value a period)."""
     variables = {}
     for name, column in seen.items():
-        unit, meaning = SEEN[name]
+        unit, meaning = MOTION_COLUMNS[name]
         extra = ("section",) if name in SECTION and "branch" in dims else ()
         if name in SUMMARY or extra:
             values = column.reshape(*shape, *column.shape[1:])
@@ -93,7 +93,7 @@ def dataset_of(
 
 
 def branched(
-    seen: Columns, names: Sequence[str], grid: Mapping[str, np.ndarray], attributes: Mapping[str, Any]
+    seen: MotionColumns, names: Sequence[str], grid: Mapping[str, np.ndarray], attributes: Mapping[str, Any]
 ) -> xr.Dataset:
     """Columns (branches x values, ...) as a Dataset over (branch, value), with the attractors at each value."""
     ((over, x),) = grid.items()

@@ -99,7 +99,7 @@ def _growth(
         length = jnp.sqrt(jnp.sum(moved**2, axis=0))
         total = total + jnp.where(k < ALIGNMENT, 0.0, jnp.log(length))
         # A tangent that has died out stays zero; its logarithm is -inf.
-        moved = moved / jnp.where(length > 0.0, length, 1.0)
+        moved = moved / jnp.where(length > 0.0, length, 1.0)[None]
         return y, moved, total, jnp.where(status <= Status.GRAZING, jnp.maximum(status, now), status)
 
     y = jnp.stack(begin)

@@ -17,7 +17,7 @@ from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.motions.blocks import compute
 from capsule_id.motions.datasets import grid_of
-from capsule_id.motions.points import SEEN, SUMMARY, points_of
+from capsule_id.motions.points import MOTION_COLUMNS, SUMMARY, sweep_points
 from capsule_id.motions.response import SETTLING, Settling
 from capsule_id.parameters import SWEPT
 from capsule_id.physics.batches import lanes_of
@@ -50,6 +50,8 @@ def draws_diagram(
     over, values : the quantity that is varied, (n,), SI (f in Hz)
     store, client : see ``blocks.compute``
 
+    Eight arguments: four state the diagram, the others are options by name.
+
     Raises
     ------
     InputError
@@ -61,10 +63,14 @@ def draws_diagram(
     drawn, _, _ = lanes_of((p, e), np.zeros(1))
     n, draws = len(grid[over]), len(np.asarray(drawn[0].m1))
     p, e = jax.tree.map(lambda leaf: np.tile(leaf, n), drawn)
-    points = points_of(p, e, {over: np.repeat(grid[over], draws)})
+    points = sweep_points(p, e, {over: np.repeat(grid[over], draws)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client)
     variables = {
-        name: ((over, "draw"), seen[name].reshape(n, draws), {"units": SEEN[name][0], "long_name": SEEN[name][1]})
+        name: (
+            (over, "draw"),
+            seen[name].reshape(n, draws),
+            {"units": MOTION_COLUMNS[name][0], "long_name": MOTION_COLUMNS[name][1]},
+        )
         for name in SUMMARY
     }
     axis = (over, grid[over], {"units": SWEPT[over].unit, "long_name": SWEPT[over].meaning})

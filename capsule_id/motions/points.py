@@ -16,10 +16,10 @@ from capsule_id.parameters import SWEPT
 from capsule_id.physics.batches import lanes_of
 from capsule_id.physics.model import CapsuleParameters, Excitation, Initial
 
-Columns = dict[str, np.ndarray]  # name -> (points, ...)
+MotionColumns = dict[str, np.ndarray]  # name -> (points, ...)
 
 # Columns of a settled motion: unit and meaning.
-SEEN = {
+MOTION_COLUMNS = {
     "x_rel": ("m", "X1 - X2 at the drive's phase at the start of a period"),
     "rate": ("m/s", "Y1 - Y2 at the drive's phase at the start of a period"),
     "Y2": ("m/s", "velocity of the capsule at the drive's phase at the start of a period"),
@@ -34,11 +34,11 @@ SEEN = {
     "status": ("1", "how the run ended: 0 complete, 1 complete with grazing, 2 and more given up"),
 }
 SECTION = ("x_rel", "rate", "Y2")  # one value a period, all others one value a point
-SUMMARY = tuple(name for name in SEEN if name not in SECTION)
+SUMMARY = tuple(name for name in MOTION_COLUMNS if name not in SECTION)
 
 
 @dataclass(frozen=True)
-class Points:
+class SweepPoints:
     """Lanes of points: every leaf and every component of the initial state is (points,)."""
 
     p: CapsuleParameters
@@ -50,14 +50,14 @@ class Points:
         """Number of points."""
         return len(np.asarray(self.p.m1))
 
-    def part(self, begin: int, end: int) -> "Points":
+    def part(self, begin: int, end: int) -> "SweepPoints":
         """The points begin .. end - 1."""
-        return Points(*jax.tree.map(lambda leaf: leaf[begin:end], (self.p, self.e, self.initial)))
+        return SweepPoints(*jax.tree.map(lambda leaf: leaf[begin:end], (self.p, self.e, self.initial)))
 
 
-def points_of(
+def sweep_points(
     p: CapsuleParameters, e: Excitation, over: Mapping[str, np.ndarray], initial: Initial | None = None
-) -> Points:
+) -> SweepPoints:
     """The lanes in which the quantities of ``over`` (symbol -> (points,), SI; ``f`` in Hz) replace those of p and e.
 
     Raises
@@ -76,17 +76,17 @@ def points_of(
     p = CapsuleParameters(**{**vars(p), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "capsule"}})
     e = Excitation(**{**vars(e), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "drive"}})
     lanes, _, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
-    return Points(*lanes)
+    return SweepPoints(*lanes)
 
 
-def columns_of(points: Points, settling: Settling) -> Columns:
-    """All columns of the settled motions, by the names of ``SEEN``."""
-    return columns(settle(points.p, points.e, points.initial, settling), points)
+def settled_columns(points: SweepPoints, settling: Settling) -> MotionColumns:
+    """All columns of the settled motions, by the names of ``MOTION_COLUMNS``."""
+    return motion_columns(settle(points.p, points.e, points.initial, settling), points)
 
 
-def columns(seen: Settled, points: Points) -> Columns:
+def motion_columns(seen: Settled, points: SweepPoints) -> MotionColumns:
     """The fields of ``seen`` and the efficiency of each motion, 0 for one that stands."""
-    found: Columns = {name: np.asarray(getattr(seen, name)) for name in SEEN if name != "efficiency"}
+    found: MotionColumns = {name: np.asarray(getattr(seen, name)) for name in MOTION_COLUMNS if name != "efficiency"}
     advance = found["mean_velocity"] * 2.0 * np.pi / np.asarray(points.e.Omega)
     # Without a drive there is neither work nor advance.
     work = np.where(found["work_per_period"] == 0.0, np.inf, found["work_per_period"])

@@ -32,7 +32,15 @@ from capsule_id.motions.datasets import (
     single,
     values_of,
 )
-from capsule_id.motions.points import SECTION, SEEN, SUMMARY, Columns, Points, columns, points_of
+from capsule_id.motions.points import (
+    MOTION_COLUMNS,
+    SECTION,
+    SUMMARY,
+    MotionColumns,
+    SweepPoints,
+    motion_columns,
+    sweep_points,
+)
 from capsule_id.motions.response import SETTLING, Settling, exponents, settle
 from capsule_id.physics.batches import CHUNK
 from capsule_id.physics.model import CapsuleParameters, Excitation, Initial
@@ -61,7 +69,9 @@ def diagram(
     over, values : the quantity that is varied (a leaf of p or e, or f) and its values (n,), SI (f in Hz)
     starts : (X1, Y1, X2, Y2), each (branches,): the initial states; default the one at rest
 
-    Returns a Dataset over (branch, <over>[, section]) with the variables of ``points.SEEN`` and, at each value, which
+    Seven arguments: four state the sweep, the others are options by name.
+
+    Returns a Dataset over (branch, <over>[, section]) with the variables of ``points.MOTION_COLUMNS`` and, at each value, which
     branches have ended on the same attractor (``attractor``) and how many there are (``attractors``).
 
     Raises
@@ -74,7 +84,7 @@ def diagram(
     branches, n = len(begin[0]), len(grid[over])
     lanes = {over: np.tile(grid[over], branches)}
     X1, Y1, X2, Y2 = (np.repeat(x, n) for x in begin)
-    points = points_of(*single(p, e), lanes, (X1, Y1, X2, Y2))
+    points = sweep_points(*single(p, e), lanes, (X1, Y1, X2, Y2))
     seen = compute(points, settling, progress=progress)
     names = ["rest"] if starts is None else [f"start {i}" for i in range(branches)]
     return branched(seen, names, grid, provenance(p, e, [over], settling, "rest" if starts is None else "starts"))
@@ -95,7 +105,7 @@ def continuation(
 
     A branch per direction (forward: in the order of ``values``) and initial state of its first value; all branches
     run side by side. A branch that fails at a value goes on from rest. The other arguments and the Dataset are as for
-    ``diagram``.
+    ``diagram``. Eight arguments: four state the sweep, the others are options by name.
 
     Raises
     ------
@@ -112,21 +122,21 @@ def continuation(
     X1, Y1, X2, Y2 = (np.tile(component, len(directions)) for component in begin)
     state: Initial = (X1, Y1, X2, Y2)
     plain = Settling(**{**vars(settling), "exponent_periods": 0})
-    parts: list[Columns] = []
+    parts: list[MotionColumns] = []
     for i in range(len(x)):
         if progress is not None:
             progress(i, len(x), "values")
-        points = points_of(*single(p, e), {over: x[order[:, i]]}, state)
+        points = sweep_points(*single(p, e), {over: x[order[:, i]]}, state)
         # As many lanes as there are branches: a full chunk would cost many times as much.
         seen = settle(points.p, points.e, points.initial, plain, width=min(len(order), CHUNK))
-        parts.append(columns(seen, points))
+        parts.append(motion_columns(seen, points))
         state = seen.end
     place = np.argsort(order, axis=1)
     # (value in the order of the branch, branch, ...) -> (branch, value, ...)
-    stacked = {name: np.stack([part[name] for part in parts], axis=1) for name in SEEN}
+    stacked = {name: np.stack([part[name] for part in parts], axis=1) for name in MOTION_COLUMNS}
     sorted_ = {name: np.stack([a[k] for a, k in zip(column, place, strict=True)]) for name, column in stacked.items()}
     flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in sorted_.items()}
-    _add_exponents(flat, points_of(*single(p, e), {over: np.tile(x, len(order))}), settling)
+    _add_exponents(flat, sweep_points(*single(p, e), {over: np.tile(x, len(order))}), settling)
     names = [way if each == 1 else f"{way} {i}" for way in directions for i in range(each)]
     return branched(flat, names, grid, provenance(p, e, [over], settling, "continuation"))
 
@@ -149,6 +159,8 @@ def motion_map(
     over : symbol -> values (n,), SI, of the two quantities (one will do)
     store, client, block : finished blocks on disk, Dask cluster, points of a block: see ``blocks.compute``
 
+    Eight arguments: three state the map, the others are options by name.
+
     Raises
     ------
     InputError
@@ -156,7 +168,7 @@ def motion_map(
     """
     grid = grid_of(over)
     mesh = np.meshgrid(*grid.values(), indexing="ij")
-    points = points_of(*single(p, e), {name: axis.ravel() for name, axis in zip(grid, mesh, strict=True)})
+    points = sweep_points(*single(p, e), {name: axis.ravel() for name, axis in zip(grid, mesh, strict=True)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client, block=block)
     return dataset_of(seen, grid, tuple(grid), mesh[0].shape, provenance(p, e, list(grid), settling, "rest"))
 
@@ -174,6 +186,7 @@ def basins(
     """Which attractor every initial state (x_rel, rate, Y2), m and m/s, leads to, at one set of parameters.
 
     A Dataset over (x_rel_0, rate_0) with the variables of ``points.SUMMARY``, ``attractor`` and ``attractors``.
+    Seven arguments: five state the initial states, the others are options by name.
 
     Raises
     ------
@@ -183,7 +196,7 @@ def basins(
     axes = {"x_rel_0": values_of("x_rel", x_rel), "rate_0": values_of("rate", rate)}
     mesh = np.meshgrid(*axes.values(), indexing="ij")
     X1, Y1 = mesh[0].ravel(), mesh[1].ravel() + Y2
-    points = points_of(*single(p, e), {}, (X1, Y1, np.zeros_like(X1), np.full_like(X1, Y2)))
+    points = sweep_points(*single(p, e), {}, (X1, Y1, np.zeros_like(X1), np.full_like(X1, Y2)))
     seen = compute(points, settling, progress=progress)
     numbers = attractors_of(seen)
     data = dataset_of(seen, {}, tuple(axes), mesh[0].shape, provenance(p, e, [], settling, "basins") | {"Y2_0": Y2})
@@ -229,7 +242,7 @@ def _starts(starts: Initial | None) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return X1, Y1, X2, Y2
 
 
-def _add_exponents(seen: Columns, points: Points, settling: Settling) -> None:
+def _add_exponents(seen: MotionColumns, points: SweepPoints, settling: Settling) -> None:
     """Lyapunov exponents of the aperiodic points of a continuation, all at once."""
     x_rel, rate, Y2 = (seen[name][:, -1] for name in SECTION)
     ends = (x_rel, rate + Y2, np.zeros_like(x_rel), Y2)

@@ -23,7 +23,8 @@ from capsule_id.errors import InputError
 
 Tree = TypeVar("Tree")
 Result = TypeVar("Result")
-Leaf = float | np.ndarray | jax.Array  # a number, or one number per lane: shape () or (batch,)
+# A number, or one for each lane: shape () or (batch,).
+NumberOrBatch = float | np.ndarray | jax.Array
 Times = jax.Array | np.ndarray
 
 # Lanes per call of an engine: enough to fill the vector units, few enough for the second-level cache.

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from capsule_id.parameters import DRIVE_LEAVES, Parameter
-from capsule_id.physics.batches import Leaf, array_module
+from capsule_id.physics.batches import NumberOrBatch, array_module
 from capsule_id.physics.series import Series
 from capsule_id.precision import require_float64
 
@@ -56,9 +56,9 @@ class Drive(Protocol):
 class Excitation:
     """The drive P_d cos(Omega t + phase) on the rod: P_d in N, Omega in rad/s, phase in rad; leaves () or (batch,)."""
 
-    P_d: Leaf
-    Omega: Leaf
-    phase: Leaf = 0.0
+    P_d: NumberOrBatch
+    Omega: NumberOrBatch
+    phase: NumberOrBatch = 0.0
 
     parameters: ClassVar[tuple[Parameter, ...]] = tuple(DRIVE_LEAVES.values())
 

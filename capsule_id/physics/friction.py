@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.parameters import TABLE, Parameter
-from capsule_id.physics.batches import Leaf, array_module
+from capsule_id.physics.batches import NumberOrBatch, array_module
 from capsule_id.physics.series import FrictionSeries, Series, divide
 from capsule_id.precision import require_float64
 
@@ -57,9 +57,9 @@ class CoulombStribeck:
     is the friction coefficient.
     """
 
-    mu: Leaf
-    N: Leaf
-    v_s: Leaf
+    mu: NumberOrBatch
+    N: NumberOrBatch
+    v_s: NumberOrBatch
 
     parameters: ClassVar[tuple[Parameter, ...]] = (
         TABLE["mu"],
@@ -112,7 +112,7 @@ def sliding_friction(law: FrictionLaw, sigma: Any, v: Any) -> jax.Array:
     return sigma * jnp.where(sigma < 0.0, law.backward(speed), law.forward(speed))
 
 
-def friction(law: FrictionLaw, Y2: Leaf, f: Leaf) -> jax.Array:
+def friction(law: FrictionLaw, Y2: NumberOrBatch, f: NumberOrBatch) -> jax.Array:
     """Exact stick-slip rule: the force of the ground on the capsule, N, so that m2 X2'' = f - friction.
 
     Sliding (Y2 != 0): the law's resistance with the sign of Y2, whatever f.
@@ -130,5 +130,5 @@ def slide_distance(law: FrictionLaw, mass: Any, speed: Any) -> Any:
 
     mass : the sliding mass, kg; the law's leaves are (), NumPy or JAX
     """
-    u = speed[:, None] * _NODES
+    u = speed[:, None] * _NODES[None]
     return mass * speed * ((u / law.forward(u)) @ _WEIGHTS)

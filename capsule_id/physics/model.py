@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, TABLE
-from capsule_id.physics.batches import Leaf, lanes_of, run_lanes
+from capsule_id.physics.batches import NumberOrBatch, lanes_of, run_lanes
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drive import Excitation as Excitation
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 require_float64()
 
-Initial = tuple[Leaf, Leaf, Leaf, Leaf]
+Initial = tuple[NumberOrBatch, NumberOrBatch, NumberOrBatch, NumberOrBatch]
 
 # Bound on the steps of one lane: 348 periods of the busiest reference motion need 45,000.
 MAX_STEPS = 100_000
@@ -54,15 +54,15 @@ class CapsuleParameters:
     g : acceleration of gravity, m/s^2
     """
 
-    m1: Leaf
-    m2: Leaf
-    k1: Leaf
-    k2: Leaf
-    c: Leaf
-    mu: Leaf
-    v_s: Leaf
-    G: Leaf
-    g: Leaf = 9.81
+    m1: NumberOrBatch
+    m2: NumberOrBatch
+    k1: NumberOrBatch
+    k2: NumberOrBatch
+    c: NumberOrBatch
+    mu: NumberOrBatch
+    v_s: NumberOrBatch
+    G: NumberOrBatch
+    g: NumberOrBatch = 9.81
 
 
 def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:

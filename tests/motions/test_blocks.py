@@ -11,7 +11,7 @@ import xarray as xr
 from capsule_id.commands.cluster import cluster
 from capsule_id.errors import InputError
 from capsule_id.motions import blocks
-from capsule_id.motions.points import points_of
+from capsule_id.motions.points import sweep_points
 from capsule_id.motions.response import Settling
 from capsule_id.motions.sweep import motion_map
 from capsule_id.physics.model import CapsuleParameters, Excitation
@@ -51,8 +51,10 @@ def test_an_interrupted_map_goes_on_from_its_finished_blocks(
     # One block is damaged as a full disk would leave it: it is computed again, the other is not.
     (store / finished[1]).write_bytes((store / finished[1]).read_bytes()[:100])
     sizes: list[int] = []
-    compute = blocks.seen_of
-    monkeypatch.setattr(blocks, "seen_of", lambda points, *rest: sizes.append(points.size) or compute(points, *rest))
+    compute = blocks.settled_block
+    monkeypatch.setattr(
+        blocks, "settled_block", lambda points, *rest: sizes.append(points.size) or compute(points, *rest)
+    )
     data = motion_map(P, E, OVER, settling=QUICK, block=20, store=store)
     assert sizes == [20, 20, 20, 10]
     xr.testing.assert_identical(data, whole)
@@ -62,10 +64,10 @@ def test_an_interrupted_map_goes_on_from_its_finished_blocks(
 
 
 def test_a_store_serves_its_own_points_only(tmp_path: Path) -> None:
-    points, keep = points_of(P, E, {"k2": np.array([1e4, 2e4])}), ("label",)
+    points, keep = sweep_points(P, E, {"k2": np.array([1e4, 2e4])}), ("label",)
     store = tmp_path / "store"
     blocks.compute(points, QUICK, keep, store=store)
-    other = points_of(P, E, {"k2": np.array([1e4, 2.0001e4])})
+    other = sweep_points(P, E, {"k2": np.array([1e4, 2.0001e4])})
     for changed in (
         {"points": other, "settling": QUICK, "keep": keep},
         {"points": points, "settling": Settling(dropped=11, observed=6), "keep": keep},

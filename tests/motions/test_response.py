@@ -75,27 +75,27 @@ def test_period_is_the_shortest_that_repeats() -> None:
     assert period_of(0.0 * k, 0.0 * k, 30.0) == 1
 
 
-def _contacts_a_period(p: CapsuleParameters, e: Excitation, start: tuple, T: float, merge: float) -> int:
-    """Contacts in the second of two periods, those parted by less than ``merge`` as one, from 4,000 samples."""
+def _contacts_a_period(
+    p: CapsuleParameters, e: Excitation, start: tuple, T: float, merge: tuple[float, ...]
+) -> list[int]:
+    """Contacts in the second of two periods, those parted by less than each of ``merge`` as one, from 4,000 samples."""
     grid = np.linspace(0.0, 2.0 * T, 64 * 63 + 1)[1:].reshape(64, 63)
     times = np.concatenate([np.zeros((64, 1)), grid], axis=1)
     touching = np.asarray(simulate(p, e, times, start).x_rel)[:, 1:].ravel() >= p.G
     change = np.diff(touching.astype(int))
     closings, openings = (grid.ravel()[1:][change == sign] for sign in (1, -1))
     before = openings[np.searchsorted(openings, closings) - 1]
-    return int(((closings > T) & (closings - before >= merge)).sum())
+    return [int(((closings > T) & (closings - before >= least)).sum()) for least in merge]
 
 
 def test_contacts_parted_by_less_than_the_stated_time_are_one(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_51.05")
-    start = tuple(x[0] for x in settle(p, e).end)
-    counts = {}
-    for merge in (0.0, 4e-3, 8e-3, 2e-2):
-        r = response(p, e, settling=Settling(merge_contacts=merge))
-        counts[merge] = r.contacts_per_period
-        assert r.label == f"P-1-F-{r.contacts_per_period:.0f}"
-        assert _contacts_a_period(p, e, start, T, merge) == r.contacts_per_period
-    assert list(counts.values()) == [7.0, 4.0, 2.0, 1.0]
+    settled, merge = settle(p, e), (0.0, 4e-3, 8e-3, 2e-2)
+    start = tuple(x[0] for x in settled.end)
+    seen = [settle(p, e, settled.end, Settling(dropped=2, observed=6, merge_contacts=least)) for least in merge]
+    assert [r.label[0] for r in seen] == ["P-1-F-7", "P-1-F-4", "P-1-F-2", "P-1-F-1"]
+    assert [r.contacts_per_period[0] for r in seen] == _contacts_a_period(p, e, start, T, merge)
+    assert response(p, e, settling=Settling(merge_contacts=merge[1])).label == "P-1-F-4"
     with pytest.raises(InputError, match="less than half a period"):
         response(p, e, settling=Settling(merge_contacts=0.6 * T))
 

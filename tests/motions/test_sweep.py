@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from capsule_id.errors import InputError
-from capsule_id.motions.points import SEEN, SUMMARY
+from capsule_id.motions.points import MOTION_COLUMNS, SUMMARY
 from capsule_id.motions.response import Settling, response
 from capsule_id.motions.sweep import basins, continuation, diagram, motion_map, spread_starts
 from capsule_id.parameters import SWEPT
@@ -101,7 +101,7 @@ def test_two_parameter_map_is_its_points_and_goes_through_a_file(tmp_path: Path)
     with xr.open_dataset(tmp_path / "map.nc", engine="h5netcdf") as read:
         xr.testing.assert_identical(read.load(), data)
         for name in read.data_vars:
-            assert read[name].attrs == dict(zip(("units", "long_name"), SEEN[str(name)], strict=True))
+            assert read[name].attrs == dict(zip(("units", "long_name"), MOTION_COLUMNS[str(name)], strict=True))
 
 
 def test_a_run_that_is_given_up_says_so_and_disturbs_no_other() -> None:

@@ -12,6 +12,7 @@ def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]
     """Estimate and standard error of the experiment's physical parameters without some readings, SI.
 
     Scatters stay at the point fit when nothing is left out, and are rescaled by the remaining misfit otherwise.
+    SciPy's Levenberg-Marquardt on NumPy residuals: a refit takes 1 to 8 ms, the compilation of another one a second.
 
     Parameters
     ----------

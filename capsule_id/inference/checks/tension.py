@@ -39,8 +39,7 @@ def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
         return penalty - likelihood
 
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        best = minimize(objective, start[free], method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-7})
-        best = minimize(objective, best.x, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9})
+        best = minimize(objective, start[free], method="BFGS", options={"gtol": 1e-6})
     u = start.copy()
     u[free] = best.x
     return -float(best.fun), target.mapping(target.theta(u))

@@ -8,8 +8,13 @@ longer compilation. Central differences with steps of a fraction of a posterior 
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
 
 from capsule_id.physics.batches import pool
+
+#: d coordinates, and a matrix of them.
+Vector = Float[np.ndarray, " d"]
+Matrix = Float[np.ndarray, "d d"]
 
 #: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
 STEP, RATIO = 0.05, 2.0
@@ -20,15 +25,17 @@ GRADIENT_STEP = 1e-3
 BATCH = 32
 
 
-def in_batches(function: Callable[[np.ndarray], np.ndarray], points: np.ndarray) -> np.ndarray:
-    """``function`` of (m, d) points, called with exactly ``BATCH`` rows at a time, on all cores; (m,)."""
+def in_batches(
+    function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"]
+) -> Float[np.ndarray, "m ..."]:
+    """``function`` of points (m, d), called with exactly ``BATCH`` rows at a time, on all cores; (m, ...)."""
     padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % BATCH, axis=0)])
     chunks = [padded[i : i + BATCH] for i in range(0, len(padded), BATCH)]
     parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
     return np.concatenate(parts)[: len(points)]
 
 
-def hessian(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector) -> Matrix:
     """(d, d) Hessian of ``function`` ((m, d) -> (m,)) at u (d,); ``scale`` (d,) a rough sd of each parameter."""
     d = len(u)
     rows, columns = np.triu_indices(d)
@@ -47,14 +54,14 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray, scale: 
     return matrix + np.triu(matrix, 1).T
 
 
-def gradient(function: Callable[[np.ndarray], np.ndarray], v: np.ndarray) -> np.ndarray:
+def gradient(function: Callable[[np.ndarray], np.ndarray], v: Vector) -> Vector:
     """(d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates of which a standard deviation is 1."""
     offsets = GRADIENT_STEP * np.eye(len(v))
     plus, minus = np.split(function(np.concatenate([v + offsets, v - offsets])), 2)
     return (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
-def root_of_inverse(hessian: np.ndarray) -> np.ndarray:
+def root_of_inverse(hessian: Matrix) -> Matrix:
     """R (d, d) with R R' = H^-1; directions without positive curvature get the weakest positive one instead.
 
     Away from the maximum H may be indefinite; it only serves as a metric there.
@@ -66,7 +73,7 @@ def root_of_inverse(hessian: np.ndarray) -> np.ndarray:
     return scale[:, None] * vectors / np.sqrt(eigenvalues)
 
 
-def jacobian(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray, step: np.ndarray) -> np.ndarray:
+def jacobian(function: Callable[[np.ndarray], np.ndarray], u: Vector, step: Vector) -> Float[np.ndarray, "n d"]:
     """(n, d) Jacobian of ``function`` ((d,) -> (n,)) at u by central differences with ``step`` (d,)."""
     columns = []
     for j, h in enumerate(step):

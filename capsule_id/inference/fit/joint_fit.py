@@ -2,10 +2,10 @@
 
     bench experiments -> their own point fit -> starts about it (``joint_starts``), runs started from their records
     -> (Levenberg–Marquardt on the located parameters <-> scatters at their conditional maxima) until neither moves
-    -> again from wherever moving one parameter alone does better
+    -> repeated from any better point that one parameter alone reaches
 
 Derivatives of the event-driven model are exact and forward; the Hessian is Gauss–Newton's, for the residuals are small
-and the parameters well known. The likelihood has side maxima (a contact more or less), hence several starts and moves.
+and the parameters well known. The likelihood has local maxima (a contact more or less), hence several starts and moves.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,39 +19,41 @@ from scipy.optimize import minimize_scalar
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
-from capsule_id.inference.fit.least_squares import LeastSquaresFit, covariance, least_squares
+from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares
 from capsule_id.inference.fit.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
-TOLERANCE, MAX_STEPS = 1e-7, 80
+#: Of one descent: dimensionless tolerance and solver steps.
+SOLVER = Solver(tolerance=1e-7, max_steps=80, normal_equations=True, heavy=True)
 #: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
-ROUNDS, STILL = 8, 0.01
-#: Where a descent ends, every parameter alone is moved by these many standard deviations. A point whose log-posterior is
-#: higher by more than ``LEAST_INCREASE`` starts another descent, at most ``ESCAPES`` times.
-MOVES, LEAST_INCREASE, ESCAPES = 2.0 ** np.arange(8), 1.0, 4
+ROUNDS, SMALL_MOVE_IN_SD = 8, 0.01
+#: After a descent each parameter alone is moved by these numbers of standard deviations. A point whose log-posterior is
+#: higher by more than ``LEAST_INCREASE`` starts another descent, at most ``MAX_RESTARTS`` times.
+MOVES_IN_SD, LEAST_INCREASE, MAX_RESTARTS = 2.0 ** np.arange(8), 1.0, 4
 #: No such move changes a positive parameter by more than this, natural logarithm.
 FARTHEST = 2.0
 #: Differences in log-posterior below this count as equal. A contact that moves over a sample gives the likelihood a
-#: kink, and so maxima side by side, less than a standard deviation apart: to the posterior they are one. At a maximum
-#: on a kink no gradient vanishes: a descent ends where its Gauss–Newton step promises no more than this.
-DENT = 0.1
+#: kink, and so local maxima less than a standard deviation apart, which count as one. At a maximum on a kink no
+#: gradient vanishes: a descent ends where its Gauss–Newton step promises no more than this.
+NEGLIGIBLE_INCREASE = 0.1
 #: Stop refining a start whose cost exceeds this many times the best.
 COST_RATIO_TO_ABANDON = 3.0
 #: Try starts until two of them fit every channel within this many times its noise.
-NOISY = 1.2
-#: A scatter's conditional maximum is looked for within this factor (logarithm) of where it stands.
-REACH = 6.0
+NOISE_RATIO_OF_A_GOOD_FIT = 1.2
+#: A scatter's conditional maximum is searched for within this natural logarithm of its value.
+SCATTER_SEARCH = 6.0
 
 
 @dataclass(frozen=True)
 class _End:
-    """Where a descent ended: u (d,), the last least-squares fit, whether everything came to rest, log-posterior."""
+    """End of a descent: u (d,), the last least-squares fit, whether it converged, log-posterior."""
 
     u: np.ndarray
     fit: LeastSquaresFit
-    at_rest: bool
+    converged: bool
     value: float
 
 
@@ -69,7 +71,7 @@ def joint_fit(
     starts = choose_starts(target, known, seed, first or {})
     ends: list[_End] = []
     for start in starts:
-        if len(ends) >= STARTS and sum(not _is_noisy(target, end.u) for end in ends) > 1:
+        if len(ends) >= STARTS and sum(not _has_excess_noise(target, end.u) for end in ends) > 1:
             break
         before = max(ends, key=lambda end: end.value, default=None)
         if before is None or not np.isfinite(before.value):
@@ -84,7 +86,7 @@ def joint_fit(
         raise InputError(
             "bench and runs are fitted from a start at which every motion is finite",
             f"none of {len(starts)} starts leads to one",
-            "look at masses, gaps and settings of the runs, and at what the bench tests tell (--experiments bench)",
+            "check masses, gaps and settings of the runs, and fit the bench alone (--experiments bench)",
         )
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
@@ -105,29 +107,29 @@ def joint_fit(
         starts=starts[: len(ends)],
         ends=u,
         log_posterior=value,
-        elsewhere=_elsewhere(u, value, spread),
-        stalled=np.array([not end.at_rest for end in ends]),
+        elsewhere=_at_another_maximum(u, value, spread),
+        stalled=np.array([not end.converged for end in ends]),
     )
 
 
-def _elsewhere(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """(s,) which of the ends u (s, d) are another maximum than the best; log-posterior (s,), posterior sd (d,)."""
     best = int(np.argmax(value))
     away = np.max(np.abs(u - u[best]) / spread, axis=1)
-    dent = (away < 1.0) & (value > value[best] - DENT)
+    dent = (away < 1.0) & (value > value[best] - NEGLIGIBLE_INCREASE)
     return ~((away <= AGREEMENT) | dent) | ~np.isfinite(value)
 
 
-def _is_noisy(target: LogPosterior, u: np.ndarray) -> bool:
-    """At u (d,) a record has clearly more noise than it shows: its motion is not described."""
+def _has_excess_noise(target: LogPosterior, u: np.ndarray) -> bool:
+    """Whether at u (d,) the residuals of a record exceed its noise level: the model does not describe its motion."""
     values = target.mapping(target.theta(u))
-    return any(e.excess_noise(e.local(values)) > NOISY for e in target.experiments)
+    return any(e.excess_noise(e.local(values)) > NOISE_RATIO_OF_A_GOOD_FIT for e in target.experiments)
 
 
 def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
-    """``_descend``, and again from wherever moving one parameter alone does better."""
+    """``_descend``, repeated from any better point that one parameter alone reaches."""
     end = _descend(target, start, limit)
-    for _ in range(ESCAPES):
+    for _ in range(MAX_RESTARTS):
         if not np.isfinite(end.value) or end.fit.cost[0] > limit:
             break
         better = _better_point(target, end)
@@ -141,11 +143,11 @@ def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
 
 
 def _better_point(target: LogPosterior, end: _End) -> np.ndarray | None:
-    """(d,) the likeliest of the points that differ from ``end`` in one located parameter; None where none gains."""
+    """(d,) the best point that differs from ``end`` in one located parameter; None where none is clearly better."""
     located = target.located
     sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(end.fit.jacobian[0].T @ end.fit.jacobian[0])), 0.0))
     farthest = np.where(target.positive[located], FARTHEST, np.inf)
-    sizes = np.minimum(MOVES[:, None] * sd, farthest)[:, None, :] * np.eye(len(located))
+    sizes = np.minimum(MOVES_IN_SD[:, None] * sd, farthest)[:, None, :] * np.eye(len(located))
     steps = np.concatenate([sizes, -sizes]).reshape(-1, len(located))
     points = np.repeat(end.u[None], len(steps) + 1, axis=0)
     points[1:, located] += steps
@@ -155,14 +157,12 @@ def _better_point(target: LogPosterior, end: _End) -> np.ndarray | None:
 
 
 def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> _End:
-    """From one start (d,); above ``limit`` of the cost it goes no further, and neither where numbers are not finite."""
+    """Descend from one start (d,); stop where the cost exceeds ``limit`` or a number is not finite."""
     located = target.located
     u, still, fit = start.copy(), False, None
     for _ in range(ROUNDS):
         residual = HeldResiduals(target, jnp.asarray(u))
-        fit = least_squares(
-            residual, u[located][None], tolerance=TOLERANCE, max_steps=MAX_STEPS, normal_equations=True, heavy=True
-        )
+        fit = least_squares(residual, u[located][None], SOLVER)
         if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
             return _End(u, fit, False, -np.inf)
         sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))
@@ -172,25 +172,25 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
         shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
         for i, value in scatters.items():
             u[i] = value
-        still = bool(moved < STILL and shift < STILL)
+        still = bool(moved < SMALL_MOVE_IN_SD and shift < SMALL_MOVE_IN_SD)
         if still or fit.cost[0] > limit:
             break
     assert fit is not None, "there is at least one round"
-    at_rest = (still or bool(fit.cost[0] > limit)) and _at_rest(fit)
-    return _End(u, fit, at_rest, float(weigh(target, u[None])[0]))
+    converged = (still or bool(fit.cost[0] > limit)) and _is_converged(fit)
+    return _End(u, fit, converged, float(weigh(target, u[None])[0]))
 
 
-def _at_rest(fit: LeastSquaresFit) -> bool:
-    """One fit, from one start, converged, or stopped where nothing is left to gain."""
+def _is_converged(fit: LeastSquaresFit) -> bool:
+    """Whether one fit, from one start, converged or stopped where no step increases the log-posterior."""
     step = np.linalg.lstsq(fit.jacobian[0], -fit.residuals[0])[0]
-    return not fit.stalled[0] or bool(0.5 * np.sum((fit.jacobian[0] @ step) ** 2) < DENT)
+    return not fit.stalled[0] or bool(0.5 * np.sum((fit.jacobian[0] @ step) ** 2) < NEGLIGIBLE_INCREASE)
 
 
 def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
     """Conditional maximum, in u, of every scatter given the located entries of u (d,), by index."""
     modes = {}
     for i, terms in _scatter_terms(target, u).items():
-        bounds = (u[i] - REACH, u[i] + REACH)
+        bounds = (u[i] - SCATTER_SEARCH, u[i] + SCATTER_SEARCH)
         found: Any = minimize_scalar(lambda t, terms=terms: -terms(t), bounds=bounds, options={"xatol": 1e-5})
         modes[i] = float(found.x)
     return modes

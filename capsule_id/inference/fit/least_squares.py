@@ -16,7 +16,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 
-from capsule_id.errors import InputError
+from capsule_id.inference.fit.covariance import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
 from capsule_id.inference.target.compiling import COMPILE, COMPILE_QUICKLY
 from capsule_id.precision import require_float64
 
@@ -37,32 +37,6 @@ the strongest parameter does, the parameter's scale is the step that moves them 
 LARGEST_OFFSET = 1e-3
 """Dimensionless, in radii of the joint confidence region: how far from a stationary point an end counts as converged
 (Bates & Watts, *Technometrics* 23, 1981, 179, the relative offset)."""
-
-
-@dataclass(frozen=True)
-class Covariance:
-    """Covariance of the parameters at a minimum, and whether the data determine them at all.
-
-    Attributes
-    ----------
-    matrix : (d, d), units of the parameters; every entry is inf where the Jacobian is rank deficient
-    rank : numerical rank of the Jacobian, its columns scaled to unit length; 0 where it is not finite
-    residual_sd : σ that the matrix was multiplied with, units of the residuals
-    """
-
-    matrix: np.ndarray
-    rank: int
-    residual_sd: float
-
-    @property
-    def rank_deficient(self) -> bool:
-        """Some combination of the parameters leaves the residuals unchanged: no standard error exists."""
-        return self.rank < self.matrix.shape[0]
-
-    @property
-    def standard_errors(self) -> np.ndarray:
-        """(d,) square roots of the diagonal, units of the parameters; inf where rank deficient."""
-        return np.sqrt(np.diag(self.matrix))
 
 
 @dataclass(frozen=True)
@@ -101,15 +75,31 @@ class LeastSquaresFit:
         return covariance(self.jacobian[index], self.residuals[index], residual_sd)
 
 
+@dataclass(frozen=True)
+class Solver:
+    """How each start is solved.
+
+    Attributes
+    ----------
+    tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
+        tolerance (1 + its size)
+    max_steps : solver steps, rejected ones included, after which a start counts as stalled
+    normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
+        times as fast where there are thousands of residuals
+    heavy : the residuals take milliseconds: compiled well, and parameters scaled by their effect (Marquardt 1963)
+    """
+
+    tolerance: float = 1e-9
+    max_steps: int = 1024
+    normal_equations: bool = False
+    heavy: bool = False
+
+
+SOLVER = Solver()
+
+
 def least_squares(
-    residual: Residual,
-    starts: np.ndarray,
-    *,
-    tolerance: float = 1e-9,
-    max_steps: int = 1024,
-    normal_equations: bool = False,
-    linearise: Linearise | None = None,
-    heavy: bool = False,
+    residual: Residual, starts: np.ndarray, solver: Solver = SOLVER, linearise: Linearise | None = None
 ) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
@@ -123,14 +113,9 @@ def least_squares(
     residual : (d,) -> (n,), a JAX function; it may close over arrays. A ``jax.tree_util.Partial`` or ``equinox.Module``
         carries its arrays as arguments instead: other numbers of the same shapes then need no new compilation
     starts : (s, d), units of the parameters
-    tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
-        tolerance (1 + its size)
-    max_steps : solver steps, rejected ones included, after which a start counts as stalled
-    normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
-        times as fast where there are thousands of residuals
+    solver : tolerance and linear algebra of each start
     linearise : the residuals and Jacobians that scale the starts and judge the ends, by another route; None compiles
         forward-mode differentiation for them
-    heavy : the residuals take milliseconds: compiled well, and parameters scaled by their effect (Marquardt 1963)
 
     Raises
     ------
@@ -140,16 +125,15 @@ def least_squares(
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    linearise = linearise or partial(_forward_mode, residual, heavy)
-    scale, unit = zip(*map(_effects if heavy else _scales, linearise(starts)[1], starts), strict=True)
-    options = {"tolerance": tolerance, "max_steps": max_steps, "normal_equations": normal_equations}
-    solve = partial(_PROGRAMS[heavy][1], residual, **options)
+    linearise = linearise or partial(_forward_mode, residual, solver.heavy)
+    scale, unit = zip(*map(_effects if solver.heavy else _scales, linearise(starts)[1], starts), strict=True)
+    solve = partial(_PROGRAMS[solver.heavy][1], residual, solver)
     # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
     arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
     ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
     x, steps = np.stack(ends), np.array(steps, dtype=int)
     residuals, jacobian = linearise(x)
-    rounding = [tolerance * one for one in unit]
+    rounding = [solver.tolerance * one for one in unit]
     message = [_reason(*one) for one in zip(results, jacobian, residuals, rounding, strict=True)]
     return LeastSquaresFit(
         x=x,
@@ -162,10 +146,10 @@ def least_squares(
     )
 
 
-def _reason(result: optx.RESULTS, jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> str:
+def _reason(result: optx.RESULTS, jacobian: Jacobian, residuals: Residuals, rounding: float) -> str:
     """Why an end is none, "" where it is one."""
     reason = optx.RESULTS[result]
-    if not _finite(jacobian, residuals):
+    if not all_finite(jacobian, residuals):
         return "The residuals or their Jacobian are not finite where this start ended: try another start."
     # A solver that only watches its steps takes heavy damping for convergence.
     if not reason and not _stationary(jacobian, residuals, rounding):
@@ -173,59 +157,9 @@ def _reason(result: optx.RESULTS, jacobian: np.ndarray, residuals: np.ndarray, r
     return reason
 
 
-def covariance(jacobian: np.ndarray, residuals: np.ndarray, residual_sd: float | None = None) -> Covariance:
-    """σ² (JᵀJ)⁻¹ from the singular values of J, never by a pseudo-inverse: a direction without data has no variance.
-
-    The columns are scaled to unit length first, so that the rank does not depend on the units of the parameters.
-
-    Parameters
-    ----------
-    jacobian : (n, d) of the residuals at the minimum
-    residuals : (n,) at the minimum
-    residual_sd : σ where it is known, 1 for residuals in units of their own sd; None estimates it from the residuals
-
-    Raises
-    ------
-    InputError
-        σ is to be estimated and there are not more residuals than parameters.
-    """
-    count, parameters = jacobian.shape
-    if residual_sd is None:
-        if count <= parameters:
-            raise InputError(
-                "the residual sd can be estimated only from more residuals than parameters",
-                f"{count} residuals for {parameters} parameters",
-                "give the sd of the measurements or more measurements",
-            )
-        residual_sd = float(np.sqrt(residuals @ residuals / (count - parameters)))
-    no_answer = np.full((parameters, parameters), np.inf)
-    if not _finite(jacobian, residuals):
-        return Covariance(no_answer, 0, residual_sd)
-    _, singular, right, column_norm = _range(jacobian)
-    if len(singular) < parameters:
-        return Covariance(no_answer, len(singular), residual_sd)
-    root = residual_sd * right.T / singular / column_norm[:, None]
-    return Covariance(root @ root.T, parameters, residual_sd)
-
-
-def _finite(jacobian: np.ndarray, residuals: np.ndarray) -> bool:
-    return bool(np.isfinite(jacobian).all() and np.isfinite(residuals).all())
-
-
-def _range(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Singular vectors and values of J with unit columns, as far as they are above rounding, and the column norms.
-
-    (n, rank), (rank,), (rank, d), (d,).
-    """
-    column_norm = np.linalg.norm(jacobian, axis=0)
-    left, singular, right = np.linalg.svd(jacobian / np.where(column_norm > 0, column_norm, 1.0), full_matrices=False)
-    rank = int(np.sum(singular > singular[0] * max(jacobian.shape) * np.finfo(float).eps))
-    return left[:, :rank], singular[:rank], right[:rank], column_norm
-
-
-def _stationary(jacobian: np.ndarray, residuals: np.ndarray, rounding: float) -> bool:
+def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bool:
     """The part of the residuals (n,) in the range of J (n, d) is small against the rest, or below ``rounding``."""
-    left = _range(jacobian)[0]
+    left = column_space(jacobian)[0]
     tangential = float(np.linalg.norm(left.T @ residuals))
     normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))
     freedom = max(len(residuals) - left.shape[1], 1)
@@ -259,24 +193,19 @@ def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _solve(
-    residual: Residual,
-    start: jax.Array,
-    scale: jax.Array,
-    unit: jax.Array,
-    *,
-    tolerance: float,
-    max_steps: int,
-    normal_equations: bool,
+    residual: Residual, solver: Solver, start: jax.Array, scale: jax.Array, unit: jax.Array
 ) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
     """From one start (d,): x (d,), steps, result code."""
     function = _with_jacobian(lambda v: residual(v * scale) / unit)
     solution = optx.least_squares(
         lambda v, _: function(v),
         optx.LevenbergMarquardt(
-            rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR()
+            rtol=solver.tolerance,
+            atol=solver.tolerance,
+            linear_solver=lx.Normal(lx.Cholesky()) if solver.normal_equations else lx.QR(),
         ),
         start / scale,
-        max_steps=max_steps,
+        max_steps=solver.max_steps,
         throw=False,
     )
     return solution.value * scale, solution.stats["num_steps"], solution.result
@@ -310,7 +239,7 @@ _PROGRAMS = {
 }
 
 
-def _effects(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     """As ``_scales``: every column of the Jacobian gets the same norm, which is then the unit of the residuals."""
     column_norm = np.linalg.norm(jacobian, axis=0)
     column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
@@ -320,7 +249,7 @@ def _effects(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float
     return scale, float(np.sqrt(FIRST_DAMPING)) * unit
 
 
-def _scales(jacobian: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
     column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
     # Not finite: the solver will say so.

@@ -14,8 +14,9 @@ import numpy as np
 from scipy import optimize
 
 from capsule_id.experiments.linear import LOG_2PI
+from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.curvature import BATCH, gradient, hessian, in_batches, jacobian, root_of_inverse
-from capsule_id.inference.fit.least_squares import covariance, least_squares
+from capsule_id.inference.fit.least_squares import Solver, least_squares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
@@ -28,10 +29,9 @@ TOLERANCE, MAXIMUM = 1e-5, 1e-3
 MAX_STEPS = 400
 #: Stands for the log-posterior where there is none: line searches need a number.
 NOWHERE = -1e12
-LEAST_SQUARES_TOLERANCE = 1e-6
 #: Least squares only has to find the basin. A damping term that is not there runs to zero, which its logarithm never
 #: reaches: the prior stops it, and quasi-Newton finds that in fewer steps.
-LEAST_SQUARES_STEPS = 50
+ROUGH = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
 #: Relative step of the difference quotients of residuals: their error is then about 1e-10 relative.
 DIFFERENCE = 1e-5
 
@@ -51,10 +51,8 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
         rough = least_squares(
             HeldResiduals(target, jnp.asarray(starts[0])),
             starts[:, located],
-            tolerance=LEAST_SQUARES_TOLERANCE,
-            max_steps=LEAST_SQUARES_STEPS,
-            normal_equations=True,
-            linearise=partial(_linearise, target, starts[0]),
+            ROUGH,
+            partial(_linearise, target, starts[0]),
         )
         compiled.result()
     ends = starts.copy()

@@ -5,6 +5,7 @@ from typing import Any
 
 import emcee
 import numpy as np
+from jaxtyping import Float
 
 #: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well.
 LARGE = 9
@@ -16,7 +17,11 @@ WIDTHS, WEIGHTS = np.array([[1.0, 2.0, 4.0], [1.0, 1.15, 1.4]]), np.array([0.85,
 #: factor, which is beyond the noise of a short pilot.
 WIDER = 1.1
 
+#: emcee's moves with their weights.
 Moves = list[tuple[Any, float]]
+#: d coordinates, and a matrix of them.
+Vector = Float[np.ndarray, " d"]
+Matrix = Float[np.ndarray, "d d"]
 
 
 class BlockMove(emcee.moves.Move):
@@ -33,7 +38,7 @@ class BlockMove(emcee.moves.Move):
     covariance : (d, d), of which the blocks are read
     """
 
-    def __init__(self, blocks: Sequence[np.ndarray], centre: np.ndarray, covariance: np.ndarray) -> None:
+    def __init__(self, blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix) -> None:
         self.centre = centre
         #: (d, blocks) which parameter belongs to which block.
         self.member = np.stack([np.isin(np.arange(len(centre)), block) for block in blocks], axis=1)
@@ -43,7 +48,7 @@ class BlockMove(emcee.moves.Move):
         #: (blocks,) degrees of freedom, and (3, blocks) widths.
         self.freedom, self.widths = np.where(large, MANY, FEW), WIDTHS[large.astype(int)].T
 
-    def log_density(self, u: np.ndarray) -> np.ndarray:
+    def log_density(self, u: Float[np.ndarray, "w d"]) -> Float[np.ndarray, "w blocks"]:
         """(w, blocks) of the proposals, up to a constant; u (w, d)."""
         square = ((u - self.centre) @ self._inverse.T) ** 2 @ self.member
         d = np.sum(self.member, axis=0)
@@ -54,7 +59,7 @@ class BlockMove(emcee.moves.Move):
         ]  # fmt: skip
         return np.logaddexp.reduce(parts, axis=0)
 
-    def draw(self, rng: np.random.RandomState, size: int) -> np.ndarray:
+    def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
         """(size, d)."""
         shape = (size, self.member.shape[1])
         scale = self.widths[rng.choice(len(WEIGHTS), p=WEIGHTS, size=shape), np.arange(shape[1])]
@@ -76,13 +81,13 @@ class BlockMove(emcee.moves.Move):
         return new_state, np.mean(accepted, axis=1)
 
 
-def block_move(blocks: Sequence[np.ndarray], centre: np.ndarray, covariance: np.ndarray) -> Moves:
+def block_move(blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix) -> Moves:
     """Block moves, with one step in ten of differential evolution, which needs no covariance."""
     return [(BlockMove(blocks, centre, covariance), 0.9), (emcee.moves.DEMove(), 0.1)]
 
 
 def candidates(
-    sample: np.ndarray, blocks: Sequence[np.ndarray], centre: np.ndarray, covariance: np.ndarray
+    sample: Float[np.ndarray, "m d"], blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix
 ) -> Mapping[str, Moves]:
     """The moves that the pilot compares, the most promising first.
 

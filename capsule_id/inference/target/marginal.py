@@ -181,7 +181,7 @@ def _conditional(
     # Forward models do not read scatters: the zeros left for them reach nothing.
     u = jnp.zeros(len(layout.block)).at[located].set(v)
     values = target.constrain(u)
-    t = start[:, None] + step[:, None] * jnp.arange(layout.nodes)
+    t = start[:, None] + step[:, None] * jnp.arange(layout.nodes)[None]
     nodes = position(t, bend[:, None])
     sizes = jnp.exp(nodes)
     terms = target.priors.at(scatter[:, None]).terms(nodes, sizes) + log_stretch(t, bend[:, None])

@@ -16,7 +16,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.special import wrightomega
+
+#: One value for each walker and scatter.
+PerScatter = Float[np.ndarray, "w scatters"]
 
 #: Densities below e^-DEPTH of their maximum are left out; those below e^-CORE of it are a tail.
 DEPTH, CORE = 21.0, 3.0
@@ -64,14 +68,21 @@ def log_stretch(t: Any, bend: Any, xp: ModuleType = jnp) -> Any:
 Terms = Callable[[np.ndarray, Grid], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-def add_to_blocks(known: np.ndarray, block: np.ndarray, integrals: np.ndarray) -> np.ndarray:
+def add_to_blocks(
+    known: Float[np.ndarray, "w blocks"], block: Int[np.ndarray, " scatters"], integrals: PerScatter
+) -> Float[np.ndarray, "w blocks"]:
     """(w, blocks) log-posterior: what is ``known`` without scatters and the integrals (w, scatters), ``block`` each."""
     total = known.T.copy()
     np.add.at(total, block, integrals.T)
     return total.T
 
 
-def choose_grid(terms: Terms, centre: np.ndarray, block: np.ndarray, probes: np.ndarray) -> Grid:
+def choose_grid(
+    terms: Terms,
+    centre: Float[np.ndarray, " scatters"],
+    block: Int[np.ndarray, " scatters"],
+    probes: Float[np.ndarray, "w ..."],
+) -> Grid:
     """Windows and number of nodes for scatters that are ``centre`` (scatters,) at the point fit.
 
     Parameters
@@ -89,8 +100,11 @@ def choose_grid(terms: Terms, centre: np.ndarray, block: np.ndarray, probes: np.
 
 
 def _windows(
-    terms: Terms, centre: np.ndarray, block: np.ndarray, probes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    terms: Terms,
+    centre: Float[np.ndarray, " scatters"],
+    block: Int[np.ndarray, " scatters"],
+    probes: Float[np.ndarray, "w ..."],
+) -> tuple[PerScatter, PerScatter, PerScatter, Bool[np.ndarray, "w scatters"]]:
     """Lowest u with density, lowest outside the tail, highest u, and whether the walker has mass in its block.
 
     (w, scatters) each. The windows are narrowed walker by walker, from ``REACH`` on.
@@ -118,7 +132,7 @@ def _windows(
     return low, core, low + width, posterior > posterior[0] - NO_MASS
 
 
-def _agree(terms: Terms, grid: Grid, probes: np.ndarray, mass: np.ndarray) -> bool:
+def _agree(terms: Terms, grid: Grid, probes: Float[np.ndarray, "w ..."], mass: Bool[np.ndarray, "w scatters"]) -> bool:
     """No integral where the posterior has mass changes when the nodes are shifted by half their distance."""
     integral, shifted = terms(probes, grid)[2][mass], terms(probes, grid.shifted(0.5))[2][mass]
     return bool(np.all(np.abs(integral - shifted) < TOLERANCE + ROUNDING * np.abs(integral)))

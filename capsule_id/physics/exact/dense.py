@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from capsule_id.physics.exact.taylor import CapsuleState, StepSeries
 from capsule_id.physics.model import Initial
 from capsule_id.physics.series import DEGREE, horner, mean
 
+# Numbers in a row: t0, h, r, X2, and two series.
 WIDTH = 4 + 2 * (DEGREE + 1)
 # Samples of a lane read off at once.
 WINDOW = 64
@@ -21,12 +23,12 @@ WINDOW = 64
 class Samples(NamedTuple):
     """times (L, n + WINDOW), padded with inf; values (L, 4, n + WINDOW) of X1, Y1, X2, Y2; next sample (L,) int32."""
 
-    times: jax.Array
-    values: jax.Array
-    next: jax.Array
+    times: Float[jax.Array, "L padded"]
+    values: Float[jax.Array, "L 4 padded"]
+    next: Int[jax.Array, " L"]
 
 
-def samples_at(times: jax.Array, initial: Initial, valid: jax.Array) -> Samples:
+def samples_at(times: Float[jax.Array, "L n"], initial: Initial, valid: Bool[jax.Array, " L"]) -> Samples:
     """No sample taken yet but the first, which is the initial state."""
     L, n = times.shape
     padded = jnp.concatenate([times, jnp.full((L, WINDOW), jnp.inf)], axis=1)
@@ -35,7 +37,7 @@ def samples_at(times: jax.Array, initial: Initial, valid: jax.Array) -> Samples:
     return Samples(padded, values.at[:, :, 0].set(first), jnp.ones(L, jnp.int32))
 
 
-def row_of(state: CapsuleState, step: StepSeries) -> jax.Array:
+def row_of(state: CapsuleState, step: StepSeries) -> Float[jax.Array, "width L"]:
     """(WIDTH, L): the step's polynomial."""
     return jnp.stack([state.t, step.h, state.r, state.X2, *step.w, *step.v])
 
@@ -49,7 +51,7 @@ def values_of(row: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     return X2 + r, horner(w, s) + Y2, X2, Y2
 
 
-def _row_at(starts: jax.Array, t: jax.Array) -> jax.Array:
+def _row_at(starts: Float[jax.Array, "K L"], t: Float[jax.Array, "L window"]) -> Int[jax.Array, "L window"]:
     """(L, WINDOW) int32: the last row that starts at or before t (L, WINDOW), by bisection in starts (K, L)."""
     lane = jnp.arange(t.shape[0])[:, None]
     length = starts.shape[0]
@@ -61,7 +63,12 @@ def _row_at(starts: jax.Array, t: jax.Array) -> jax.Array:
     return jax.lax.fori_loop(0, (length - 1).bit_length(), halve, jnp.zeros(t.shape, jnp.int32))
 
 
-def read_off(samples: Samples, rows: jax.Array, starts: jax.Array, reached: jax.Array) -> Samples:
+def read_off(
+    samples: Samples,
+    rows: Float[jax.Array, "K width L"],
+    starts: Float[jax.Array, "K L"],
+    reached: Float[jax.Array, " L"],
+) -> Samples:
     """Take every sample up to ``reached`` (L,) off the rows."""
     starts, reached = jax.lax.stop_gradient((starts, reached))
     L, length = samples.times.shape

@@ -64,7 +64,7 @@ def _grown(speed: jax.Array, stretch: jax.Array, y: StateArray) -> tuple[jax.Arr
 
 
 def initial_lanes(problem: Problem, times: jax.Array, y: StateArray) -> MarchState:
-    """MarchState at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
+    """Lanes at times[:, 0]; ``Status.INVALID`` where something is not finite or not admissible."""
     t = times[:, 0]
     floors = [jnp.broadcast_to(floor, t.shape) for floor in problem.floors]
     speed, stretch = _grown(floors[0], floors[1], y)
@@ -98,7 +98,7 @@ def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int
     status = jnp.where(active & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
     return MarchState(
         t=t_new,
-        y=jnp.where(accepted, y_new, y),
+        y=jnp.where(accepted[None], y_new, y),
         h=jnp.where(active, h_next, lanes.h),
         speed=jnp.where(accepted, speed, lanes.speed),
         stretch=jnp.where(accepted, stretch, lanes.stretch),
@@ -194,8 +194,8 @@ def _interpolate(t: jax.Array, y: jax.Array, V2: jax.Array, times: jax.Array) ->
 
 def interpolate(field: Field, t: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
     """States (4, L, n) at ``times`` (L, n), from rows t (N, L) and y (N, 4, L) of a march through ``field``."""
-    V2 = field(t, y[:, 0] - y[:, 2], y[:, 1], y[:, 3])[1]
-    # MarchState stand last in rows, first in times: rows are written by lane, times are searched by lane.
+    V2 = jax.vmap(field)(t, y[:, 0] - y[:, 2], y[:, 1], y[:, 3])[1]
+    # Lanes stand last in rows, first in times: rows are written by lane, times are searched by lane.
     return jax.vmap(_interpolate, in_axes=(1, 2, 1, 0), out_axes=1)(t, y, V2, times)
 
 
@@ -212,12 +212,11 @@ def run(build: Build, system: Any, times: jax.Array, y: StateArray, max_steps: i
 
     def body(carry: tuple[MarchState, jax.Array]) -> tuple[MarchState, jax.Array]:
         rows, lanes = segment(build, system, end, carry[0], max_steps, STEPS_PER_SEGMENT)
-        return lanes, jnp.where(
-            inside(rows, lanes, times), interpolate(problem.field, rows[:, 0], rows[:, 1:], times), carry[1]
-        )
+        here = inside(rows, lanes, times)[None]
+        return lanes, jnp.where(here, interpolate(problem.field, rows[:, 0], rows[:, 1:], times), carry[1])
 
     nothing = jnp.full((4, *times.shape), jnp.nan)
-    samples = nothing.at[:, :, 0].set(jnp.where(lanes.status == Status.OK, y, jnp.nan))
+    samples = nothing.at[:, :, 0].set(jnp.where((lanes.status == Status.OK)[None], y, jnp.nan))
     lanes, samples = jax.lax.while_loop(lambda carry: running(end, carry[0]), body, (lanes, samples))
     return Record(samples, lanes.closings, lanes.steps, lanes.status)
 
@@ -254,7 +253,7 @@ def replay(problem: Problem, y: StateArray, t: jax.Array, times: jax.Array) -> t
     def one(y: StateArray, span: tuple[jax.Array, jax.Array]) -> tuple[StateArray, StateArray]:
         t, h = span
         taken = jnp.isfinite(h) & (h > 0.0)
-        y = jnp.where(taken, step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)
+        y = jnp.where(taken[None], step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)
         return y, y
 
     spans = (jnp.where(jnp.isfinite(t[:-1]), t[:-1], 0.0), jnp.diff(t, axis=0))

@@ -66,7 +66,7 @@ def _tangent_maps(
             lanes, d_y, out = carry
             function, after, held = piece(lanes)
             d_y, d_samples = jax.jvp(function, (system, lanes.y), (tangent[0], d_y))[1]
-            return after, d_y, jnp.where(held, d_samples, out)
+            return after, d_y, jnp.where(held[None], d_samples, out)
 
         first = jnp.zeros((4, *times.shape)).at[:, :, 0].set(tangent[1])
         carry = (initial_lanes(build(system), times, y), tangent[1], first)
@@ -79,14 +79,14 @@ def _tangent_maps(
             k, c_system, c_y = carry
             begin = jax.tree.map(lambda rows: rows[k - 1], store)
             function, _, held = piece(begin)
-            more, c_y = jax.vjp(function, system, begin.y)[1]((c_y, jnp.where(held, cotangent, 0.0)))
+            more, c_y = jax.vjp(function, system, begin.y)[1]((c_y, jnp.where(held[None], cotangent, 0.0)))
             return k - 1, jax.tree.map(jnp.add, c_system, more), c_y
 
         none = jax.tree.map(jnp.zeros_like, (system, y))
         _, c_system, c_y = jax.lax.while_loop(lambda c: c[0] > 0, body, (count, *none))
         # A lane that has failed has NaN cotangents at samples that no segment holds.
         poison = jnp.where(jnp.any(jnp.isnan(cotangent), axis=(0, 2)), jnp.nan, 0.0)
-        return jax.tree.map(lambda leaf: leaf + poison, (c_system, c_y + cotangent[:, :, 0]))
+        return jax.tree.map(lambda leaf: leaf + poison, c_system), c_y + cotangent[:, :, 0] + poison[None]
 
     return forward, backward
 
@@ -136,9 +136,9 @@ def differentiable_run(build: Build, max_steps: int) -> Callable[[Any, jax.Array
         field = build(jax.tree.map(lambda leaf: leaf[..., None], system)).field
         rate = derivative(field, times, samples)
         # A later start from the same state is the same start from a state moved back along the field.
-        d_y = d_y - rate[:, :, 0] * d_times[:, 0]
+        d_y = d_y - rate[:, :, 0] * d_times[None, :, 0]
         forward, backward = _tangent_maps(build, (system, times, y), max_steps)
-        d_samples = _apply_linear(forward, backward, (d_system, d_y), samples) + rate * d_times
+        d_samples = _apply_linear(forward, backward, (d_system, d_y), samples) + rate * d_times[None]
         d_samples = d_samples * jnp.where(jnp.isfinite(samples), 1.0, jnp.nan)
         counts = [jnp.zeros(leaf.shape, jax.dtypes.float0) for leaf in record[1:]]
         return record, Record(d_samples, *counts)

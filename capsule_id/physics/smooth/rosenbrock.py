@@ -16,8 +16,8 @@ StateArray = jax.Array  # (4, L): X1, Y1, X2, Y2 of L lanes, m and m/s
 # (t, r, Y1, Y2) -> (Y1', X2', Y2'): the field depends on the positions through r = X1 - X2 alone, and X1' = Y1.
 Field = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
 
-ORDER = 3
-_GAMMA = 0.5
+# RODAS3: order of the method, and the coefficient of the Jacobian in each stage.
+_METHOD_ORDER, _GAMMA = 3, 0.5
 # Step control, the usual constants: aim 10 % below the tolerance; no change beyond these factors.
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 5.0
 
@@ -55,7 +55,7 @@ def _stage_solver(
 
 
 def step(field: Field, t: jax.Array, y: StateArray, h: jax.Array) -> tuple[StateArray, StateArray]:
-    """StateArray at t + h and its error estimate, (4, L) each.
+    """State at t + h and its error estimate, (4, L) each.
 
     RODAS3 (Sandu et al. 1997, "Benchmarking stiff ODE solvers for atmospheric chemistry problems II"): four stages,
     three evaluations of the field, order 3 with an embedded method of order 2, both stiffly accurate and L-stable:
@@ -63,9 +63,10 @@ def step(field: Field, t: jax.Array, y: StateArray, h: jax.Array) -> tuple[State
     """
     solve, f_t = _stage_solver(field, t, y, h)
     f = derivative(field, t, y)
-    i = 1.0 / h
-    u1 = solve(f + 0.5 * h * f_t)
-    u2 = solve(f + 1.5 * h * f_t + 4.0 * i * u1)
+    per_state = h[None]
+    i = 1.0 / per_state
+    u1 = solve(f + 0.5 * per_state * f_t)
+    u2 = solve(f + 1.5 * per_state * f_t + 4.0 * i * u1)
     y3 = y + 2.0 * u1
     u3 = solve(derivative(field, t + h, y3) + i * (u1 - u2))
     y4 = y3 + u3
@@ -75,5 +76,5 @@ def step(field: Field, t: jax.Array, y: StateArray, h: jax.Array) -> tuple[State
 
 def step_factor(error: jax.Array) -> jax.Array:
     """By what the step length changes after a step of this error in units of the tolerance; not finite: shrink."""
-    factor = _SAFETY * jnp.maximum(error, (_SAFETY / _GROW) ** ORDER) ** (-1.0 / ORDER)
+    factor = _SAFETY * jnp.maximum(error, (_SAFETY / _GROW) ** _METHOD_ORDER) ** (-1.0 / _METHOD_ORDER)
     return jnp.where(jnp.isfinite(error), jnp.maximum(factor, _SHRINK), _SHRINK)

@@ -15,15 +15,15 @@ from capsule_id.inference.checks.verdict import check_starts
 from capsule_id.inference.fit import joint_fit as module
 from capsule_id.inference.fit.joint_fit import (
     LEAST_INCREASE,
-    _at_rest,
+    _at_another_maximum,
     _better_point,
     _descend,
-    _elsewhere,
+    _is_converged,
     joint_fit,
     scatter_modes,
 )
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
-from capsule_id.inference.fit.least_squares import least_squares, linearised
+from capsule_id.inference.fit.least_squares import Solver, least_squares, linearised
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables.run_notes import smoothing_shift
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
@@ -71,23 +71,23 @@ def test_the_likeliest_candidates_about_a_wrong_bench_lead_to_the_maximum() -> N
     np.testing.assert_allclose(weigh(target, ends), np.max(fit.log_posterior), atol=0.1)
 
 
-@pytest.mark.parametrize(("pull", "at_rest"), [(0.1, True), (0.5, False)])
-def test_a_minimum_on_a_kink_is_one_unless_much_is_left_to_gain(pull: float, at_rest: bool) -> None:
+@pytest.mark.parametrize(("pull", "converged"), [(0.1, True), (0.5, False)])
+def test_a_minimum_on_a_kink_is_one_unless_much_is_left_to_gain(pull: float, converged: bool) -> None:
     """2500 residuals that rise with |x|, and whose mean would have it below zero: no derivative vanishes at x = 0."""
     noise = np.random.default_rng(0).standard_normal(2500)
     noise += (pull - np.sum(noise) / 50.0) / 50.0
     residual = Partial(lambda noise, v: noise + jnp.abs(v[0]) / 50.0, jnp.asarray(noise))
-    fit = least_squares(residual, np.array([[3.0]]), heavy=True, normal_equations=True)
+    fit = least_squares(residual, np.array([[3.0]]), Solver(heavy=True, normal_equations=True))
     assert fit.x[0, 0] == pytest.approx(0.0, abs=1e-3)
     assert fit.stalled[0]
-    assert _at_rest(fit) is at_rest
+    assert _is_converged(fit) is converged
 
 
 def test_ends_are_one_maximum_where_the_posterior_cannot_tell() -> None:
     """The best, one beside it, a dent, a point on its slope, and one as high, but two sd away."""
     u = np.array([[0.0, 0.0], [0.04, 0.0], [0.5, 0.0], [0.5, 0.0], [2.0, 0.0]])
     value = np.array([10.0, 9.9, 9.95, 9.8, 9.99])
-    assert _elsewhere(u, value, np.ones(2)).tolist() == [False, False, False, True, True]
+    assert _at_another_maximum(u, value, np.ones(2)).tolist() == [False, False, False, True, True]
 
 
 def test_starts_go_on_until_two_ends_describe_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:

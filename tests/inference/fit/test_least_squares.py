@@ -8,7 +8,8 @@ import scipy.optimize
 from jax.tree_util import Partial
 
 from capsule_id.errors import InputError
-from capsule_id.inference.fit.least_squares import LeastSquaresFit, covariance, least_squares
+from capsule_id.inference.fit.covariance import covariance
+from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares
 from tests.inference.fit.nist_strd import PROBLEMS
 
 RAT43 = next(problem for problem in PROBLEMS if problem.name == "Rat43")
@@ -132,7 +133,7 @@ def test_residual_variance_is_unbiased(replicates: list[LeastSquaresFit]) -> Non
 
 
 def test_too_few_steps_are_reported() -> None:
-    fit = least_squares(RAT43.residual, RAT43.starts, max_steps=5)
+    fit = least_squares(RAT43.residual, RAT43.starts, Solver(max_steps=5))
     assert fit.stalled.tolist() == [True, True]
     assert fit.steps.tolist() == [5, 5]
     assert all("maximum number of steps" in message for message in fit.message)
