@@ -96,7 +96,9 @@ def friction_comparison(
     speed = np.linspace(0.0, 1.15 * top if top > 0 else 1.0, 161)
 
     def curve(values: ValuesBySymbol) -> np.ndarray:
-        return np.asarray(friction.coefficient(values).forward(speed))
+        # Tilts alone say nothing of sliding: the line through them is level.
+        known = all(row.symbol in values for row in friction.parameters)
+        return np.asarray(friction.coefficient(values).forward(speed if known else 0.0 * speed))
 
     lower, upper = band(np.array([curve(draw) for draw in draws]))
     curves = [Curve(f"this fit, {friction.name}", speed, curve(theta), lower, upper)]

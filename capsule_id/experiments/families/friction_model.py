@@ -5,18 +5,21 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import equinox as eqx
-import numpy as np
+import jax
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.parameters import Parameter
+from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force
 from capsule_id.rig.model import Rig, Table
 
 #: Symbol of the leaf that holds the normal force, N.
 NORMAL_FORCE = "N"
+#: Relative changes of the break-away force below this are rounding.
+ROUNDING = 1e-9
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PerWeight:
     """A law divided by the weight of capsule and rod: its resistance is the friction coefficient, 1.
@@ -82,8 +85,15 @@ class FrictionModel:
 
     @property
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
-        """Those that the break-away force depends on: mu alone in eq. (1), all of another law."""
-        return self.parameters[:1] if self.is_proportional else self.parameters
+        """Those that the break-away force depends on, by their effect at the prior medians: mu alone in eq. (1)."""
+        medians = {row.symbol: _prior_of(row).median for row in self.parameters}
+        force = self._at(medians, 1.0).forward(0.0)
+
+        def matters(row: Parameter) -> bool:
+            other = 1.1 * medians[row.symbol] or _prior_of(row).spread
+            return bool(abs(self._at({**medians, row.symbol: other}, 1.0).forward(0.0) - force) > ROUNDING * force)
+
+        return tuple(row for row in self.parameters if matters(row))
 
     @property
     def masses(self) -> tuple[str, ...]:
@@ -114,9 +124,15 @@ class FrictionModel:
         return PerWeight(self.force(theta), _weight(theta))
 
     def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
-        # Tilts alone do not sample v_s; at infinite v_s eq. (1) is the constant mu.
-        known = {"v_s": np.inf, **theta, NORMAL_FORCE: N}
-        return cast(Any, self.law)(**{row.symbol: known[row.symbol] for row in self.law.parameters})
+        # What tilts alone do not sample has no effect at rest: any value serves there.
+        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in self.parameters}
+        constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
+        return cast(Any, self.law)(**known, **constant)
+
+
+def _prior_of(row: Parameter) -> Prior:
+    assert row.prior is not None, "a friction model refuses rows without a prior"
+    return row.prior
 
 
 def _weight(theta: ValuesBySymbol) -> Any:

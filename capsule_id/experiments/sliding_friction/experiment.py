@@ -12,7 +12,7 @@ from capsule_id.experiments.families.friction_experiment import FrictionExperime
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.sliding_friction.declaration import SLIDING_SCATTER
-from capsule_id.physics.friction import normal_force
+from capsule_id.physics.friction import FrictionLaw, normal_force
 from capsule_id.rig.model import Rig, Table
 
 
@@ -52,8 +52,7 @@ class SlidingFriction(FrictionExperiment):
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         law = self.friction.force(theta) if self.quantity == "force" else self.friction.coefficient(theta)
-        predicted, slope = jax.jvp(law.forward, (xp.asarray(self.speed),), (xp.ones(self.n),))
-        predicted, slope = xp.asarray(predicted), xp.asarray(slope)
+        predicted, slope = (xp.asarray(values) for values in _value_and_slope(law, self.speed))
         variance = self.values_sd**2 + (slope * self.speed_sd) ** 2
         return (Misfit(self.values - predicted, variance, predicted, no_design(self.n, xp)),)
 
@@ -68,3 +67,9 @@ class SlidingFriction(FrictionExperiment):
 
     def starts(self) -> dict[str, Start]:
         return {**self.rough_starts(), "sliding_scatter": Start(0.02, 0.3)}
+
+
+@jax.jit
+def _value_and_slope(law: FrictionLaw, speed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Resistance and its derivative with respect to the speed, (n,) each."""
+    return jax.jvp(law.forward, (speed,), (jnp.ones_like(speed),))
