@@ -66,11 +66,15 @@ def own_panels(experiments: Sequence["Experiment"], values: Values, draws: Seque
         yield from e.comparisons(e.local(values), [e.local(draw) for draw in draws])
 
 
-def made_by(reference: str) -> Maker:
-    """``make`` of the experiment class at ``reference``, ``module:class``; it is imported at the first call."""
+def made_by(reference: str, capsule: str = "") -> Maker:
+    """``make`` of the experiment class at ``reference``, ``module:class``; it is imported when it is called.
+
+    ``capsule`` is the class where the setting ``forward`` is "capsule".
+    """
 
     def make(table: Table[Any], rig: Rig, friction: "FrictionModel") -> tuple["Experiment", ...]:
-        return resolve_name(reference).make(table, rig, friction)
+        by_capsule = capsule and table.settings.forward == "capsule"
+        return resolve_name(capsule if by_capsule else reference).make(table, rig, friction)
 
     return make
 

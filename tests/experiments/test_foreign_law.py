@@ -23,7 +23,6 @@ from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 from tests.experiments import bench
 from tests.rig.folder import RIG_TOML, write_folder
 
-
 #: (n,) m/s, and N.
 Speed = Any
 
@@ -136,8 +135,8 @@ def test_the_report_draws_the_fitted_law(fitted: Fit, tmp_path: Path) -> None:
 def test_a_bench_without_runs_is_fitted_too() -> None:
     rng = np.random.default_rng(2)
     tables = tilts(rng), pushes(rng), sliding(rng, "force"), sliding(rng, "coefficient")
-    masses = {"m1": Quantity(bench.M1, 1e-4), "m2": Quantity(bench.M2, 1e-4)}
-    point = cid.fit(bench.rig(*tables, **masses), budget=None, friction=Lorentzian).point_fit
+    rig = bench.rig(*tables, m1=Quantity(bench.M1, 1e-4), m2=Quantity(bench.M2, 1e-4))
+    point = cid.fit(rig, budget=None, friction=Lorentzian).point_fit
     assert {"m1", "m2", "F_s", "F_c", "v_0"} < set(point.names)
     for row in Lorentzian.parameters:
         assert abs(point.values[row.name] - getattr(TRUTH, row.name)) < 4.0 * point.standard_errors[row.name]

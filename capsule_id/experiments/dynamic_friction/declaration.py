@@ -11,7 +11,7 @@ from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
-from capsule_id.rig.model import Settings, Table
+from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule
 
 PUSH_SCATTER = scatter(
@@ -27,10 +27,6 @@ class PushSettings(Settings):
     """``forward``: the closed form of a locked rod, or the capsule model of a free one."""
 
     forward: Literal["closed", "capsule"] = "closed"
-
-
-def _masses(table: Table[PushSettings]) -> tuple[str, ...]:
-    return ("m1", "m2") if table.settings.forward == "capsule" else ()
 
 
 def pushes(
@@ -83,9 +79,12 @@ KIND = Kind(
     columns={"speed": ColumnRule("m/s", POSITIVE), "distance": ColumnRule("m", POSITIVE)},
     sets=(("speed", "distance"),),
     settings=PushSettings,
-    masses=_masses,
+    masses=lambda table: ("m1", "m2") if table.settings.forward == "capsule" else (),
     parameters=(PUSH_SCATTER,),
-    make=made_by("capsule_id.experiments.dynamic_friction.experiment:DynamicFriction"),
+    make=made_by(
+        "capsule_id.experiments.dynamic_friction.experiment:DynamicFriction",
+        capsule="capsule_id.experiments.families.capsule_bench:CapsulePushes",
+    ),
     template=TEMPLATE,
     informs="mu, v_s",
     captions=CAPTIONS,

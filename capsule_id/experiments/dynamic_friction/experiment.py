@@ -36,15 +36,6 @@ class DynamicFriction(FrictionExperiment):
         self.speed_sd = table.columns["speed"].reading_sd
         self.distance_sd = table.columns["distance"].reading_sd
 
-    @classmethod
-    def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> "tuple[DynamicFriction]":
-        """The closed form, or the capsule model."""
-        if table.settings.forward == "closed":
-            return (cls(table, rig, friction),)
-        from capsule_id.experiments.families.capsule_bench import CapsulePushes
-
-        return (CapsulePushes(table, rig, friction),)
-
     @property
     def scatters(self) -> tuple[str]:
         return ("push_scatter",)

@@ -84,11 +84,6 @@ def _check_drive(entry: Entry[RunSettings]) -> None:
         raise entry.error("P_d", rule, "none", "add sd = ... to it, or leave P_d out")
 
 
-def _masses(table: Table[RunSettings]) -> tuple[str, ...]:
-    del table
-    return "m1", "m2"
-
-
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
     """What the run cannot measure, at rough values."""
     from capsule_id.experiments.families.friction_model import EQUATION_1
@@ -156,7 +151,7 @@ KIND = Kind(
     channels=tuple(NOISE),
     settings=RunSettings,
     rules=(_check_drive, Entry.check_length),
-    masses=_masses,
+    masses=lambda table: ("m1", "m2"),
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
     make=made_by("capsule_id.experiments.forced_run.experiment:ForcedRun"),
     template=TEMPLATE,

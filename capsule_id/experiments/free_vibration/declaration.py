@@ -158,7 +158,10 @@ KIND = Kind(
     rules=(_check_spring_with_gap, _check_window, _check_forward),
     masses=_masses,
     parameters=(NOISE_SD, AMPLITUDE, TURNING_TIME),
-    make=made_by("capsule_id.experiments.free_vibration.experiment:FreeVibration"),
+    make=made_by(
+        "capsule_id.experiments.free_vibration.experiment:FreeVibration",
+        capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
+    ),
     template=TEMPLATE,
     informs="k1, c",
     captions={"free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation."},

@@ -94,15 +94,6 @@ class FreeVibration(SurfaceExperiment):
             self.substeps = max(1, int(np.ceil(rough.Omega_o * np.max(np.diff(self.time)) / STEP_PHASE)))
             self.about = About(table, rig, (*rows, parameter("c_q"), noise, *self.motion_parameters(rough)))
 
-    @classmethod
-    def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> "tuple[FreeVibration]":
-        """The closed form, or the capsule model."""
-        if table.settings.forward == "closed":
-            return (cls(table, rig, friction),)
-        from capsule_id.experiments.families.capsule_bench import CapsuleDecay
-
-        return (CapsuleDecay(table, rig, friction),)
-
     def with_damping(self, damping: str) -> "FreeVibration":
         """The same record under another damping model."""
         return FreeVibration(self.table, self.rig, self.friction, damping)

@@ -7,17 +7,11 @@ from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
-from capsule_id.rig.model import Table
 from capsule_id.rig.schema import ColumnRule
 
 SLIDING_SCATTER = scatter(
     "sliding_scatter", "1", "relative scatter of mu, steady sliding", r"s_\mathrm{sl}", Prior("halfnormal", 0.0, 0.05)
 )
-
-
-def _masses(table: Table) -> tuple[str, ...]:
-    """A force is divided by the weight."""
-    return ("m1", "m2") if "force" in table.columns else ()
 
 
 TEMPLATE = """\
@@ -35,7 +29,7 @@ KIND = Kind(
         "coefficient": ColumnRule("1", POSITIVE),
     },
     sets=(("speed", "force"), ("speed", "coefficient")),
-    masses=_masses,
+    masses=lambda table: ("m1", "m2") if "force" in table.columns else (),
     parameters=(SLIDING_SCATTER,),
     make=made_by("capsule_id.experiments.sliding_friction.experiment:SlidingFriction"),
     template=TEMPLATE,
