@@ -9,6 +9,7 @@ from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.output import check_directory, publish, work_in_progress
+from capsule_id.physics.friction import FrictionLaw
 from capsule_id.report.write import write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
@@ -33,23 +34,30 @@ class Fit(Result):
             publish(partial, path)
 
 
-def read_rig(folder: str | Path, registry: Registry | None = None) -> Rig:
+def read_rig(folder: str | Path, registry: Registry | None = None, friction: type[FrictionLaw] | None = None) -> Rig:
     """Read and check a rig folder.
 
     Parameters
     ----------
     folder : holds ``rig.toml`` and the tables that it names
     registry : the kinds of experiments that it may have, by default the built-in ones and those of installed packages
+    friction : class of a friction law; ``[prior]`` may then state its parameters
 
     Raises
     ------
     InputError
         At the first fault: file, line and column, the rule, the value found, the remedy.
     """
-    return read.read_rig(folder, registry or default_registry())
+    return read.read_rig(folder, registry or default_registry(), () if friction is None else friction.parameters)
 
 
-def fit(rig: Rig, seed: int = 0, experiments: Choice = "all", budget: int | None = DEFAULT_BUDGET) -> Fit:
+def fit(
+    rig: Rig,
+    seed: int = 0,
+    experiments: Choice = "all",
+    budget: int | None = DEFAULT_BUDGET,
+    friction: type[FrictionLaw] | None = None,
+) -> Fit:
     """Fit a rig: point estimate, posterior, checks.
 
     Parameters
@@ -58,11 +66,12 @@ def fit(rig: Rig, seed: int = 0, experiments: Choice = "all", budget: int | None
     seed : the same seed gives the same numbers
     experiments : "bench", "runs" or "all"
     budget : emcee steps of an ensemble after burn-in; None for the point fit alone
+    friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
 
     Raises
     ------
     InputError
-        If the rig holds nothing to fit, or ``experiments`` is another word.
+        If the rig holds nothing to fit, ``experiments`` is another word, or ``friction`` cannot be fitted.
     """
-    result = fit_rig(rig, seed, experiments, budget)
+    result = fit_rig(rig, seed, experiments, budget, friction=friction)
     return Fit(**{field.name: getattr(result, field.name) for field in fields(result)})

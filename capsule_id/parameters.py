@@ -28,6 +28,11 @@ class Prior:
     location: float
     spread: float
 
+    @property
+    def median(self) -> float:
+        """SI; of a weighing without its restriction to positive values."""
+        return self.spread * NormalDist().inv_cdf(0.75) if self.kind == "halfnormal" else self.location
+
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw ``size`` independent values, SI."""
         if self.kind == "lognormal":

@@ -80,8 +80,12 @@ def test_the_exit_codes_are_those_of_the_command() -> None:
     assert set(rows("| exit code | meaning |")) == {"0", "3", *map(str, (cli.BAD_INPUT, cli.INTERNAL, cli.INTERRUPTED))}
 
 
-def test_the_example_in_python_gives_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    exec(block, {})
-    (promised,) = re.findall(r"print\(.*\)  # (\S+)", block)
-    assert capsys.readouterr().out.split() == [promised]
+def test_the_examples_in_python_give_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
+    """The motion, then a friction law that goes on from it."""
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    names: dict[str, object] = {"__name__": "readme"}
+    for block in blocks:
+        exec(block, names)
+        (promised,) = re.findall(r"print\(.*\)  # (\S+)", block)
+        assert capsys.readouterr().out.split() == [promised]
+    assert len(blocks) == 2

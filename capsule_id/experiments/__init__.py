@@ -10,6 +10,7 @@ from capsule_id.rig.model import Rig, Table
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
+    from capsule_id.physics.friction import FrictionLaw
     from capsule_id.views import Comparison
 
 #: Which experiments of a rig are fitted: bench tests, forced runs, or both.
@@ -35,7 +36,10 @@ def select_tables(rig: Rig, experiments: Choice, registry: Registry | None = Non
 
 
 def make_experiments(
-    rig: Rig, experiments: Choice = "all", registry: Registry | None = None
+    rig: Rig,
+    experiments: Choice = "all",
+    registry: Registry | None = None,
+    friction: "type[FrictionLaw] | None" = None,
 ) -> tuple["Experiment", ...]:
     """The rig's experiments, in the order of ``rig.toml``.
 
@@ -43,11 +47,13 @@ def make_experiments(
     ----------
     experiments : which of them
     registry : the kinds that read the rig, by default all
+    friction : class of the friction law, by default eq. (1)
 
     Raises
     ------
     InputError
-        If nothing is left to fit, the tables of a kind cannot be fitted together, or ``experiments`` is unknown.
+        If nothing is left to fit, the tables of a kind cannot be fitted together, ``experiments`` is unknown, or
+        ``friction`` cannot be fitted.
     """
     kinds = registry or default_registry()
     tables = select_tables(rig, experiments, kinds)
@@ -56,7 +62,18 @@ def make_experiments(
         raise InputError(rule, f"none with --experiments {experiments}", "add one to rig.toml", rig.folder / "rig.toml")
     for name, kind in kinds.items():
         kind.check([table for table in tables if table.kind == name])
-    return tuple(e for table in tables for e in kinds[table.kind].make(table, rig))
+    # The law loads JAX, which a faulty folder must not wait for.
+    from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+
+    model = EQUATION_1 if friction is None else FrictionModel(friction)
+    model.check(kinds.parameters)
+    made = tuple(e for table in tables for e in kinds[table.kind].make(table, rig, model))
+    for e in made:
+        for mass in e.masses:
+            if getattr(rig, mass) is None:
+                rule = f"the friction law {model.name} is in N, and {e.label} needs {mass}"
+                raise InputError(rule, "not stated", f"add {mass} to [rig]", rig.folder / "rig.toml")
+    return made
 
 
 def paper_estimates(experiments: Sequence["Experiment"], registry: Registry | None = None) -> dict[str, float]:

@@ -29,6 +29,7 @@ from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Finding
 
 if TYPE_CHECKING:
+    from capsule_id.experiments.families.friction_model import FrictionModel
     from capsule_id.physics.smooth.engine import Smoothing
 
 require_float64()
@@ -85,8 +86,12 @@ class Experiment(eqx.Module):
     tables: ClassVar[tuple[TableMaker, ...]] = ()
 
     @classmethod
-    def make(cls, table: Table, rig: Rig) -> "tuple[Experiment, ...]":
-        """The experiments of one table: one, or the parts of a record that is to be cut."""
+    def make(cls, table: Table, rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":
+        """The experiments of one table: one, or the parts of a record that is to be cut.
+
+        ``friction`` is the law that the experiments of a fit share; a kind without a sliding capsule has no use for it.
+        """
+        del friction
         return (cls(table, rig),)  # type: ignore[call-arg, arg-type]  # pyright: ignore
 
     @property

@@ -6,6 +6,7 @@ imported where it is used.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,12 +16,16 @@ from capsule_id.rig.schema import KindRule
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
+    from capsule_id.experiments.families.friction_model import FrictionModel
     from capsule_id.views import Comparison
 
 #: Parameter values, SI, by name (``k1``, ``k2[soft]``).
 Values = Mapping[str, float]
 #: A rough value, SI, by parameter name, and whether a bench test of the rig gave it (else the prior's median).
 Estimate = Callable[[str], tuple[float, bool]]
+
+#: The experiments of one table of a rig, with the friction law of the fit.
+Maker = Callable[[Table[Any], Rig, "FrictionModel"], tuple["Experiment", ...]]
 
 
 @dataclass(frozen=True)
@@ -61,13 +66,27 @@ def own_panels(experiments: Sequence["Experiment"], values: Values, draws: Seque
         yield from e.comparisons(e.local(values), [e.local(draw) for draw in draws])
 
 
+def made_by(reference: str, capsule: str = "") -> Maker:
+    """``make`` of the experiment class at ``reference``, ``module:class``; it is imported when it is called.
+
+    ``capsule`` is the class where the setting ``forward`` is "capsule".
+    """
+
+    def make(table: Table[Any], rig: Rig, friction: "FrictionModel") -> tuple["Experiment", ...]:
+        by_capsule = capsule and table.settings.forward == "capsule"
+        return resolve_name(capsule if by_capsule else reference).make(table, rig, friction)
+
+    return make
+
+
 @dataclass(frozen=True, kw_only=True)
 class Kind(KindRule):
     """One kind of experiment; the attributes of ``KindRule`` besides these.
 
     Attributes
     ----------
-    make : the experiments of one table, several where a record is cut into parts
+    make : the experiments of one table, several where a record is cut into parts; ``made_by`` names a class. The third
+        argument is the friction law of the fit
     template : the commented lines of ``rig.toml`` that ``capsule-id init`` writes
     informs : the parameters that it measures, for tables
     captions : of its panels in the report, by ``Comparison.kind``
@@ -84,7 +103,7 @@ class Kind(KindRule):
     truth : true values, SI by name, that only this kind adds to a synthetic rig
     """
 
-    make: Callable[[Table[Any], Rig], tuple["Experiment", ...]]
+    make: Maker
     template: str
     informs: str
     captions: Mapping[str, str]

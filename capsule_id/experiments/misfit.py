@@ -95,7 +95,7 @@ class Misfit:
     fixed_variance, scale : () or (n,); both () where all readings have one variance
     design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
     ordinate : fixed variance and scale of the readings' own error where true abscissas were integrated out along the
-        model (errors in both columns, see ``capsule_id.experiments.line``): it normalises the density
+        model (errors in both columns, see ``capsule_id.experiments.families.line_experiment``): it normalises the density
     """
 
     raw: Any

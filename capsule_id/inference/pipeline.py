@@ -21,6 +21,7 @@ from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.parameters import Parameter, parameter
+from capsule_id.physics.friction import FrictionLaw
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison, NoteTable
 
@@ -39,6 +40,7 @@ def fit_rig(
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
     progress: OnProgress | None = None,
+    friction: type[FrictionLaw] | None = None,
 ) -> Result:
     """Fit ``rig``.
 
@@ -49,6 +51,7 @@ def fit_rig(
     budget : emcee steps of an ensemble; None draws no sample
     store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
     progress : see ``capsule_id.inference.sampling.ensembles.sample``
+    friction : class of a friction law in place of eq. (1)
 
     Raises
     ------
@@ -58,7 +61,7 @@ def fit_rig(
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(3)]
     if progress:
         progress(0, 1, "point fit")
-    stage = fit_points(rig, make_experiments(rig, experiments), seeds[0], sampled=budget is not None)
+    stage = fit_points(rig, make_experiments(rig, experiments, friction=friction), seeds[0], sampled=budget is not None)
     target, point = stage.target, stage.fit
     posterior = None
     if budget is not None:

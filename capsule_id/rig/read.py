@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from capsule_id.errors import InputError
+from capsule_id.parameters import Parameter
 from capsule_id.rig.decode import decode
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
@@ -30,13 +31,14 @@ STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder stat
 _READING_ERRORS = ("_sd", "_resolution")
 
 
-def read_rig(folder: str | Path, kinds: Mapping[str, KindRule]) -> Rig:
+def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequence[Parameter] = ()) -> Rig:
     """Read and check a rig folder.
 
     Parameters
     ----------
     folder : holds ``rig.toml`` and the tables that it names
     kinds : the kinds of experiments that it may have, by name
+    parameters : further rows that ``[prior]`` may state, those of a friction law
 
     Returns
     -------
@@ -73,7 +75,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule]) -> Rig:
         m1=stated.get("m1"),
         m2=stated.get("m2"),
         g=stated.get("g", Quantity(STANDARD_GRAVITY)),
-        priors=MappingProxyType(_read_priors(document, tables, kinds)),
+        priors=MappingProxyType(_read_priors(document, tables, [*parameter_rows(kinds).values(), *parameters])),
         tables=tables,
         files=MappingProxyType({"rig.toml": sha256, **files}),
         folder=folder,
@@ -113,11 +115,11 @@ def _check_masses(
 
 
 def _read_priors(
-    document: TomlDocument, tables: Sequence[Table], kinds: Mapping[str, KindRule]
+    document: TomlDocument, tables: Sequence[Table], parameters: Sequence[Parameter]
 ) -> dict[str, PriorOverride]:
-    """The entries of ``[prior]``, by parameter name."""
+    """The entries of ``[prior]``, by parameter name; they may state the priors of ``parameters``."""
     entries = read_table(document, ("prior",), document.data.get("prior", {}), "[prior]")
-    rows = {symbol: row for symbol, row in parameter_rows(kinds).items() if row.prior_can_be_stated}
+    rows = {row.symbol: row for row in parameters if row.prior_can_be_stated}
     known = ["k2[<spring>]" if symbol == "k2" else symbol for symbol in sorted(rows, key=lambda s: rows[s].scatter)]
     priors = {}
     for key, value in entries.items():

@@ -26,8 +26,12 @@ def run_table(
     return bench.table("forced_run", columns, label, spring="s", gap=Quantity(G), Omega=Omega, P_d=Quantity(P_d))
 
 
+#: Break-away force of ``TRUTH``, N.
+F_B = TRUTH["mu"] * (TRUTH["m1"] + TRUTH["m2"]) * TRUTH["g"]
+
+
 def said(table: Table, k2: float) -> str:
-    return "\n".join(finding.text for finding in feasibility(table, {**TRUTH, "k2": k2}))
+    return "\n".join(finding.text for finding in feasibility(table, {**TRUTH, "k2": k2}, F_B))
 
 
 def test_the_printed_settings_of_figure_4_allow_no_contact() -> None:

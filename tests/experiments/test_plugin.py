@@ -9,8 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from capsule_id import experiments
+from capsule_id.api import read_rig
 from capsule_id.errors import InputError
+from capsule_id.experiments import registry
 from capsule_id.experiments.registry import GROUP, Registry, default_registry
+from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.inference.target.log_posterior import LogPosterior
 from tests import cli_tools
 
 #: The kinds without the package, made before a test installs it.
@@ -122,3 +127,30 @@ def test_a_faulty_package_is_named(
     assert str(caught.value).startswith("rolling-rig: the experiment kind rolling_resistance of an installed package")
     assert fault in caught.value.value
     assert caught.value.remedy == "update the package rolling-rig, or uninstall it"
+
+
+def test_a_built_in_kind_is_one_folder_and_one_line(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same kind as a folder of the package, found through its name in ``BUILT_IN`` alone."""
+    home = tmp_path / "rolling_resistance"
+    home.mkdir()
+    (home / "__init__.py").touch()
+    for source, target in (("__init__.py", "declaration.py"), ("experiment.py", "experiment.py")):
+        text = (PLUGIN / source).read_text(encoding="utf-8")
+        text = text.replace("rolling_rig.experiment:", "capsule_id.experiments.rolling_resistance.experiment:")
+        text = text.replace(
+            "from rolling_rig import", "from capsule_id.experiments.rolling_resistance.declaration import"
+        )
+        assert "rolling_rig" not in text
+        (home / target).write_text(text, encoding="utf-8")
+    monkeypatch.setattr(experiments, "__path__", [*experiments.__path__, str(tmp_path)])
+    monkeypatch.setattr(registry, "BUILT_IN", (*registry.BUILT_IN, "rolling_resistance"))
+    kinds = default_registry.__wrapped__()
+    assert list(kinds) == [*KINDS, "rolling_resistance"]
+    rig = read_rig(folder, kinds)
+    (experiment,) = experiments.make_experiments(rig, registry=kinds)
+    fit = point_fit(LogPosterior(rig, [experiment]), 0)
+    assert fit.values["c_rr"] == pytest.approx(sum(FORCES) / len(FORCES) / (0.640 * 9.81), rel=2e-3)
+    for name in [name for name in sys.modules if "rolling_resistance" in name]:
+        sys.modules.pop(name)

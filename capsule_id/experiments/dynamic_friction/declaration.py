@@ -2,20 +2,17 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
-from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
-from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 
 PUSH_SCATTER = scatter(
     "push_scatter", "1", "relative scatter of mu from push to push", r"s_\mathrm{push}", Prior("halfnormal", 0.0, 0.05)
@@ -30,17 +27,6 @@ class PushSettings(Settings):
     """``forward``: the closed form of a locked rod, or the capsule model of a free one."""
 
     forward: Literal["closed", "capsule"] = "closed"
-
-
-def _masses(table: Table[PushSettings]) -> tuple[str, ...]:
-    return ("m1", "m2") if table.settings.forward == "capsule" else ()
-
-
-def _make(table: Table[PushSettings], rig: Rig) -> tuple["DynamicFriction"]:
-    from capsule_id.experiments.capsule_bench import CapsulePushes
-    from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
-
-    return ((CapsulePushes if table.settings.forward == "capsule" else DynamicFriction)(table, rig),)
 
 
 def pushes(
@@ -58,7 +44,7 @@ def pushes(
     The surface's mu scatters by ``surface_scatter`` (relative) from push to push. Each argument is one quantity of the
     protocol, so there are more than six.
     """
-    from capsule_id.experiments.friction_curve import unit_law
+    from capsule_id.experiments.families.friction_experiment import unit_law
     from capsule_id.physics.friction import slide_distance
 
     surface = mu * (1.0 + surface_scatter * rng.standard_normal(len(speeds)))
@@ -93,9 +79,12 @@ KIND = Kind(
     columns={"speed": ColumnRule("m/s", POSITIVE), "distance": ColumnRule("m", POSITIVE)},
     sets=(("speed", "distance"),),
     settings=PushSettings,
-    masses=_masses,
+    masses=lambda table: ("m1", "m2") if table.settings.forward == "capsule" else (),
     parameters=(PUSH_SCATTER,),
-    make=_make,
+    make=made_by(
+        "capsule_id.experiments.dynamic_friction.experiment:DynamicFriction",
+        capsule="capsule_id.experiments.families.capsule_bench:CapsulePushes",
+    ),
     template=TEMPLATE,
     informs="mu, v_s",
     captions=CAPTIONS,

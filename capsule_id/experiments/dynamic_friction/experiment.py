@@ -1,15 +1,16 @@
 """Pushes: an initial speed and the distance slid, rod locked to the capsule (paper, section 2.2)."""
 
 from types import ModuleType
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
-from capsule_id.experiments.friction_curve import FrictionExperiment, unit_law
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.parameters import parameter
 from capsule_id.physics.friction import slide_distance
 from capsule_id.rig.model import Rig, Table
 
@@ -28,8 +29,9 @@ class DynamicFriction(FrictionExperiment):
 
     role = "dynamic"
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), PUSH_SCATTER))
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        self.friction = friction
+        self.about = About(table, rig, (*friction.parameters, PUSH_SCATTER))
         self.speed, self.distance = table["speed"], table["distance"]
         self.speed_sd = table.columns["speed"].reading_sd
         self.distance_sd = table.columns["distance"].reading_sd
@@ -43,20 +45,18 @@ class DynamicFriction(FrictionExperiment):
         return self.distance
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        law, g = unit_law(theta["mu"], theta["v_s"]), theta["g"]
-        distance = slide_distance(law, 1.0 / g, self.speed)
-        slope = self.speed / (g * law.forward(self.speed))
-        variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
+        distance, variance = self.locked_slide(theta)
         return (Misfit(self.distance - distance, variance, distance, no_design(self.n, xp)),)
+
+    def locked_slide(self, theta: ValuesBySymbol) -> tuple[Any, Any]:
+        """Distance, m, with the rod locked, and its variance by the reading errors, m^2; (n,) each."""
+        law, g = self.friction.coefficient(theta), theta["g"]
+        slope = self.speed / (g * law.forward(self.speed))
+        return slide_distance(law, 1.0 / g, self.speed), self.distance_sd**2 + (slope * self.speed_sd) ** 2
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Pushes are read as mu = v^2/(2gd) at their initial speed."""
         return self.speed, self.speed**2 / (2.0 * self.rig.g.value * self.distance)
 
     def starts(self) -> dict[str, Start]:
-        _, coefficient = self.paper_points()
-        return {
-            "mu": Start(float(np.max(coefficient)), 0.3),
-            "v_s": Start(float(np.median(self.speed)), 0.5),
-            "push_scatter": Start(0.02, 0.3),
-        }
+        return {**self.rough_starts(), "push_scatter": Start(0.02, 0.3)}

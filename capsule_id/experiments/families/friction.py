@@ -10,7 +10,7 @@ from capsule_id.experiments.kind import Values
 from capsule_id.rig.model import Table
 
 if TYPE_CHECKING:
-    from capsule_id.experiments.friction_curve import FrictionExperiment
+    from capsule_id.experiments.families.friction_experiment import FrictionExperiment
     from capsule_id.views import Comparison
 
 CAPTIONS = {
@@ -20,7 +20,7 @@ CAPTIONS = {
 
 def friction_estimates(experiments: Sequence["FrictionExperiment"]) -> Values:
     """The paper's mu and v_s: eq. (1) fitted to the points of all friction experiments."""
-    from capsule_id.experiments.friction_curve import paper_friction_fit
+    from capsule_id.experiments.families.friction_experiment import paper_friction_fit
 
     points = [e.paper_points() for e in experiments]
     speed, coefficient = (np.concatenate(parts) for parts in zip(*points, strict=True))
@@ -31,7 +31,7 @@ def friction_panels(
     experiments: Sequence["FrictionExperiment"], values: Values, draws: Sequence[Values]
 ) -> tuple["Comparison"]:
     """One panel of all friction experiments."""
-    from capsule_id.experiments.friction_curve import friction_comparison
+    from capsule_id.experiments.families.friction_experiment import friction_comparison
 
     # Local values differ in scatters only; together they have both mu and v_s where one experiment has them.
     points: list[Values] = [{k: v for e in experiments for k, v in e.local(p).items()} for p in (values, *draws)]

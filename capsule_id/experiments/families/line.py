@@ -11,7 +11,7 @@ from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Table
 
 if TYPE_CHECKING:
-    from capsule_id.experiments.line import Line
+    from capsule_id.experiments.families.line_experiment import Line
 
 
 def line_estimates(experiments: Sequence["Line"]) -> Values:

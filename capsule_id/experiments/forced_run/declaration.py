@@ -2,20 +2,17 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
-from capsule_id.experiments.kind import Estimate, Kind, Twin, Values
+from capsule_id.experiments.kind import Estimate, Kind, Twin, Values, made_by
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.run_description import describe_run, run_warning
 from capsule_id.rig.domains import NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.forced_run.experiment import ForcedRun
 
 #: Recorded channels: name, unit, LaTeX subscript.
 _CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
@@ -87,20 +84,9 @@ def _check_drive(entry: Entry[RunSettings]) -> None:
         raise entry.error("P_d", rule, "none", "add sd = ... to it, or leave P_d out")
 
 
-def _masses(table: Table[RunSettings]) -> tuple[str, ...]:
-    del table
-    return "m1", "m2"
-
-
-def _make(table: Table[RunSettings], rig: Rig) -> tuple["ForcedRun", ...]:
-    """A run, or its parts where ``segment`` is stated."""
-    from capsule_id.experiments.forced_run.experiment import ForcedRun
-
-    return ForcedRun.make(table, rig)
-
-
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
     """What the run cannot measure, at rough values."""
+    from capsule_id.experiments.families.friction_model import EQUATION_1
     from capsule_id.experiments.forced_run.feasibility import feasibility
 
     assert rig.m1 is not None, "the reader requires both masses for a forced run"
@@ -114,7 +100,8 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
     note = f" (by the prior's median, not measured here: {', '.join(guessed)})" if guessed else ""
     theta = {"m1": rig.m1.value, "m2": rig.m2.value, "g": rig.g.value}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
-    return [finding.text.removeprefix(f"{table.label}: ") for finding in feasibility(table, theta, note)]
+    F_b = float(EQUATION_1.force(theta).forward(0.0))
+    return [finding.text.removeprefix(f"{table.label}: ") for finding in feasibility(table, theta, F_b, note)]
 
 
 def _lint_drive(table: Table[RunSettings]) -> Iterable[str]:
@@ -164,9 +151,9 @@ KIND = Kind(
     channels=tuple(NOISE),
     settings=RunSettings,
     rules=(_check_drive, Entry.check_length),
-    masses=_masses,
+    masses=lambda table: ("m1", "m2"),
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
-    make=_make,
+    make=made_by("capsule_id.experiments.forced_run.experiment:ForcedRun"),
     template=TEMPLATE,
     informs="all of them together, and the gap",
     captions={

@@ -19,7 +19,8 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
-from capsule_id.experiments.forced_run.about import AboutRun
+from capsule_id.experiments.families.capsule_experiment import CapsuleForward
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.forced_run.declaration import NOISE
 from capsule_id.experiments.forced_run.feasibility import check_feasible
 from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts
@@ -27,14 +28,12 @@ from capsule_id.experiments.forced_run.panels import run_comparisons
 from capsule_id.experiments.forced_run.parts import parts_of
 from capsule_id.experiments.forced_run.predictability import check_predictable, predictable_parts
 from capsule_id.experiments.forced_run.restart import corrected_start
-from capsule_id.experiments.forced_run.start import RunStart, rough_start
+from capsule_id.experiments.forced_run.start import AboutRun, RunStart, rough_start
 from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
-from capsule_id.experiments.forward import CapsuleForward
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, innovations
 from capsule_id.physics.forces import rod_acceleration
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
-from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.records.view import view_record
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Finding
@@ -95,10 +94,10 @@ class ForcedRun(CapsuleForward):
         self,
         table: Table,
         rig: Rig,
+        friction: FrictionModel = EQUATION_1,
         part_of: str | None = None,
         leads: bool = True,
         capsule_rate: float | None = None,
-        smoothing: Smoothing | None = None,
     ) -> None:
         """One record, or a part of one.
 
@@ -110,7 +109,7 @@ class ForcedRun(CapsuleForward):
         capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or read off the record
         """
         settings, gap = table.settings, table.settings.gap
-        self.smoothing = smoothing
+        self.friction, self.smoothing = friction, None
         self.channels = tuple(name for name in NOISE if name in table.columns)
         self.time = table["time"]
         self.values = np.stack([table[name] for name in self.channels])
@@ -139,8 +138,9 @@ class ForcedRun(CapsuleForward):
         self.about = replace(self.about, parameters=run_parameters(self, ranges))
 
     @classmethod
-    def make(cls, table: Table, rig: Rig) -> "tuple[ForcedRun, ...]":
-        run, seconds = cls(table, rig), table.settings.segment
+    def make(cls, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> "tuple[ForcedRun, ...]":
+        """A run, or its parts where ``segment`` is stated."""
+        run, seconds = cls(table, rig, friction), table.settings.segment
         return (run,) if seconds is None else run.parts(seconds)
 
     def parts(self, seconds: float) -> "tuple[ForcedRun, ...]":
@@ -148,15 +148,15 @@ class ForcedRun(CapsuleForward):
         tables = parts_of(self.table, seconds)
         if len(tables) == 1:
             return (self,)
-        return tuple(
-            ForcedRun(table, self.rig, self.about.record, self.about.leads and i == 0, smoothing=self.smoothing)
-            for i, table in enumerate(tables)
-        )
+        return tuple(self._remade(table, self.about.leads and i == 0) for i, table in enumerate(tables))
 
     def restarted(self, capsule_rate: float) -> "ForcedRun":
         """The same record with its capsule at this speed, m/s, at the first sample; 0: stuck."""
-        about = self.about
-        return ForcedRun(self.table, self.rig, about.record, about.leads, capsule_rate, self.smoothing)
+        return self._remade(self.table, self.about.leads, capsule_rate)
+
+    def _remade(self, table: Table, leads: bool, capsule_rate: float | None = None) -> "ForcedRun":
+        run = ForcedRun(table, self.rig, self.friction, self.about.record, leads, capsule_rate)
+        return run.with_smoothing(self.smoothing)
 
     def _stated(self, settings: Any, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
         """Stated sd of a gain or delay by channel, and whether there is one."""
@@ -196,23 +196,20 @@ class ForcedRun(CapsuleForward):
         gap = self.gap if self.gap_known else theta["G"]
         stated: Any = self.drive if self.drive_known else theta.get("P_d")
         force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
-        names = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "g")
-        return CapsuleParameters(G=gap, **{name: theta[name] for name in names}), Excitation(
-            force, self.Omega, theta["phase"]
-        )
+        return self.parameters_of(theta, theta["k2"], gap), Excitation(force, self.Omega, theta["phase"])
 
     def motion(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Trajectory:
         """The model's motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
         if self.settled:
             early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
-            run = self.simulated(p, e, xp.concatenate([early, self.time]))
+            run = self.simulated(theta, p, e, xp.concatenate([early, self.time]))
             settled = {name: getattr(run, name)[1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
             X2 = settled["X2"][0]
             return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})
         Y2 = self.moves * theta.get("capsule_start", 0.0) + 0.0 * theta["x_start"]
         initial = (theta["x_start"], theta["y_start"] + Y2, 0.0, Y2)
-        return self.simulated(p, e, self.time, initial)
+        return self.simulated(theta, p, e, self.time, initial)
 
     def predict(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> list[Any]:
         """Noise-free channels (n,), offsets and gains left out, in the order of ``channels``.

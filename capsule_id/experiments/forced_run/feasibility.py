@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.physics.forces import rod_acceleration, rod_on_capsule
-from capsule_id.physics.friction import normal_force
 from capsule_id.physics.grazing import grazing_load
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.records.tone import tone_at
@@ -61,25 +60,26 @@ def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
         theta = run.local(fit.values)
         p, e = run.capsule(theta)
         conditions = RunConditions(run.Omega, float(e.P_d), float(p.G))  # pyright: ignore[reportArgumentType]
-        findings += feasibility(run.table, theta, conditions=conditions)
+        F_b = float(run.friction.force(theta).forward(0.0))
+        findings += feasibility(run.table, theta, F_b, conditions=conditions)
     return findings
 
 
 def feasibility(
-    table: Table, theta: Mapping[str, float], note: str = "", conditions: RunConditions | None = None
+    table: Table, theta: Mapping[str, float], F_b: float, note: str = "", conditions: RunConditions | None = None
 ) -> list[Finding]:
     """Findings, level ``warn``, on one forced run; none where its settings can do what they are for.
 
     Parameters
     ----------
     table : a ``forced_run``
-    theta : values by symbol, SI: m1, m2, k1, c, mu, k2 (of this run's spring), g, and K where P_d is not stated
+    theta : values by symbol, SI: m1, m2, k1, c, k2 (of this run's spring), and K where P_d is not stated
+    F_b : break-away force, N
     note : where the values come from, added to every finding that rests on them
     conditions : None: as stated
     """
     drive = conditions or stated_conditions(table, theta.get("K", np.nan))
     reached, touches = held_rod(theta, drive)
-    F_b = theta["mu"] * normal_force(theta["m1"], theta["m2"], theta["g"])
     without_contact = drive.P_d / float(grazing_load(theta["m1"], theta["k1"], theta["c"], 1.0, drive.Omega))
     grazing = float(grazing_load(theta["m1"], theta["k1"], theta["c"], drive.G, drive.Omega))
     linear_force = without_contact * float(np.hypot(theta["k1"], theta["c"] * drive.Omega))
@@ -92,8 +92,8 @@ def feasibility(
         )
     if reached <= F_b:
         texts.append(
-            f"the rod pushes a capsule at rest with {reached:.3g} N at most, F_b = mu (m1 + m2) g = {F_b:.3g} N: the "
-            "capsule cannot set off, so the run says nothing of v_s; drive harder, or nearer to resonance"
+            f"the rod pushes a capsule at rest with {reached:.3g} N at most, the break-away force is F_b = {F_b:.3g} N: the "
+            "capsule cannot set off, so the run does not inform the friction law; drive harder, or nearer to resonance"
         )
     texts += _sampling(table, theta, touches and drive.P_d >= grazing)
     texts += _length(table, theta, drive)

@@ -23,7 +23,7 @@ PHASE_WIDTH = np.pi
 def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...]:
     """Those sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
     of, whole, settings = run.label, run.about.record, run.table.settings
-    rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")] + [parameter("k2", run.spring)]
+    rows = [parameter("k1"), parameter("c"), *run.friction.parameters, parameter("k2", run.spring)]
     if not run.gap_known:
         rows.append(parameter("G", whole, Prior("positive_normal", settings.gap.value, settings.gap.sd)))
     if run.driven_by_current:

@@ -9,6 +9,7 @@ import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted, ok_if_empty
+from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
 from capsule_id.views import Finding
 
@@ -29,16 +30,20 @@ def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
     size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
     motion = run.motion(theta, np)
     start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
-    derivative = np.asarray(_derivative_of_end(*run.capsule(theta), run.time[[0, -1]], start))
+    derivative = np.asarray(
+        _derivative_of_end(*run.capsule(theta), run.friction.force(theta), run.time[[0, -1]], start)
+    )
     return float(np.linalg.norm(derivative * size / size[:, None], 2))
 
 
 @jax.jit
-def _derivative_of_end(p: CapsuleParameters, e: Excitation, times: jax.Array, start: jax.Array) -> jax.Array:
+def _derivative_of_end(
+    p: CapsuleParameters, e: Excitation, law: FrictionLaw, times: jax.Array, start: jax.Array
+) -> jax.Array:
     """(3, 3) of (x_rel, its rate, Y2) at the last of ``times`` with respect to the same at the first."""
 
     def end(state: jax.Array) -> jax.Array:
-        t = simulate(p, e, times, (state[0], state[1] + state[2], 0.0, state[2]))
+        t = simulate(p, e, times, (state[0], state[1] + state[2], 0.0, state[2]), friction=law)
         return jnp.stack([t.X1[-1] - t.X2[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]])
 
     return jax.jacfwd(end)(start)

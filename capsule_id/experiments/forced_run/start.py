@@ -1,11 +1,12 @@
 """Where the fit of a forced run may start: state and drive at the first sample, read off the record itself."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from capsule_id.experiments.base import About
 from capsule_id.records.noise import noise_level
 from capsule_id.records.tone import tone_at
 
@@ -41,6 +42,26 @@ class RunStart:
     amplitude: float
     phase: float
     noise: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class AboutRun(About):
+    """What a run was made of.
+
+    Attributes
+    ----------
+    record : label of the record that the run is, or is a part of
+    leads : the run is a whole record, or the first part of one
+    start : the kind of initial state
+    start_is_open : no kind of initial state was stated
+    rough : state and drive at the first sample, read off the record (the speed by the model, where that found one)
+    """
+
+    record: str = field(compare=False)
+    leads: bool = field(compare=False)
+    start: str = field(compare=False)
+    start_is_open: bool = field(compare=False)
+    rough: RunStart = field(compare=False)
 
 
 def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: float) -> RunStart:

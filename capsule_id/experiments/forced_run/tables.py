@@ -8,7 +8,6 @@ import pandas as pd
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted
-from capsule_id.physics.friction import normal_force
 from capsule_id.records.label import measured_motion
 from capsule_id.views import NoteTable
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable]:
     """The paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
 
-    Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0, with Omega0 = sqrt(k1/m1) and F_b = mu (m1 + m2) g.
+    Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0. Omega0 = sqrt(k1/m1); F_b is the break-away force.
     """
     if not fit.draws:
         return []
@@ -32,23 +31,23 @@ def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable]:
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["mean", "sd"]).rename_axis("group")
     caption = (
         "Groups that carry the rig over to a prototype of another size: equal groups, equal motion. Omega0 = √(k1/m1), "
-        "zeta = c/(2 m1 Omega0), F_b = mu (m1 + m2) g; a shared group is listed once."
+        "zeta = c/(2 m1 Omega0), F_b: break-away force, mu (m1 + m2) g by eq. (1); a shared group is listed once."
     )
     return [NoteTable("Nondimensional groups", caption, frame)]
 
 
 def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
     p, e = run.capsule(theta)
-    m1, m2, k1, k2, c, mu, v_s, G, g = (
-        float(getattr(p, name)) for name in ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")
-    )
-    Omega0, F_b = np.sqrt(k1 / m1), mu * normal_force(m1, m2, g)
+    m1, m2, k1, k2, c, G = (float(getattr(p, name)) for name in ("m1", "m2", "k1", "k2", "c", "G"))
+    Omega0, F_b = np.sqrt(k1 / m1), float(run.friction.force(theta).forward(0.0))
     length, of = F_b / k1, run.label
+    scales = {"N": ("F_b", F_b), "m/s": ("(Omega0 F_b/k1)", Omega0 * length)}
+    own = [(row.symbol, *scales[row.unit]) for row in run.friction.parameters if row.unit in scales]
     return {
         "Omega0, rad/s": Omega0,
         "zeta": c / (2.0 * m1 * Omega0),
         "m2/m1": m2 / m1,
-        "v_s / (Omega0 F_b/k1)": v_s / (Omega0 * length),
+        **{f"{symbol} / {scale}": theta[symbol] / value for symbol, scale, value in own},
         f"k2/k1 [{run.spring}]": k2 / k1,
         f"Omega/Omega0 [{of}]": run.Omega / Omega0,
         f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore[reportArgumentType]

@@ -10,7 +10,6 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.free_vibration.decrement import equilibrium
-from capsule_id.physics.friction import normal_force
 from capsule_id.views import Finding
 
 if TYPE_CHECKING:
@@ -49,9 +48,10 @@ def check_free_decay(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fi
     """Expected: a free capsule that does not slip, and a rod that does not reach the support spring."""
     findings, theta = [], fit.values
     for e in records:
-        if e.table.settings.capsule == "free" and "mu" in theta and "m2" in theta:
+        needed = {"m2", *(row.symbol for row in e.friction.parameters_at_rest)}
+        if e.table.settings.capsule == "free" and needed <= set(theta):
             force = e.largest_force(theta)
-            threshold = float(theta["mu"] * normal_force(theta["m1"], theta["m2"], theta["g"]))
+            threshold = float(e.friction.force(theta).forward(0.0))
             if force > threshold:
                 text = (
                     f"{e.label}: a free capsule stays at rest while |f| <= F_b = {threshold:.3g} N; the record "

@@ -9,7 +9,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.free_vibration.window import decay_window
-from capsule_id.experiments.kind import Kind, Values
+from capsule_id.experiments.kind import Kind, Values, made_by
 from capsule_id.parameters import nuisance, scatter
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
@@ -96,14 +96,6 @@ def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
     return ("m1", "m2") if moves else ("m1",)
 
 
-def _make(table: Table[DecaySettings], rig: Rig) -> tuple["FreeVibration"]:
-    """The closed form, or the capsule model."""
-    from capsule_id.experiments.capsule_bench import CapsuleDecay
-    from capsule_id.experiments.free_vibration.experiment import FreeVibration
-
-    return ((CapsuleDecay if table.settings.forward == "capsule" else FreeVibration)(table, rig),)
-
-
 def _lint(table: Table[DecaySettings]) -> Iterable[str]:
     """Sampling and length of a free decay."""
     time, x_rel = decay_window(table)
@@ -166,7 +158,10 @@ KIND = Kind(
     rules=(_check_spring_with_gap, _check_window, _check_forward),
     masses=_masses,
     parameters=(NOISE_SD, AMPLITUDE, TURNING_TIME),
-    make=_make,
+    make=made_by(
+        "capsule_id.experiments.free_vibration.experiment:FreeVibration",
+        capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
+    ),
     template=TEMPLATE,
     informs="k1, c",
     captions={"free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation."},

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, band
+from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label, band
 from capsule_id.experiments.checks.series import autocorrelation
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.free_vibration.checks import check_free_decay, check_stiffness
 from capsule_id.experiments.free_vibration.decay_models import (
     STEP_PHASE,
@@ -37,7 +38,7 @@ NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 SMOOTHING_ORDER = 3
 
 
-class FreeVibration(Experiment):
+class FreeVibration(SurfaceExperiment):
     """x_rel(t) of one record: the whole record, raw, white noise; k1 and c are shared by all records.
 
     Viscous damping: the two solutions and the offset enter linearly and are integrated out. Dry or quadratic damping
@@ -60,8 +61,11 @@ class FreeVibration(Experiment):
     checks = (check_stiffness, check_free_decay)
     tables = (decay_table, damping_table)
 
-    def __init__(self, table: Table, rig: Rig, damping: str | None = None) -> None:
+    def __init__(
+        self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1, damping: str | None = None
+    ) -> None:
         """``damping`` None: as stated in the settings."""
+        self.friction = friction
         time, self.values = decay_window(table)
         self.time = time - float(time[0])
         self.damping = damping or table.settings.damping
@@ -92,7 +96,7 @@ class FreeVibration(Experiment):
 
     def with_damping(self, damping: str) -> "FreeVibration":
         """The same record under another damping model."""
-        return FreeVibration(self.table, self.rig, damping)
+        return FreeVibration(self.table, self.rig, self.friction, damping)
 
     def noise_prior(self) -> Prior:
         """Default prior of the record's noise sd, m."""

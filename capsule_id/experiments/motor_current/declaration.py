@@ -1,17 +1,14 @@
 """Motor current: columns, settings, template and twin."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
 from capsule_id.experiments.families.line import line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
-from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
+from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule, QuantityRule
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.motor_current.experiment import MotorCurrent
 
 #: The twin's currents, A, and its reading errors, N and A.
 CURRENTS = np.linspace(0.25, 2.0, 8)
@@ -23,12 +20,6 @@ class MotorSettings(Settings):
     """``sd_ratio``: the force's reading error per the current's, N/A."""
 
     sd_ratio: Annotated[float | None, QuantityRule("N/A")] = None
-
-
-def _make(table: Table[MotorSettings], rig: Rig) -> tuple["MotorCurrent"]:
-    from capsule_id.experiments.motor_current.experiment import MotorCurrent
-
-    return (MotorCurrent(table, rig),)
 
 
 def calibration(
@@ -68,7 +59,7 @@ KIND = Kind(
     sets=(("force", "current"),),
     settings=MotorSettings,
     rules=(refuse_idle_sd_ratio,),
-    make=_make,
+    make=made_by("capsule_id.experiments.motor_current.experiment:MotorCurrent"),
     template=TEMPLATE,
     informs="K",
     captions={"motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K."},

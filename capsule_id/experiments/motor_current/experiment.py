@@ -1,6 +1,6 @@
 """Motor current: a known force on the rod balanced by the motor (paper, Fig. 3); K = dF/dI."""
 
-from capsule_id.experiments.line import Line
+from capsule_id.experiments.families.line_experiment import Line
 from capsule_id.parameters import parameter
 from capsule_id.rig.model import Rig, Table
 

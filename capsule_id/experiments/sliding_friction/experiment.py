@@ -1,25 +1,25 @@
-"""Steady sliding: friction force, or coefficient, at a held speed, on eq. (1)."""
+"""Steady sliding: friction force, or coefficient, at a held speed."""
 
 from types import ModuleType
-from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.friction_curve import FrictionExperiment, unit_law
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.sliding_friction.declaration import SLIDING_SCATTER
-from capsule_id.parameters import parameter
-from capsule_id.physics.friction import normal_force
+from capsule_id.physics.friction import FrictionLaw, normal_force
 from capsule_id.rig.model import Rig, Table
 
 
 class SlidingFriction(FrictionExperiment):
     """y = w mu_d(v), w = (m1 + m2) g for a force and 1 for a coefficient.
 
-    Variance: reading errors of y and of v (through the slope of eq. (1)) and the relative scatter of mu.
+    Variance: reading errors of y and of v (through the slope of the friction law) and the relative scatter of mu.
     """
 
     speed: np.ndarray
@@ -30,8 +30,9 @@ class SlidingFriction(FrictionExperiment):
 
     role = "sliding"
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        self.about = About(table, rig, (parameter("mu"), parameter("v_s"), SLIDING_SCATTER))
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        self.friction = friction
+        self.about = About(table, rig, (*friction.parameters, SLIDING_SCATTER))
         self.quantity = "force" if "force" in table.columns else "coefficient"
         self.speed, self.values = table["speed"], table[self.quantity]
         self.speed_sd = table.columns["speed"].reading_sd
@@ -43,19 +44,15 @@ class SlidingFriction(FrictionExperiment):
 
     @property
     def masses(self) -> tuple[str, ...]:
-        return ("m1", "m2") if self.quantity == "force" else ()
+        return ("m1", "m2") if self.quantity == "force" else super().masses
 
     @property
     def observed(self) -> np.ndarray:
         return self.values
 
-    def _weight(self, theta: ValuesBySymbol) -> Any:
-        return normal_force(theta["m1"], theta["m2"], theta["g"]) if self.quantity == "force" else 1.0
-
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        mu, v_s, weight = theta["mu"], theta["v_s"], self._weight(theta)
-        predicted = weight * unit_law(mu, v_s).forward(self.speed)
-        slope = -0.5 * weight * mu * xp.exp(-self.speed / v_s) / v_s
+        law = self.friction.force(theta) if self.quantity == "force" else self.friction.coefficient(theta)
+        predicted, slope = (xp.asarray(values) for values in _value_and_slope(law, self.speed))
         variance = self.values_sd**2 + (slope * self.speed_sd) ** 2
         return (Misfit(self.values - predicted, variance, predicted, no_design(self.n, xp)),)
 
@@ -69,9 +66,10 @@ class SlidingFriction(FrictionExperiment):
         return self.speed, self.values / normal_force(m1.value, m2.value, self.rig.g.value)
 
     def starts(self) -> dict[str, Start]:
-        speed, coefficient = self.paper_points()
-        return {
-            "mu": Start(float(np.max(coefficient)), 0.3),
-            "v_s": Start(float(np.median(speed)), 0.5),
-            "sliding_scatter": Start(0.02, 0.3),
-        }
+        return {**self.rough_starts(), "sliding_scatter": Start(0.02, 0.3)}
+
+
+@jax.jit
+def _value_and_slope(law: FrictionLaw, speed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Resistance and its derivative with respect to the speed, (n,) each."""
+    return jax.jvp(law.forward, (speed,), (jnp.ones_like(speed),))

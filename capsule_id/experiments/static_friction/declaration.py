@@ -2,21 +2,18 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
-from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE, SLOPE_ANGLE
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.static_friction.experiment import StaticFriction
 
 TILT_SD = scatter(
     "tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", Prior("halfnormal", 0.0, np.deg2rad(1.0))
@@ -55,12 +52,6 @@ def _check_tilt(entry: Entry[TiltSettings]) -> None:
         raise entry.file.error(row, "height", "height must be less than the length of the board", value, remedy)
 
 
-def _make(table: Table[TiltSettings], rig: Rig) -> tuple["StaticFriction"]:
-    from capsule_id.experiments.static_friction.experiment import StaticFriction
-
-    return (StaticFriction(table, rig),)
-
-
 def tilts(
     rng: np.random.Generator, mu: float, trials: int = TRIALS, tilt_sd: float = TRIAL_SD
 ) -> dict[str, np.ndarray]:
@@ -94,7 +85,7 @@ KIND = Kind(
     settings=TiltSettings,
     rules=(_check_tilt,),
     parameters=(TILT_SD,),
-    make=_make,
+    make=made_by("capsule_id.experiments.static_friction.experiment:StaticFriction"),
     template=TEMPLATE,
     informs="mu",
     captions=CAPTIONS,

@@ -6,15 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.friction_curve import FrictionExperiment
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.static_friction.declaration import TILT_SD
-from capsule_id.parameters import parameter
 from capsule_id.rig.model import Rig, Table
 
 
 class StaticFriction(FrictionExperiment):
-    """Trials of one surface: angle_i = arctan(mu) + N(0, tilt_sd^2 + reading error^2).
+    """Trials of one surface: angle_i = arctan(mu_0) + N(0, tilt_sd^2 + reading error^2).
+
+    mu_0 is the coefficient at break-away. A capsule that slides down counts as one that slides forward.
 
     Where height and length are recorded instead of the angle, ``length_is`` says which side of the triangle the length
     is: the tilted board (sin = height/length) or the base (tan = height/length).
@@ -25,8 +27,9 @@ class StaticFriction(FrictionExperiment):
 
     role = "static"
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        self.about = About(table, rig, (parameter("mu"), TILT_SD))
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        self.friction = friction
+        self.about = About(table, rig, (*friction.parameters_at_rest, TILT_SD))
         self.angle, self.reading_sd = _angles(table)
 
     @property
@@ -38,7 +41,8 @@ class StaticFriction(FrictionExperiment):
         return self.angle
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        return (Misfit(self.angle - xp.arctan(theta["mu"]), self.reading_sd**2, 1.0, no_design(self.n, xp)),)
+        angle = xp.arctan(self.friction.coefficient(theta).forward(0.0))
+        return (Misfit(self.angle - angle, self.reading_sd**2, 1.0, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Tilts are read as mu = tan(angle) at speed 0."""

@@ -1,17 +1,14 @@
 """Support spring: columns, settings, template and twin."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
 from capsule_id.experiments.families.line import line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
-from capsule_id.rig.model import Quantity, Rig, Settings, Table
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
+from capsule_id.rig.model import Quantity, Settings
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.support_spring.experiment import SupportSpring
 
 #: The twin's deflections, m, and the noise of the force as a share of full scale.
 DEFLECTIONS = np.linspace(0.0, 1e-3, 11)
@@ -27,12 +24,6 @@ class SpringSettings(Settings):
     spring: Annotated[str, NameRule()]
     length: Annotated[Quantity | None, QuantityRule("m", has_sd=True)] = None
     sd_ratio: Annotated[float | None, QuantityRule("N/m")] = None
-
-
-def _make(table: Table[SpringSettings], rig: Rig) -> tuple["SupportSpring"]:
-    from capsule_id.experiments.support_spring.experiment import SupportSpring
-
-    return (SupportSpring(table, rig),)
 
 
 def static_test(
@@ -73,7 +64,7 @@ KIND = Kind(
     sets=(("deflection", "force"),),
     settings=SpringSettings,
     rules=(refuse_idle_sd_ratio,),
-    make=_make,
+    make=made_by("capsule_id.experiments.support_spring.experiment:SupportSpring"),
     template=TEMPLATE,
     informs="k2 of that spring",
     captions={"support_spring": "The slope of the line is the stiffness of the support spring."},

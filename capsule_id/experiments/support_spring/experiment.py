@@ -1,6 +1,6 @@
 """Support spring: static force against deflection (paper, section 2.2)."""
 
-from capsule_id.experiments.line import Line
+from capsule_id.experiments.families.line_experiment import Line
 from capsule_id.experiments.support_spring.checks import check_cantilever
 from capsule_id.parameters import parameter
 from capsule_id.rig.model import Quantity, Rig, Table

@@ -223,8 +223,8 @@ class LogPosterior(eqx.Module):
                 merged[row.name] = Start(float(centre), min(s.spread for s in starts))
             else:  # masses: the measured value; others: the prior median
                 prior = prior_of(row)
-                spread = np.log(prior.spread) if prior.kind == "lognormal" else prior.spread / prior.location
-                merged[row.name] = Start(prior.location, min(spread, WIDEST_START))
+                spread = np.log(prior.spread) if prior.kind == "lognormal" else prior_sd(row)
+                merged[row.name] = Start(prior.median, float(min(spread, WIDEST_START)))
         return merged
 
     def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, np.ndarray]:

@@ -2,18 +2,15 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
-from capsule_id.experiments.kind import Kind
+from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Parameter, Prior, scatter
 from capsule_id.rig.domains import POSITIVE
-from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.model import Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.base import Experiment
 
 C_RR = Parameter("c_rr", "1", "rolling resistance coefficient", r"c_\mathrm{rr}", Prior("lognormal", 0.01, 100.0))
 SCATTER = scatter(
@@ -38,12 +35,6 @@ def _lint(table: Table[RollingSettings]) -> Iterable[str]:
         yield "fewer than 6 speeds; measure more"
 
 
-def _make(table: Table[RollingSettings], rig: Rig) -> "tuple[Experiment]":
-    from rolling_rig.experiment import RollingResistance
-
-    return (RollingResistance(table, rig),)
-
-
 KIND = Kind(
     name="rolling_resistance",
     columns={"speed": ColumnRule("m/s", POSITIVE), "force": ColumnRule("N", POSITIVE)},
@@ -51,7 +42,7 @@ KIND = Kind(
     settings=RollingSettings,
     masses=_masses,
     parameters=(C_RR, SCATTER),
-    make=_make,
+    make=made_by("rolling_rig.experiment:RollingResistance"),
     template="""\
 #: Rolling resistance: c_rr. Columns: speed [m/s], force [N].
 # [[experiment]]

@@ -8,10 +8,9 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.lines import curvature_test
+from capsule_id.experiments.families.line_experiment import Line, curvature_test
 from capsule_id.experiments.free_vibration.decay_models import dry_decay
 from capsule_id.experiments.free_vibration.twin import DECAY_NOISE, RELEASES, decay
-from capsule_id.experiments.line import Line
 from capsule_id.experiments.static_friction.declaration import tilts as tilted
 from capsule_id.inference.checks.regression import outliers
 from capsule_id.inference.checks.setting import Setting

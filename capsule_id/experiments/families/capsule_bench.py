@@ -15,14 +15,13 @@ import numpy as np
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
-from capsule_id.experiments.forward import CapsuleForward
+from capsule_id.experiments.families.capsule_experiment import CapsuleForward
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.friction_curve import unit_law
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Prior, parameter
-from capsule_id.physics.friction import slide_distance
-from capsule_id.physics.model import CapsuleParameters, Excitation
+from capsule_id.physics.model import Excitation
 from capsule_id.rig.model import Rig, Table
 
 #: No drive: its frequency means nothing then.
@@ -47,14 +46,14 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     checks = ()
     tables = ()
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        FreeVibration.__init__(self, table, rig)
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        FreeVibration.__init__(self, table, rig, friction)
         self.smoothing = None
         gap = table.settings.gap
         self.within_reach = gap is not None
         self.gap = FAR if gap is None else gap.value
         self.gap_known = gap is None or gap.sd == 0.0
-        rows = [parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")]
+        rows = [parameter("k1"), parameter("c"), *friction.parameters]
         if gap is not None:
             rows.append(parameter("k2", table.settings.spring))
             if gap.sd > 0.0:
@@ -69,9 +68,9 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
     def motion_of(self, theta: ValuesBySymbol) -> Any:
         """(n,) x_rel of the model."""
-        p = _capsule(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
+        p = self.parameters_of(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
-        t = self.simulated(p, OFF, self.time, initial)
+        t = self.simulated(theta, p, OFF, self.time, initial)
         return t.X1 - t.X2
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
@@ -100,27 +99,19 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
     # A push with the capsule model depends on k1 and c too: by itself it is no friction test.
     checks = ()
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        DynamicFriction.__init__(self, table, rig)
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        DynamicFriction.__init__(self, table, rig, friction)
         self.smoothing = None
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
-        rows = (*(parameter(symbol) for symbol in ("k1", "c", "mu", "v_s")), PUSH_SCATTER)
-        self.about = About(table, rig, rows)
+        self.about = About(table, rig, (parameter("k1"), parameter("c"), *friction.parameters, PUSH_SCATTER))
 
     def slide(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
         """(n,) m that the capsule goes."""
         still, v = xp.zeros(self.n), xp.asarray(self.speed)
         times = xp.stack([xp.zeros(self.n), xp.asarray(self.horizon)], axis=1)
-        t = self.simulated(_capsule(theta, 0.0, FAR), OFF, times, (still, v, still, v))
+        t = self.simulated(theta, self.parameters_of(theta, 0.0, FAR), OFF, times, (still, v, still, v))
         return xp.asarray(t.X2)[:, -1]
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        law, g = unit_law(theta["mu"], theta["v_s"]), theta["g"]
-        locked = slide_distance(law, 1.0 / g, self.speed)
-        slope = self.speed / (g * law.forward(self.speed))
-        variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
+        locked, variance = self.locked_slide(theta)
         return (Misfit(self.distance - self.slide(theta, xp), variance, locked, no_design(self.n, xp)),)
-
-
-def _capsule(theta: ValuesBySymbol, k2: Any, gap: Any) -> CapsuleParameters:
-    return CapsuleParameters(G=gap, k2=k2, **{name: theta[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")})

@@ -5,12 +5,13 @@ from typing import Any, Self
 import equinox as eqx
 from numpy.typing import ArrayLike
 
-from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.families.friction_model import SurfaceExperiment
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
 
 
-class CapsuleForward(Experiment):
+class CapsuleForward(SurfaceExperiment):
     """An experiment that the capsule model predicts.
 
     Attributes
@@ -30,10 +31,18 @@ class CapsuleForward(Experiment):
         """The same readings with the smoothed model of these ``widths`` as forward model; None: the exact one."""
         return eqx.tree_at(lambda e: e.smoothing, self, widths, is_leaf=lambda x: x is None)
 
-    def simulated(self, p: CapsuleParameters, e: Excitation, times: ArrayLike, initial: Any = None) -> Trajectory:
-        """``simulate`` by this experiment's model."""
-        model = "exact" if self.smoothing is None else "smooth"
-        return simulate(p, e, times, initial, model=model, smoothing=self.smoothing)
+    def parameters_of(self, theta: ValuesBySymbol, k2: Any, gap: Any) -> CapsuleParameters:
+        """The capsule at ``theta``; mu and v_s are placeholders where another friction law replaces them."""
+        names = ("m1", "m2", "k1", "c", "g")
+        friction = {"mu": theta.get("mu", 0.0), "v_s": theta.get("v_s", 1.0)}
+        return CapsuleParameters(G=gap, k2=k2, **friction, **{name: theta[name] for name in names})
+
+    def simulated(
+        self, theta: ValuesBySymbol, p: CapsuleParameters, e: Excitation, times: ArrayLike, initial: Any = None
+    ) -> Trajectory:
+        """``simulate`` by this experiment's model, with the friction law at ``theta``."""
+        model, law = "exact" if self.smoothing is None else "smooth", self.friction.force(theta)
+        return simulate(p, e, times, initial, model=model, smoothing=self.smoothing, friction=law)
 
     def advice_on_coloured_noise(self) -> str:
         remedy = 'check spring, gap and friction law, or state noise = "ar1" where the sensor filters'

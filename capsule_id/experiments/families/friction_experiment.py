@@ -1,15 +1,18 @@
-"""The friction coefficient of eq. (1) against velocity: the paper's protocol and the picture (Fig. 2)."""
+"""Friction experiments: the coefficient against velocity (Fig. 2), the paper's protocol, the check of one surface."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from scipy.optimize import curve_fit
 
-from capsule_id.experiments.base import Experiment, ValuesBySymbol, band
-from capsule_id.experiments.checks.friction import check_one_surface
+from capsule_id.experiments.base import Start, ValuesBySymbol, band
+from capsule_id.experiments.checks.context import Fitted
+from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.families.friction_model import SurfaceExperiment
 from capsule_id.physics.friction import CoulombStribeck, slide_distance
-from capsule_id.views import Comparison, Curve, Points
+from capsule_id.views import Comparison, Curve, Finding, Points
 
 
 def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
@@ -41,15 +44,43 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
     return {"mu": float(mu), "v_s": float(v_s)}
 
 
-class FrictionExperiment(Experiment):
-    """An experiment on the surface: it shares eq. (1), the paper's protocol and one panel with the others."""
+def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> list[Finding]:
+    """Expected: tilts and slides agree on the coefficient at break-away."""
+    tilts = [e for e in experiments if e.role == "static"]
+    slides = [e for e in experiments if e.role != "static"]
+    if not tilts or not slides:
+        return []
+    found, friction = fit.tension(tilts, slides), tilts[0].friction
+    by_tilting, by_sliding = (friction.coefficient(values).forward(0.0) for values in (found.one, found.other))
+    seen = f"mu = {by_tilting:.3f} by tilting, {by_sliding:.3f} by sliding (p = {found.p:.2g})"
+    if found.p < LEVEL:
+        labels = ", ".join(e.label for e in tilts)
+        text = (
+            f"{labels} and {', '.join(e.label for e in slides)}: expected one surface; {seen}: were they measured on the "
+            "same surface, and is the tilt read at break-away?"
+        )
+        return [Finding("experiments agree", "fail", text, tilts[0].label)]
+    return [Finding("experiments agree", "ok", seen)]
+
+
+class FrictionExperiment(SurfaceExperiment):
+    """An experiment on the surface: it shares the friction law, the paper's protocol and one panel with the others."""
 
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
     checks = (check_one_surface,)
 
+    @property
+    def masses(self) -> tuple[str, ...]:
+        return self.friction.masses
+
     @abstractmethod
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Speed, m/s, and coefficient, as the paper reads them, (n,) each."""
+
+    def rough_starts(self) -> dict[str, Start]:
+        """Starts of mu and v_s, from the readings as the paper reads them; another law starts at its prior medians."""
+        speed, coefficient = self.paper_points()
+        return {"mu": Start(float(np.max(coefficient)), 0.3), "v_s": Start(float(np.median(speed)), 0.5)}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return friction_comparison([self], theta, draws)
@@ -59,23 +90,24 @@ def friction_comparison(
     experiments: list[FrictionExperiment], theta: ValuesBySymbol, draws: list[ValuesBySymbol]
 ) -> Comparison:
     """Friction coefficient against velocity: readings, the paper's curve, ours with its band (paper, Fig. 2)."""
+    friction = experiments[0].friction
     points = [Points(e.label, *e.paper_points(), role=e.role) for e in experiments]
     top = max(float(np.max(p.x)) for p in points)
     speed = np.linspace(0.0, 1.15 * top if top > 0 else 1.0, 161)
 
     def curve(values: ValuesBySymbol) -> np.ndarray:
-        if "v_s" not in values:
-            return np.full(speed.size, float(values["mu"]))
-        return unit_law(values["mu"], values["v_s"]).forward(speed)
+        # Tilts alone say nothing of sliding: the line through them is level.
+        known = all(row.symbol in values for row in friction.parameters)
+        return np.asarray(friction.coefficient(values).forward(speed if known else 0.0 * speed))
 
     lower, upper = band(np.array([curve(draw) for draw in draws]))
-    curves = [Curve("this fit, eq. (1)", speed, curve(theta), lower, upper)]
+    curves = [Curve(f"this fit, {friction.name}", speed, curve(theta), lower, upper)]
     paper = paper_friction_fit(np.concatenate([p.x for p in points]), np.concatenate([p.y for p in points]))
     if "v_s" in paper:
         curves.append(Curve("the paper's fit", speed, unit_law(**paper).forward(speed), role="paper"))
-    if "v_s" in theta and any(p.role == "dynamic" for p in points):
+    if any(p.role == "dynamic" for p in points):
         reading = np.maximum(speed[1:], 1e-3 * speed[-1])
-        distance = slide_distance(unit_law(theta["mu"], theta["v_s"]), 1.0 / theta["g"], reading)
+        distance = slide_distance(friction.coefficient(theta), 1.0 / theta["g"], reading)
         expected = reading**2 / (2.0 * theta["g"] * distance)
         curves.append(Curve("this fit, read as v²/(2gd)", reading, expected, role="alternative"))
     return Comparison(

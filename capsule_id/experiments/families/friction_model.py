@@ -1,0 +1,158 @@
+"""The friction law of a fit: which parameters are sampled for it, and the law at their values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
+
+import equinox as eqx
+import jax
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import Experiment, ValuesBySymbol
+from capsule_id.parameters import Parameter, Prior
+from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force
+from capsule_id.rig.model import Rig, Table
+
+#: Symbol of the leaf that holds the normal force, N.
+NORMAL_FORCE = "N"
+#: Relative changes of the break-away force below this are rounding.
+ROUNDING = 1e-9
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PerWeight:
+    """A law divided by the weight of capsule and rod: its resistance is the friction coefficient, 1.
+
+    Attributes
+    ----------
+    law : resistance in N
+    weight : (m1 + m2) g, N
+    """
+
+    law: FrictionLaw
+    weight: Any
+
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+
+    def forward(self, speed: Any) -> Any:
+        """Coefficient of a capsule that slides towards positive X2, 1."""
+        return self.law.forward(speed) / self.weight
+
+    def backward(self, speed: Any) -> Any:
+        """Coefficient of a capsule that slides towards negative X2, 1."""
+        return self.law.backward(speed) / self.weight
+
+
+@dataclass(frozen=True)
+class FrictionModel:
+    """One friction law for all experiments of a fit, as a function of the parameter values.
+
+    The leaves of the law are its sampled parameters. A leaf ``N`` is not sampled: it holds the weight (m1 + m2) g.
+
+    Attributes
+    ----------
+    law : its class; eq. (1) by default
+
+    Raises
+    ------
+    InputError
+        If the law has a leaf other than N that is not sampled, or a sampled one without a default prior.
+    """
+
+    law: type[FrictionLaw] = CoulombStribeck
+
+    def __post_init__(self) -> None:
+        for row in self.law.parameters:
+            if row.symbol != NORMAL_FORCE and (row.prior is None or not row.sampled):
+                rule = f"every parameter of the friction law {self.law.__name__} must have a default prior"
+                raise InputError(rule, f"{row.symbol} has none", f"give Parameter({row.symbol!r}, ...) a prior")
+
+    @property
+    def name(self) -> str:
+        """For legends."""
+        return "eq. (1)" if self.is_proportional else self.law.__name__
+
+    @property
+    def is_proportional(self) -> bool:
+        """The law is eq. (1): proportional to the normal force, so that a coefficient needs no mass."""
+        return self.law is CoulombStribeck
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The sampled parameters."""
+        return tuple(row for row in self.law.parameters if row.symbol != NORMAL_FORCE)
+
+    @property
+    def parameters_at_rest(self) -> tuple[Parameter, ...]:
+        """Those that the break-away force depends on, by their effect at the prior medians: mu alone in eq. (1)."""
+        medians = {row.symbol: _prior_of(row).median for row in self.parameters}
+        force = self._at(medians, 1.0).forward(0.0)
+
+        def matters(row: Parameter) -> bool:
+            other = 1.1 * medians[row.symbol] or _prior_of(row).spread
+            return bool(abs(self._at({**medians, row.symbol: other}, 1.0).forward(0.0) - force) > ROUNDING * force)
+
+        return tuple(row for row in self.parameters if matters(row))
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        """Symbols of the masses that the coefficient depends on."""
+        return () if self.is_proportional else ("m1", "m2")
+
+    def check(self, known: Mapping[str, Parameter]) -> None:
+        """Refuse a law with a parameter that has the symbol of another one of ``known``, the package's and its kinds'.
+
+        Raises
+        ------
+        InputError
+            At the first such parameter.
+        """
+        for row in self.parameters:
+            if known.get(row.symbol, row) != row:
+                rule = f"a parameter of the friction law {self.law.__name__} must have a symbol of its own"
+                raise InputError(rule, f"{row.symbol}: {known[row.symbol].meaning}", "rename it")
+
+    def force(self, theta: ValuesBySymbol) -> FrictionLaw:
+        """The law at ``theta``, N; theta has m1, m2 and g."""
+        return self._at(theta, _weight(theta))
+
+    def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
+        """Resistance per weight (m1 + m2) g at ``theta``, 1; theta has ``masses`` and g."""
+        if self.is_proportional:
+            return self._at(theta, 1.0)
+        return PerWeight(self.force(theta), _weight(theta))
+
+    def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
+        # What tilts alone do not sample has no effect at rest: any value serves there.
+        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in self.parameters}
+        constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
+        return cast(Any, self.law)(**known, **constant)
+
+
+def _prior_of(row: Parameter) -> Prior:
+    assert row.prior is not None, "a friction model refuses rows without a prior"
+    return row.prior
+
+
+def _weight(theta: ValuesBySymbol) -> Any:
+    return normal_force(theta["m1"], theta["m2"], theta["g"])
+
+
+#: The paper's law, for experiments of a fit without another one.
+EQUATION_1 = FrictionModel()
+
+
+class SurfaceExperiment(Experiment):
+    """An experiment of a capsule that slides; its constructor takes the friction law besides table and rig.
+
+    Attributes
+    ----------
+    friction : the law that all experiments of the fit share
+    """
+
+    friction: FrictionModel = eqx.field(static=True)
+
+    @classmethod
+    def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> "tuple[SurfaceExperiment, ...]":
+        return (cls(table, rig, friction),)  # type: ignore[call-arg, arg-type]  # pyright: ignore

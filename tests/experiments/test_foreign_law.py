@@ -1,0 +1,228 @@
+"""A friction law that the package does not know: one class, simulated, fitted through the exact engine, reported."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import capsule_id as cid
+from capsule_id.api import Fit
+from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.families.friction_model import FrictionModel
+from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.parameters import Parameter, Prior
+from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
+from tests.experiments import bench
+from tests.rig.folder import RIG_TOML, write_folder
+
+#: (n,) m/s, and N.
+Speed = Any
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lorentzian:
+    """F_c + (F_s - F_c)/(1 + (v/v_0)^2), both ways: Stribeck's effect with another shape than eq. (1)."""
+
+    F_s: float
+    F_c: float
+    v_0: float
+
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("F_s", "N", "break-away force", "F_s", Prior("lognormal", 3.0, 5.0)),
+        Parameter("F_c", "N", "friction at high speed", "F_c", Prior("lognormal", 2.0, 5.0)),
+        Parameter("v_0", "m/s", "speed of half the weakening", "v_0", Prior("lognormal", 0.1, 10.0)),
+    )
+
+    def forward(self, speed: Speed) -> Speed:
+        return self.F_c + (self.F_s - self.F_c) / (1.0 + (speed / self.v_0) ** 2)
+
+    backward = forward
+
+
+TRUTH = Lorentzian(F_s=3.9, F_c=1.4, v_0=0.08)
+WEIGHT = (bench.M1 + bench.M2) * bench.G
+K2, GAP, OMEGA, P_D = 18960.0, 1e-3, 34.56, 4.0
+TILT_SD, DISTANCE_SD, NOISE = np.deg2rad(0.3), 0.3e-3, 2e-5
+#: k1, c and k2 are known to 2 %, so that few readings are enough.
+KNOWN = {name: PriorOverride(value, 1.04) for name, value in (("k1", bench.K1), ("c", bench.C), ("k2[L60]", K2))}
+
+
+def tilts(rng: np.random.Generator) -> Table:
+    angle = np.arctan(TRUTH.F_s / WEIGHT) + TILT_SD * rng.standard_normal(8)
+    return bench.table("static_friction", [bench.column("angle", angle)])
+
+
+def pushes(rng: np.random.Generator) -> Table:
+    """Distances by SciPy's quadrature of m u/F(u)."""
+    speed = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
+    mass = bench.M1 + bench.M2
+    distance = np.array([quad(lambda u: mass * u / TRUTH.forward(u), 0.0, v)[0] for v in speed])
+    distance += DISTANCE_SD * rng.standard_normal(len(speed))
+    return bench.table(
+        "dynamic_friction", [bench.column("speed", speed), bench.column("distance", distance, DISTANCE_SD)]
+    )
+
+
+def sliding(rng: np.random.Generator, quantity: str) -> Table:
+    speed = np.array([0.03, 0.06, 0.1, 0.2, 0.4, 0.8])
+    values = TRUTH.forward(speed) / (1.0 if quantity == "force" else WEIGHT)
+    values = values * (1.0 + 0.02 * rng.standard_normal(len(speed)))
+    return bench.table("sliding_friction", [bench.column("speed", speed), bench.column(quantity, values)], quantity)
+
+
+def run(rng: np.random.Generator) -> Table:
+    """0.2 s from rest."""
+    time = np.arange(200) / 1000.0
+    p = CapsuleParameters(bench.M1, bench.M2, bench.K1, K2, bench.C, mu=0.0, v_s=1.0, G=GAP, g=bench.G)
+    t = simulate(p, Excitation(P_D, OMEGA), time, friction=TRUTH)
+    assert float(np.ptp(t.X2)) > 1e-3, "the capsule slides"
+    seen = {"x_rel": t.x_rel, "x_capsule": t.X2}
+    columns = [bench.column(name, values + NOISE * rng.standard_normal(len(time))) for name, values in seen.items()]
+    settings = {"spring": "L60", "gap": Quantity(GAP), "Omega": OMEGA, "P_d": Quantity(P_D), "start": "stuck"}
+    return bench.table("forced_run", [bench.column("time", time), *columns], "run", **settings)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    rng = np.random.default_rng(5)
+    return bench.rig(tilts(rng), pushes(rng), run(rng), priors=KNOWN)
+
+
+@pytest.fixture(scope="module")
+def fitted(rig: Rig) -> Fit:
+    return cid.fit(rig, budget=None, friction=Lorentzian)
+
+
+def test_a_fit_recovers_the_law(fitted: Fit) -> None:
+    point = fitted.point_fit
+    for row in Lorentzian.parameters:
+        pull = (point.values[row.name] - getattr(TRUTH, row.name)) / point.standard_errors[row.name]
+        assert abs(pull) < 4.0, row.name
+        assert point.standard_errors[row.name] < 0.05 * getattr(TRUTH, row.name)
+    assert {"mu", "v_s"}.isdisjoint(point.names)
+    assert not [finding.text for finding in fitted.findings if finding.level == "fail"]
+
+
+def test_the_papers_law_fits_the_same_readings_worse(rig: Rig, fitted: Fit) -> None:
+    """The negative control."""
+    other = fit_points(rig, make_experiments(rig), 0, sampled=False).fit
+    assert {"mu", "v_s"} <= set(other.names)
+    assert fitted.point_fit.log_posterior.max() - other.log_posterior.max() > 30.0
+
+
+def test_the_report_draws_the_fitted_law(fitted: Fit, tmp_path: Path) -> None:
+    (panel,) = (panel for panel in fitted.comparisons if panel.kind == "friction")
+    curve = next(curve for curve in panel.curves if curve.role == "ours")
+    assert curve.label == "this fit, Lorentzian"
+    best = Lorentzian(*(fitted.point_fit.values[row.name] for row in Lorentzian.parameters))
+    np.testing.assert_allclose(curve.y, best.forward(curve.x) / WEIGHT, rtol=1e-12)
+    fitted.write(tmp_path / "out")
+    html = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "break-away force" in html
+    assert "this fit, Lorentzian" not in html  # it stands in the picture
+    assert (tmp_path / "out" / "parameters.json").read_text(encoding="utf-8").count('"F_c"') == 1
+
+
+def test_a_bench_without_runs_is_fitted_too() -> None:
+    rng = np.random.default_rng(2)
+    tables = tilts(rng), pushes(rng), sliding(rng, "force"), sliding(rng, "coefficient")
+    rig = bench.rig(*tables, m1=Quantity(bench.M1, 1e-4), m2=Quantity(bench.M2, 1e-4))
+    point = cid.fit(rig, budget=None, friction=Lorentzian).point_fit
+    assert {"m1", "m2", "F_s", "F_c", "v_0"} < set(point.names)
+    for row in Lorentzian.parameters:
+        assert abs(point.values[row.name] - getattr(TRUTH, row.name)) < 4.0 * point.standard_errors[row.name]
+
+
+def test_eq_1_named_explicitly_is_the_default() -> None:
+    rig = bench.rig(*(make(np.random.default_rng(1)) for make in (tilts, pushes)))
+    plain, named = (LogPosterior(rig, make_experiments(rig, friction=law)) for law in (None, CoulombStribeck))
+    assert plain.names == named.names == ("mu", "tilt_sd", "v_s", "push_scatter")
+    u = np.log([[0.6, 0.01, 0.2, 0.02]])
+    assert float(plain.batch(u)[0]) == float(named.batch(u)[0])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class OnWeight(Lorentzian):
+    """A law with a leaf N, the weight of capsule and rod."""
+
+    N: float
+
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        *Lorentzian.parameters,
+        Parameter("N", "N", "normal force", "N", sampled=False),
+    )
+
+    def forward(self, speed: Speed) -> Speed:
+        return self.N * super().forward(speed)
+
+    backward = forward
+
+
+def test_a_leaf_N_is_the_weight() -> None:
+    model = FrictionModel(OnWeight)
+    assert model.parameters == Lorentzian.parameters
+    theta = {"F_s": 3.9, "F_c": 1.4, "v_0": 0.08, "m1": bench.M1, "m2": bench.M2, "g": bench.G}
+    assert model.force(theta).forward(np.array(0.1)) == pytest.approx(WEIGHT * TRUTH.forward(np.array(0.1)), rel=1e-14)
+    assert model.coefficient(theta).forward(np.array(0.1)) == pytest.approx(TRUTH.forward(np.array(0.1)), rel=1e-14)
+
+
+class Priorless(Lorentzian):
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        replace(Lorentzian.parameters[0], prior=None),
+        *Lorentzian.parameters[1:],
+    )
+
+
+class Taken(Lorentzian):
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        replace(Lorentzian.parameters[0], symbol="k1"),
+        *Lorentzian.parameters[1:],
+    )
+
+
+@pytest.mark.parametrize(
+    ("law", "m2", "text"),
+    [
+        (Priorless, bench.CAPSULE, "every parameter of the friction law Priorless must have a default prior, F_s has"),
+        (Taken, bench.CAPSULE, "symbol of its own, k1: stiffness between rod and capsule, rename it"),
+        (Lorentzian, None, "the friction law Lorentzian is in N, and static_friction needs m2, not stated, add m2"),
+    ],
+)
+def test_a_law_that_cannot_be_fitted_is_refused(law: type[Lorentzian], m2: Quantity | None, text: str) -> None:
+    own = replace(bench.rig(tilts(np.random.default_rng(0))), m2=m2)
+    with pytest.raises(InputError) as caught:
+        cid.fit(own, budget=None, friction=law)
+    assert text in str(caught.value)
+
+
+def test_the_prior_of_its_parameters_can_be_stated(tmp_path: Path) -> None:
+    text = RIG_TOML.replace("[prior]\n", '[prior]\nF_s = { median = 4, factor = 2, unit = "N" }\n')
+    folder = write_folder(tmp_path / "rig", text)
+    assert cid.read_rig(folder, friction=Lorentzian).priors["F_s"] == PriorOverride(4.0, 2.0)
+    with pytest.raises(InputError, match="F_s"):
+        cid.read_rig(folder)
+
+
+def test_any_kind_of_prior_gives_a_start() -> None:
+    rows = tuple(replace(row, prior=Prior("halfnormal", 0.0, 2.0)) for row in Lorentzian.parameters[1:])
+    law = type("Halfnormal", (Lorentzian,), {"parameters": (Lorentzian.parameters[0], *rows)})
+    rig = bench.rig(*(make(np.random.default_rng(1)) for make in (tilts, pushes)))
+    starts = LogPosterior(rig, make_experiments(rig, friction=law)).starts()
+    assert [starts[name].centre for name in ("F_s", "F_c", "v_0")] == pytest.approx([3.0, 1.349, 1.349], rel=1e-3)
+
+
+def test_tilts_sample_what_acts_at_rest() -> None:
+    rig = bench.rig(tilts(np.random.default_rng(0)))
+    assert LogPosterior(rig, make_experiments(rig, friction=Lorentzian)).names == ("F_s", "tilt_sd")
+    (panel,) = cid.fit(rig, budget=None, friction=Lorentzian).comparisons
+    assert len(set(panel.curves[0].y)) == 1
