@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from capsule_id.experiments.base import Experiment
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.views import Facts
 
 
 class CapsuleForward(Experiment):
@@ -35,6 +36,5 @@ class CapsuleForward(Experiment):
         model = "exact" if self.smoothing is None else "smooth"
         return simulate(p, e, times, initial, model=model, smoothing=self.smoothing)
 
-    def advice_on_coloured_noise(self) -> str:
-        remedy = 'check spring, gap and friction law, or state noise = "ar1" where the sensor filters'
-        return f": look at its residuals and phase portrait, {remedy}"
+    def noise_facts(self) -> Facts:
+        return {"model": "capsule"}

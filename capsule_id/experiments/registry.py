@@ -14,6 +14,7 @@ from capsule_id.experiments.kind import Kind
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import Rig
 from capsule_id.rig.schema import parameter_rows
+from capsule_id.views import Message
 
 GROUP = "capsule_id.experiments"
 
@@ -65,6 +66,11 @@ class Registry(Mapping[str, Kind]):
     def captions(self) -> Mapping[str, str]:
         """Captions of all panels, by ``Comparison.kind``."""
         return {name: text for kind in self.kinds for name, text in kind.captions.items()}
+
+    @property
+    def messages(self) -> Mapping[str, Message]:
+        """Words of the checks and tables of all kinds, by code."""
+        return {code: message for kind in self.kinds for code, message in kind.messages.items()}
 
     def has_runs(self, rig: Rig) -> bool:
         """Whether ``rig`` has forced runs."""

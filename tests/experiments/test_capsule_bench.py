@@ -54,7 +54,7 @@ def fitted(release: float, forward: str) -> PointStage:
     known = {"mu": PriorOverride(MU, 1.02), "v_s": PriorOverride(V_S, 1.1)}
     table = decay(release, forward)
     rig = bench.rig(table, priors=known)
-    return fit_points(rig, make_experiments(rig), 0, sampled=False)
+    return fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)
 
 
 def estimate(stage: PointStage, name: str) -> tuple[float, float]:

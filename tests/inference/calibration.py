@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+import capsule_id as cid
 from capsule_id.api import read_rig
-from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Posterior, Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.synthetic import Truth, synthesize
@@ -76,7 +76,7 @@ def study(folder: Path, seeds: Sequence[int], budget: int = DEFAULT_BUDGET) -> I
         truth = random_truth(np.random.default_rng([seed, 0]))
         rig = folder / f"rig_{seed}"
         synthesize(rig, seed, truth)
-        yield outcome_of(fit_rig(read_rig(rig), seed, budget=budget), truth)
+        yield outcome_of(cid.fit(read_rig(rig), seed, budget=budget), truth)
 
 
 def summarise(outcomes: Sequence[Outcome]) -> Calibration:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.pipeline import fit_rig
+import capsule_id as cid
 from capsule_id.inference.result import Result
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import coil_spring
@@ -20,7 +20,7 @@ def _fit(folder: Path, budget: int | None = None, leave_out: int | None = None, 
     keep = np.arange(deflection.size) != (-1 if leave_out is None else leave_out)
     columns = {"deflection [cm]": deflection[keep], "force [N]": 9.81e-3 * mass[keep]}
     rig = make_rig(folder, Entry("support_spring", "coil", columns, {"spring": '"coil"', **settings}))
-    return fit_rig(rig, budget=budget)
+    return cid.fit(rig, budget=budget)
 
 
 # The masses are weighed to 0.01 g and the deflection is read to 1 mm: 1e-4 N against 0.29 mm.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.inference.pipeline import fit_rig
+import capsule_id as cid
 from capsule_id.inference.result import Result
 from tests.measured.folders import Entry, make_rig, note
 from tests.measured.sources import load_cells
@@ -39,7 +39,7 @@ def _plateaus(cell: int, keep: int | None) -> tuple[np.ndarray, np.ndarray, int]
 
 def _fit(folder: Path, load: np.ndarray, counts: np.ndarray) -> Result:
     columns = {"current [A]": load, "force [N]": counts}
-    return fit_rig(make_rig(folder, Entry("motor_current", "cell", columns)), budget=None)
+    return cid.fit(make_rig(folder, Entry("motor_current", "cell", columns)), budget=None)
 
 
 @pytest.mark.parametrize(("cell", "keep", "slope"), CELLS)

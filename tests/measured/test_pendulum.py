@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
+import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.tables import DAMPING_MODELS
 from capsule_id.inference.fit.point_fit import bic, point_fit
-from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Result
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
@@ -36,7 +36,7 @@ def _rig(folder: Path, time: np.ndarray, angle: np.ndarray) -> Rig:
 
 @pytest.fixture(scope="module")
 def swing(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    return fit_rig(_rig(tmp_path_factory.mktemp("swing"), *pendulum(3)), budget=None)
+    return cid.fit(_rig(tmp_path_factory.mktemp("swing"), *pendulum(3)), budget=None)
 
 
 @pytest.mark.parametrize("record", [1, 2])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
-from capsule_id.inference.pipeline import fit_rig
+import capsule_id as cid
 from capsule_id.inference.result import Result
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import ship_roll, ship_roll_stiffness
@@ -32,7 +32,7 @@ def roll(tmp_path_factory: pytest.TempPathFactory) -> Result:
         {"start": quantity(START, "s"), "stop": quantity(STOP, "s")},
     )
     folder: Path = tmp_path_factory.mktemp("roll")
-    return fit_rig(make_rig(folder, entry, head={"m1": quantity(INERTIA, "kg")}), budget=None)
+    return cid.fit(make_rig(folder, entry, head={"m1": quantity(INERTIA, "kg")}), budget=None)
 
 
 def _peaks() -> tuple[np.ndarray, np.ndarray]:

@@ -18,12 +18,13 @@ def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) 
     if not tilts or not slides:
         return []
     found = fit.tension(tilts, slides)
-    seen = f"mu = {found.one['mu']:.3f} by tilting, {found.other['mu']:.3f} by sliding (p = {found.p:.2g})"
+    facts = {
+        "tilts": ", ".join(e.label for e in tilts),
+        "slides": ", ".join(e.label for e in slides),
+        "mu_tilts": found.one["mu"],
+        "mu_slides": found.other["mu"],
+        "p": found.p,
+    }
     if found.p < LEVEL:
-        labels = ", ".join(e.label for e in tilts)
-        text = (
-            f"{labels} and {', '.join(e.label for e in slides)}: expected one surface; {seen}: were they measured on the "
-            "same surface, and is the tilt read at break-away?"
-        )
-        return [Finding("experiments agree", "fail", text, tilts[0].label)]
-    return [Finding("experiments agree", "ok", seen)]
+        return [Finding("friction.one_surface", "fail", facts, tilts[0].label)]
+    return [Finding("friction.one_surface", "ok", facts)]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from capsule_id.experiments.families.line import line_estimates, lint_line, refuse_idle_sd_ratio
+from capsule_id.experiments.families.line import MESSAGES, line_estimates, lint_line, refuse_idle_sd_ratio
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.rig.model import Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, QuantityRule
@@ -72,6 +72,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="K",
     captions={"motor_current": "Counterpart of the paper's Fig. 3: the slope of the line is K."},
+    messages=MESSAGES,
     lint=(lint_line,),
     paper=line_estimates,
     twin=_measure,

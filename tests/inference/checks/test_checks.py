@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.lines import curvature_test
@@ -17,7 +18,6 @@ from capsule_id.inference.checks.regression import outliers
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Finding
@@ -117,7 +117,7 @@ def test_planted_faults_are_named(
 def test_an_unconverged_budget_is_named(tmp_path: Path) -> None:
     """60 steps are not enough for anything; the numbers come with a verdict that is not clean."""
     synthesize(tmp_path / "rig", SEED)
-    result = fit_rig(read_rig(tmp_path / "rig"), SEED, budget=60)
+    result = cid.fit(read_rig(tmp_path / "rig"), SEED, budget=60)
     failed = [f for f in result.findings if f.level == "fail"]
     assert [f.check for f in failed] == ["chains converged"]
     assert "--max-steps" in failed[0].text

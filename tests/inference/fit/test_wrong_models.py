@@ -38,7 +38,7 @@ def whiteness_of(**departures: float) -> Finding:
     priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
     # The same shapes as in test_joint_fit.py: one compiled program serves both.
     rig = bench.rig(table, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
-    stage = fit_points(rig, make_experiments(rig), 0, sampled=False)
+    stage = fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)
     values = stage.target.mapping(stage.target.theta(stage.fit.u))
     return check_whiteness(Setting(stage.target, stage.fit, None, values))[0]
 
