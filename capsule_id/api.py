@@ -12,20 +12,21 @@ from capsule_id.inference.result import Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
-from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.report.messages import caption_of, finding_text, messages_of
 from capsule_id.report.write import write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
-from capsule_id.views import Finding
+from capsule_id.views import Finding, ResultTable
 
 
 @dataclass(frozen=True)
 class Fit(Result):
     """A ``Result`` in words and files."""
 
-    def text(self, finding: Finding) -> str:
-        """What ``finding`` says: what was expected, what was found, what to do."""
-        return finding_text(finding, messages_of(self.registry))
+    def text(self, item: Finding | ResultTable) -> str:
+        """What a finding says (what was expected, what was found, what to do), or the caption of a table."""
+        messages = messages_of(self.registry)
+        return finding_text(item, messages) if isinstance(item, Finding) else caption_of(item, messages)
 
     def write(self, directory: str | Path) -> None:
         """Write parameters.json, parameters.csv, posterior.nc, report.html and figures/ into ``directory``.

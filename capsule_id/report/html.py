@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from capsule_id.inference.result import Result
 from capsule_id.report.columns import columns_of, table_rows
 from capsule_id.report.gallery import Picture
-from capsule_id.report.messages import finding_text, messages_of, title_of
+from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.typography import MISSING, symbol_parts
 from capsule_id.views import Finding, Level, Message, ResultTable
 
@@ -91,8 +91,8 @@ def _note(note: ResultTable, messages: Mapping[str, Message]) -> dict[str, objec
         ([index] if named else []) + list(row)
         for index, row in zip(frame.index, frame.itertuples(index=False), strict=True)
     ]
-    caption = messages[note.code].text("caption", note.facts) if note.code in messages else ""
-    return {"title": title_of(note.code, messages), "caption": caption, "header": header, "rows": rows}
+    title, caption = title_of(note.code, messages), caption_of(note, messages)
+    return {"title": title, "caption": caption, "header": header, "rows": rows}
 
 
 def _number(value: object, form: str = ".5g") -> str:

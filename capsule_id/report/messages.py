@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from capsule_id.experiments.registry import Registry
-from capsule_id.views import Facts, Finding, Message
+from capsule_id.views import Facts, Finding, Message, ResultTable
 
 
 def messages_of(registry: Registry) -> Mapping[str, Message]:
@@ -28,6 +28,11 @@ def finding_text(finding: Finding, messages: Mapping[str, Message]) -> str:
     if not finding.experiment or finding.experiment in text:
         return text
     return f"{finding.experiment}: {text}"
+
+
+def caption_of(table: ResultTable, messages: Mapping[str, Message]) -> str:
+    """The caption of a table; "" where no kind declares words for it."""
+    return messages[table.code].text("caption", table.facts) if table.code in messages else ""
 
 
 def _disagreeing_starts(facts: Facts) -> str:

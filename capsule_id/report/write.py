@@ -67,12 +67,11 @@ def parameters_json(result: Result) -> dict[str, object]:
 
 def table_frame(result: Result) -> pd.DataFrame:
     """Physical parameters and nuisances in one table, SI; ``role`` separates them, every row says ``synthetic``."""
-    parts = [result.summary.assign(role="physical"), result.nuisances.assign(role="nuisance")]
-    table = pd.concat([part for part in parts if len(part)])
+    table = pd.concat([part for part in (result.summary, result.nuisances) if len(part)]).rename_axis("name")
     rows = table.to_dict("index")
     columns = {column.key: [column.of(row) for row in rows.values()] for column in columns_of("csv")}
-    frame = pd.DataFrame(columns, index=table.index.rename("name"))
-    return frame.assign(role=table["role"], synthetic=result.rig.synthetic)
+    roles = ["physical"] * len(result.summary) + ["nuisance"] * len(result.nuisances)
+    return table.assign(**columns, role=roles, synthetic=result.rig.synthetic)
 
 
 def _plain(value: object) -> object:

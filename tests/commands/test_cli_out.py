@@ -88,7 +88,7 @@ def test_directories_that_are_refused(here: Path, capsys: pytest.CaptureFixture[
 
 def test_nothing_is_left_where_the_fit_itself_refuses(here: Path) -> None:
     before = listing(here)
-    with pytest.raises(InputError), work_in_progress(here / "far" / "away", {}, resume=False) as partial:
+    with pytest.raises(InputError), work_in_progress(here / "far" / "away", {}, resume=False) as partial:  # noqa: PT012
         (partial / "figures").mkdir()
         raise InputError("a rule", "broken", "mend it")
     assert listing(here) == before
@@ -133,7 +133,7 @@ def test_a_kill_between_the_steps_of_publishing(
 ) -> None:
     """DIR is then the old result, the new one or absent, never a half; and the next run sets everything right."""
     old = fake_result(here / "out") / "parameters.json"
-    with pytest.raises(Killed), work_in_progress(here / "out", {"seed": 0}, resume=False) as partial:
+    with pytest.raises(Killed), work_in_progress(here / "out", {"seed": 0}, resume=False) as partial:  # noqa: PT012
         (partial / "parameters.json").write_text(old.read_text().replace("old", "new"))
         with monkeypatch.context() as patch:
             die_at(patch, moment)

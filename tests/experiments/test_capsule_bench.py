@@ -14,7 +14,9 @@ from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.free_vibration.checks import check_free_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_curve import unit_law
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity, Table

@@ -20,7 +20,7 @@ VARIED = ("k1", "c", "mu", "v_s", "K", "k2[soft]", "k2[medium]", "k2[stiff]")
 
 @dataclass(frozen=True)
 class Outcome:
-    """One rig: z = Φ⁻¹(posterior CDF at the truth) of every physical parameter, and (check, experiment) that failed."""
+    """One rig: z = Φ⁻¹(posterior CDF at the truth) of every physical parameter; code and experiment of failed checks."""
 
     z: dict[str, float]
     failed: tuple[tuple[str, str], ...]
@@ -67,7 +67,7 @@ def outcome_of(result: Result, truth: Truth) -> Outcome:
     assert result.posterior is not None
     known = truth.flat()
     z = {name: normal_score(result.posterior, name, known[name]) for name in result.summary.index}
-    return Outcome(z, tuple((f.check, f.experiment) for f in result.findings if f.level == "fail"))
+    return Outcome(z, tuple((f.code, f.experiment) for f in result.findings if f.level == "fail"))
 
 
 def study(folder: Path, seeds: Sequence[int], budget: int = DEFAULT_BUDGET) -> Iterator[Outcome]:

@@ -5,9 +5,12 @@ import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.checks.experiment_checks import check_whiteness
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import PriorOverride, Quantity
 from capsule_id.views import Finding
 from tests.experiments import bench
@@ -54,4 +57,4 @@ def test_another_model_is_reported(departure: dict[str, float]) -> None:
     """The cubic term stiffens the rod by 3 % at 1.5 mm."""
     found = whiteness_of(**departure)
     assert (found.level, found.experiment) == ("fail", "run_1")
-    assert "not to be trusted" in found.text
+    assert "not to be trusted" in finding_text(found, FIT_MESSAGES)

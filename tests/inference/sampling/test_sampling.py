@@ -94,7 +94,7 @@ def test_scores_are_standard_normal() -> None:
 def test_seeds() -> None:
     """The same seed gives the same draws whatever NumPy's global state is, another seed others."""
     first = draw(3, budget=400)
-    np.random.seed(99)
+    np.random.seed(99)  # noqa: NPY002
     np.testing.assert_array_equal(draw(3, budget=400).draws, first.draws)
     assert not np.array_equal(draw(4, budget=400).draws, first.draws)
 
