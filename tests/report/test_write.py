@@ -275,7 +275,7 @@ def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None
 def test_netcdf_refusals(result: Result, unsampled: Result, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="nothing was sampled"):
         write_posterior(unsampled, tmp_path / "x.nc")
-    clash = dataclasses.replace(result, groups={"fixed": {"k2": 1.0}})
+    clash = dataclasses.replace(result, fixed={"k2": 1.0})
     with pytest.raises(ValueError, match=re.escape("k2 is used both alone and as a family")):
         write_posterior(clash, tmp_path / "x.nc")
 
