@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     rig = read_rig(args.data, kinds)
     directory = args.out if args.out is not None else Path("results") / rig.name
     check_directory(directory)
-    if args.experiments != "bench" and kinds.has_runs(rig):
+    if args.experiments != "bench" and rig.has_runs:
         prefer_whole_loops()
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.api import fit

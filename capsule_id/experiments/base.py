@@ -72,8 +72,6 @@ class Experiment(eqx.Module):
 
     about: About = eqx.field(static=True)
 
-    #: A test on the bench, as against a recorded run of the capsule.
-    bench: ClassVar[bool] = True
     #: Readings follow each other in time: residuals must be white.
     time_series: ClassVar[bool] = False
     #: The forward model is the event-driven capsule: differentiable in forward mode only, and slow (milliseconds).
@@ -104,6 +102,11 @@ class Experiment(eqx.Module):
     @property
     def kind(self) -> str:
         return self.table.kind
+
+    @property
+    def bench(self) -> bool:
+        """A test on the bench, as against a recorded run of the capsule."""
+        return self.table.bench
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -73,7 +73,6 @@ class Kind(KindRule):
     informs : the parameters that it measures, for tables
     captions : of its panels in the report, by ``Comparison.kind``
     messages : words of its own checks and tables in the report, by code
-    bench : a bench test; else a forced run
     lint : what deserves attention in a table before a fit, a line each
     lint_rig : the same, where it takes the rest of the rig or rough values
     describe : what ``capsule-id check`` says of a table, a line each
@@ -91,7 +90,6 @@ class Kind(KindRule):
     informs: str
     captions: Mapping[str, str]
     messages: Mapping[str, Message] = field(default_factory=dict)
-    bench: bool = True
     lint: tuple[Callable[[Table[Any]], Iterable[str]], ...] = ()
     lint_rig: Callable[[Table[Any], Rig, Estimate], Iterable[str]] = field(default=lambda table, rig, estimate: ())
     describe: Callable[[Table[Any]], Iterable[str]] = field(default=lambda table: ())

@@ -98,7 +98,7 @@ def _compile(pool: Executor | None, target: LogPosterior) -> None:
 def _rough(target: LogPosterior, registry: Registry) -> dict[str, float]:
     """The paper's estimates from the rig's bench tests; those that ``target`` lacks are made for it."""
     bench = [e for e in target.experiments if e.bench]
-    if not bench and select_tables(target.rig, "bench", registry):
+    if not bench and select_tables(target.rig, "bench"):
         bench = make_experiments(target.rig, "bench", registry)
     return paper_estimates(bench, registry)
 
