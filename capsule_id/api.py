@@ -1,23 +1,33 @@
 """What the commands do, as functions: read a rig folder, fit it."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
-from capsule_id.experiments import Choice
+from capsule_id.console import OnProgress
+from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.registry import Registry, default_registry
-from capsule_id.inference.pipeline import fit_rig
+from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.inference.pipeline import check_fit, make_result, provenance, sample_posterior, stage_seeds
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.physics.friction import FrictionLaw
+from capsule_id.report.messages import caption_of, finding_text, messages_of
 from capsule_id.report.write import write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
+from capsule_id.views import Finding, ResultTable
 
 
 @dataclass(frozen=True)
 class Fit(Result):
-    """A ``Result`` that can be written."""
+    """A ``Result`` in words and files."""
+
+    def text(self, item: Finding | ResultTable) -> str:
+        """What a finding says (what was expected, what was found, what to do), or the caption of a table."""
+        messages = messages_of(self.registry)
+        return finding_text(item, messages) if isinstance(item, Finding) else caption_of(item, messages)
 
     def write(self, directory: str | Path) -> None:
         """Write parameters.json, parameters.csv, posterior.nc, report.html and figures/ into ``directory``.
@@ -56,9 +66,12 @@ def fit(
     seed: int = 0,
     experiments: Choice = "all",
     budget: int | None = DEFAULT_BUDGET,
+    store: Path | None = None,
+    progress: OnProgress | None = None,
+    registry: Registry | None = None,
     friction: type[FrictionLaw] | None = None,
 ) -> Fit:
-    """Fit a rig: point estimate, posterior, checks.
+    """Fit a rig: point estimate, posterior, checks. The command ``fit-params`` chooses every one of the parameters.
 
     Parameters
     ----------
@@ -66,6 +79,9 @@ def fit(
     seed : the same seed gives the same numbers
     experiments : "bench", "runs" or "all"
     budget : emcee steps of an ensemble after burn-in; None for the point fit alone
+    store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
+    progress : called with (draws done, draws until the next check, the stage)
+    registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
     friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
 
     Raises
@@ -73,5 +89,10 @@ def fit(
     InputError
         If the rig holds nothing to fit, ``experiments`` is another word, or ``friction`` cannot be fitted.
     """
-    result = fit_rig(rig, seed, experiments, budget, friction=friction)
-    return Fit(**{field.name: getattr(result, field.name) for field in fields(result)})
+    kinds, seeds = registry or default_registry(), stage_seeds(seed)
+    if progress:
+        progress(0, 1, "point fit")
+    target = LogPosterior(rig, make_experiments(rig, experiments, kinds, friction))
+    point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
+    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress))
+    return make_result(checked, kinds, seeds.report, provenance(rig, seed, experiments), Fit)

@@ -1,28 +1,68 @@
-"""What a reader sees of a fit: findings, panels, small tables.
+"""What a reader sees of a fit: findings, panels, tables.
 
-Experiments and checks make them, the report renders them.
+Experiments and checks make them with codes and numbers; the report adds the texts and renders them.
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 Level = Literal["ok", "warn", "fail"]
+#: What a check or a table has found, by name; quantities in the unit that the text prints.
+Facts = Mapping[str, Any]
+#: A format string over facts, or a function of them.
+Text = str | Callable[[Facts], str]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The outcome of one check: which experiment, what was expected, what was seen, what to do.
+    """The outcome of one check.
 
-    ``experiment`` is the label of the experiment it is about, or "" when it is about the whole fit.
+    Attributes
+    ----------
+    code : stable name of what was checked, such as ``residuals.white``; a ``Message`` gives its words
+    facts : numbers and names that the text needs
+    experiment : label of the experiment that the finding is about; "" where it is about the whole fit
     """
 
-    check: str
+    code: str
     level: Level
-    text: str
+    facts: Facts = field(default_factory=dict)
     experiment: str = ""
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """A small table: estimates with and without flagged rows, damping models, priors. ``Message`` gives its words."""
+
+    code: str
+    frame: pd.DataFrame
+    facts: Facts = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Message:
+    """The words of one code: its title, the text of a finding of each level, the caption of a table."""
+
+    title: str
+    ok: Text = ""
+    warn: Text = ""
+    fail: Text = ""
+    caption: Text = ""
+
+    def text(self, part: Literal["ok", "warn", "fail", "caption"], facts: Facts) -> str:
+        """The text of ``part`` with ``facts`` filled in.
+
+        Raises
+        ------
+        KeyError
+            If the text needs a fact that is missing.
+        """
+        text: Text = getattr(self, part)
+        return text.format_map(facts) if isinstance(text, str) else text(facts)
 
 
 @dataclass(frozen=True)
@@ -74,12 +114,3 @@ class Comparison:
     autocorrelation: np.ndarray | None = None
     autocorrelation_bound: float | None = None
     predictive_p: float | None = None
-
-
-@dataclass(frozen=True)
-class NoteTable:
-    """A small table with a caption: estimates with and without flagged rows, damping alternatives, priors, ..."""
-
-    title: str
-    caption: str
-    frame: pd.DataFrame

@@ -201,7 +201,7 @@ def _measured_points(
     from capsule_id.commands.measured_runs import Span, overlay
 
     diagram = len(axes) == 1 and args.posterior is None
-    if not diagram or not default_registry().has_runs(rig):
+    if not diagram or not rig.has_runs:
         return ()
     x = axes[0].values()
     by_name = args.spring if args.k2 is None else None

@@ -52,11 +52,13 @@ def run(args: argparse.Namespace) -> int:
     rig = read_rig(args.data, kinds)
     directory = args.out if args.out is not None else Path("results") / rig.name
     check_directory(directory)
-    if args.experiments != "bench" and kinds.has_runs(rig):
+    if args.experiments != "bench" and rig.has_runs:
         set_loop_option()
     # JAX loads only now, so that a faulty folder is reported at once.
-    from capsule_id.inference.pipeline import PACKAGES, fit_rig, package_versions
+    from capsule_id.api import fit
+    from capsule_id.inference.pipeline import PACKAGES, package_versions
     from capsule_id.report.console_table import table_text
+    from capsule_id.report.messages import messages_of, title_of
     from capsule_id.report.write import write_result
 
     make_experiments(rig, args.experiments, kinds)
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     }
     budget = None if args.no_sample else args.max_steps
     with work_in_progress(directory, fingerprint, args.resume) as partial, Progress(not args.quiet) as progress:
-        result = fit_rig(rig, args.seed, args.experiments, budget, partial / CHAINS, progress)
+        result = fit(rig, args.seed, args.experiments, budget, partial / CHAINS, progress, kinds)
         progress(0, 1, "report")
         write_result(result, partial)
         publish(partial, directory)
@@ -76,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     say(f"{table_text(result.summary, synthetic=rig.synthetic, clean=result.clean)}\nreport: {report}")
     if result.clean:
         return 0
-    failed = sorted({finding.check for finding in result.findings if finding.level == "fail"})
+    messages = messages_of(kinds)
+    failed = sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
     return 3

@@ -20,7 +20,7 @@ CHOICES: tuple[Choice, ...] = get_args(Choice)
 Shared = TypeVar("Shared")
 
 
-def select_tables(rig: Rig, experiments: Choice, registry: Registry | None = None) -> list[Table]:
+def select_tables(rig: Rig, experiments: Choice) -> list[Table]:
     """The rig's tables that ``experiments`` names; may be empty.
 
     Raises
@@ -31,8 +31,7 @@ def select_tables(rig: Rig, experiments: Choice, registry: Registry | None = Non
     if experiments not in CHOICES:
         known = ", ".join(f'"{choice}"' for choice in CHOICES)
         raise InputError(f"experiments must be one of {known}", repr(experiments), "correct the word")
-    kinds = registry or default_registry()
-    return [t for t in rig.tables if experiments == "all" or kinds[t.kind].bench == (experiments == "bench")]
+    return [table for table in rig.tables if experiments == "all" or table.bench == (experiments == "bench")]
 
 
 def make_experiments(
@@ -56,7 +55,7 @@ def make_experiments(
         ``friction`` cannot be fitted.
     """
     kinds = registry or default_registry()
-    tables = select_tables(rig, experiments, kinds)
+    tables = select_tables(rig, experiments)
     if not tables:
         rule = "the rig folder must hold an experiment to fit"
         raise InputError(rule, f"none with --experiments {experiments}", "add one to rig.toml", rig.folder / "rig.toml")

@@ -26,7 +26,7 @@ from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter
 from capsule_id.precision import require_float64
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Finding
+from capsule_id.views import Comparison, Facts, Finding
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.friction_model import FrictionModel
@@ -73,8 +73,6 @@ class Experiment(eqx.Module):
 
     about: About = eqx.field(static=True)
 
-    #: A test on the bench, as against a recorded run of the capsule.
-    bench: ClassVar[bool] = True
     #: Readings follow each other in time: residuals must be white.
     time_series: ClassVar[bool] = False
     #: The forward model is the event-driven capsule: differentiable in forward mode only, and slow (milliseconds).
@@ -109,6 +107,11 @@ class Experiment(eqx.Module):
     @property
     def kind(self) -> str:
         return self.table.kind
+
+    @property
+    def bench(self) -> bool:
+        """A test on the bench, as against a recorded run of the capsule."""
+        return self.table.bench
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -247,9 +250,9 @@ class Experiment(eqx.Module):
         del widths
         return self
 
-    def advice_on_coloured_noise(self) -> str:
-        """What to do where the residuals are not white; continues the sentence of the finding."""
-        return ": look at its residuals"
+    def noise_facts(self) -> Facts:
+        """What the report's advice needs where the residuals are not white: ``model``, and what drifts in the record."""
+        return {}
 
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
         """The record as the paper looks at it; None where there is no such view."""

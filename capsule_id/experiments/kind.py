@@ -13,6 +13,7 @@ import numpy as np
 
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import KindRule
+from capsule_id.views import Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
@@ -90,7 +91,7 @@ class Kind(KindRule):
     template : the commented lines of ``rig.toml`` that ``capsule-id init`` writes
     informs : the parameters that it measures, for tables
     captions : of its panels in the report, by ``Comparison.kind``
-    bench : a bench test; else a forced run
+    messages : words of its own checks and tables in the report, by code
     lint : what deserves attention in a table before a fit, a line each
     lint_rig : the same, where it takes the rest of the rig or rough values
     describe : what ``capsule-id check`` says of a table, a line each
@@ -107,7 +108,7 @@ class Kind(KindRule):
     template: str
     informs: str
     captions: Mapping[str, str]
-    bench: bool = True
+    messages: Mapping[str, Message] = field(default_factory=dict)
     lint: tuple[Callable[[Table[Any]], Iterable[str]], ...] = ()
     lint_rig: Callable[[Table[Any], Rig, Estimate], Iterable[str]] = field(default=lambda table, rig, estimate: ())
     describe: Callable[[Table[Any]], Iterable[str]] = field(default=lambda table: ())

@@ -12,8 +12,8 @@ from importlib.metadata import entry_points
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
 from capsule_id.parameters import Parameter
-from capsule_id.rig.model import Rig
 from capsule_id.rig.schema import parameter_rows
+from capsule_id.views import Message
 
 GROUP = "capsule_id.experiments"
 
@@ -66,9 +66,10 @@ class Registry(Mapping[str, Kind]):
         """Captions of all panels, by ``Comparison.kind``."""
         return {name: text for kind in self.kinds for name, text in kind.captions.items()}
 
-    def has_runs(self, rig: Rig) -> bool:
-        """Whether ``rig`` has forced runs."""
-        return any(not self.by_name[table.kind].bench for table in rig.tables)
+    @property
+    def messages(self) -> Mapping[str, Message]:
+        """Words of the checks and tables of all kinds, by code."""
+        return {code: message for kind in self.kinds for code, message in kind.messages.items()}
 
     def __getitem__(self, name: str) -> Kind:
         return self.by_name[name]

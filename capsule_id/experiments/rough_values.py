@@ -19,7 +19,7 @@ def rough_values(rig: Rig, registry: Registry | None = None) -> Estimate:
 
     @cache
     def known() -> dict[str, float]:
-        experiments = make_experiments(rig, "bench", kinds) if select_tables(rig, "bench", kinds) else ()
+        experiments = make_experiments(rig, "bench", kinds) if select_tables(rig, "bench") else ()
         values = paper_estimates(experiments, kinds)
         for name, kind in kinds.items():
             values |= kind.rough([e for e in experiments if e.kind == name], rig)

@@ -1,18 +1,20 @@
-"""The frozen nouns that inference hands on; the report renders them and computes nothing."""
+"""The frozen values that inference hands on; the report renders them and computes nothing."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
+from capsule_id.experiments import Choice
 from capsule_id.experiments.checks.context import RunRecord as RunRecord
+from capsule_id.experiments.registry import Registry
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison as Comparison
 from capsule_id.views import Curve as Curve
 from capsule_id.views import Finding as Finding
-from capsule_id.views import NoteTable as NoteTable
 from capsule_id.views import Points as Points
+from capsule_id.views import ResultTable as ResultTable
 
 
 @dataclass(frozen=True)
@@ -82,25 +84,61 @@ class Posterior:
 
 
 @dataclass(frozen=True)
-class Result:
-    """What ``fit`` returns and ``fit-params`` writes.
+class PointwiseLogLikelihood:
+    """Log-density of every reading at some draws.
 
-    ``summary`` has one row per physical parameter (index ``name``) and the columns unit, meaning, paper, map,
-    standard_error, mean, sd, median, lower, upper, ess, rhat, informed; missing numbers are NaN, SI throughout.
-    ``nuisances`` is the same table for scatters and noise.
+    Attributes
+    ----------
+    values : (chain, draw, n) by label of the experiment
+    chain, draw : which walkers and which stored draws
+    """
+
+    values: Mapping[str, np.ndarray]
+    chain: np.ndarray
+    draw: np.ndarray
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a result was made from: the seed, the chosen experiments, versions of packages, SHA-256 of the files."""
+
+    seed: int
+    experiments: Choice
+    versions: Mapping[str, str]
+    files: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a fit has found, complete for the report.
+
+    Attributes
+    ----------
+    registry : the kinds of the rig's experiments, which declare the words of their panels and checks
+    summary : a row per physical parameter (index ``name``), SI, missing numbers NaN; columns unit, meaning, paper, map,
+        standard_error, mean, sd, median, lower, upper, ess, rhat, informed
+    nuisances : the same table for scatters and noise
+    fixed : constants by name, SI
+    observed : (n,) readings that enter the likelihood, SI, by label
+    prior : (draws,) of the prior by parameter name, SI
+    log_likelihood : None without a sample
     """
 
     rig: Rig
+    registry: Registry
     summary: pd.DataFrame
     nuisances: pd.DataFrame
     point_fit: PointFit
     posterior: Posterior | None
     findings: tuple[Finding, ...]
     comparisons: tuple[Comparison, ...]
-    notes: tuple[NoteTable, ...]
-    provenance: Mapping[str, object]
-    groups: Mapping[str, object] = field(default_factory=dict)
-    records: tuple[RunRecord, ...] = ()
+    notes: tuple[ResultTable, ...]
+    records: tuple[RunRecord, ...]
+    fixed: Mapping[str, float]
+    observed: Mapping[str, np.ndarray]
+    prior: Mapping[str, np.ndarray]
+    log_likelihood: PointwiseLogLikelihood | None
+    provenance: Provenance
 
     @property
     def clean(self) -> bool:

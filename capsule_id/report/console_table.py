@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from capsule_id.report.rows import Row, has_sample, table_rows
+from capsule_id.report.columns import columns_of, table_rows
 
 WIDTH = 110
 _SHORTEST_NAME = 8
@@ -21,11 +21,11 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, clean: bool) -> str:
     synthetic : the rig is a synthetic one: said in a line of its own
     clean : the verdict; where it is not clean a line says so
     """
-    sampled = has_sample(summary)
-    header = ["", "unit", "paper", "MAP ± s.e."]
-    if sampled:
-        header += ["mean ± sd", "95 % interval", "ESS", "R-hat", "informed"]
-    table = [header] + [_cells(row, sampled) for row in table_rows(summary)]
+    columns = columns_of("console", summary)
+    table = [["", *(column.header for column in columns)]]
+    for row in table_rows(summary):
+        cells = [column.text(row) for column in columns]
+        table.append([row.name, *("NO" if cell == "no" else cell for cell in cells)])
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     # Only names can be of any length (a spring may be called anything), so they give way.
     others = sum(widths[1:]) + len(_GAP) * (len(widths) - 1)
@@ -34,19 +34,6 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, clean: bool) -> str:
     rule = "-" * max(map(len, lines))
     loud = [text for text, on in ((SYNTHETIC, synthetic), (NOT_CLEAN, not clean)) if on]
     return "\n".join([*loud, lines[0], rule, *lines[1:]])
-
-
-def _cells(row: Row, sampled: bool) -> list[str]:
-    cells = [row.name, row.unit, row.paper, row.map]
-    if sampled:
-        cells += [
-            row.mean,
-            row.interval,
-            row.ess,
-            row.rhat,
-            row.informed.upper() if row.informed == "no" else row.informed,
-        ]
-    return cells
 
 
 def _line(cells: list[str], widths: list[int]) -> str:

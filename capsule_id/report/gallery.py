@@ -1,13 +1,12 @@
 """All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from matplotlib.figure import Figure
 
-from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.result import Result, RunRecord
 from capsule_id.report.figures import comparisons as figures
 from capsule_id.report.figures.corner import corner
@@ -52,7 +51,14 @@ def pictures(result: Result) -> tuple[Picture, ...]:
     """Draw every figure of the result; synthetic data are marked on each of them."""
     names = _unique(_comparison_name(item) for item in result.comparisons)
     drawn = [
-        _picture(result, name, "measured", item.title, comparison_caption(item), figures.comparison_figure(item))
+        _picture(
+            result,
+            name,
+            "measured",
+            item.title,
+            comparison_caption(item, result.registry.captions),
+            figures.comparison_figure(item),
+        )
         for name, item in zip(names, result.comparisons, strict=True)
     ]
     labels = _unique(_UNSAFE.sub("_", record.name) for record in result.records)
@@ -92,9 +98,9 @@ def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Pict
     return drawn
 
 
-def comparison_caption(item: Comparison) -> str:
+def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
     """What the panel shows, and its posterior predictive p-value where there is one."""
-    parts = [default_registry().captions.get(item.kind, "Measured beside predicted.")]
+    parts = [captions.get(item.kind, "Measured beside predicted.")]
     if item.residuals is not None:
         parts.append("Shaded: the range that holds 95 % of a good fit's residuals.")
     if any(points.flagged is not None and points.flagged.any() for points in item.points):

@@ -10,10 +10,11 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from capsule_id.inference.result import Result
+from capsule_id.report.columns import columns_of, table_rows
 from capsule_id.report.gallery import Picture
-from capsule_id.report.rows import table_rows
+from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.typography import MISSING, symbol_parts
-from capsule_id.views import Finding, Level, NoteTable
+from capsule_id.views import Finding, Level, Message, ResultTable
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
@@ -29,20 +30,21 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    messages = messages_of(result.registry)
+    worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
+    titles = {finding.code: title_of(finding.code, messages) for finding in result.findings}
     environment.filters |= {"symbol_parts": symbol_parts, "number": _number, "embed": _embed}
     return environment.get_template("report.html.j2").render(
         result=result,
         sections={name: _section(pictures, name) for name in ("measured", "sample", "point_fit")},
-        parameters=table_rows(result.summary),
-        nuisances=table_rows(result.nuisances),
-        checks=_checks(result.findings),
-        findings=sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level)),
+        parameters=_parameters(result.summary),
+        nuisances=_parameters(result.nuisances),
+        checks=_checks(result.findings, titles),
+        findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
         words=_WORDS,
-        failed=list(dict.fromkeys(finding.check for finding in result.findings if finding.level == "fail")),
+        failed=list(dict.fromkeys(titles[finding.code] for finding in result.findings if finding.level == "fail")),
         starts=_starts(result),
-        notes=[_note(note) for note in result.notes],
-        facts={key: value for key, value in result.provenance.items() if not isinstance(value, Mapping)},
-        tables={key: value for key, value in result.provenance.items() if isinstance(value, Mapping)},
+        notes=[_note(note, messages) for note in result.notes],
         missing=MISSING,
     )
 
@@ -52,11 +54,18 @@ def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
     return sorted((picture for picture in pictures if picture.section == name), key=lambda picture: picture.wide)
 
 
-def _checks(findings: Sequence[Finding]) -> list[tuple[str, Level, int]]:
-    """A cell per check: its name, its worst level, and how many findings have that level."""
+def _parameters(frame: pd.DataFrame) -> dict[str, object]:
+    """Columns, and rows of name and printed cells."""
+    columns = columns_of("html", frame)
+    rows = [(row.name, [(column, column.text(row)) for column in columns]) for row in table_rows(frame)]
+    return {"columns": columns, "rows": rows}
+
+
+def _checks(findings: Sequence[Finding], titles: Mapping[str, str]) -> list[tuple[str, Level, int]]:
+    """A cell per check: its title, its worst level, and how many findings have that level."""
     cells = []
-    for check in dict.fromkeys(finding.check for finding in findings):
-        levels = [finding.level for finding in findings if finding.check == check]
+    for check in dict.fromkeys(titles[finding.code] for finding in findings):
+        levels = [finding.level for finding in findings if titles[finding.code] == check]
         worst = min(levels, key=_WORST_FIRST.index)
         cells.append((check, worst, levels.count(worst)))
     return cells
@@ -72,7 +81,7 @@ def _starts(result: Result) -> list[tuple[int, str, str, bool]]:
     ]
 
 
-def _note(note: NoteTable) -> dict[str, object]:
+def _note(note: ResultTable, messages: Mapping[str, Message]) -> dict[str, object]:
     frame = note.frame
     named = not isinstance(frame.index, pd.RangeIndex)
     header = [(str(frame.index.name or ""), False)] if named else []
@@ -82,7 +91,8 @@ def _note(note: NoteTable) -> dict[str, object]:
         ([index] if named else []) + list(row)
         for index, row in zip(frame.index, frame.itertuples(index=False), strict=True)
     ]
-    return {"title": note.title, "caption": note.caption, "header": header, "rows": rows}
+    title, caption = title_of(note.code, messages), caption_of(note, messages)
+    return {"title": title, "caption": caption, "header": header, "rows": rows}
 
 
 def _number(value: object, form: str = ".5g") -> str:

@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import xarray as xr
 
-from capsule_id.inference.result import Posterior, Result
+from capsule_id.inference.result import PointwiseLogLikelihood, Posterior, Result
 from capsule_id.parameters import TABLE
 
 # The extra dimension of bracketed names; every other family gets "<base>_of".
@@ -33,11 +32,11 @@ def write_posterior(result: Result, path: Path) -> None:
     for frame in (result.summary, result.nuisances):
         units |= {str(name): str(unit) for name, unit in frame["unit"].items()}
     groups = {
-        "posterior": _posterior(result.posterior, cast("Mapping[str, float]", result.groups.get("fixed", {})), units),
+        "posterior": _posterior(result.posterior, result.fixed, units),
         "sample_stats": _sample_stats(result.posterior),
-        "observed_data": _observed(result.groups),
-        "log_likelihood": _log_likelihood(result.groups),
-        "prior": _prior(result.groups, units),
+        "observed_data": _observed(result.observed),
+        "log_likelihood": _log_likelihood(result.log_likelihood),
+        "prior": _families({name: draws[np.newaxis] for name, draws in result.prior.items()}, units),
     }
     tree = xr.DataTree.from_dict({name: group for name, group in groups.items() if group.data_vars})
     tree.attrs = {"rig": result.rig.name, "synthetic": int(result.rig.synthetic)}
@@ -72,30 +71,22 @@ def _sample_stats(posterior: Posterior) -> xr.Dataset:
     return dataset.assign_coords(chain=np.arange(chains), draw=np.arange(draws), ensemble=_ensemble_of(posterior))
 
 
-def _observed(groups: Mapping[str, object]) -> xr.Dataset:
-    observed = cast("Mapping[str, np.ndarray]", groups.get("observed", {}))
+def _observed(observed: Mapping[str, np.ndarray]) -> xr.Dataset:
     return xr.Dataset(
         {label: (f"{label}_row", np.asarray(y, np.float64), {"units": "SI"}) for label, y in observed.items()}
     )
 
 
-def _log_likelihood(groups: Mapping[str, object]) -> xr.Dataset:
-    pointwise = cast("Mapping[str, np.ndarray]", groups.get("log_likelihood", {}))
-    if not pointwise:
+def _log_likelihood(pointwise: PointwiseLogLikelihood | None) -> xr.Dataset:
+    if pointwise is None:
         return xr.Dataset()
     dataset = xr.Dataset(
         {
             label: (("chain", "draw", f"{label}_row"), np.asarray(values, np.float64), {"units": "1"})
-            for label, values in pointwise.items()
+            for label, values in pointwise.values.items()
         }
     )
-    chain = np.asarray(groups["log_likelihood_chain"])
-    return dataset.assign_coords(chain=chain, draw=np.asarray(groups["log_likelihood_draw"]))
-
-
-def _prior(groups: Mapping[str, object], units: Mapping[str, str]) -> xr.Dataset:
-    prior = cast("Mapping[str, np.ndarray]", groups.get("prior", {}))
-    return _families({name: np.asarray(draws, np.float64)[np.newaxis] for name, draws in prior.items()}, units)
+    return dataset.assign_coords(chain=pointwise.chain, draw=pointwise.draw)
 
 
 def _ensemble_of(posterior: Posterior) -> tuple[str, np.ndarray]:

@@ -3,18 +3,19 @@
 import json
 import math
 import numbers
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from capsule_id.inference.result import Result
+from capsule_id.report.columns import columns_of
 from capsule_id.report.gallery import pictures
 from capsule_id.report.html import render
+from capsule_id.report.messages import finding_text, messages_of, title_of
 from capsule_id.report.netcdf import write_posterior
-from capsule_id.views import Finding
 
 
 def write_result(result: Result, directory: Path) -> None:
@@ -40,43 +41,37 @@ def write_result(result: Result, directory: Path) -> None:
 
 def parameters_json(result: Result) -> dict[str, object]:
     """The content of parameters.json, ready for strict JSON: what is missing or not finite is None."""
+    messages, columns = messages_of(result.registry), columns_of("json")
     return {
         "rig": result.rig.name,
         "synthetic": result.rig.synthetic,
-        "parameters": {str(name): _parameter(row) for name, row in result.summary.to_dict("index").items()},
+        "parameters": {
+            str(name): {column.key: _plain(column.of(row)) for column in columns}
+            for name, row in result.summary.to_dict("index").items()
+        },
         "verdict": {
             "clean": result.clean,
-            "findings": [{"check": f.check, "level": f.level, "text": finding_text(f)} for f in result.findings],
+            "findings": [
+                {
+                    "check": title_of(finding.code, messages),
+                    "level": finding.level,
+                    "text": finding_text(finding, messages),
+                    "code": finding.code,
+                }
+                for finding in result.findings
+            ],
         },
-        "provenance": _plain(result.provenance),
+        "provenance": _plain(asdict(result.provenance)),
     }
-
-
-def finding_text(finding: Finding) -> str:
-    """The text of a finding, with its experiment in front where the text does not name it itself."""
-    if not finding.experiment or finding.experiment in finding.text:
-        return finding.text
-    return f"{finding.experiment}: {finding.text}"
 
 
 def table_frame(result: Result) -> pd.DataFrame:
-    """Physical parameters and nuisances in one table, SI; ``role`` tells them apart, every row says ``synthetic``."""
-    parts = [result.summary.assign(role="physical"), result.nuisances.assign(role="nuisance")]
-    frame = pd.concat([part for part in parts if len(part)])
-    frame.index.name = "name"
-    return frame.assign(synthetic=result.rig.synthetic)
-
-
-def _parameter(row: Mapping[Hashable, Any]) -> dict[str, object]:
-    ends = [_plain(row["lower"]), _plain(row["upper"])]
-    return {
-        "unit": row["unit"],
-        **{key: _plain(row[key]) for key in ("paper", "map", "mean", "sd", "median")},
-        "ci95": None if None in ends else ends,
-        "ess": _plain(row["ess"]),
-        "rhat": _plain(row["rhat"]),
-        "informed": None if pd.isna(row["informed"]) else bool(row["informed"]),
-    }
+    """Physical parameters and nuisances in one table, SI; ``role`` separates them, every row says ``synthetic``."""
+    table = pd.concat([part for part in (result.summary, result.nuisances) if len(part)]).rename_axis("name")
+    rows = table.to_dict("index")
+    columns = {column.key: [column.of(row) for row in rows.values()] for column in columns_of("csv")}
+    roles = ["physical"] * len(result.summary) + ["nuisance"] * len(result.nuisances)
+    return table.assign(**columns, role=roles, synthetic=result.rig.synthetic)
 
 
 def _plain(value: object) -> object:
@@ -87,8 +82,10 @@ def _plain(value: object) -> object:
         return _plain(value.tolist())
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [_plain(item) for item in value]
-    if value is None or isinstance(value, bool | np.bool_):
-        return None if value is None else bool(value)
+    if value is None or value is pd.NA:
+        return None
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
     if isinstance(value, numbers.Integral):
         return int(value)
     if isinstance(value, numbers.Real):

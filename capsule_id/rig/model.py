@@ -73,6 +73,7 @@ class Table(Generic[S]):
     columns : by name
     settings : of its kind, checked, defaults filled in
     rows : (n,) 1-based line number of every row in the file, read-only; findings name rows by it
+    bench : its kind is a bench test; else a forced run
     """
 
     kind: str
@@ -81,6 +82,7 @@ class Table(Generic[S]):
     columns: Mapping[str, Column]
     settings: S
     rows: np.ndarray
+    bench: bool = True
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""
@@ -109,3 +111,8 @@ class Rig:
     tables: tuple[Table[Any], ...]
     files: Mapping[str, str]
     folder: Path
+
+    @property
+    def has_runs(self) -> bool:
+        """Whether any table is a forced run."""
+        return any(not table.bench for table in self.tables)

@@ -185,7 +185,7 @@ def _read_experiment(
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
     columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
     _refuse_reading_errors_without_column(document, path, entry, errors, file)
-    table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows)
+    table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows, kind.bench)
     for rule in kind.rules:
         rule(Entry(table, document, path, file))
     return table, file.sha256

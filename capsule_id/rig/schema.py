@@ -105,6 +105,7 @@ class KindRule:
     rules : each raises an ``InputError`` where columns and settings are inconsistent
     masses : the masses of [rig] that an experiment with this table needs
     parameters : rows of the parameters that only experiments of this kind have
+    bench : a bench test; else a forced run
     """
 
     name: str
@@ -116,6 +117,7 @@ class KindRule:
     rules: tuple[Callable[["Entry[Any]"], None], ...] = ()
     masses: Callable[[Table[Any]], tuple[str, ...]] = field(default=lambda table: ())
     parameters: tuple[Parameter, ...] = ()
+    bench: bool = True
 
     @property
     def setting_rules(self) -> Mapping[str, SettingRule]:

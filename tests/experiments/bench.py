@@ -23,8 +23,9 @@ def column(name: str, values: ArrayLike, sd: float | None = None, resolution: fl
 def table(kind: str, columns: Sequence[Column], label: str = "", **settings: object) -> Table:
     """An ``[[experiment]]`` of these columns."""
     rows = np.arange(2, 2 + len(columns[0].values))
-    own = default_registry()[kind].settings(**settings)
-    return Table(kind, label or kind, f"{label or kind}.csv", {c.name: c for c in columns}, own, rows)
+    rule = default_registry()[kind]
+    own, named = rule.settings(**settings), {c.name: c for c in columns}
+    return Table(kind, label or kind, f"{label or kind}.csv", named, own, rows, rule.bench)
 
 
 def rig(

@@ -14,7 +14,9 @@ from capsule_id.experiments.families.capsule_bench import CapsuleDecay, CapsuleP
 from capsule_id.experiments.families.friction_experiment import unit_law
 from capsule_id.experiments.free_vibration.checks import check_free_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity, Table
@@ -54,7 +56,7 @@ def fitted(release: float, forward: str) -> PointStage:
     known = {"mu": PriorOverride(MU, 1.02), "v_s": PriorOverride(V_S, 1.1)}
     table = decay(release, forward)
     rig = bench.rig(table, priors=known)
-    return fit_points(rig, make_experiments(rig), 0, sampled=False)
+    return fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)
 
 
 def estimate(stage: PointStage, name: str) -> tuple[float, float]:

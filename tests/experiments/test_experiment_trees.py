@@ -21,14 +21,13 @@ from capsule_id.experiments.misfit import Misfit
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.fit.point_stage import BenchFit
 from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.target import log_posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig, Table
 from capsule_id.synthetic import synthesize
-from capsule_id.views import Comparison, Finding, NoteTable
+from capsule_id.views import Comparison, Finding, ResultTable
 from tests.experiments import bench
 from tests.forced_runs import make, theta
 
@@ -112,12 +111,12 @@ def test_log_posteriors_of_many_rigs_share_one_program(tmp_path: Path) -> None:
 
 
 def check_balance(members: Sequence["Weighing"], fit: Fitted) -> list[Finding]:
-    return [Finding("balance", "ok", f"{len(members)} weighings, {fit.values['load']:.3f} kg")]
+    return [Finding("balance", "ok", {"members": len(members), "load": fit.values["load"]})]
 
 
-def weighing_table(members: Sequence["Weighing"], fit: Fitted) -> list[NoteTable]:
+def weighing_table(members: Sequence["Weighing"], fit: Fitted) -> list[ResultTable]:
     frame = pd.DataFrame({"kg": [fit.values["load"]]}, index=[e.label for e in members][:1])
-    return [NoteTable("Weighings", "From another package.", frame)]
+    return [ResultTable("weighings", frame)]
 
 
 class Weighing(Experiment):
@@ -159,5 +158,6 @@ def test_a_kind_from_elsewhere_is_fitted_checked_and_tabulated() -> None:
     setting = run_checks(Setting(target, fit, None, target.mapping(target.theta(fit.u))))
     assert fit.values["load"] == pytest.approx(0.505, abs=1e-4)
     assert fit.standard_errors["load"] == pytest.approx(0.01 / np.sqrt(8.0), rel=1e-3)
-    assert [f.text for f in setting.findings if f.check == "balance"] == ["2 weighings, 0.505 kg"]
-    assert "Weighings" in [note.title for note in make_notes(setting, BenchFit())]
+    (balance,) = [f for f in setting.findings if f.code == "balance"]
+    assert balance.facts == {"members": 2, "load": fit.values["load"]}
+    assert "weighings" in [note.code for note in make_notes(setting, {})]

@@ -4,6 +4,7 @@ import bench
 import numpy as np
 import pytest
 
+from capsule_id.experiments.forced_run.declaration import MESSAGES
 from capsule_id.experiments.forced_run.feasibility import RunConditions, contact_time, feasibility, held_rod
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.rough_values import rough_values
@@ -31,7 +32,8 @@ F_B = TRUTH["mu"] * (TRUTH["m1"] + TRUTH["m2"]) * TRUTH["g"]
 
 
 def said(table: Table, k2: float) -> str:
-    return "\n".join(finding.text for finding in feasibility(table, {**TRUTH, "k2": k2}, F_B))
+    found = feasibility(table, {**TRUTH, "k2": k2}, F_B)
+    return "\n".join(MESSAGES[finding.code].text(finding.level, finding.facts) for finding in found)
 
 
 def test_the_printed_settings_of_figure_4_allow_no_contact() -> None:

@@ -81,11 +81,21 @@ def test_it_is_fitted_and_reported(site: Path, folder: Path, tmp_path: Path) -> 
     """Independent route: the mean force over the weight."""
     done = run(site, str(folder), "--out", str(tmp_path / "out"), "--no-sample", "--quiet", name="fit_params")
     assert (done.returncode, done.stderr) == (0, "")
-    fitted = json.loads((tmp_path / "out" / "parameters.json").read_text())["parameters"]
+    saved = json.loads((tmp_path / "out" / "parameters.json").read_text())
+    fitted = saved["parameters"]
     weight = (0.110 + 0.530) * 9.81
     assert set(fitted) == {"c_rr", "m1", "m2"}
     assert fitted["c_rr"]["map"] == pytest.approx(sum(FORCES) / len(FORCES) / weight, rel=2e-3)
-    assert "Rolling resistance: the force at each speed" in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Rolling resistance: the force at each speed" in page
+    # Its own check and its own table, in its own words.
+    (own,) = [finding for finding in saved["verdict"]["findings"] if finding["code"] == "rolling.speeds"]
+    text = "the force is the same at all 5 speeds"
+    assert (own["check"], own["level"]) == ("rolling at all speeds", "ok")
+    assert own["text"] == f"rolling_resistance: {text}"
+    assert text in page
+    assert "Speeds of the wheel" in page
+    assert "Where c_rr = 0.010 was measured." in page
 
 
 def load(site: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:

@@ -19,7 +19,7 @@ def test_a_motion_that_forgets_its_start_is_predictable_and_a_chaotic_one_is_not
     assert growth(run, wild) > LARGEST_GROWTH
     found = check_predictable([run], fitted(run, wild))
     assert found[0].level == "fail"
-    assert "run_1" in found[0].text
+    assert found[0].experiment == "run_1"
 
 
 def fitted(run: ForcedRun, values: dict[str, float]) -> Setting:

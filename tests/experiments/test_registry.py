@@ -224,5 +224,5 @@ def test_the_choices_of_experiments(tmp_path: Path) -> None:
     assert chosen["runs"] == ["run_01"]
     assert chosen["all"] == [*chosen["bench"], *chosen["runs"]]
     assert len(chosen["bench"]) == len(TABLES) - 1
-    assert KINDS.has_runs(rig)
-    assert not KINDS.has_runs(replace(rig, tables=rig.tables[:-1]))
+    assert rig.has_runs
+    assert not replace(rig, tables=rig.tables[:-1]).has_runs

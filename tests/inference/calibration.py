@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+import capsule_id as cid
 from capsule_id.api import read_rig
-from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.result import Posterior, Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.synthetic import Truth, synthesize
@@ -20,7 +20,7 @@ VARIED = ("k1", "c", "mu", "v_s", "K", "k2[soft]", "k2[medium]", "k2[stiff]")
 
 @dataclass(frozen=True)
 class Outcome:
-    """One rig: z = Φ⁻¹(posterior CDF at the truth) of every physical parameter, and (check, experiment) that failed."""
+    """One rig: z = Φ⁻¹(posterior CDF at the truth) of every physical parameter; code and experiment of failed checks."""
 
     z: dict[str, float]
     failed: tuple[tuple[str, str], ...]
@@ -67,7 +67,7 @@ def outcome_of(result: Result, truth: Truth) -> Outcome:
     assert result.posterior is not None
     known = truth.flat()
     z = {name: normal_score(result.posterior, name, known[name]) for name in result.summary.index}
-    return Outcome(z, tuple((f.check, f.experiment) for f in result.findings if f.level == "fail"))
+    return Outcome(z, tuple((f.code, f.experiment) for f in result.findings if f.level == "fail"))
 
 
 def study(folder: Path, seeds: Sequence[int], budget: int = DEFAULT_BUDGET) -> Iterator[Outcome]:
@@ -76,7 +76,7 @@ def study(folder: Path, seeds: Sequence[int], budget: int = DEFAULT_BUDGET) -> I
         truth = random_truth(np.random.default_rng([seed, 0]))
         rig = folder / f"rig_{seed}"
         synthesize(rig, seed, truth)
-        yield outcome_of(fit_rig(read_rig(rig), seed, budget=budget), truth)
+        yield outcome_of(cid.fit(read_rig(rig), seed, budget=budget), truth)
 
 
 def summarise(outcomes: Sequence[Outcome]) -> Calibration:

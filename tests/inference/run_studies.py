@@ -1,6 +1,5 @@
 """Forced runs through the whole fit: rigs with random truths, and rigs with something wrong planted in them."""
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
-from capsule_id.inference.pipeline import fit_rig
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.calibration import normal_score
 
@@ -46,11 +47,11 @@ def recover(folder: Path, seed: int, budget: int) -> Recovery:
     """Synthesize the rig of ``seed`` in ``folder`` and fit it, bench and runs."""
     truth = random_truth(np.random.default_rng([seed, 4]))
     synthesize(folder, seed, truth, runs=True)
-    result = fit_rig(read_rig(folder), seed, budget=budget)
+    result = cid.fit(read_rig(folder), seed, budget=budget)
     assert result.posterior is not None
     known = truth.flat()
     z = {name: normal_score(result.posterior, name, known[name]) for name in result.summary.index if name in known}
-    failed = tuple((f.check, f.text) for f in result.findings if f.level == "fail")
+    failed = tuple((f.code, result.text(f)) for f in result.findings if f.level == "fail")
     return Recovery(z, failed, float(np.max(result.posterior.rhat)), float(np.min(result.posterior.ess)))
 
 
@@ -81,9 +82,7 @@ def named_by(stage: PointStage) -> str:
     found = check_agreement(stage.target, stage.fit, stage.bench.fit, stage.bench.sample)[0]
     if found.level == "ok":
         return ""
-    named = re.search(r"largest disagreement in (\S+)", found.text)
-    assert named is not None
-    return named[1]
+    return found.facts["distances"][0][0]
 
 
 def disagreement_of(folder: Path, seed: int, runs: Sequence[str] = ()) -> PointStage:
@@ -91,4 +90,4 @@ def disagreement_of(folder: Path, seed: int, runs: Sequence[str] = ()) -> PointS
     rig = read_rig(folder)
     kept = tuple(t for t in rig.tables if t.kind != "forced_run" or not runs or t.label in runs)
     rig = replace(rig, tables=kept)
-    return fit_points(rig, make_experiments(rig), seed, sampled=True)
+    return fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), seed, sampled=True)

@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
+import capsule_id as cid
 from capsule_id.api import read_rig
-from capsule_id.inference.pipeline import fit_rig
 from tests.cli_tools import small_rig
 
 
 def test_caption_and_table_show_the_same_p_value(tmp_path: Path) -> None:
     """The scatter of a line is a nuisance with its own random draw, so two evaluations would differ."""
-    result = fit_rig(read_rig(small_rig(tmp_path / "rig", tables=("motor_current", "support_spring_soft"))), budget=40)
-    (note,) = [note for note in result.notes if note.title == "Posterior predictive checks"]
+    result = cid.fit(read_rig(small_rig(tmp_path / "rig", tables=("motor_current", "support_spring_soft"))), budget=40)
+    (note,) = [note for note in result.notes if note.code == "readings.predictive"]
     shown = {item.label: item.predictive_p for item in result.comparisons}
     assert set(shown) == set(note.frame.index)
     assert shown == dict(note.frame["p"])

@@ -9,7 +9,7 @@ import numpy as np
 from capsule_id.api import read_rig
 from capsule_id.inference.result import Result
 from capsule_id.rig.model import Rig
-from capsule_id.views import NoteTable
+from capsule_id.views import ResultTable
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def make_rig(folder: Path, *entries: Entry, head: Mapping[str, str] | None = Non
     return read_rig(folder)
 
 
-def note(result: Result, title: str) -> NoteTable:
-    """The result's only note table with this title."""
-    (found,) = [table for table in result.notes if table.title == title]
+def note(result: Result, code: str) -> ResultTable:
+    """The result's only table with this code."""
+    (found,) = [table for table in result.notes if table.code == code]
     return found

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.inference.pipeline import fit_rig
-from capsule_id.inference.result import Result
+import capsule_id as cid
+from capsule_id.api import Fit
 from tests.measured.folders import Entry, make_rig, note
 from tests.measured.sources import load_cells
 
@@ -37,9 +37,9 @@ def _plateaus(cell: int, keep: int | None) -> tuple[np.ndarray, np.ndarray, int]
     return load[rows], counts[rows, cell], -1 if keep is None else int(np.searchsorted(rows, keep))
 
 
-def _fit(folder: Path, load: np.ndarray, counts: np.ndarray) -> Result:
+def _fit(folder: Path, load: np.ndarray, counts: np.ndarray) -> Fit:
     columns = {"current [A]": load, "force [N]": counts}
-    return fit_rig(make_rig(folder, Entry("motor_current", "cell", columns)), budget=None)
+    return cid.fit(make_rig(folder, Entry("motor_current", "cell", columns)), budget=None)
 
 
 @pytest.mark.parametrize(("cell", "keep", "slope"), CELLS)
@@ -49,9 +49,9 @@ def test_the_drop_out_is_flagged_and_the_slope_given_without_it(
     load, counts, row = _plateaus(cell, keep)
     result = _fit(tmp_path, load, counts)
     (finding,) = [f for f in result.findings if f.level == "fail"]
-    assert finding.check == "outliers"
-    assert f"cell.csv line {row + 2} stands" in finding.text
-    line = note(result, "Calibration lines").frame.loc["cell"]
+    assert finding.code == "outliers"
+    assert f"cell.csv line {row + 2} stands" in result.text(finding)
+    line = note(result, "lines.slopes").frame.loc["cell"]
     assert line["without flagged rows"] == pytest.approx(slope, abs=0.6)
     assert line["± without"] == pytest.approx(0.2, abs=0.05)
     # With the drop-out the line is worthless, and looks it.

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
+import capsule_id as cid
+from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.tables import DAMPING_MODELS
 from capsule_id.inference.fit.point_fit import bic, point_fit
-from capsule_id.inference.pipeline import fit_rig
-from capsule_id.inference.result import Result
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
@@ -35,8 +35,8 @@ def _rig(folder: Path, time: np.ndarray, angle: np.ndarray) -> Rig:
 
 
 @pytest.fixture(scope="module")
-def swing(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    return fit_rig(_rig(tmp_path_factory.mktemp("swing"), *pendulum(3)), budget=None)
+def swing(tmp_path_factory: pytest.TempPathFactory) -> Fit:
+    return cid.fit(_rig(tmp_path_factory.mktemp("swing"), *pendulum(3)), budget=None)
 
 
 @pytest.mark.parametrize("record", [1, 2])
@@ -46,31 +46,31 @@ def test_the_other_records_end_before_the_angle_is_small(record: int) -> None:
     assert min(np.min(np.abs(part)) for part in peaks) > np.deg2rad(30.0)
 
 
-def test_the_part_that_is_fitted_has_small_angles(swing: Result) -> None:
+def test_the_part_that_is_fitted_has_small_angles(swing: Fit) -> None:
     (panel,) = swing.comparisons
     assert np.max(np.abs(panel.points[0].y)) < np.deg2rad(25.0)
 
 
-def test_the_decrement_is_said_to_grow_as_the_swing_falls(swing: Result) -> None:
-    (finding,) = [f for f in swing.findings if f.check == "residuals white"]
+def test_the_decrement_is_said_to_grow_as_the_swing_falls(swing: Fit) -> None:
+    (finding,) = [f for f in swing.findings if f.code == "residuals.white"]
     assert finding.level == "fail"
-    assert "the damping grows as the amplitude falls" in finding.text
+    assert "the damping grows as the amplitude falls" in swing.text(finding)
 
 
-def test_mixed_dry_and_viscous_damping_is_preferred(swing: Result) -> None:
-    models = note(swing, "Damping models compared")
+def test_mixed_dry_and_viscous_damping_is_preferred(swing: Fit) -> None:
+    models = note(swing, "decays.damping")
     frame = models.frame
     assert frame["BIC"].idxmin() == "dry"
     assert (frame["BIC"].drop("dry") > 100.0).all()
     assert (frame["starts agree"] == "yes").all()
-    assert "takes off the same amount every cycle" in models.caption
+    assert "takes off the same amount every cycle" in swing.text(models)
     F_dry, error = _dry_friction(str(frame.loc["dry", "further"]))
     assert F_dry > 20.0 * error
     assert frame.loc["dry", "c, N s/m"] > 0.1
 
 
-def test_the_dry_friction_is_what_the_peaks_lose(swing: Result) -> None:
-    frame = note(swing, "Damping models compared").frame
+def test_the_dry_friction_is_what_the_peaks_lose(swing: Fit) -> None:
+    frame = note(swing, "decays.damping").frame
     F_dry, _ = _dry_friction(str(frame.loc["dry", "further"]))
     time, angle = pendulum(3)
     angle = angle[time >= START]
@@ -89,7 +89,7 @@ def test_a_viscous_swing_is_not_taken_for_a_dry_one(tmp_path: Path) -> None:
     rig = _rig(tmp_path, time, RESOLUTION * np.round(angle / RESOLUTION))
     (record,) = make_experiments(rig)
     assert isinstance(record, FreeVibration)
-    assert record.damping_trend() == ""
+    assert record.damping_trend() == {}
     scores = {}
     for damping in DAMPING_MODELS:
         target = LogPosterior(rig, [record.with_damping(damping)])

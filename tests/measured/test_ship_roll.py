@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
-from capsule_id.inference.pipeline import fit_rig
-from capsule_id.inference.result import Result
+import capsule_id as cid
+from capsule_id.api import Fit
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import ship_roll, ship_roll_stiffness
 
@@ -23,7 +23,7 @@ START, STOP = 25.0, 70.0
 
 
 @pytest.fixture(scope="module")
-def roll(tmp_path_factory: pytest.TempPathFactory) -> Result:
+def roll(tmp_path_factory: pytest.TempPathFactory) -> Fit:
     time, angle = ship_roll()
     entry = Entry(
         "free_vibration",
@@ -32,7 +32,7 @@ def roll(tmp_path_factory: pytest.TempPathFactory) -> Result:
         {"start": quantity(START, "s"), "stop": quantity(STOP, "s")},
     )
     folder: Path = tmp_path_factory.mktemp("roll")
-    return fit_rig(make_rig(folder, entry, head={"m1": quantity(INERTIA, "kg")}), budget=None)
+    return cid.fit(make_rig(folder, entry, head={"m1": quantity(INERTIA, "kg")}), budget=None)
 
 
 def _peaks() -> tuple[np.ndarray, np.ndarray]:
@@ -44,26 +44,26 @@ def _peaks() -> tuple[np.ndarray, np.ndarray]:
     return time[index], np.abs(angle[index])
 
 
-def test_the_hydrostatic_stiffness_comes_out(roll: Result) -> None:
+def test_the_hydrostatic_stiffness_comes_out(roll: Fit) -> None:
     assert ship_roll_stiffness() == pytest.approx(821.96, abs=0.005)  # as the authors print it
     k1 = roll.summary.loc["k1"]
     assert k1["map"] == pytest.approx(ship_roll_stiffness(), rel=0.01)
     assert k1["paper"] == pytest.approx(ship_roll_stiffness(), rel=0.01)
-    assert all(finding.level == "ok" for finding in roll.findings if finding.check == "starts agree")
+    assert all(finding.level == "ok" for finding in roll.findings if finding.code == "starts.agree")
 
 
-def test_the_viscous_model_is_reported_as_inadequate(roll: Result) -> None:
+def test_the_viscous_model_is_reported_as_inadequate(roll: Fit) -> None:
     assert not roll.clean
-    (finding,) = [f for f in roll.findings if f.check == "residuals white"]
+    (finding,) = [f for f in roll.findings if f.code == "residuals.white"]
     assert (finding.level, finding.experiment) == ("fail", "roll_21337")
-    assert "the damping grows with amplitude" in finding.text
+    assert "the damping grows with amplitude" in roll.text(finding)
     # The authors' cubic stiffness term is positive as well.
-    assert "the stiffness grows with amplitude" in finding.text
+    assert "the stiffness grows with amplitude" in roll.text(finding)
 
 
-def test_the_decrements_told_are_those_of_the_peaks(roll: Result) -> None:
-    (finding,) = [f for f in roll.findings if f.check == "residuals white"]
-    told = re.search(r"logarithmic decrement goes from ([\d.]+) to ([\d.]+)", finding.text)
+def test_the_decrements_told_are_those_of_the_peaks(roll: Fit) -> None:
+    (finding,) = [f for f in roll.findings if f.code == "residuals.white"]
+    told = re.search(r"logarithmic decrement goes from ([\d.]+) to ([\d.]+)", roll.text(finding))
     assert told is not None
     _, heights = _peaks()
     size = np.log(heights[:-1] + heights[1:])  # of neighbours: the heel drops out
@@ -73,14 +73,14 @@ def test_the_decrements_told_are_those_of_the_peaks(roll: Result) -> None:
     assert float(told[2]) == pytest.approx(late, rel=0.15)
 
 
-def test_quadratic_damping_is_preferred_and_explains_the_decrements(roll: Result) -> None:
-    models = note(roll, "Damping models compared")
+def test_quadratic_damping_is_preferred_and_explains_the_decrements(roll: Fit) -> None:
+    models = note(roll, "decays.damping")
     frame = models.frame
     assert frame["BIC"].idxmin() == "quadratic"
     assert (frame["BIC"].drop("quadratic") > 100.0).all()
-    assert "the damping grows with amplitude" in models.caption
+    assert "the damping grows with amplitude" in roll.text(models)
     # Not all is well then either: the stiffness is not linear, and the report says so.
-    assert "None of the three leaves white residuals" in models.caption
+    assert "None of the three leaves white residuals" in roll.text(models)
     c, k1 = frame.loc["quadratic", ["c, N s/m", "k1, N/m"]]
     told = re.match(r"c_q = ([\d.]+) ", str(frame.loc["quadratic", "further"]))
     assert told is not None

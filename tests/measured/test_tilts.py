@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.inference.pipeline import fit_rig
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, quantity
 from tests.measured.sources import tilt_notes
@@ -39,7 +39,7 @@ def test_each_reading_of_length_gives_its_own_coefficient(tmp_path: Path, pair: 
     expected = {"board": np.tan(np.arcsin(ratio)), "base": ratio}
     found = {}
     for length_is, coefficients in expected.items():
-        result = fit_rig(_rig(tmp_path / length_is, pair, length_is), budget=None)
+        result = cid.fit(_rig(tmp_path / length_is, pair, length_is), budget=None)
         mu = result.summary.loc["mu"]
         assert mu["paper"] == pytest.approx(np.mean(coefficients), rel=1e-12)
         # Between the two the angles are averaged, not their tangents, and the prior is felt a little.
@@ -52,7 +52,7 @@ def test_each_reading_of_length_gives_its_own_coefficient(tmp_path: Path, pair: 
 
 def test_the_two_readings_of_the_foam_die(tmp_path: Path) -> None:
     mu = {
-        length_is: fit_rig(_rig(tmp_path / length_is, "foam_box", length_is), budget=None).summary.loc["mu", "paper"]
+        length_is: cid.fit(_rig(tmp_path / length_is, "foam_box", length_is), budget=None).summary.loc["mu", "paper"]
         for length_is in ("board", "base")
     }
     assert mu["board"] == pytest.approx(0.539, abs=5e-4)

@@ -66,7 +66,7 @@ def table_of(
     channels = {k: v for k, v in record.items() if k != "settings" and (not only or k in (*only, "time"))}
     columns = {name: Column(name, "", 1.0, values[:samples]) for name, values in channels.items()}
     stated = RunSettings(**(dict(record["settings"]) | settings))  # type: ignore[call-overload]
-    return Table("forced_run", "run", "run.csv", columns, stated, np.arange(len(columns["time"].values)) + 2)
+    return Table("forced_run", "run", "run.csv", columns, stated, np.arange(len(columns["time"].values)) + 2, False)
 
 
 @cache

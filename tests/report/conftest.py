@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from capsule_id.inference.result import PointFit, Posterior, Result
+from capsule_id.experiments.registry import default_registry
+from capsule_id.inference.result import PointFit, PointwiseLogLikelihood, Posterior, Provenance, Result
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.rig.model import Quantity, Rig
-from capsule_id.views import Comparison, Curve, Finding, NoteTable, Points
+from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 
 PHYSICAL = {
     # name: (unit, meaning, value, sd, paper)
@@ -132,36 +133,36 @@ def _posterior(rng: np.random.Generator, ensembles: int, draws: int, walkers: in
     )  # fmt: skip
 
 
-def _groups(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> dict[str, object]:
+def _log_likelihood(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> PointwiseLogLikelihood:
     chains, draws = np.arange(0, 8, 2), np.arange(0, 20, 4)
-    observed = {item.label: item.points[0].y for item in comparisons}
-    return {
-        "fixed": {"g": 9.81},
-        "observed": observed,
-        "log_likelihood": {label: rng.normal(size=(len(chains), len(draws), y.size)) for label, y in observed.items()},
-        "log_likelihood_chain": chains,
-        "log_likelihood_draw": draws,
-        "prior": {name: np.exp(rng.normal(size=500)) for name in SAMPLED},
-    }
+    shapes = {item.label: (len(chains), len(draws), item.points[0].y.size) for item in comparisons}
+    return PointwiseLogLikelihood({label: rng.normal(size=shape) for label, shape in shapes.items()}, chains, draws)
+
+
+#: What a check of an outlier has found, and the same of coloured residuals.
+OUTLIER = {
+    "file": "stiff.csv", "lines": [5], "score": 4.1, "p": 1e-4, "most": 3,
+    "estimates": [("k2[stiff]", "N/m", 56410.0, 56350.0)],
+}  # fmt: skip
+COLOURED = {"record": "free_vibration_2", "Q": 250.0, "lags": 20, "p": 1e-30, "model": "decay"}
+CHAINS = {
+    "draws": 1000, "length": 12.0, "slowest": "v_s", "rhat": 1.2, "worst": "mu", "length_wanted": 50.0,
+    "rhat_wanted": 1.01,
+}  # fmt: skip
 
 
 def _findings() -> tuple[Finding, ...]:
-    white = "expected a white record, seen Ljung-Box p = 0.3"
-    outlier = (
-        "expected |residual| < 3 sd, seen 4.1 sd in row 5 of the table; look at that row: "
-        "k2 is 56410 N/m with and 56350 N/m without it"
-    )
     return (
-        Finding("starts agree", "ok", "all 6 starts ended at the same maximum, log-posterior within 1e-7"),
-        Finding("chains converged", "ok", "every parameter has N > 50 tau and R-hat ≤ 1.01 (largest 1.002)"),
-        *(Finding("residuals white", "ok", white, f"free_vibration_{i}") for i in (1, 2, 3)),
-        Finding("outliers", "warn", outlier, "support_spring_stiff"),
-        Finding("linearity", "ok", "quadratic term 0.3 ± 0.5 N/A², line adequate", "motor_current"),
-        Finding("parameters informed", "warn", "m1 and m2 are known from the weighing only"),
+        Finding("starts.agree", "ok", {"starts": 6}),
+        Finding("chains.converged", "ok", {**CHAINS, "length": 61.0, "rhat": 1.002}),
+        Finding("residuals.white", "ok", {"records": 3, "lags": 20}),
+        Finding("outliers", "warn", OUTLIER, "support_spring_stiff"),
+        Finding("lines.straight", "ok", {"number": 4}, "motor_current"),
+        Finding("parameters.informed", "warn", {"names": "v_s"}),
     )
 
 
-def _notes() -> tuple[NoteTable, ...]:
+def _notes() -> tuple[ResultTable, ...]:
     rows = {"k2 [N/m]": [56410.123, 56350.2], "sd [N/m]": [46.0, 31.0]}
     priors = {
         "parameter": ["k1", "mu"],
@@ -170,12 +171,8 @@ def _notes() -> tuple[NoteTable, ...]:
         "factor": [100.0, np.nan],
     }
     return (
-        NoteTable(
-            "With and without the flagged row",
-            "Nothing is dropped by itself.",
-            pd.DataFrame(rows, index=["all rows", "without row 5"]),
-        ),
-        NoteTable("Priors", "Log-normal: 95 % within median/factor to median × factor.", pd.DataFrame(priors)),
+        ResultTable("lines.slopes", pd.DataFrame(rows, index=["all rows", "without row 5"])),
+        ResultTable("parameters.priors", pd.DataFrame(priors)),
     )
 
 
@@ -191,17 +188,10 @@ def make_result(seed: int = 0, ensembles: int = 4, draws: int = 60, walkers: int
         *(_line("support_spring", f"support_spring_{name}", slope, rng) for name, slope in springs),
         *(_decay(i, rng) for i in (1, 2, 3)),
     )
-    provenance = {
-        "seed": seed,
-        "experiments": "bench",
-        "versions": {"capsule_id": "0.1.0", "jax": "0.10.2", "emcee": "3.1.6"},
-        "files": files,
-        "command": "fit-params data --seed 0",
-        "budget": np.float64(np.nan),
-        "counts": np.arange(3),
-    }
+    versions = {"capsule_id": "0.1.0", "jax": "0.10.2", "emcee": "3.1.6"}
     return Result(
         rig=rig,
+        registry=default_registry(),
         summary=_frame(PHYSICAL, rng),
         nuisances=_frame(NUISANCES, rng),
         point_fit=_point_fit(rng),
@@ -209,8 +199,12 @@ def make_result(seed: int = 0, ensembles: int = 4, draws: int = 60, walkers: int
         findings=_findings(),
         comparisons=comparisons,
         notes=_notes(),
-        provenance=provenance,
-        groups=_groups(rng, comparisons),
+        records=(),
+        fixed={"g": 9.81},
+        observed={item.label: item.points[0].y for item in comparisons},
+        prior={name: np.exp(rng.normal(size=500)) for name in SAMPLED},
+        log_likelihood=_log_likelihood(rng, comparisons),
+        provenance=Provenance(seed, "bench", versions, files),
     )
 
 
@@ -230,8 +224,8 @@ def drawn(result: Result) -> tuple[Picture, ...]:
 def unclean(result: Result) -> Result:
     """The same from a real rig, with two failures."""
     bad = (
-        Finding("chains converged", "fail", "expected N > 50 tau, seen 12 tau for v_s; run longer"),
-        Finding("residuals white", "fail", "expected a white record, seen Ljung-Box p = 1e-30", "free_vibration_2"),
+        Finding("chains.converged", "fail", CHAINS),
+        Finding("residuals.white", "fail", COLOURED, "free_vibration_2"),
     )
     return dataclasses.replace(
         result, findings=result.findings + bad, rig=dataclasses.replace(result.rig, synthetic=False)
@@ -246,7 +240,7 @@ def unsampled(result: Result) -> Result:
     for frame in (summary, nuisances):
         frame["informed"] = frame["informed"].astype(object)
         frame[columns] = np.nan
-    return dataclasses.replace(result, summary=summary, nuisances=nuisances, posterior=None, groups={})
+    return dataclasses.replace(result, summary=summary, nuisances=nuisances, posterior=None, log_likelihood=None)
 
 
 @pytest.fixture

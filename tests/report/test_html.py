@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from capsule_id.inference.result import Result
+from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
-from capsule_id.views import Finding, NoteTable
+from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.views import Finding, ResultTable
 
 EMPTY = {"meta", "img", "br"}
 
@@ -103,7 +104,8 @@ def test_verdict_strip_has_text_beside_colour(unclean: Result) -> None:
 
 def test_every_finding_is_there_in_full_worst_first(unclean: Result) -> None:
     text = Page(render(unclean, ())).text
-    places = [text.index(finding.text) for finding in unclean.findings]
+    messages = messages_of(unclean.registry)
+    places = [text.index(" ".join(finding_text(finding, messages).split())) for finding in unclean.findings]
     assert max(places[-2:]) < min(places[:-2])
 
 
@@ -140,8 +142,8 @@ def test_hostile_text_is_escaped(result: Result, bad: str) -> None:
     summary["meaning"] = bad
     frame = pd.DataFrame({bad: [bad]}, index=[bad])
     hostile = dataclasses.replace(
-        result, summary=summary, notes=(NoteTable(bad, bad, frame),), findings=(Finding(bad, "fail", bad, bad),),
-        rig=dataclasses.replace(result.rig, name=bad), provenance={"seed": bad, bad: bad, "files": {bad: bad}},
+        result, summary=summary, notes=(ResultTable(bad, frame),), findings=(Finding(bad, "fail", {bad: bad}, bad),),
+        rig=dataclasses.replace(result.rig, name=bad), provenance=Provenance(0, "all", {bad: bad}, {bad: bad}),
     )  # fmt: skip
     picture = Picture("x", "measured", bad, bad, 10, 10, b"")
     page = render(hostile, (picture,))
@@ -161,9 +163,7 @@ def test_notes_show_cells_and_dashes(page: str) -> None:
 
 def test_note_frames_of_every_kind(result: Result) -> None:
     frame = pd.DataFrame({"text": ["a", None], "number": [-1.23456789e-7, np.nan], "count": [1234567, 2]})
-    page = render(
-        dataclasses.replace(result, notes=(NoteTable("t", "c", frame), NoteTable("e", "c", frame.iloc[:0]))), ()
-    )
+    page = render(dataclasses.replace(result, notes=(ResultTable("t", frame), ResultTable("e", frame.iloc[:0]))), ())
     text = Page(page).text
     assert "a −1.2346e−07 1234567" in text
     assert "– – 2" in text
@@ -174,13 +174,13 @@ def test_provenance_is_complete_and_undated(result: Result, page: str) -> None:
     for digest in result.rig.files.values():
         assert digest in text
     assert "0.10.2" in text
-    assert "fit-params data --seed 0" in text
+    assert "seed 0 experiments bench" in text
     assert not re.search(r"\b20\d\d-\d\d", text)
 
 
 def test_minimal_result(result: Result) -> None:
     bare = dataclasses.replace(
-        result, posterior=None, findings=(), comparisons=(), notes=(), groups={}, nuisances=result.nuisances.iloc[:0],
+        result, posterior=None, findings=(), comparisons=(), notes=(), log_likelihood=None, nuisances=result.nuisances.iloc[:0],
         summary=result.summary.iloc[:1],
     )  # fmt: skip
     text = Page(render(bare, pictures(bare))).text

@@ -13,12 +13,14 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.result import Result
 from capsule_id.parameters import symbol_of
+from capsule_id.report import columns
+from capsule_id.report.console_table import table_text
 from capsule_id.report.netcdf import write_posterior
 from capsule_id.report.write import parameters_json, write_result
 from capsule_id.views import Finding
+from tests.report.conftest import COLOURED
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +43,7 @@ def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_result_has_the_names_units_and_meanings_of_the_parameter_table(result: Result) -> None:
     for frame, physical in ((result.summary, True), (result.nuisances, False)):
         for name, row in frame.iterrows():
-            known = default_registry().parameters[symbol_of(str(name))]
+            known = result.registry.parameters[symbol_of(str(name))]
             assert (row["unit"], row["meaning"], physical) == (known.unit, known.meaning, known.physical), name
 
 
@@ -91,24 +93,66 @@ def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> N
         assert entry["informed"] is bool(row["informed"])
         assert entry["paper"] == (None if np.isnan(row["paper"]) else row["paper"])
     assert content["verdict"]["clean"] is True
-    assert all(list(finding) == ["check", "level", "text"] for finding in content["verdict"]["findings"])
+    assert all(list(finding) == ["check", "level", "text", "code"] for finding in content["verdict"]["findings"])
     assert content["provenance"]["files"] == dict(result.rig.files)
     assert content["provenance"]["seed"] == 0
-    assert content["provenance"]["budget"] is None
-    assert content["provenance"]["counts"] == [0, 1, 2]
+    assert content["provenance"]["versions"] == dict(result.provenance.versions)
+    assert content["provenance"]["experiments"] == "bench"
 
 
 def test_findings_in_json_name_their_experiment(result: Result) -> None:
     findings = (
-        Finding("a", "fail", "seen 4", "run_1"),
-        Finding("b", "ok", "run_1 is white", "run_1"),
-        Finding("c", "ok", "fine"),
+        Finding("decays.slip", "fail", {"force": 4.0, "F_b": 3.0}, "run_1"),
+        Finding("residuals.white", "fail", {**COLOURED, "record": "run_1"}, "run_1"),
+        Finding("errors.stated", "ok"),
     )
     content = parameters_json(dataclasses.replace(result, findings=findings))
     verdict = content["verdict"]
     assert isinstance(verdict, dict)
     assert verdict["clean"] is False
-    assert [finding["text"] for finding in verdict["findings"]] == ["run_1: seen 4", "run_1 is white", "fine"]
+    slip, white, errors = verdict["findings"]
+    assert (slip["check"], slip["code"], slip["level"]) == ("free decay", "decays.slip", "fail")
+    assert slip["text"].startswith("run_1: expected a free capsule at rest, |f| <= F_b = 3 N; the record reaches 4 N")
+    assert white["text"].startswith("run_1: expected white residuals")
+    assert white["text"].count("run_1") == 1
+    assert errors["text"] == "stated reading errors explain the scatter"
+
+
+def test_a_finding_without_words_is_given_by_its_facts(result: Result) -> None:
+    content = parameters_json(dataclasses.replace(result, findings=(Finding("balance", "ok", {"kg": 2.5}, "run_1"),)))
+    verdict = content["verdict"]
+    assert isinstance(verdict, dict)
+    assert verdict["findings"] == [{"check": "balance", "level": "ok", "text": "run_1: kg = 2.5", "code": "balance"}]
+
+
+def test_a_column_declared_once_is_in_every_output(
+    result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Negative control: without the declaration it is in none."""
+    shrinkage = columns.OutputColumn(
+        "z_paper",
+        "z of the paper",
+        lambda row: f"{row.values['paper'] - row.values['mean']:+.9f}",
+        lambda values: values["paper"] - values["mean"],
+    )
+    row = result.summary.loc["k1"]
+    for declared, times in (((), 0), ((shrinkage,), 1)):
+        monkeypatch.setattr(columns, "COLUMNS", (*columns.COLUMNS, *declared))
+        folder = tmp_path / str(times)
+        folder.mkdir()
+        write_result(result, folder)
+        entry = json.loads((folder / "parameters.json").read_text(encoding="utf-8"))["parameters"]["k1"]
+        table = pd.read_csv(folder / "parameters.csv", index_col="name")
+        page = (folder / "report.html").read_text(encoding="utf-8")
+        console = table_text(result.summary, synthetic=False, clean=True)
+        number = f"{row['paper'] - row['mean']:+.9f}"
+        assert ("z_paper" in entry) == ("z_paper" in table) == bool(times)
+        # The page has a table of physical parameters and one of nuisances, and the paper estimates no nuisance.
+        assert page.count(number) == console.count(number) == times
+        assert ("z of the paper" in page) == ("z of the paper" in console) == bool(times)
+        if times:
+            assert entry["z_paper"] == pytest.approx(row["paper"] - row["mean"], rel=1e-12)
+            assert table.loc["k1", "z_paper"] == pytest.approx(row["paper"] - row["mean"], rel=1e-12)
 
 
 def test_point_fit_only_is_null_and_has_no_posterior(unsampled: Result, tmp_path: Path) -> None:
@@ -204,23 +248,24 @@ def test_the_other_groups_hold_what_was_given(folder: Path, result: Result) -> N
         with xr.open_dataset(folder / "posterior.nc", group=group, engine="h5netcdf") as data:
             assert all(len(variable.attrs["units"]) > 0 for variable in data.data_vars.values())
             if group == "prior":
-                np.testing.assert_array_equal(data["k2"].sel(spring="stiff")[0], result.groups["prior"]["k2[stiff]"])  # type: ignore[index]
+                np.testing.assert_array_equal(data["k2"].sel(spring="stiff")[0], result.prior["k2[stiff]"])
                 continue
-            given = result.groups["observed" if group == "observed_data" else group]
-            assert isinstance(given, dict)
+            assert result.log_likelihood is not None
+            given = result.observed if group == "observed_data" else result.log_likelihood.values
             for label, values in given.items():
                 np.testing.assert_array_equal(data[label], values)
                 assert data[label].dims[-1] == f"{label}_row"
 
 
-def test_without_groups_only_the_sample_is_written(result: Result, tmp_path: Path, arviz: ModuleType) -> None:
-    write_posterior(dataclasses.replace(result, groups={}), tmp_path / "x.nc")
+def test_without_arrays_only_the_sample_is_written(result: Result, tmp_path: Path, arviz: ModuleType) -> None:
+    bare = dataclasses.replace(result, fixed={}, observed={}, prior={}, log_likelihood=None)
+    write_posterior(bare, tmp_path / "x.nc")
     assert set(arviz.from_netcdf(str(tmp_path / "x.nc")).groups()) == {"posterior", "sample_stats"}
 
 
 def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None:
     fixed = {"k2[rigid]": 1e6}
-    write_posterior(dataclasses.replace(result, groups={"fixed": fixed}), tmp_path / "x.nc")
+    write_posterior(dataclasses.replace(result, fixed=fixed), tmp_path / "x.nc")
     with xr.open_dataset(tmp_path / "x.nc", group="posterior", engine="h5netcdf") as data:
         assert list(data["spring"].values) == ["soft", "medium", "stiff", "rigid"]
         assert np.all(data["k2"].sel(spring="rigid") == 1e6)
@@ -230,7 +275,7 @@ def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None
 def test_netcdf_refusals(result: Result, unsampled: Result, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="nothing was sampled"):
         write_posterior(unsampled, tmp_path / "x.nc")
-    clash = dataclasses.replace(result, groups={"fixed": {"k2": 1.0}})
+    clash = dataclasses.replace(result, fixed={"k2": 1.0})
     with pytest.raises(ValueError, match=re.escape("k2 is used both alone and as a family")):
         write_posterior(clash, tmp_path / "x.nc")
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from capsule_id.records.view import RecordView
-from capsule_id.views import Finding, NoteTable
+from capsule_id.views import Finding, ResultTable
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
@@ -90,9 +90,4 @@ class Fitted(Protocol):
 
 #: The experiments of a fit that declare a check, and the fit -> findings. Tables likewise.
 Check = Callable[[Sequence[Any], Fitted], list[Finding]]
-TableMaker = Callable[[Sequence[Any], Fitted], list[NoteTable]]
-
-
-def ok_if_empty(findings: list[Finding], check: str, text: str) -> list[Finding]:
-    """``findings``, or one of level "ok" where there are none."""
-    return findings or [Finding(check, "ok", text)]
+TableMaker = Callable[[Sequence[Any], Fitted], list[ResultTable]]

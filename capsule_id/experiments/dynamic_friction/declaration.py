@@ -6,7 +6,13 @@ from typing import Literal
 
 import numpy as np
 
-from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
+from capsule_id.experiments.families.friction import (
+    CAPTIONS,
+    MESSAGES,
+    check_scatter,
+    friction_estimates,
+    friction_panels,
+)
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.parameters import Prior, scatter
@@ -88,6 +94,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="mu, v_s",
     captions=CAPTIONS,
+    messages=MESSAGES,
     lint=(partial(lint_rows, fewest=5), lint_reading_errors),
     check=check_scatter,
     paper=friction_estimates,

@@ -9,6 +9,7 @@ from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.families.friction_model import SurfaceExperiment
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.views import Facts
 
 
 class CapsuleForward(SurfaceExperiment):
@@ -44,6 +45,5 @@ class CapsuleForward(SurfaceExperiment):
         model, law = "exact" if self.smoothing is None else "smooth", self.friction.force(theta)
         return simulate(p, e, times, initial, model=model, smoothing=self.smoothing, friction=law)
 
-    def advice_on_coloured_noise(self) -> str:
-        remedy = 'check spring, gap and friction law, or state noise = "ar1" where the sensor filters'
-        return f": look at its residuals and phase portrait, {remedy}"
+    def noise_facts(self) -> Facts:
+        return {"model": "capsule"}

@@ -8,6 +8,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Values
 from capsule_id.rig.model import Table
+from capsule_id.views import Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.friction_experiment import FrictionExperiment
@@ -15,6 +16,17 @@ if TYPE_CHECKING:
 
 CAPTIONS = {
     "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours."
+}
+
+MESSAGES = {
+    "friction.one_surface": Message(
+        "experiments agree",
+        ok="mu = {mu_tilts:.3f} by tilting, {mu_slides:.3f} by sliding (p = {p:.2g})",
+        fail=(
+            "{tilts} and {slides}: expected one surface; found mu = {mu_tilts:.3f} by tilting and {mu_slides:.3f} by "
+            "sliding (p = {p:.2g}). Measure both on the same surface, and read the tilt at break-away."
+        ),
+    )
 }
 
 

@@ -52,15 +52,16 @@ def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) 
         return []
     found, friction = fit.tension(tilts, slides), tilts[0].friction
     by_tilting, by_sliding = (friction.coefficient(values).forward(0.0) for values in (found.one, found.other))
-    seen = f"mu = {by_tilting:.3f} by tilting, {by_sliding:.3f} by sliding (p = {found.p:.2g})"
+    facts = {
+        "tilts": ", ".join(e.label for e in tilts),
+        "slides": ", ".join(e.label for e in slides),
+        "mu_tilts": float(by_tilting),
+        "mu_slides": float(by_sliding),
+        "p": found.p,
+    }
     if found.p < LEVEL:
-        labels = ", ".join(e.label for e in tilts)
-        text = (
-            f"{labels} and {', '.join(e.label for e in slides)}: expected one surface; {seen}: were they measured on the "
-            "same surface, and is the tilt read at break-away?"
-        )
-        return [Finding("experiments agree", "fail", text, tilts[0].label)]
-    return [Finding("experiments agree", "ok", seen)]
+        return [Finding("friction.one_surface", "fail", facts, tilts[0].label)]
+    return [Finding("friction.one_surface", "ok", facts)]
 
 
 class FrictionExperiment(SurfaceExperiment):

@@ -9,9 +9,32 @@ from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Table
+from capsule_id.views import Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.line_experiment import Line
+
+MESSAGES = {
+    "lines.rise": Message(
+        "linearity",
+        fail="{name} is positive, but the line falls: {slope:.3g} {unit}. Check the signs of {x} and {y}.",
+    ),
+    "lines.straight": Message(
+        "linearity",
+        ok="{number} calibration lines are straight",
+        fail=(
+            "expected a straight line; a parabola departs from it by {departure:.1%} of the range at mid range "
+            "(p = {p:.1g}), so {name} depends on where it is read. Use the part of the range that the runs use."
+        ),
+    ),
+    "lines.slopes": Message(
+        "Calibration lines",
+        caption=(
+            "Slopes by generalised least squares. The ordinary line is the paper's estimate. Flagged rows are shown, not "
+            "dropped."
+        ),
+    ),
+}
 
 
 def line_estimates(experiments: Sequence["Line"]) -> Values:

@@ -18,14 +18,14 @@ import pandas as pd
 from scipy import stats
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, band
-from capsule_id.experiments.checks.context import Fitted, ok_if_empty
+from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Curve, Finding, NoteTable, Points
+from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 
 #: Default prior of a scatter: log-normal, median 1 % of the range of y, factor 100.
 SCATTER_MEDIAN, SCATTER_FACTOR = 0.01, 100.0
@@ -39,21 +39,14 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
         # A single wild reading can tilt the whole line: that is the outlier's finding, not this one's.
         slope = refit(e, theta, left_out)[e.symbol][0]
         if slope <= 0.0:
-            text = (
-                f"{e.label}: {e.slope.name} is positive, the line falls ({slope:.3g} {e.slope.unit}): check the signs of "
-                f"{e.x_name} and {e.y_name}"
-            )
-            findings.append(Finding("linearity", "fail", text, e.label))
+            facts = {"name": e.slope.name, "slope": slope, "unit": e.slope.unit, "x": e.x_name, "y": e.y_name}
+            findings.append(Finding("lines.rise", "fail", facts, e.label))
             continue
         bend, p = curvature_test(e, theta, left_out)
         if p * len(lines) < LEVEL:
-            text = (
-                f"{e.label}: expected a straight line; a parabola departs from it by {100 * bend:.1f} % of the range at "
-                f"mid range (p = {p:.1g}), so {e.slope.name} depends on where it is read: use the part of the range "
-                "that the runs use"
-            )
-            findings.append(Finding("linearity", "fail", text, e.label))
-    return ok_if_empty(findings, "linearity", f"{len(lines)} calibration lines are straight")
+            facts = {"name": e.slope.name, "departure": bend, "p": p}
+            findings.append(Finding("lines.straight", "fail", facts, e.label))
+    return findings or [Finding("lines.straight", "ok", {"number": len(lines)})]
 
 
 def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int]) -> tuple[float, float]:
@@ -76,7 +69,7 @@ def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int])
     return float(coefficients[2] * 0.25 / abs(coefficients[1])), float(p)
 
 
-def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[NoteTable]:
+def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
     """Slopes with and without flagged rows, beside the paper's ordinary line."""
     rows = []
     for e in lines:
@@ -93,10 +86,7 @@ def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[NoteTable]:
             without = refit(e, theta, left_out)[e.symbol] if left_out else (np.nan, np.nan)
             row |= {"without flagged rows": without[0], "± without": without[1]}
         rows.append(row | e.table_extras() | {"errors": e.errors})
-    caption = (
-        "Slopes by generalised least squares; the ordinary line is the paper's. Flagged rows are shown, not dropped."
-    )
-    return [NoteTable("Calibration lines", caption, pd.DataFrame(rows).set_index("table"))]
+    return [ResultTable("lines.slopes", pd.DataFrame(rows).set_index("table"))]
 
 
 class Line(Experiment):

@@ -13,6 +13,7 @@ from capsule_id.rig.domains import NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
+from capsule_id.views import Message
 
 #: Recorded channels: name, unit, LaTeX subscript.
 _CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
@@ -101,7 +102,7 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
     theta = {"m1": rig.m1.value, "m2": rig.m2.value, "g": rig.g.value}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
     F_b = float(EQUATION_1.force(theta).forward(0.0))
-    return [finding.text.removeprefix(f"{table.label}: ") for finding in feasibility(table, theta, F_b, note)]
+    return [MESSAGES[found.code].text(found.level, found.facts) + note for found in feasibility(table, theta, F_b)]
 
 
 def _lint_drive(table: Table[RunSettings]) -> Iterable[str]:
@@ -138,6 +139,78 @@ TEMPLATE = """\
 # segment = { value = 0.3, unit = "s" }
 """
 
+MESSAGES = {
+    "runs.contact": Message(
+        "feasible",
+        warn=(
+            "at Omega = {Omega:.4g} rad/s the rod reaches the gap of {gap_mm:.3g} mm from P_d = {needed:.3g} N on, the run has "
+            "{P_d:.3g} N: no lasting contact from rest, so the run does not determine k2; check P_d, gap and Omega, drive "
+            "harder, or narrow the gap"
+        ),
+    ),
+    "runs.slip": Message(
+        "feasible",
+        warn=(
+            "the rod pushes a capsule at rest with {force:.3g} N at most, the break-away force is {F_b:.3g} N: the capsule "
+            "cannot set off, so the run does not determine the friction law; drive harder, or nearer to resonance"
+        ),
+    ),
+    "runs.sampling": Message(
+        "feasible",
+        warn=(
+            "a contact lasts about pi sqrt(m*/k2) = {contact_ms:.2g} ms, {samples:.2g} samples, and {wanted} or more are "
+            "wanted; sample at {rate:.2g} Hz or more"
+        ),
+    ),
+    "runs.length": Message(
+        "feasible",
+        warn=(
+            "{periods:.2g} excitation periods are left after the start has died out ({decay:.2g} s), {wanted} or more are "
+            "wanted; record for {seconds:.2g} s or more"
+        ),
+    ),
+    "runs.predictable": Message(
+        "runs predictable",
+        ok="an error of the initial state grows less than {limit:g} times in each of {number} runs",
+        fail=(
+            "expected a motion that forgets its start; an error of the initial state grows {growth:.2g} times over the record, "
+            "so one initial state cannot predict it. State segment, or record less of it."
+        ),
+    ),
+    "runs.cut": Message(
+        "runs predictable",
+        warn=(
+            "an error of the initial state grows {growth:.2g} times over the record where the fit starts, so the record was "
+            "cut into {parts} parts of {seconds:.2g} s, each with an initial state of its own; "
+            'segment = {{ value = ..., unit = "s" }} states another length'
+        ),
+    ),
+    "runs.grazing": Message(
+        "runs predictable",
+        warn="{status} Its covariance at the point fit may be wrong; the sample does not use it.",
+    ),
+    "runs.start": Message(
+        "start of a run",
+        fail=(
+            "{labels}: expected one kind of start to fit; the kind of start did not settle after {rounds} fits. State "
+            'start = "stuck" or "moving", or cut the record where the capsule is clearly at rest.'
+        ),
+    ),
+    "runs.groups": Message(
+        "Nondimensional groups",
+        caption=(
+            "A prototype of another size with equal groups has an equal motion. Omega0 = √(k1/m1), zeta = c/(2 m1 Omega0), "
+            "F_b: break-away force, mu (m1 + m2) g by eq. (1). A shared group is listed once."
+        ),
+    ),
+    "runs.motion": Message(
+        "Motion predicted and observed",
+        caption=(
+            "Over the record, from its first sample to its last. The record's velocity rests on five samples at either end."
+        ),
+    ),
+}
+
 KIND = Kind(
     name="forced_run",
     columns={
@@ -160,6 +233,7 @@ KIND = Kind(
         "forced_run": "Forced run: one recorded channel, its residuals at the point fit, and their autocorrelation.",
         "phase_portrait": "Phase plane as the paper draws it: the record through Savitzky–Golay, the model, the impact line.",
     },
+    messages=MESSAGES,
     bench=False,
     lint=(_lint_drive,),
     lint_rig=_lint_feasibility,

@@ -85,7 +85,6 @@ class ForcedRun(CapsuleForward):
     coloured: bool = eqx.field(static=True)
     second_reading: bool = eqx.field(static=True)
 
-    bench = False
     time_series = True
     checks = (check_feasible, check_predictable)
     tables = (predicted_motion, scaled_groups)

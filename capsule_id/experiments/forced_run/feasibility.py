@@ -22,8 +22,6 @@ from capsule_id.views import Finding
 if TYPE_CHECKING:
     from capsule_id.experiments.forced_run.experiment import ForcedRun
 
-#: The name that every finding of this module carries.
-CHECK = "feasible"
 #: Fewer samples than this in one touch of the support spring draw no impact.
 SAMPLES_PER_CONTACT = 10
 #: A run shows the settled motion in this many excitation periods ...
@@ -61,12 +59,12 @@ def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
         p, e = run.capsule(theta)
         conditions = RunConditions(run.Omega, float(e.P_d), float(p.G))  # pyright: ignore[reportArgumentType]
         F_b = float(run.friction.force(theta).forward(0.0))
-        findings += feasibility(run.table, theta, F_b, conditions=conditions)
+        findings += feasibility(run.table, theta, F_b, conditions)
     return findings
 
 
 def feasibility(
-    table: Table, theta: Mapping[str, float], F_b: float, note: str = "", conditions: RunConditions | None = None
+    table: Table, theta: Mapping[str, float], F_b: float, conditions: RunConditions | None = None
 ) -> list[Finding]:
     """Findings, level ``warn``, on one forced run; none where its settings can do what they are for.
 
@@ -75,7 +73,6 @@ def feasibility(
     table : a ``forced_run``
     theta : values by symbol, SI: m1, m2, k1, c, k2 (of this run's spring), and K where P_d is not stated
     F_b : break-away force, N
-    note : where the values come from, added to every finding that rests on them
     conditions : None: as stated
     """
     drive = conditions or stated_conditions(table, theta.get("K", np.nan))
@@ -83,21 +80,13 @@ def feasibility(
     without_contact = drive.P_d / float(grazing_load(theta["m1"], theta["k1"], theta["c"], 1.0, drive.Omega))
     grazing = float(grazing_load(theta["m1"], theta["k1"], theta["c"], drive.G, drive.Omega))
     linear_force = without_contact * float(np.hypot(theta["k1"], theta["c"] * drive.Omega))
-    texts = []
+    findings = []
     if drive.P_d < grazing and linear_force <= F_b:
-        texts.append(
-            f"at Omega = {drive.Omega:.4g} rad/s the rod reaches the gap of {1e3 * drive.G:.3g} mm from P_d = "
-            f"{grazing:.3g} N on, the run has {drive.P_d:.3g} N: no lasting contact from rest, so it says nothing of k2; "
-            "check P_d, gap and Omega, drive harder, or narrow the gap"
-        )
+        facts = {"Omega": drive.Omega, "gap_mm": 1e3 * drive.G, "needed": grazing, "P_d": drive.P_d}
+        findings.append(Finding("runs.contact", "warn", facts, table.label))
     if reached <= F_b:
-        texts.append(
-            f"the rod pushes a capsule at rest with {reached:.3g} N at most, the break-away force is F_b = {F_b:.3g} N: the "
-            "capsule cannot set off, so the run does not inform the friction law; drive harder, or nearer to resonance"
-        )
-    texts += _sampling(table, theta, touches and drive.P_d >= grazing)
-    texts += _length(table, theta, drive)
-    return [Finding(CHECK, "warn", f"{table.label}: {text}{note}", table.label) for text in texts]
+        findings.append(Finding("runs.slip", "warn", {"force": reached, "F_b": F_b}, table.label))
+    return [*findings, *_sampling(table, theta, touches and drive.P_d >= grazing), *_length(table, theta, drive)]
 
 
 def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, bool]:
@@ -127,26 +116,32 @@ def contact_time(m1: float, m2: float, k2: float) -> float:
     return float(np.pi * np.sqrt(1.0 / ((1.0 / m1 + 1.0 / m2) * k2)))
 
 
-def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[str]:
+def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[Finding]:
     """Samples within a touch, where there are touches; the shortest is that of a capsule which gives way."""
     step = float(np.median(np.diff(table["time"])))
     touch = contact_time(theta["m1"], theta["m2"], theta["k2"])
     if not touches or touch / step >= SAMPLES_PER_CONTACT:
         return []
-    return [
-        f"a contact lasts about pi sqrt(m*/k2) = {1e3 * touch:.2g} ms, {touch / step:.2g} samples, and "
-        f"{SAMPLES_PER_CONTACT} or more are wanted; sample at {SAMPLES_PER_CONTACT / touch:.2g} Hz or more"
-    ]
+    facts = {
+        "contact_ms": 1e3 * touch,
+        "samples": touch / step,
+        "wanted": SAMPLES_PER_CONTACT,
+        "rate": SAMPLES_PER_CONTACT / touch,
+    }
+    return [Finding("runs.sampling", "warn", facts, table.label)]
 
 
-def _length(table: Table, theta: Mapping[str, float], drive: RunConditions) -> list[str]:
+def _length(table: Table, theta: Mapping[str, float], drive: RunConditions) -> list[Finding]:
     """Excitation periods left once the start has died out."""
     time, start = table["time"], DECAY_TIMES * 2.0 * theta["m1"] / theta["c"]
     period = 2.0 * np.pi / drive.Omega
     settled = (float(time[-1] - time[0]) - start) / period
     if settled >= SETTLED_PERIODS:
         return []
-    return [
-        f"{max(settled, 0.0):.2g} excitation periods are left after the start has died out ({start:.2g} s), "
-        f"{SETTLED_PERIODS} or more are wanted; record for {start + SETTLED_PERIODS * period:.2g} s or more"
-    ]
+    facts = {
+        "periods": max(settled, 0.0),
+        "decay": start,
+        "wanted": SETTLED_PERIODS,
+        "seconds": start + SETTLED_PERIODS * period,
+    }
+    return [Finding("runs.length", "warn", facts, table.label)]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.experiments.checks.context import Fitted, ok_if_empty
+from capsule_id.experiments.checks.context import Fitted
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
 from capsule_id.views import Finding
@@ -60,12 +60,8 @@ def predictable_parts(run: "ForcedRun", theta: ValuesBySymbol) -> "tuple[tuple[F
     if len(parts) == 1:
         return parts, []
     seconds = (run.time[-1] - run.time[0]) / len(parts)
-    text = (
-        f"{run.label}: an error of the initial state grows {factor:.2g} times over the record where the fit starts, "
-        f"so it was cut into {len(parts)} parts of {seconds:.2g} s, each with an initial state of its own; "
-        'segment = { value = ..., unit = "s" } states another length'
-    )
-    return parts, [Finding("runs predictable", "warn", text, run.label)]
+    facts = {"growth": factor, "parts": len(parts), "seconds": seconds}
+    return parts, [Finding("runs.cut", "warn", facts, run.label)]
 
 
 def _part_length(run: "ForcedRun", factor: float) -> float:
@@ -84,16 +80,8 @@ def check_predictable(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]
         local = run.local(fit.values)
         status = Status(int(run.motion(local, np).status))
         if status is Status.GRAZING:
-            text = (
-                f"{run.label}: {status.sentence} Its covariance at the point fit may be off; the sample does not use it"
-            )
-            findings.append(Finding("runs predictable", "warn", text, run.label))
+            findings.append(Finding("runs.grazing", "warn", {"status": status.sentence}, run.label))
         factor = growth(run, local)
         if not factor < LARGEST_GROWTH:
-            text = (
-                f"{run.label}: expected a motion that forgets its start; an error of the initial state grows {factor:.2g} "
-                f"times over the record, so one initial state cannot predict it: state segments, or record less of it"
-            )
-            findings.append(Finding("runs predictable", "fail", text, run.label))
-    seen = f"none of {len(runs)} runs amplifies an error of its start {LARGEST_GROWTH:g} times"
-    return ok_if_empty(findings, "runs predictable", seen)
+            findings.append(Finding("runs.predictable", "fail", {"growth": factor}, run.label))
+    return findings or [Finding("runs.predictable", "ok", {"number": len(runs), "limit": LARGEST_GROWTH})]

@@ -9,13 +9,13 @@ import pandas as pd
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.records.label import measured_motion
-from capsule_id.views import NoteTable
+from capsule_id.views import ResultTable
 
 if TYPE_CHECKING:
     from capsule_id.experiments.forced_run.experiment import ForcedRun
 
 
-def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable]:
+def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
     """The paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
 
     Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0. Omega0 = sqrt(k1/m1); F_b is the break-away force.
@@ -29,11 +29,7 @@ def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable]:
                 columns.setdefault(name, []).append(value)
     rows = {name: [np.mean(column), np.std(column, ddof=1)] for name, column in columns.items()}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["mean", "sd"]).rename_axis("group")
-    caption = (
-        "Groups that carry the rig over to a prototype of another size: equal groups, equal motion. Omega0 = √(k1/m1), "
-        "zeta = c/(2 m1 Omega0), F_b: break-away force, mu (m1 + m2) g by eq. (1); a shared group is listed once."
-    )
-    return [NoteTable("Nondimensional groups", caption, frame)]
+    return [ResultTable("runs.groups", frame)]
 
 
 def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
@@ -55,7 +51,7 @@ def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
     }
 
 
-def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable]:
+def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
     """Contacts and mean velocity of the capsule over the record: observed, at the point fit, 95 % band of the draws."""
     rows = {}
     for run in runs:
@@ -77,8 +73,5 @@ def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[NoteTable
             place = run.values[run.channels.index("x_capsule")]
             row["mean velocity, record, mm/s"] = 1e3 * float(np.mean(place[-5:]) - np.mean(place[:5])) / span
         rows[run.label] = row
-    caption = (
-        "Over the record, from its first sample to its last; the record's velocity from five samples at either end."
-    )
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("run")
-    return [NoteTable("Motion predicted and observed", caption, frame)]
+    return [ResultTable("runs.motion", frame)]

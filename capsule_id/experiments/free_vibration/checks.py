@@ -25,14 +25,8 @@ def check_stiffness(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
     mean = np.average(k1, weights=weight)
     q = float(np.sum(weight * (k1 - mean) ** 2))
     p = float(stats.chi2.sf(q, len(records) - 1))
-    if p < LEVEL:
-        text = (
-            f"expected one k1 for all releases (linear near the working point); the records give {k1.min():.5g} to "
-            f"{k1.max():.5g} N/m (chi-square {q:.1f} for {len(records) - 1} d.f., p = {p:.1g}): release from smaller "
-            "deflections, or treat k1 as valid at one amplitude only"
-        )
-        return [Finding("stiffness against amplitude", "fail", text)]
-    return [Finding("stiffness against amplitude", "ok", f"k1 is the same in all {len(records)} records (p = {p:.2g})")]
+    facts = {"records": len(records), "low": k1.min(), "high": k1.max(), "chi_square": q, "p": p}
+    return [Finding("decays.stiffness", "fail" if p < LEVEL else "ok", facts)]
 
 
 def stiffness_by_record(
@@ -53,18 +47,9 @@ def check_free_decay(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fi
             force = e.largest_force(theta)
             threshold = float(e.friction.force(theta).forward(0.0))
             if force > threshold:
-                text = (
-                    f"{e.label}: a free capsule stays at rest while |f| <= F_b = {threshold:.3g} N; the record "
-                    f"reaches {force:.3g} N, so the capsule slips and this is no free decay: hold the capsule, or "
-                    "release from a smaller deflection"
-                )
-                findings.append(Finding("free decay", "fail", text, e.label))
+                findings.append(Finding("decays.slip", "fail", {"force": force, "F_b": threshold}, e.label))
         gap = e.table.settings.gap
         reach = float(np.max(e.values - equilibrium(e.values)))
         if gap is not None and reach >= gap.value:
-            text = (
-                f"{e.label}: x_rel reaches {reach:.3g} m, the support spring stands at {gap.value:.3g} m, so the "
-                "rod hits it and this is no free decay: move the spring away, or start the window later"
-            )
-            findings.append(Finding("free decay", "fail", text, e.label))
+            findings.append(Finding("decays.contact", "fail", {"reach": reach, "gap": gap.value}, e.label))
     return findings

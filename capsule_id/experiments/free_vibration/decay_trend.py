@@ -8,9 +8,10 @@ stiffness that depends on the amplitude.
 import numpy as np
 
 from capsule_id.experiments.free_vibration.decrement import Decrement
+from capsule_id.views import Facts
 
-#: A drift is told where it stands out by this many standard errors: neighbouring peaks are not independent.
-TOLD = 5.0
+#: A drift is reported where it exceeds this many standard errors: neighbouring peaks are not independent.
+REPORTED = 5.0
 #: Peaks of a parabola through fewer half cycles say nothing of its scatter.
 FEWEST_HALF_CYCLES = 6
 #: Peaks lower than this many noise sds are lifted by the noise.
@@ -26,34 +27,34 @@ def _drift(values: np.ndarray) -> tuple[float, float, bool]:
     design = np.vander(index, 3)
     variance = float(rest @ rest) / (len(values) - 3) * np.linalg.inv(design.T @ design)[0, 0]
     first, last = np.polyval(np.polyder(coefficients), index[[0, -1]])
-    return float(first), float(last), bool(abs(coefficients[0]) > TOLD * np.sqrt(variance))
+    return float(first), float(last), bool(abs(coefficients[0]) > REPORTED * np.sqrt(variance))
 
 
-def describe_trend(decrement: Decrement, noise: float) -> str:
-    """What drifts, in words with numbers, SI; "" where nothing does or too few peaks stand out.
+def trend(decrement: Decrement, noise: float) -> Facts:
+    """What drifts while the amplitude falls, SI; empty where nothing does or too few peaks stand out.
 
     Parameters
     ----------
     decrement : of the smoothed record
     noise : sd, m: later peaks, once they are lower than ``PEAK_NOISE_RATIO`` of it, are left out
+
+    Returns
+    -------
+    ``amplitude`` (m), and of ``decrement`` (1) and ``frequency`` (rad/s) those that drift: first and last value each.
     """
     height = np.abs(decrement.peaks)
     low = np.flatnonzero(height < PEAK_NOISE_RATIO * noise)
     count = int(low[0]) if len(low) else len(height)
     if count < FEWEST_HALF_CYCLES:
-        return ""
+        return {}
     # Means of neighbours stand on opposite sides of the equilibrium, so an error of that drops out.
     size = 0.5 * (height[1:count] + height[: count - 1])
     middle = 0.5 * (decrement.times[1:count] + decrement.times[: count - 1])
-    parts = []
-    first, last, told = _drift(np.log(size))
-    if told:
-        law = "the damping grows with amplitude" if first < last else "the damping grows as the amplitude falls"
-        parts.append(f"its logarithmic decrement goes from {-2.0 * first:.3g} to {-2.0 * last:.3g} ({law})")
-    first, last, told = _drift(middle)
-    if told:
-        law = "the stiffness falls with amplitude" if first > last else "the stiffness grows with amplitude"
-        parts.append(f"its frequency from {np.pi / first:.4g} to {np.pi / last:.4g} rad/s ({law})")
-    if not parts:
-        return ""
-    return f"while its amplitude falls from {size[0]:.2g} to {size[-1]:.2g} m, {' and '.join(parts)}"
+    facts = {}
+    first, last, drifts = _drift(np.log(size))
+    if drifts:
+        facts["decrement"] = (-2.0 * first, -2.0 * last)
+    first, last, drifts = _drift(middle)
+    if drifts:
+        facts["frequency"] = (np.pi / first, np.pi / last)
+    return {"amplitude": (float(size[0]), float(size[-1])), **facts} if facts else {}

@@ -16,6 +16,7 @@ from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, sampling_step
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, NameRule, QuantityRule
+from capsule_id.views import Facts, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -150,6 +151,58 @@ TEMPLATE = """\
 #: a support spring within reach: both of spring = "L60" and gap = { value = 1.0, sd = 0.02, unit = "mm" }
 """
 
+_DAMPING = {
+    "viscous": "Viscous damping alone fits as well as dry or quadratic damping beside it.",
+    "dry": "Dry friction beside the viscous damping fits best: it takes off the same amount every cycle.",
+    "quadratic": "Quadratic beside viscous damping fits best: the damping grows with amplitude.",
+}
+
+
+def _damping_caption(facts: Facts) -> str:
+    """The best of the three models, and whether any of them is good enough."""
+    rest = "" if facts["any_white"] else " None of the three leaves white residuals: another effect is present."
+    return (
+        "The damping model of the fit leaves structure in the residuals. Here all three models are fitted to the decays "
+        f'alone; BIC is relative to the best. {_DAMPING[facts["best"]]}{rest} State damping = "viscous", "dry" or '
+        '"quadratic" to choose one.'
+    )
+
+
+MESSAGES = {
+    "decays.stiffness": Message(
+        "stiffness against amplitude",
+        ok="k1 is the same in all {records} records (p = {p:.2g})",
+        fail=(
+            "expected one k1 for all releases (linear near the working point); the {records} records give {low:.5g} to "
+            "{high:.5g} N/m (chi-square {chi_square:.1f}, p = {p:.1g}). Release from smaller deflections, or use k1 at this "
+            "amplitude only."
+        ),
+    ),
+    "decays.slip": Message(
+        "free decay",
+        fail=(
+            "expected a free capsule at rest, |f| <= F_b = {F_b:.3g} N; the record reaches {force:.3g} N, so the capsule "
+            "slips and this is no free decay. Hold the capsule, or release from a smaller deflection."
+        ),
+    ),
+    "decays.contact": Message(
+        "free decay",
+        fail=(
+            "x_rel reaches {reach:.3g} m and the support spring stands at {gap:.3g} m, so the rod hits it and this is no "
+            "free decay. Move the spring away, or start the window later."
+        ),
+    ),
+    "decays.records": Message(
+        "Free vibration, record by record",
+        caption=(
+            "Each record alone, by least squares on the whole raw record, beside the paper's protocol. The paper's k1 is low "
+            "by ζ², because it takes the damped frequency for the natural one. Its c depends on how peaks are read out of "
+            "noise."
+        ),
+    ),
+    "decays.damping": Message("Damping models compared", caption=_damping_caption),
+}
+
 KIND = Kind(
     name="free_vibration",
     columns={"time": ColumnRule("s", increasing=True), "x_rel": ColumnRule("m", varies=True)},
@@ -165,6 +218,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="k1, c",
     captions={"free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation."},
+    messages=MESSAGES,
     lint=(_lint,),
     paper=_paper,
     rough=_rough,

@@ -19,7 +19,7 @@ from capsule_id.experiments.free_vibration.decay_models import (
     viscous_basis,
 )
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
-from capsule_id.experiments.free_vibration.decay_trend import describe_trend
+from capsule_id.experiments.free_vibration.decay_trend import trend
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_table
@@ -30,7 +30,7 @@ from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Curve, Points
+from capsule_id.views import Comparison, Curve, Facts, Points
 
 #: Default prior of a record's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
@@ -230,20 +230,18 @@ class FreeVibration(SurfaceExperiment):
         """Largest distance of a sample from the rest position, m."""
         return float(np.max(np.abs(self.values - equilibrium(self.values))))
 
-    def damping_trend(self) -> str:
-        """How the peaks show damping and frequency to vary with amplitude; "" where nothing drifts."""
+    def damping_trend(self) -> Facts:
+        """How damping and frequency of the peaks vary with amplitude, see ``trend``; empty where nothing drifts."""
         decrement = self.paper_decrement()
-        return "" if decrement is None else describe_trend(decrement, noise_level(self.values))
+        return {} if decrement is None else trend(decrement, noise_level(self.values))
 
     def largest_force(self, theta: ValuesBySymbol) -> float:
         """max |f|, f = k1 x_rel + c d(x_rel)/dt, over the record, N."""
         x = self.smoothed() - equilibrium(self.values)
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.time))))
 
-    def advice_on_coloured_noise(self) -> str:
-        drift = self.damping_trend()
-        remedy = "compare the damping models below, cut the record to free decay with start/stop"
-        return f"{'; ' + drift if drift else ''}: {remedy}"
+    def noise_facts(self) -> Facts:
+        return {"model": "decay", **self.damping_trend()}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         def curve(values: ValuesBySymbol) -> np.ndarray:

@@ -10,21 +10,16 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
 from capsule_id.experiments.free_vibration.checks import stiffness_by_record
-from capsule_id.views import NoteTable
+from capsule_id.views import ResultTable
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
 
 #: The damping models that are compared when the residuals of a decay are not white.
 DAMPING_MODELS = ("viscous", "dry", "quadratic")
-_VERDICTS = {
-    "viscous": "Neither dry nor quadratic damping describes the decays better than viscous damping alone.",
-    "dry": "Dry friction beside the viscous damping fits best: it takes off the same amount every cycle.",
-    "quadratic": "Quadratic beside viscous damping fits best: the damping grows with amplitude.",
-}
 
 
-def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[NoteTable]:
+def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
     """k1 and c of every record alone, beside the paper's protocol."""
     k1, k1_sd, deflection = stiffness_by_record(records, fit.values)
     rows = []
@@ -44,17 +39,13 @@ def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[NoteTab
                 "c, raw peaks": raw.c if raw else np.nan,
             }
         )
-    caption = (
-        "Each record alone, by least squares on the whole raw record, beside the paper's protocol. The paper's k1 is low "
-        "by ζ² (it takes the damped frequency for the natural one); its c depends on how peaks are read out of noise."
-    )
-    return [NoteTable("Free vibration, record by record", caption, pd.DataFrame(rows).set_index("record"))]
+    return [ResultTable("decays.records", pd.DataFrame(rows).set_index("record"))]
 
 
-def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[NoteTable]:
+def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
     """The decays alone under each damping model, ranked by BIC; [] where their residuals are white."""
     labels = {record.label for record in records}
-    if not any(f.check == "residuals white" and f.level == "fail" and f.experiment in labels for f in fit.findings):
+    if not any(f.code == "residuals.white" and f.level == "fail" and f.experiment in labels for f in fit.findings):
         return []
     rows = []
     for damping in DAMPING_MODELS:
@@ -79,12 +70,5 @@ def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[NoteT
         )
     frame = pd.DataFrame(rows).set_index("damping")
     frame["BIC"] -= frame["BIC"].min()
-    best = str(frame["BIC"].idxmin())
-    verdict = _VERDICTS[best]
-    if "yes" not in frame["residuals white"].tolist():
-        verdict += " None of the three leaves white residuals, so something else is at work beside the damping."
-    caption = (
-        "The damping model asked for leaves structure in the residuals; here are all three, fitted to the decays alone. BIC "
-        f'is relative to the best. {verdict} Ask for a model with damping = "viscous", "dry" or "quadratic".'
-    )
-    return [NoteTable("Damping models compared", caption, frame)]
+    facts = {"best": str(frame["BIC"].idxmin()), "any_white": "yes" in frame["residuals white"].tolist()}
+    return [ResultTable("decays.damping", frame, facts)]

@@ -2,7 +2,13 @@
 
 from functools import partial
 
-from capsule_id.experiments.families.friction import CAPTIONS, check_scatter, friction_estimates, friction_panels
+from capsule_id.experiments.families.friction import (
+    CAPTIONS,
+    MESSAGES,
+    check_scatter,
+    friction_estimates,
+    friction_panels,
+)
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
@@ -35,6 +41,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="mu, v_s",
     captions=CAPTIONS,
+    messages=MESSAGES,
     lint=(partial(lint_rows, fewest=5),),
     check=check_scatter,
     paper=friction_estimates,

@@ -5,10 +5,12 @@ from typing import Annotated
 
 import numpy as np
 
+from capsule_id.experiments.families.line import MESSAGES as LINE_MESSAGES
 from capsule_id.experiments.families.line import line_estimates, lint_line, refuse_idle_sd_ratio
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.rig.model import Quantity, Settings
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
+from capsule_id.views import Message
 
 #: The twin's deflections, m, and the noise of the force as a share of full scale.
 DEFLECTIONS = np.linspace(0.0, 1e-3, 11)
@@ -58,6 +60,15 @@ TEMPLATE = """\
 # length = { value = 60, sd = 0.5, unit = "mm" }
 """
 
+CANTILEVER = Message(
+    "cantilever law",
+    ok="k2 ~ L^({exponent:.3f} ± {sd:.3f}), p = {p:.2g} for the -3 of a cantilever",
+    warn=(
+        "expected k2 ~ L^-3, as a cantilever has; found L^({exponent:.3f} ± {sd:.3f}), p = {p:.2g}. Check the clamp and the "
+        "stated lengths; k2 of each spring stays a parameter of its own."
+    ),
+)
+
 KIND = Kind(
     name="support_spring",
     columns={"deflection": ColumnRule("m", varies=True), "force": ColumnRule("N", varies=True)},
@@ -68,6 +79,7 @@ KIND = Kind(
     template=TEMPLATE,
     informs="k2 of that spring",
     captions={"support_spring": "The slope of the line is the stiffness of the support spring."},
+    messages={**LINE_MESSAGES, "springs.cantilever": CANTILEVER},
     lint=(lint_line,),
     paper=line_estimates,
     twin=_measure,

@@ -124,31 +124,19 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     far = [name for name in found if p[name] < LEVEL and name not in lost]
     far.sort(key=lambda name: -abs(found[name].sd))
     if lost and not far:
-        text = (
-            f"expected finite estimates of all {len(found)} shared parameters from bench and runs; of {', '.join(lost)} "
-            "there is none, so nothing was compared: look at what the records and tests of these determine"
-        )
-        return Finding("bench and runs agree", "warn", text)
-    worst = far[0] if far else min(p, key=lambda name: p[name])
-    judge = " by the bench's sample" if sampled else ""
-    size = f"{found[worst].sd:+.1f} sd of the curvature, {_stated(p[worst])}{judge} over {len(found)} shared parameters"
-    seen = f"largest disagreement in {worst} ({size})"
-    if not far:
-        return Finding("bench and runs agree", "ok", seen)
-    others = [f"{name} ({found[name].sd:+.1f} sd, {_stated(p[name])})" for name in far[1:]]
-    text = (
-        f"expected bench and runs to tell of one capsule; {seen}: the bench's {worst} does not fit the recorded motion"
-        f"{'; then ' + ', '.join(others) if others else ''}: repeat its bench test, or ask what differs in the runs"
-    )
+        return Finding("bench_and_runs.estimates", "warn", {"shared": len(found), "missing": lost})
     # The curvature of few trials understates their tails.
-    return Finding("bench and runs agree", "fail" if sampled else "warn", text)
+    level = "ok" if not far else "fail" if sampled else "warn"
+    named = far or [min(p, key=lambda name: p[name])]
+    facts = {
+        "distances": [(name, found[name].sd, p[name]) for name in named],
+        "shared": len(found),
+        "sampled": sampled,
+    }
+    return Finding("bench_and_runs.agree", level, facts)
 
 
 def _family_wise(z: float, number: int) -> float:
     """p-value of the largest of ``number`` scores (two-sided, Šidák)."""
     with np.errstate(divide="ignore"):  # z = 0: log(0), and p = 1
         return float(-np.expm1(number * np.log1p(-2.0 * stats.norm.sf(abs(z)))))
-
-
-def _stated(p: float) -> str:
-    return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"

@@ -6,7 +6,6 @@ Every check that can fail has a family-wise false-alarm rate of ``LEVEL`` over i
 import numpy as np
 from scipy import stats
 
-from capsule_id.experiments.checks.context import ok_if_empty
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LAGS, LEVEL, ljung_box
 from capsule_id.inference.checks.regression import MOST_FLAGGED, outliers
@@ -26,17 +25,11 @@ def check_whiteness(s: Setting) -> list[Finding]:
     for e, label, residuals in records:
         q, p, lags = ljung_box(residuals)
         if p * len(records) < LEVEL:
-            text = (
-                f"{label}: expected white residuals; Ljung–Box Q = {q:.0f} over {lags} lags (p = {p:.1g}), so the model "
-                f"misses something or the noise is coloured, and the intervals are not to be trusted"
-                f"{e.advice_on_coloured_noise()}"
-            )
-            findings.append(Finding("residuals white", "fail", text, e.label))
+            facts = {"record": label, "Q": q, "lags": lags, "p": p, **e.noise_facts()}
+            findings.append(Finding("residuals.white", "fail", facts, e.label))
     if not records:
         return []
-    return ok_if_empty(
-        findings, "residuals white", f"residuals of {len(records)} records are white (Ljung–Box, {LAGS} lags)"
-    )
+    return findings or [Finding("residuals.white", "ok", {"records": len(records), "lags": LAGS})]
 
 
 def check_outliers(s: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
@@ -50,29 +43,19 @@ def check_outliers(s: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
             continue
         rows = [o.row for o in found]
         flagged[e.label] = rows
-        several, most = len(found) > 1, len(found) == MOST_FLAGGED
-        numbers = [str(line) for line in sorted(int(e.table.rows[o.row]) for o in found)]
-        lines = (
-            f"lines {', '.join(numbers[:-1])} and {numbers[-1]} stand up to" if several else f"line {numbers[0]} stands"
-        )
-        more = (
-            f" (no more than {MOST_FLAGGED} rows are named: if more stand off, look at the whole table)" if most else ""
-        )
-        physical = [row for row in e.parameters if row.physical]
         without = refit(e, theta, rows)
-        change = "; ".join(
-            f"{row.name} = {s.values[row.name]:.5g} {row.unit} with {'them' if several else 'it'}, "
-            f"{without[row.symbol][0]:.5g} without"
-            for row in physical
-        )
-        text = (
-            f"{e.label}: {e.table.file} {lines} {abs(found[0].score):.3g} studentised residuals off the others "
-            f"(p = {found[0].p:.1g}){more}; {change}. Nothing was dropped: check the reading, correct or remove it yourself"
-        )
-        findings.append(Finding("outliers", "fail", text, e.label))
-    if not tables:
-        return [], {}
-    return ok_if_empty(findings, "outliers", "no reading stands apart from the others of its table"), flagged
+        facts = {
+            "file": e.table.file,
+            "lines": sorted(int(e.table.rows[row]) for row in rows),
+            "score": abs(found[0].score),
+            "p": found[0].p,
+            "most": MOST_FLAGGED,
+            "estimates": [
+                (row.name, row.unit, s.values[row.name], without[row.symbol][0]) for row in e.parameters if row.physical
+            ],
+        }
+        findings.append(Finding("outliers", "fail", facts, e.label))
+    return findings or [Finding("outliers", "ok")] * bool(tables), flagged
 
 
 def check_stated_errors(s: Setting) -> list[Finding]:
@@ -84,9 +67,6 @@ def check_stated_errors(s: Setting) -> list[Finding]:
         freedom = e.n - 2
         p = float(stats.chi2.sf(square, freedom)) if freedom > 0 else 1.0
         if p * len(known) < LEVEL:
-            text = (
-                f"{e.label}: the stated reading errors explain a chi-square of about {freedom}; {square:.0f} was seen "
-                f"(p = {p:.1g}): the errors are larger than stated, or the line is not straight"
-            )
-            findings.append(Finding("stated errors", "fail", text, e.label))
-    return ok_if_empty(findings, "stated errors", "stated reading errors explain the scatter") if known else []
+            facts = {"freedom": freedom, "chi_square": square, "p": p}
+            findings.append(Finding("errors.stated", "fail", facts, e.label))
+    return findings or [Finding("errors.stated", "ok")] * bool(known)

@@ -7,6 +7,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks.context import Refit, Tension
 from capsule_id.inference.checks.tension import tension
 from capsule_id.inference.fit.point_fit import bic, point_fit
+from capsule_id.inference.fit.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
@@ -17,7 +18,10 @@ from capsule_id.views import Finding
 class Setting:
     """The fit, and what the checks have found so far; see ``capsule_id.experiments.checks.context.Fitted``.
 
-    ``seed`` is that of the starts of further point fits.
+    Attributes
+    ----------
+    bench : what the bench tests determine by themselves, where runs were fitted too
+    seed : of the starts of further point fits
     """
 
     target: LogPosterior
@@ -28,6 +32,7 @@ class Setting:
     seed: int = 0
     flagged: Mapping[str, Sequence[int]] = field(default_factory=dict)
     findings: Sequence[Finding] = ()
+    bench: BenchFit = field(default_factory=BenchFit)
 
     @property
     def rig(self) -> Rig:

@@ -58,49 +58,40 @@ def declared(
 
 def check_starts(fit: PointFit) -> list[Finding]:
     """Expected: every start of the point fit ends at one maximum, or at one that holds no mass."""
-    number = len(fit.starts)
+    facts: dict[str, Any] = {"starts": len(fit.starts)}
     if fit.agree and not fit.stalled.any():
-        return [Finding("starts agree", "ok", f"all {number} starts of the point fit ended at the same maximum")]
-    spread = np.sqrt(np.diag(fit.covariance))
-    distance = np.abs(fit.ends - fit.u) / spread
-    away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
+        return [Finding("starts.agree", "ok", facts)]
     elsewhere = fit.elsewhere
+    facts |= {"stalled": int(fit.stalled.sum()), "elsewhere": int(elsewhere.sum())}
+    if not elsewhere.any():
+        return [Finding("starts.agree", "fail", facts)]
+    distance = np.abs(fit.ends - fit.u) / np.sqrt(np.diag(fit.covariance))
+    away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
+    worst = int(np.argmax(np.where(elsewhere, away, -np.inf)))
+    facts |= {"distance": away[worst], "name": fit.names[int(np.argmax(distance[worst]))]}
     # How much less probable the other ends are: a mode that far down holds no posterior mass.
     below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
-    inferior = elsewhere & (below > NEGLIGIBLE_MODE)
-    worst = int(np.argmax(np.where(elsewhere, away, -np.inf)))
-    name = fit.names[int(np.argmax(distance[worst]))]
-    seen = (
-        f"expected {number} starts to end at the same maximum; {int(fit.stalled.sum())} stalled, {int(elsewhere.sum())} "
-        "ended elsewhere"
-    )
-    if not elsewhere.any():
-        remedy = "look at the residuals, and at parameters that the data hardly determine"
-        return [Finding("starts agree", "fail", f"{seen}: {remedy}")]
-    seen += f", the furthest {away[worst]:.2g} posterior sd away in {name}"
-    if np.all(inferior | ~elsewhere) and np.sum(~elsewhere) >= 2 and not fit.stalled[~elsewhere].any():
-        text = f"{seen}; those ends are lower by {np.min(below[inferior]):.0f} in log-posterior, so they hold no mass"
-        return [Finding("starts agree", "warn", text)]
-    text = f"{seen}: look at the records for a second explanation, or narrow the prior of that parameter in rig.toml"
-    return [Finding("starts agree", "fail", text)]
+    negligible = np.all(below[elsewhere] > NEGLIGIBLE_MODE)
+    if negligible and np.sum(~elsewhere) >= 2 and not fit.stalled[~elsewhere].any():
+        return [Finding("starts.agree", "warn", {**facts, "below": np.min(below[elsewhere])})]
+    return [Finding("starts.agree", "fail", facts)]
 
 
 def _chains(s: Setting) -> list[Finding]:
     p = s.posterior
     if p is None:
-        return [Finding("chains converged", "warn", "no sample was drawn: there are no intervals")]
+        return [Finding("chains.converged", "warn")]
     worst_tau, worst_rhat = int(np.argmax(p.tau)), int(np.argmax(p.rhat))
-    seen = (
-        f"{p.draws.shape[1]} draws of each ensemble are {p.draws.shape[1] / p.tau[worst_tau]:.0f} autocorrelation times "
-        f"of {p.names[worst_tau]}, largest split R-hat {p.rhat[worst_rhat]:.4f} ({p.names[worst_rhat]})"
-    )
-    if p.converged:
-        return [Finding("chains converged", "ok", seen)]
-    text = (
-        f"expected more than {LENGTH_IN_TAU:.0f} autocorrelation times and R-hat <= {MAX_RHAT}; {seen}, and the budget of "
-        "steps is spent: raise --max-steps, or look for a parameter that the data do not inform"
-    )
-    return [Finding("chains converged", "fail", text)]
+    facts = {
+        "draws": p.draws.shape[1],
+        "length": p.draws.shape[1] / p.tau[worst_tau],
+        "slowest": p.names[worst_tau],
+        "rhat": p.rhat[worst_rhat],
+        "worst": p.names[worst_rhat],
+        "length_wanted": LENGTH_IN_TAU,
+        "rhat_wanted": MAX_RHAT,
+    }
+    return [Finding("chains.converged", "ok" if p.converged else "fail", facts)]
 
 
 def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -> np.ndarray:
@@ -121,17 +112,11 @@ def _informed(s: Setting) -> list[Finding]:
         for row, ok in zip(s.target.parameters, known, strict=True)
         if row.physical and row.symbol not in ("m1", "m2") and not ok
     ]
-    if not names:
-        return [Finding("parameters informed", "ok", "the data narrow the prior of every physical parameter")]
-    text = f"the data hardly narrow the prior of {', '.join(names)}: what is printed for it is the prior; add a test"
-    return [Finding("parameters informed", "warn", text)]
+    return [Finding("parameters.informed", "warn" if names else "ok", {"names": ", ".join(names)})]
 
 
 def _boundary(s: Setting) -> list[Finding]:
     """Posteriors in the tail of a prior."""
     z = np.abs(s.target.prior_residuals(s.fit.u))
     names = [row.name for row, pull in zip(s.target.parameters, z, strict=True) if pull > PRIOR_PULL]
-    if not names:
-        return [Finding("boundary effects", "ok", "no parameter ends in the tail of its prior")]
-    text = f"{', '.join(names)} ended in the tail of its prior, which pulls it: state a wider or better placed [prior]"
-    return [Finding("boundary effects", "warn", text)]
+    return [Finding("priors.tails", "warn" if names else "ok", {"names": ", ".join(names)})]

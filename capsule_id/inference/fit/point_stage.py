@@ -3,20 +3,20 @@
 experiments -> bench fit (closed forms) -> runs whose start is forgotten too late are cut -> LogPosterior -> joint fit
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.registry import Registry
 from capsule_id.inference.fit.joint_fit import joint_fit
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import sample
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior, compile_ahead
-from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 
 #: emcee steps of the bench's own sample, which shows what the runs add and whether they agree.
@@ -40,34 +40,35 @@ class PointStage:
     target: LogPosterior
     fit: PointFit
     bench: BenchFit
+    seed: int
     findings: tuple[Finding, ...] = ()
 
 
-def fit_points(rig: Rig, experiments: Sequence[Experiment], seed: int, sampled: bool) -> PointStage:
-    """Fit ``experiments``.
+def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: bool) -> PointStage:
+    """Fit the experiments of ``target``.
 
     Parameters
     ----------
+    registry : the kinds of the rig, for rough values from bench tests that are not fitted
     seed : of the starts, and of the bench's own sample
     sampled : a sample will follow: its compilation begins, and the bench gets one of its own
     """
-    closed = [e for e in experiments if not e.event_driven]
+    closed = [e for e in target.experiments if not e.event_driven]
     with ThreadPoolExecutor(1) if sampled else nullcontext() as pool:
-        if len(closed) == len(experiments):
-            target = LogPosterior(rig, experiments)
+        if len(closed) == len(target.experiments):
             _compile(pool, target)
-            return PointStage(target, point_fit(target, seed), BenchFit())
+            return PointStage(target, point_fit(target, seed), BenchFit(), seed)
         bench = BenchFit()
         if not closed:
-            known = _rough(rig, experiments)
+            known = _rough(target, registry)
         else:
-            alone = LogPosterior(rig, closed)
+            alone = LogPosterior(target.rig, closed)
             fit = point_fit(alone, seed)
             own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
             bench, known = BenchFit(fit, own), dict(fit.values)
-        target, findings = cut_unpredictable(LogPosterior(rig, experiments), known)
+        target, findings = cut_unpredictable(target, known)
         target, joint, wavering = _fit_with_right_starts(target, known, seed, pool)
-    return PointStage(target, joint, bench, (*findings, *wavering))
+    return PointStage(target, joint, bench, seed, (*findings, *wavering))
 
 
 def _fit_with_right_starts(
@@ -84,11 +85,8 @@ def _fit_with_right_starts(
         if remaining:
             target, first = LogPosterior(target.rig, corrected[0]), corrected[1]
     doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
-    text = (
-        f"{', '.join(doubtful)}: expected one kind of start to fit; the kind of start did not settle after {ROUNDS} fits: "
-        'state start = "stuck" or "moving", or cut the record where the capsule is clearly at rest'
-    )
-    return target, joint, [Finding("start of a run", "fail", text, doubtful[0])]
+    facts = {"labels": ", ".join(doubtful), "rounds": ROUNDS}
+    return target, joint, [Finding("runs.start", "fail", facts, doubtful[0])]
 
 
 def _compile(pool: Executor | None, target: LogPosterior) -> None:
@@ -97,12 +95,12 @@ def _compile(pool: Executor | None, target: LogPosterior) -> None:
         pool.submit(compile_ahead, target)
 
 
-def _rough(rig: Rig, experiments: Sequence[Experiment]) -> dict[str, float]:
-    """The paper's estimates from the rig's bench tests; those that are not among ``experiments`` are made for it."""
-    bench = [e for e in experiments if e.bench]
-    if not bench and select_tables(rig, "bench"):
-        bench = make_experiments(rig, "bench")
-    return paper_estimates(bench)
+def _rough(target: LogPosterior, registry: Registry) -> dict[str, float]:
+    """The paper's estimates from the rig's bench tests; those that ``target`` lacks are made for it."""
+    bench = [e for e in target.experiments if e.bench]
+    if not bench and select_tables(target.rig, "bench"):
+        bench = make_experiments(target.rig, "bench", registry)
+    return paper_estimates(bench, registry)
 
 
 def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple[LogPosterior, list[Finding]]:

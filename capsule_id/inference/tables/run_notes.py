@@ -13,30 +13,33 @@ from capsule_id.inference.fit.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.views import NoteTable
-
-#: Parameters that bench and runs may share.
-SHARED = ("m1", "m2", "k1", "c", "mu", "v_s", "K", "k2")
+from capsule_id.views import ResultTable
 
 
-def precision_gained(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> NoteTable:
+def precision_gained(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> ResultTable:
     """Posterior sd with bench only, runs only, both; from samples where there are any, else from point fits."""
-    known = {row.name for e in target.experiments if not e.bench for row in e.parameters} | {"m1", "m2"}
+    shared, known = shared_symbols(target), run_parameters(target)
     alone = runs_alone(target, joint)
     sds = dict(zip(alone.names, np.sqrt(np.diag(alone.covariance)), strict=True))
     runs = {name: float(sd * abs(joint.values[name])) if name in known else np.nan for name, sd in sds.items()}
     rows = {}
-    for i, name in enumerate(target.names):
-        if target.parameters[i].symbol not in SHARED:
-            continue
+    for name in (row.name for row in target.parameters if row.symbol in shared):
         rows[name] = [_sd(bench.fit, bench.sample, name), runs[name], _sd(joint, sample, name)]
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["bench only", "runs only", "both"])
     frame["bench only / both"] = frame["bench only"] / frame["both"]
-    caption = (
-        "Posterior standard deviation, SI. Runs only: from the curvature of their likelihood and the priors at the joint "
-        "point fit; bench and both: from the samples, where they were drawn."
-    )
-    return NoteTable("What the runs buy", caption, frame.rename_axis("parameter"))
+    return ResultTable("runs.precision", frame.rename_axis("parameter"))
+
+
+def run_parameters(target: LogPosterior) -> set[str]:
+    """Names of the physical parameters that a run has, masses included."""
+    return {row.name for e in target.experiments if not e.bench for row in e.parameters if row.physical} | {"m1", "m2"}
+
+
+def shared_symbols(target: LogPosterior) -> set[str]:
+    """Symbols of the parameters of runs that a bench test may measure too: those that belong to no single run."""
+    runs = {e.label for e in target.experiments if not e.bench}
+    known = run_parameters(target)
+    return {row.symbol for row in target.parameters if row.name in known and row.of not in runs}
 
 
 def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:
@@ -48,7 +51,7 @@ def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:
     return float(np.sqrt(fit.covariance[i, i]) * abs(fit.values[name]))
 
 
-def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing | None = None) -> NoteTable:
+def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing | None = None) -> ResultTable:
     """By how much a fit of the smoothed model would differ from this one, in posterior sd, at ``widths``.
 
     One Gauss–Newton step: the difference of the residuals of both models, through the exact model's Jacobian. ``widths``
@@ -60,11 +63,8 @@ def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing
     rows = {target.names[i]: [d, s, d / s] for i, d, s in zip(located, shift, sd, strict=True)}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["shift of u", "sd of u", "shift / sd"])
     frame = frame.loc[[name for name in frame.index if target.parameters[target.names.index(name)].physical]]
-    caption = (
-        f"The posterior is the exact model's. Had the smoothed model been fitted (velocity {widths.velocity:g} m/s, "
-        f"penetration {widths.penetration:g} m), the estimates would have moved by this much (u: logarithm)."
-    )
-    return NoteTable("What smoothing would do", caption, frame.rename_axis("parameter"))
+    facts = {"velocity": widths.velocity, "penetration": widths.penetration}
+    return ResultTable("runs.smoothing", frame.rename_axis("parameter"), facts)
 
 
 @eqx.filter_jit

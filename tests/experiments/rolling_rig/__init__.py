@@ -11,6 +11,7 @@ from capsule_id.parameters import Parameter, Prior, scatter
 from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.model import Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule
+from capsule_id.views import Message
 
 C_RR = Parameter("c_rr", "1", "rolling resistance coefficient", r"c_\mathrm{rr}", Prior("lognormal", 0.01, 100.0))
 SCATTER = scatter(
@@ -52,5 +53,13 @@ KIND = Kind(
 """,
     informs="c_rr",
     captions={"rolling_resistance": "Rolling resistance: the force at each speed, and the fitted one."},
+    messages={
+        "rolling.speeds": Message(
+            "rolling at all speeds",
+            ok="the force is the same at all {speeds} speeds",
+            warn="expected the same force at all {speeds} speeds; it changes by {slope:.2g} N s/m. Roll on a harder floor.",
+        ),
+        "rolling.range": Message("Speeds of the wheel", caption="Where c_rr = {c_rr:.3f} was measured."),
+    },
     lint=(_lint,),
 )

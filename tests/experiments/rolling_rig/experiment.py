@@ -1,15 +1,35 @@
 """The force that keeps a wheeled capsule rolling: F = c_rr (m1 + m2) g, with a scatter."""
 
+from collections.abc import Sequence
 from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, no_design
+from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.rig.model import Rig, Table
-from capsule_id.views import Comparison, Curve, Points
+from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 from rolling_rig import C_RR, SCATTER
+
+
+def check_speeds(tables: "Sequence[RollingResistance]", fit: Fitted) -> list[Finding]:
+    """Expected: a force that does not depend on the speed."""
+    findings = []
+    for e in tables:
+        rest = e.misfit(e.local(fit.values)).raw
+        slope = float(np.polyfit(e.speed, rest, 1)[0])
+        level = "ok" if abs(np.corrcoef(e.speed, rest)[0, 1]) < 0.9 else "warn"
+        findings.append(Finding("rolling.speeds", level, {"speeds": e.n, "slope": slope}, e.label))
+    return findings
+
+
+def speed_table(tables: "Sequence[RollingResistance]", fit: Fitted) -> list[ResultTable]:
+    """The range of the speeds."""
+    frame = pd.DataFrame({"slowest, m/s": [e.speed.min() for e in tables]}, index=[e.label for e in tables])
+    return [ResultTable("rolling.range", frame, {"c_rr": fit.values["c_rr"]})]
 
 
 class RollingResistance(Experiment):
@@ -18,6 +38,9 @@ class RollingResistance(Experiment):
     speed: np.ndarray
     force: np.ndarray
     reading_sd: float
+
+    checks = (check_speeds,)
+    tables = (speed_table,)
 
     def __init__(self, table: Table, rig: Rig) -> None:
         self.about = About(table, rig, (C_RR, SCATTER))

@@ -6,22 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.line_experiment import Line, curvature_test
 from capsule_id.experiments.free_vibration.decay_models import dry_decay
 from capsule_id.experiments.free_vibration.twin import DECAY_NOISE, RELEASES, decay
+from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.static_friction.declaration import tilts as tilted
 from capsule_id.inference.checks.regression import outliers
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.pipeline import fit_rig
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Finding
 
 SEED = 7
+WORDS = messages_of(default_registry())
 TRUTH = Truth()
 #: Sizes of the planted faults.
 OUTLIER = 0.03  # of full scale, where the noise is 0.2 %
@@ -87,39 +90,39 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> list[Finding]:
 
 def test_a_clean_rig_fails_nothing(clean: list[Finding]) -> None:
     assert [f for f in clean if f.level == "fail"] == []
-    assert [f.check for f in clean if f.level == "warn"] == ["chains converged"]  # no sample was drawn
+    assert [f.code for f in clean if f.level == "warn"] == ["chains.converged"]  # no sample was drawn
 
 
 @pytest.mark.parametrize(
-    ("fault", "check", "experiment", "words"),
+    ("fault", "code", "experiment", "words"),
     [
         (outlier, "outliers", "support_spring_medium", "support_spring_medium.csv line 7"),
-        (dry_friction, "residuals white", "free_vibration_2", "white residuals"),
-        (bent_line, "linearity", "motor_current", "straight line"),
-        (other_surface, "experiments agree", "static_friction", "one surface"),
+        (dry_friction, "residuals.white", "free_vibration_2", "white residuals"),
+        (bent_line, "lines.straight", "motor_current", "straight line"),
+        (other_surface, "friction.one_surface", "static_friction", "one surface"),
     ],
 )
 def test_planted_faults_are_named(
     tmp_path: Path,
     clean: list[Finding],
     fault: Callable[[Path], None],
-    check: str,
+    code: str,
     experiment: str,
     words: str,
 ) -> None:
-    found = [f for f in findings(tmp_path / "rig", fault) if f.check == check and f.level == "fail"]
+    found = [f for f in findings(tmp_path / "rig", fault) if f.code == code and f.level == "fail"]
     assert [f.experiment for f in found] == [experiment]
-    assert words in found[0].text
-    assert [f.level for f in clean if f.check == check] == ["ok"]
+    assert words in finding_text(found[0], WORDS)
+    assert [f.level for f in clean if f.code == code] == ["ok"]
 
 
 def test_an_unconverged_budget_is_named(tmp_path: Path) -> None:
     """60 steps are not enough for anything; the numbers come with a verdict that is not clean."""
     synthesize(tmp_path / "rig", SEED)
-    result = fit_rig(read_rig(tmp_path / "rig"), SEED, budget=60)
+    result = cid.fit(read_rig(tmp_path / "rig"), SEED, budget=60)
     failed = [f for f in result.findings if f.level == "fail"]
-    assert [f.check for f in failed] == ["chains converged"]
-    assert "--max-steps" in failed[0].text
+    assert [f.code for f in failed] == ["chains.converged"]
+    assert "--max-steps" in result.text(failed[0])
     assert not result.clean
 
 

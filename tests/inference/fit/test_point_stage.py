@@ -3,6 +3,7 @@
 import pytest
 
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.forced_run.declaration import MESSAGES
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.twin import RunSetup, make_runs
 from capsule_id.inference.fit import point_stage
@@ -29,7 +30,8 @@ def test_a_chaotic_record_is_cut_and_a_tame_one_is_not() -> None:
     parts = target.experiments
     assert len(parts) >= 3
     assert [(finding.level, finding.experiment) for finding in findings] == [("warn", "wild")]
-    assert f"cut into {len(parts)} parts" in findings[0].text
+    assert (findings[0].code, findings[0].facts["parts"]) == ("runs.cut", len(parts))
+    assert f"cut into {len(parts)} parts" in MESSAGES["runs.cut"].text("warn", findings[0].facts)
     run = make(1, samples=1000)
     tame = LogPosterior(run.rig, [run])
     kept, findings = cut_unpredictable(tame, TRUTH)

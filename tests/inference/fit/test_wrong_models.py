@@ -5,9 +5,12 @@ import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.checks.experiment_checks import check_whiteness
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import PriorOverride, Quantity
 from capsule_id.views import Finding
 from tests.experiments import bench
@@ -38,7 +41,7 @@ def whiteness_of(**departures: float) -> Finding:
     priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
     # The same shapes as in test_joint_fit.py: one compiled program serves both.
     rig = bench.rig(table, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
-    stage = fit_points(rig, make_experiments(rig), 0, sampled=False)
+    stage = fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)
     values = stage.target.mapping(stage.target.theta(stage.fit.u))
     return check_whiteness(Setting(stage.target, stage.fit, None, values))[0]
 
@@ -54,4 +57,4 @@ def test_another_model_is_reported(departure: dict[str, float]) -> None:
     """The cubic term stiffens the rod by 3 % at 1.5 mm."""
     found = whiteness_of(**departure)
     assert (found.level, found.experiment) == ("fail", "run_1")
-    assert "not to be trusted" in found.text
+    assert "not to be trusted" in finding_text(found, FIT_MESSAGES)

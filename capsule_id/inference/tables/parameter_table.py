@@ -1,0 +1,62 @@
+"""The parameter table and the nuisance table of a result."""
+
+import numpy as np
+import pandas as pd
+
+from capsule_id.experiments import paper_estimates
+from capsule_id.experiments.registry import Registry
+from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.verdict import informed
+from capsule_id.inference.result import Posterior
+from capsule_id.parameters import Parameter, parameter
+
+COLUMNS = (
+    "unit", "meaning", "paper", "map", "standard_error", "mean", "sd", "median", "lower", "upper", "ess", "rhat",
+    "informed",
+)  # fmt: skip
+
+
+def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Physical parameters, and nuisances; see ``Result``."""
+    target, point, posterior = setting.target, setting.fit, setting.posterior
+    masses = {"m1": setting.rig.m1, "m2": setting.rig.m2}
+    paper = paper_estimates(target.experiments, registry)
+    paper |= {name: mass.value for name, mass in masses.items() if mass is not None}
+    known = informed(target, posterior, point)
+    rows: list[tuple[Parameter, dict[str, object]]] = []
+    for i, row in enumerate(target.parameters):
+        entry: dict[str, object] = {
+            "unit": row.unit,
+            "meaning": row.meaning,
+            "paper": paper.get(row.name, np.nan),
+            "map": point.values[row.name],
+            "standard_error": point.standard_errors[row.name],
+            "informed": bool(known[i]),
+        }
+        rows.append((row, entry | ({} if posterior is None else _sample_columns(posterior, i))))
+    for symbol in (symbol for symbol in masses if symbol in target.fixed):
+        row, value = parameter(symbol), target.fixed[symbol]
+        exact = dict.fromkeys(("paper", "map", "mean", "median", "lower", "upper"), value)
+        errors = {"standard_error": 0.0, "sd": 0.0}
+        rows.append((row, {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact, **errors}))
+    physical, nuisances = (
+        pd.DataFrame.from_dict({row.name: entry for row, entry in rows if row.physical == chosen}, orient="index")
+        .reindex(columns=list(COLUMNS))
+        .rename_axis("name")
+        for chosen in (True, False)
+    )
+    return physical, nuisances
+
+
+def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
+    draws = posterior.draws[..., i].ravel()
+    lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
+    return {
+        "mean": np.mean(draws),
+        "sd": np.std(draws, ddof=1),
+        "median": median,
+        "lower": lower,
+        "upper": upper,
+        "ess": posterior.ess[i],
+        "rhat": posterior.rhat[i],
+    }

@@ -1,0 +1,132 @@
+"""The columns of a parameter table, declared once for parameters.json, parameters.csv, the page and standard output.
+
+All numbers of a row keep two digits of the posterior sd (without a sample: of the standard error), the point fit those
+of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m).
+"""
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from capsule_id.report.typography import MISSING, decimals_for, fixed, prefix_for
+
+Output = Literal["json", "csv", "html", "console"]
+FILES: frozenset[Output] = frozenset({"json", "csv"})
+EVERYWHERE: frozenset[Output] = FILES.union({"html", "console"})
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of ``Result.summary`` or ``Result.nuisances`` and how its numbers are printed.
+
+    Attributes
+    ----------
+    values : SI, by column of the table
+    scale, unit : factor and unit of the printed numbers
+    decimals, point_decimals : of the sample's numbers, and of those of the point fit; None: six digits
+    """
+
+    name: str
+    values: Mapping[Hashable, Any]
+    scale: float
+    unit: str
+    decimals: int | None
+    point_decimals: int | None
+
+    def number(self, column: str, decimals: int | None = None) -> str:
+        """One number in the printed unit, by default with the row's decimals."""
+        return fixed(float(self.values[column]) * self.scale, self.decimals if decimals is None else decimals)
+
+    def plus_minus(self, column: str, error: str, decimals: int | None) -> str:
+        """``1421.3 ± 3.1``; the value alone where there is no error."""
+        centre = self.number(column, decimals)
+        known = centre != MISSING and decimals_for(float(self.values[error])) is not None
+        return f"{centre} ± {self.number(error, decimals)}" if known else centre
+
+
+def table_rows(frame: pd.DataFrame) -> list[Row]:
+    """The rows of ``frame`` in their order."""
+    return [_row(str(name), values) for name, values in frame.to_dict("index").items()]
+
+
+def _row(name: str, values: Mapping[Hashable, Any]) -> Row:
+    scale, unit = prefix_for(str(values["unit"]), float(values["map"]))
+    sample, point = (decimals_for(float(values[column]) * scale) for column in ("sd", "standard_error"))
+    decimals = point if sample is None else sample
+    return Row(name, values, scale, unit, decimals, decimals if point is None else point)
+
+
+def _interval(row: Row) -> str:
+    ends = row.number("lower"), row.number("upper")
+    return MISSING if MISSING in ends else " to ".join(ends)
+
+
+def _ends(values: Mapping[Hashable, Any]) -> list[float] | None:
+    ends = [float(values["lower"]), float(values["upper"])]
+    return ends if np.all(np.isfinite(ends)) else None
+
+
+def _informed(row: Row) -> str:
+    """Masses read "weighed": their prior is the weighing, so data that do not narrow it further are normal."""
+    informed = row.values["informed"]
+    if pd.isna(informed):
+        return ""
+    return "yes" if informed else "weighed" if row.name in ("m1", "m2") else "no"
+
+
+@dataclass(frozen=True)
+class OutputColumn:
+    """One column.
+
+    Attributes
+    ----------
+    key : its name in files
+    header : its name where it is printed
+    text : the printed cell
+    value : what files hold, SI; None: the table's column ``key``
+    outputs : where it appears
+    sampled : rests on the sample: it is not printed without one
+    numeric : set flush right
+    """
+
+    key: str
+    header: str = ""
+    text: Callable[[Row], str] = field(default=lambda row: "")
+    value: Callable[[Mapping[Hashable, Any]], object] | None = None
+    outputs: frozenset[Output] = EVERYWHERE
+    sampled: bool = False
+    numeric: bool = True
+
+    def of(self, values: Mapping[Hashable, Any]) -> object:
+        """What files hold for a row of the table."""
+        return values[self.key] if self.value is None else self.value(values)
+
+
+COLUMNS = (
+    OutputColumn("meaning", "meaning", lambda row: row.values["meaning"], outputs=frozenset({"csv", "html"}), numeric=False),
+    OutputColumn("unit", "unit", lambda row: row.unit, numeric=False),
+    OutputColumn("paper", "paper", lambda row: row.number("paper")),
+    OutputColumn("map", "MAP ± s.e.", lambda row: row.plus_minus("map", "standard_error", row.point_decimals)),
+    OutputColumn("standard_error", outputs=frozenset({"csv"})),
+    OutputColumn("mean", "mean ± sd", lambda row: row.plus_minus("mean", "sd", row.decimals), sampled=True),
+    OutputColumn("sd", outputs=FILES),
+    OutputColumn("median", "median", lambda row: row.number("median"), outputs=EVERYWHERE - {"console"}, sampled=True),
+    OutputColumn("lower", outputs=frozenset({"csv"})),
+    OutputColumn("upper", outputs=frozenset({"csv"})),
+    OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),
+    OutputColumn("ess", "ESS", lambda row: fixed(float(row.values["ess"]), 0), sampled=True),
+    OutputColumn("rhat", "R-hat", lambda row: fixed(float(row.values["rhat"]), 3), sampled=True),
+    OutputColumn("informed", "informed", _informed, sampled=True, numeric=False),
+)  # fmt: skip
+
+
+def columns_of(output: Output, frame: pd.DataFrame | None = None) -> list[OutputColumn]:
+    """The columns of ``output``; of a printed ``frame`` without those that have nothing to show."""
+    columns = [column for column in COLUMNS if output in column.outputs]
+    if frame is None:
+        return columns
+    sampled, rows = bool(frame["ess"].notna().any()), table_rows(frame)
+    return [c for c in columns if (sampled or not c.sampled) and any(c.text(row) not in ("", MISSING) for row in rows)]

@@ -1,0 +1,209 @@
+"""The words of the report for the checks and tables of a fit, by code; kinds of experiments declare those of their own."""
+
+from collections.abc import Mapping
+
+from capsule_id.experiments.registry import Registry
+from capsule_id.views import Facts, Finding, Message, ResultTable
+
+
+def messages_of(registry: Registry) -> Mapping[str, Message]:
+    """The words of every code: those of the fit as a whole, and those that the kinds of ``registry`` declare."""
+    return {**FIT_MESSAGES, **registry.messages}
+
+
+def title_of(code: str, messages: Mapping[str, Message]) -> str:
+    """The title of a check or a table; the code itself where no kind declares words for it."""
+    return messages[code].title if code in messages else code
+
+
+def finding_text(finding: Finding, messages: Mapping[str, Message]) -> str:
+    """The text of a finding, with its experiment in front where the text does not name it itself.
+
+    A finding whose code has no words is given by its facts.
+    """
+    if finding.code in messages:
+        text = messages[finding.code].text(finding.level, finding.facts)
+    else:
+        text = ", ".join(f"{name} = {value}" for name, value in finding.facts.items())
+    if not finding.experiment or finding.experiment in text:
+        return text
+    return f"{finding.experiment}: {text}"
+
+
+def caption_of(table: ResultTable, messages: Mapping[str, Message]) -> str:
+    """The caption of a table; "" where no kind declares words for it."""
+    return messages[table.code].text("caption", table.facts) if table.code in messages else ""
+
+
+def _disagreeing_starts(facts: Facts) -> str:
+    seen = (
+        f"expected {facts['starts']} starts to end at the same maximum; {facts['stalled']} stalled, {facts['elsewhere']} "
+        "ended elsewhere"
+    )
+    if "name" not in facts:
+        return f"{seen}. Look at the residuals, and at parameters that the data hardly determine."
+    seen += f", the furthest {facts['distance']:.2g} posterior sd away in {facts['name']}"
+    if "below" in facts:
+        return f"{seen}. Those ends are lower by {facts['below']:.0f} in log-posterior, so they hold no mass."
+    return f"{seen}. Look for a second explanation of the records, or narrow the prior of that parameter in rig.toml."
+
+
+_CHAINS = (
+    "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, largest split R-hat {rhat:.4f} "
+    "({worst})"
+)
+
+
+def _coloured_residuals(facts: Facts) -> str:
+    """The statistic, what drifts in the record, and the remedy of the model that predicts it."""
+    seen = (
+        f"{facts['record']}: expected white residuals; found Ljung–Box Q = {facts['Q']:.0f} over {facts['lags']} lags "
+        f"(p = {facts['p']:.1g}). The model lacks an effect or the noise is coloured, and the intervals are not to be "
+        "trusted."
+    )
+    remedy = {
+        "capsule": (
+            "Look at the residuals and the phase portrait, check spring, gap and friction law, or state "
+            'noise = "ar1" where the sensor filters.'
+        ),
+        "decay": "Compare the damping models below, or cut the record to free decay with start/stop.",
+    }.get(facts.get("model", ""), "Look at the residuals.")
+    return " ".join(filter(None, [seen, _drift(facts), remedy]))
+
+
+def _drift(facts: Facts) -> str:
+    """What drifts while a decay dies away."""
+    parts = []
+    if "decrement" in facts:
+        first, last = facts["decrement"]
+        law = "the damping grows with amplitude" if first > last else "the damping grows as the amplitude falls"
+        parts.append(f"its logarithmic decrement goes from {first:.3g} to {last:.3g} ({law})")
+    if "frequency" in facts:
+        first, last = facts["frequency"]
+        law = "the stiffness falls with amplitude" if first < last else "the stiffness grows with amplitude"
+        parts.append(f"its frequency goes from {first:.4g} to {last:.4g} rad/s ({law})")
+    if not parts:
+        return ""
+    large, small = facts["amplitude"]
+    return f"While the amplitude falls from {large:.2g} to {small:.2g} m, {' and '.join(parts)}."
+
+
+def _outliers(facts: Facts) -> str:
+    """The lines of the file, how far they stand off, and what they do to the estimates."""
+    lines = [str(line) for line in facts["lines"]]
+    several = len(lines) > 1
+    where = f"lines {', '.join(lines[:-1])} and {lines[-1]} stand up to" if several else f"line {lines[0]} stands"
+    more = f" At most {facts['most']} rows are named: look at the whole table." if len(lines) == facts["most"] else ""
+    change = "; ".join(
+        f"{name} = {value:.5g} {unit} with {'them' if several else 'it'}, {without:.5g} without"
+        for name, unit, value, without in facts["estimates"]
+    )
+    return (
+        f"{facts['file']} {where} {facts['score']:.3g} studentised residuals off the others (p = {facts['p']:.1g}).{more} "
+        f"{change}. Nothing was dropped: check the reading, then correct it or remove it yourself."
+    )
+
+
+def _largest_disagreement(facts: Facts) -> str:
+    (name, sd, p), *_ = facts["distances"]
+    judge = " by the bench's sample" if facts["sampled"] else ""
+    return (
+        f"largest disagreement in {name} ({sd:+.1f} sd of the curvature, {_stated(p)}{judge} over {facts['shared']} shared "
+        "parameters)"
+    )
+
+
+def _inconsistent(facts: Facts) -> str:
+    (name, *_), *others = facts["distances"]
+    further = "".join(f", then {other} ({sd:+.1f} sd, {_stated(p)})" for other, sd, p in others)
+    return (
+        f"bench tests and forced runs are inconsistent: {_largest_disagreement(facts)}{further}. The bench's {name} does "
+        "not fit the recorded motion. Repeat its bench test, or find what differs in the runs."
+    )
+
+
+def _stated(p: float) -> str:
+    return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"
+
+
+FIT_MESSAGES: Mapping[str, Message] = {
+    "starts.agree": Message(
+        "starts agree",
+        ok="all {starts} starts of the point fit ended at the same maximum",
+        warn=_disagreeing_starts,
+        fail=_disagreeing_starts,
+    ),
+    "chains.converged": Message(
+        "chains converged",
+        ok=_CHAINS,
+        warn="no sample was drawn: there are no intervals",
+        fail=(
+            "expected more than {length_wanted:.0f} autocorrelation times and R-hat <= {rhat_wanted}; found "
+            + _CHAINS
+            + " when the steps were used up. Raise --max-steps, or look for a parameter that the data do not inform."
+        ),
+    ),
+    "residuals.white": Message(
+        "residuals white",
+        ok="residuals of {records} records are white (Ljung–Box, {lags} lags)",
+        fail=_coloured_residuals,
+    ),
+    "outliers": Message("outliers", ok="no reading stands apart from the others of its table", fail=_outliers),
+    "errors.stated": Message(
+        "stated errors",
+        ok="stated reading errors explain the scatter",
+        fail=(
+            "expected a chi-square of about {freedom} from the stated reading errors; found {chi_square:.0f} "
+            "(p = {p:.1g}). The errors are larger than stated, or the line is not straight."
+        ),
+    ),
+    "parameters.informed": Message(
+        "parameters informed",
+        ok="the data narrow the prior of every physical parameter",
+        warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
+    ),
+    "priors.tails": Message(
+        "boundary effects",
+        ok="no parameter ends in the tail of its prior",
+        warn="{names} ended in the tail of the prior, which pulls the estimate. State a wider or better placed [prior].",
+    ),
+    "bench_and_runs.agree": Message(
+        "bench and runs agree", ok=_largest_disagreement, warn=_inconsistent, fail=_inconsistent
+    ),
+    "bench_and_runs.estimates": Message(
+        "bench and runs agree",
+        warn=lambda facts: (
+            f"expected finite estimates of all {facts['shared']} shared parameters from bench and runs; there is none of "
+            f"{', '.join(facts['missing'])}, so nothing was compared. Look at what the records and tests determine."
+        ),
+    ),
+    "runs.precision": Message(
+        "Precision gained from forced runs",
+        caption=(
+            "Posterior standard deviation, SI. Runs only: from the curvature of their likelihood and the priors at the joint "
+            "point fit. Bench and both: from the samples, where they were drawn."
+        ),
+    ),
+    "runs.smoothing": Message(
+        "Effect of smoothing",
+        caption=(
+            "The posterior is that of the exact model. A fit of the smoothed model (velocity {velocity:g} m/s, penetration "
+            "{penetration:g} m) would shift the estimates by this much (u: logarithm)."
+        ),
+    ),
+    "parameters.priors": Message(
+        "Priors",
+        caption=(
+            "Every prior is proper; a factor f holds 95 % within median/f to median×f. Amplitudes, offsets and intercepts "
+            "have normal priors ten times as wide as their record and are integrated out in closed form."
+        ),
+    ),
+    "readings.predictive": Message(
+        "Posterior predictive checks",
+        caption=(
+            "Probability that a replicate misses the model by more than the readings do (chi-square discrepancy). Near 0: "
+            "the readings scatter more than the fit allows. Where the scatter itself is estimated, it is near 0.5 by "
+            "construction."
+        ),
+    ),
+}

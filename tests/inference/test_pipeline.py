@@ -1,0 +1,53 @@
+"""The stages of a fit, run one by one, give the numbers of ``capsule_id.fit``."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import capsule_id as cid
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.registry import default_registry
+from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.inference.pipeline import check_fit, make_result, provenance, sample_posterior, stage_seeds
+from capsule_id.inference.target.log_posterior import LogPosterior
+from tests.cli_tools import small_rig
+
+BUDGET = 40
+
+
+def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None:
+    folder = small_rig(tmp_path / "rig", tables=("motor_current", "support_spring_soft"))
+    kinds = default_registry()
+    rig = cid.read_rig(folder, kinds)
+    seeds = stage_seeds(3)
+    experiments = make_experiments(rig, "bench", kinds)
+    target = LogPosterior(rig, experiments)
+    point = fit_points(target, kinds, seeds.starts, True)
+    sampled = sample_posterior(point, seeds.walkers, BUDGET)
+    checked = check_fit(sampled)
+    result = make_result(checked, kinds, seeds.report, provenance(rig, 3, "bench"))
+    assert sampled.findings == ()
+    assert len(checked.findings) > 5
+    for stage in (point, sampled, checked, result):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            stage.fit = None  # type: ignore[misc]
+    whole = cid.fit(rig, 3, "bench", BUDGET)
+    pd.testing.assert_frame_equal(result.summary, whole.summary, check_exact=True)
+    pd.testing.assert_frame_equal(result.nuisances, whole.nuisances, check_exact=True)
+    assert result.findings == whole.findings
+    assert result.provenance == whole.provenance
+    assert [note.code for note in result.notes] == [note.code for note in whole.notes]
+    assert [item.predictive_p for item in result.comparisons] == [item.predictive_p for item in whole.comparisons]
+    assert result.log_likelihood is not None
+    assert whole.log_likelihood is not None
+    for label, values in result.log_likelihood.values.items():
+        np.testing.assert_array_equal(values, whole.log_likelihood.values[label])
+    # Negative control: another seed gives another sample.
+    assert isinstance(point, PointStage)
+    other = sample_posterior(point, stage_seeds(4).walkers, BUDGET)
+    assert other.posterior is not None
+    assert result.posterior is not None
+    assert not np.array_equal(other.posterior.draws, result.posterior.draws)
