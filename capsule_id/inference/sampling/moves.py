@@ -7,6 +7,8 @@ import emcee
 import numpy as np
 from jaxtyping import Float
 
+from capsule_id.inference.fit.curvature import Matrix, Vector
+
 #: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well.
 LARGE = 9
 #: Degrees of freedom of the proposal for small and for large blocks, and its widths with their weights. Small blocks may
@@ -19,9 +21,6 @@ WIDER = 1.1
 
 #: emcee's moves with their weights.
 Moves = list[tuple[Any, float]]
-#: d coordinates, and a matrix of them.
-Vector = Float[np.ndarray, " d"]
-Matrix = Float[np.ndarray, "d d"]
 
 
 class BlockMove(emcee.moves.Move):
