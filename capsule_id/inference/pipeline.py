@@ -51,7 +51,7 @@ def fit_rig(
     budget : emcee steps of an ensemble; None draws no sample
     store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
     progress : see ``capsule_id.inference.sampling.ensembles.sample``
-    friction : class of a friction law in place of eq. (1)
+    friction : class of a friction law in place of eq. (1); the seventh choice, so there are more than six parameters
 
     Raises
     ------
