@@ -59,9 +59,8 @@ class Axis:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add DATA and the options of quantities, motions and output. ``run`` parses all numbers."""
-    parser.add_argument(
-        "data", metavar="DATA", nargs="?", help="fitted rig folder, for its parameters (default: Table 1)"
-    )
+    text = "fitted rig folder, for its parameters (default: Table 1)"
+    parser.add_argument("data", metavar="DATA", nargs="?", help=text)
     group = parser.add_argument_group("varied quantities")
     group.add_argument("--over", metavar="NAME", required=True, choices=tuple(SWEPT), help=", ".join(SWEPT))
     group.add_argument("--from", dest="begin", metavar="X", required=True, help="first value")
@@ -75,9 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "initial state: rest (default), many states, or the last state at the previous value"
     group.add_argument("--method", choices=METHODS, default="rest", help=text)
     group.add_argument("--states", metavar="N", default="16", help="initial states of --method states (default 16)")
-    group.add_argument(
-        "--seed", metavar="N", default="0", help="random seed of the initial states and of --draws (default 0)"
-    )
+    text = "random seed of the initial states and of --draws (default 0)"
+    group.add_argument("--seed", metavar="N", default="0", help=text)
     group.add_argument("--dropped", metavar="N", default="300", help="excitation periods dropped (default 300)")
     group.add_argument("--observed", metavar="N", default="48", help="excitation periods observed (default 48)")
     text = "s; contacts separated by less count as one (default 0: off)"
@@ -86,9 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--draws", metavar="N", help="number of draws with --posterior (default 100)")
     add_capsule_arguments(parser, FIG_6_DEFAULTS)
     group = parser.add_argument_group("execution and output")
-    group.add_argument(
-        "--scheduler", metavar="S", help="Dask for maps and bands: threads, processes or an address tcp://..."
-    )
+    text = "Dask for maps and bands: threads, processes or an address tcp://..."
+    group.add_argument("--scheduler", metavar="S", help=text)
     group.add_argument("--resume", action="store_true", help="reuse the finished blocks of an interrupted map")
     group.add_argument("--quiet", action="store_true", help="no progress on standard error")
     text = "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)"
@@ -109,9 +106,8 @@ def run(args: argparse.Namespace) -> int:
     if rig is not None and args.result is None:
         args.result = Path("results") / rig.name
         if not (args.result / "parameters.json").is_file():
-            raise InputError(
-                "DATA must have been fitted", f"no {args.result}", "run fit-params on it, or give --result"
-            )
+            remedy = "run fit-params on it, or give --result"
+            raise InputError("DATA must have been fitted", f"no {args.result}", remedy)
     free = frozenset("Omega" if axis.name == "f" else axis.name for axis in axes)
     values = capsule_values(args, FIG_6_DEFAULTS, free | _names_from_posterior(args))
     out = args.out if args.out is not None else _default_out(rig.name if rig is not None else None, axes)
@@ -281,7 +277,7 @@ def _dask_client(scheduler: str | None) -> Any:
     """A context manager: a Dask client, or None to compute in this process."""
     if scheduler is None:
         return nullcontext()
-    from capsule_id.commands.cluster import cluster
+    from capsule_id.motions.cluster import cluster
 
     return cluster(scheduler)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from capsule_id.commands.cluster import cluster
+from capsule_id.motions.cluster import cluster
 from capsule_id.errors import InputError
 from capsule_id.motions import blocks
 from capsule_id.motions.points import sweep_points

@@ -1,4 +1,4 @@
-"""A Dask cluster for large maps: threads or processes of this machine, or a running cluster."""
+"""A Dask cluster for the blocks of a map: threads or processes of this machine, or a running cluster."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
