@@ -1,4 +1,7 @@
-"""The support spring k2 behind the gap G, exact and smoothed; forces in N, lengths in m, elementwise."""
+"""The support spring k2 behind the gap G, exact and smoothed; forces in N, lengths in m, elementwise.
+
+The exact engine integrates the linear spring as series coefficients (``exact.taylor``) and does not call ``support``.
+"""
 
 from typing import Any
 

@@ -34,9 +34,17 @@ class CapsuleForward(SurfaceExperiment):
 
     def parameters_of(self, theta: ValuesBySymbol, k2: Any, gap: Any) -> CapsuleParameters:
         """The capsule at ``theta``; mu and v_s are placeholders where another friction law replaces them."""
-        names = ("m1", "m2", "k1", "c", "g")
-        friction = {"mu": theta.get("mu", 0.0), "v_s": theta.get("v_s", 1.0)}
-        return CapsuleParameters(G=gap, k2=k2, **friction, **{name: theta[name] for name in names})
+        return CapsuleParameters(
+            m1=theta["m1"],
+            m2=theta["m2"],
+            k1=theta["k1"],
+            k2=k2,
+            c=theta["c"],
+            mu=theta.get("mu", 0.0),
+            v_s=theta.get("v_s", 1.0),
+            G=gap,
+            g=theta["g"],
+        )
 
     def simulated(
         self, theta: ValuesBySymbol, p: CapsuleParameters, e: Excitation, times: ArrayLike, initial: Any = None

@@ -95,7 +95,7 @@ def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, b
     A capsule at rest stays there while |f| <= F_b, so this is exact for the question whether it sets off.
     """
     m1, k1, c, k2 = (float(theta[name]) for name in ("m1", "k1", "c", "k2"))
-    held = CapsuleParameters(m1, np.inf, k1, k2, c, mu=np.inf, v_s=np.inf, G=drive.G)
+    held = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=drive.G)
     e = Excitation(drive.P_d, drive.Omega)
 
     def rate(t: float, state: np.ndarray) -> list[float]:

@@ -34,7 +34,7 @@ def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]
 
 def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
     p, e = run.capsule(theta)
-    m1, m2, k1, k2, c, G = (float(getattr(p, name)) for name in ("m1", "m2", "k1", "k2", "c", "G"))
+    m1, m2, k1, k2, c, G = (float(leaf) for leaf in (p.m1, p.m2, p.k1, p.k2, p.c, p.G))  # pyright: ignore[reportArgumentType]
     Omega0, F_b = np.sqrt(k1 / m1), float(run.friction.force(theta).forward(0.0))
     length, of = F_b / k1, run.label
     scales = {"N": ("F_b", F_b), "m/s": ("(Omega0 F_b/k1)", Omega0 * length)}

@@ -60,7 +60,7 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
             return PointStage(target, point_fit(target, seed), BenchFit(), seed)
         bench = BenchFit()
         if not closed:
-            known = _rough(target, registry)
+            known = _paper_values(target, registry)
         else:
             alone = LogPosterior(target.rig, closed)
             fit = point_fit(alone, seed)
@@ -95,7 +95,7 @@ def _compile(pool: Executor | None, target: LogPosterior) -> None:
         pool.submit(compile_ahead, target)
 
 
-def _rough(target: LogPosterior, registry: Registry) -> dict[str, float]:
+def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:
     """The paper's estimates from the rig's bench tests; those that ``target`` lacks are made for it."""
     bench = [e for e in target.experiments if e.bench]
     if not bench and select_tables(target.rig, "bench"):

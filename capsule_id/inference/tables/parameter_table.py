@@ -10,7 +10,7 @@ from capsule_id.inference.checks.verdict import informed
 from capsule_id.inference.result import Posterior
 from capsule_id.parameters import Parameter, parameter
 
-COLUMNS = (
+SUMMARY_COLUMNS = (
     "unit", "meaning", "paper", "map", "standard_error", "mean", "sd", "median", "lower", "upper", "ess", "rhat",
     "informed",
 )  # fmt: skip
@@ -41,7 +41,7 @@ def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame
         rows.append((row, {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact, **errors}))
     physical, nuisances = (
         pd.DataFrame.from_dict({row.name: entry for row, entry in rows if row.physical == chosen}, orient="index")
-        .reindex(columns=list(COLUMNS))
+        .reindex(columns=list(SUMMARY_COLUMNS))
         .rename_axis("name")
         for chosen in (True, False)
     )

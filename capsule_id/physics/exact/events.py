@@ -1,7 +1,8 @@
 """Changes of mode: where on a step the first one lies, and which mode follows.
 
 In a mode three functions must stay >= 0: the gap's (d in contact, -d out of it) and, while sliding, the velocity in the
-mode's direction, or, while stuck, F_forward - f and F_backward + f. All are linear in the state, so they are polynomials in s.
+mode's direction, or, while stuck, F_forward - f and F_backward + f. Each is a linear combination
+of the series of the step, so it is a polynomial in s.
 """
 
 from typing import NamedTuple
