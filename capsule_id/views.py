@@ -5,10 +5,12 @@ Experiments and checks make them with codes and numbers; the report adds the tex
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import pandas as pd
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Level = Literal["ok", "warn", "fail"]
 #: What a check or a table has found, by name; quantities in the unit that the text prints.
@@ -39,7 +41,7 @@ class ResultTable:
     """A small table: estimates with and without flagged rows, damping models, priors. ``Message`` gives its words."""
 
     code: str
-    frame: pd.DataFrame
+    frame: "pd.DataFrame"
     facts: Facts = field(default_factory=dict)
 
 

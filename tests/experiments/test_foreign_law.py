@@ -14,6 +14,7 @@ from capsule_id.api import Fit
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.friction_model import FrictionModel
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import Parameter, Prior
@@ -114,7 +115,7 @@ def test_a_fit_recovers_the_law(fitted: Fit) -> None:
 
 def test_the_papers_law_fits_the_same_readings_worse(rig: Rig, fitted: Fit) -> None:
     """The negative control."""
-    other = fit_points(rig, make_experiments(rig), 0, sampled=False).fit
+    other = fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False).fit
     assert {"mu", "v_s"} <= set(other.names)
     assert fitted.point_fit.log_posterior.max() - other.log_posterior.max() > 30.0
 
