@@ -42,6 +42,7 @@ from capsule_id.views import Comparison
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
 #: Largest number of stored pointwise log-likelihoods. It limits the number of walkers where there are many readings.
 POINTWISE_SIZE = 2_000_000
+#: Packages whose versions the provenance records.
 PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
 AnyResult = TypeVar("AnyResult", bound=Result)

@@ -125,7 +125,7 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     far.sort(key=lambda name: -abs(found[name].sd))
     if lost and not far:
         return Finding("bench_and_runs.estimates", "warn", {"shared": len(found), "missing": lost})
-    # The curvature of few trials understates their tails.
+    # The Laplace approximation of few trials underestimates their tails.
     level = "ok" if not far else "fail" if sampled else "warn"
     named = far or [min(p, key=lambda name: p[name])]
     facts = {

@@ -20,16 +20,18 @@ from capsule_id.inference.fit.least_squares import Solver, least_squares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
+#: Default number of starting points.
 STARTS = 5
 #: Ends that differ by less than this many posterior standard deviations count as the same maximum.
 AGREEMENT = 0.05
 #: Gradients per posterior standard deviation: quasi-Newton stops below the first, and its end counts as a maximum
 #: below the second. Rounding of the log-posterior may stop it in between.
 TOLERANCE, MAXIMUM = 1e-5, 1e-3
+#: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
 #: Replaces a log-posterior that is not finite, because line searches need a finite number.
 NOWHERE = -1e12
-#: Largest number of least-squares steps, which only find the basin. The logarithm of an absent damping term decreases
+#: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
 #: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
 ROUGH = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
 #: Relative step of the difference quotients of residuals; their relative error is about 1e-10.

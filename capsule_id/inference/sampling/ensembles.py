@@ -16,6 +16,7 @@ from capsule_id.inference.sampling.diagnostics import effective_sample_size, ens
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import LARGE, Moves, block_move, candidates
 
+#: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
 #: Smallest number of walkers of an ensemble: one batch of the log-posterior. There are at least two per parameter.
 MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
@@ -29,11 +30,12 @@ FIRST_CHECK, CHECK_EVERY = 120, 30
 BURN_IN_IN_TAU = 8.0
 #: Spread of the initial walkers relative to the Laplace approximation, dimensionless.
 OVERDISPERSION = 1.2
+#: Largest number of emcee steps of an ensemble after burn-in, unless stated.
 DEFAULT_BUDGET = 20_000
 #: Stored draws per autocorrelation time of the pilot, and the largest number of steps per stored draw. The limit is
 #: needed because a short pilot estimates the autocorrelation time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
-#: Steps of the pilot's burn-in, half of which determines the block proposal, and steps of each measured move.
+#: Steps of the pilot's burn-in, half of which determines the block proposal, and steps of each measured move (short, long).
 PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
 #: Name of the move that the pilot adapts to its own sample, largest number of adaptations, and steps of each.
 ADAPTED, ADAPTATIONS, ADAPTING_STEPS = "adapted block independence + differential evolution", 4, 200
