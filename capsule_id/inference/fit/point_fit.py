@@ -30,10 +30,10 @@ TOLERANCE, MAXIMUM = 1e-5, 1e-3
 #: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
 #: Replaces a log-posterior that is not finite, because line searches need a finite number.
-NOWHERE = -1e12
+LOG_POSTERIOR_FLOOR = -1e12
 #: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
 #: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
-ROUGH = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
+BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
 #: Relative step of the difference quotients of residuals; their relative error is about 1e-10.
 DIFFERENCE = 1e-5
 
@@ -53,7 +53,7 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
         rough = least_squares(
             HeldResiduals(target, jnp.asarray(starts[0])),
             starts[:, located],
-            ROUGH,
+            BASIN_SOLVER,
             partial(_linearise, target, starts[0]),
         )
         compiled.result()
@@ -101,7 +101,7 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
     def negative(v: np.ndarray) -> np.ndarray:
         """Negative log-posterior (m,) at whitened v (m, d)."""
         value = in_batches(target.batch, end + v @ whitening.T)
-        return -np.where(np.isfinite(value), value, NOWHERE)
+        return -np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR)
 
     solution = optimize.minimize(
         lambda v: float(negative(v[None])[0]),
@@ -111,7 +111,7 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
         options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
     )
     value = -float(solution.fun)
-    return end + whitening @ solution.x, value, value > NOWHERE and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
+    return end + whitening @ solution.x, value, value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
 
 
 def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
