@@ -119,7 +119,7 @@ class ForcedRun(CapsuleForward):
         self.drive_known = drive is not None and drive.sd == 0.0
         reading_sd = np.array([table.columns[name].reading_sd for name in self.channels])
         self.reading_variance = reading_sd**2
-        # A constant channel has zero range, so its scale is the reading step, or a tiny number.
+        # A constant channel has zero range, so its scale is the reading error, or 1e-9 in SI units.
         ranges = np.maximum(np.ptp(self.values, axis=1), np.maximum(reading_sd, 1e-9))
         self.widths = NUISANCE_WIDTH * ranges
         self.gain_sd, self.has_gain = self._stated(settings, "gain")

@@ -28,8 +28,8 @@ SAMPLES_PER_CONTACT = 10
 SETTLED_PERIODS = 8
 #: Duration of the transient in units of 2 m1/c; exp(-4) = 2 % of it remains.
 DECAY_TIMES = 4.0
-#: Simulated excitation periods of the rod on a held capsule, relative tolerance, and number of steps per simulation that
-#: bounds the step size from below. The bound limits the effort for drives of extremely long period.
+#: Simulated excitation periods of the rod on a held capsule, relative tolerance, and largest number of steps imposed to
+#: resolve contacts. The limit bounds the effort for drives of extremely long period.
 HELD_PERIODS, HELD_TOLERANCE, HELD_STEPS = 12, 1e-6, 20_000
 #: Largest simulated duration of the rod on a held capsule, in units of 2 m1/c.
 HELD_DECAYS = 50.0

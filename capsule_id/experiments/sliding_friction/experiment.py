@@ -17,9 +17,9 @@ from capsule_id.rig.model import Rig, Table
 
 
 class SlidingFriction(FrictionExperiment):
-    """y = w mu_d(v), w = (m1 + m2) g for a force and 1 for a coefficient.
+    """Steady sliding, y = w mu_d(v), with w = (m1 + m2) g for a force and 1 for a coefficient.
 
-    Variance: reading errors of y and of v (through the slope of the friction law) and the relative scatter of mu.
+    The variance has reading errors of y and of v (through the slope of the friction law) and relative scatter of mu.
     """
 
     speed: np.ndarray
@@ -57,7 +57,7 @@ class SlidingFriction(FrictionExperiment):
         return (Misfit(self.values - predicted, variance, predicted, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Steady sliding is read as measured."""
+        """Measured points (speed, coefficient)."""
         if self.quantity == "coefficient":
             return self.speed, self.values
         m1, m2 = self.rig.m1, self.rig.m2

@@ -111,7 +111,11 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
         options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
     )
     value = -float(solution.fun)
-    return end + whitening @ solution.x, value, value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
+    return (
+        end + whitening @ solution.x,
+        value,
+        value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM),
+    )
 
 
 def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
