@@ -12,6 +12,7 @@ import numpy as np
 
 #: sd of the normal prior of a linear nuisance relative to the range of its record, dimensionless; wide but proper.
 NUISANCE_WIDTH = 10.0
+#: log(2 pi), from the normalisation of a normal density.
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 

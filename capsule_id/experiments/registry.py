@@ -15,6 +15,7 @@ from capsule_id.parameters import Parameter
 from capsule_id.rig.schema import parameter_rows
 from capsule_id.views import Message
 
+#: Entry-point group of installed packages with further kinds.
 GROUP = "capsule_id.experiments"
 
 #: Folders of the built-in kinds, in the order of templates and synthetic rigs.

@@ -20,7 +20,7 @@ class DynamicFriction(FrictionExperiment):
 
     The paper uses mu_d = v^2/(2gd) as mu at speed v, but it is an average over the slide.
     The variance of d has three terms: its reading error, that of v through dd/dv = v/(g mu_d(v)), and the scatter of
-    mu from push to push, to first order (d is proportional to 1/mu).
+    mu from push to push. The last one is first order (d is proportional to 1/mu).
     """
 
     speed: np.ndarray

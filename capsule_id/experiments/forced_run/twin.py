@@ -34,10 +34,13 @@ RUNS = (
 SPRING_FACTOR = 1.5
 #: Excitation periods from rest before the record starts; the record starts at a random phase.
 SETTLED = 40
+#: Number of samples and sampling rate, Hz, of a record.
 SAMPLES, RATE = 2000, 1000.0
+#: Noise level of each channel, SI (m, m, m/s^2, A).
 NOISE_SD = {"x_rel": 10e-6, "x_capsule": 5e-6, "acceleration_rod": 1.0, "current": 5e-3}
 #: Standard deviation of the channels' zero errors, SI. x_capsule has none, because it is zero at the first sample.
 OFFSET_SD = {"x_rel": 20e-6, "acceleration_rod": 0.5, "current": 20e-3}
+#: Standard deviation of the measured gap, m.
 GAP_SD = 0.02e-3
 
 

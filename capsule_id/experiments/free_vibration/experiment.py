@@ -160,7 +160,7 @@ class FreeVibration(SurfaceExperiment):
     # -- the paper's estimator and starts ---------------------------------------------------------------------------
 
     def smoothed(self) -> np.ndarray:
-        """(n,) the record after Savitzky–Golay, m; a record sampled unevenly stays raw, because the filter needs steps."""
+        """(n,) the record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
         try:
             sampling_step(self.time)
         except InputError:

@@ -61,8 +61,8 @@ class SlidingFriction(FrictionExperiment):
         if self.quantity == "coefficient":
             return self.speed, self.values
         m1, m2 = self.rig.m1, self.rig.m2
-        assert m1 is not None, "the schema asks for both masses beside a sliding force"
-        assert m2 is not None, "the schema asks for both masses beside a sliding force"
+        assert m1 is not None, "the schema requires both masses for a sliding force"
+        assert m2 is not None, "the schema requires both masses for a sliding force"
         return self.speed, self.values / normal_force(m1.value, m2.value, self.rig.g.value)
 
     def starts(self) -> dict[str, Start]:

@@ -117,7 +117,7 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
 
     Among the parameters that disagree significantly, the largest disagreement, in sd, is reported.
     The distance in sd measures how much the error of one parameter explains. An error in one parameter also shifts
-    the parameters correlated with it (v_s with mu), and heavy tails make z a poor measure of its origin.
+    the parameters correlated with it (v_s with mu). Heavy tails make z a poor measure of its origin.
     """
     p = {name: _family_wise(one.z, len(found)) for name, one in found.items()}
     lost = [name for name, one in found.items() if not (np.isfinite(one.sd) and np.isfinite(one.z))]

@@ -95,6 +95,7 @@ class Solver:
     heavy: bool = False
 
 
+#: Default solver settings.
 SOLVER = Solver()
 
 

@@ -15,6 +15,7 @@ from capsule_id.inference.sampling.ensemble import OpenBackend
 
 #: Time between two copies, s.
 SAVE_EVERY = 5.0
+#: Length of the digest of a copy, bytes.
 _DIGEST = hashlib.sha256().digest_size
 
 

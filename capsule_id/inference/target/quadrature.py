@@ -63,8 +63,8 @@ def log_stretch(t: Any, bend: Any, xp: ModuleType = jnp) -> Any:
     return xp.log1p(xp.exp(bend - t))
 
 
-#: (located u (w, ...), grid) -> log-posterior terms without scatters (w, blocks), log-densities of t at the nodes (w,
-#: scatters, nodes), and the logarithms of their integrals (w, scatters).
+#: (located u (w, ...), grid) -> log-posterior terms without scatters (w, blocks); log-densities of t at the nodes (w,
+#: scatters, nodes); logarithms of their integrals (w, scatters).
 Terms = Callable[[np.ndarray, Grid], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
