@@ -1,4 +1,4 @@
-"""Experiments: a folder per kind, one declaration each; here what is done with all experiments of a rig together."""
+"""Experiments: a folder per kind with one declaration; this module handles all experiments of a rig together."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from capsule_id.physics.friction import FrictionLaw
     from capsule_id.views import Comparison
 
-#: Which experiments of a rig are fitted: bench tests, forced runs, or both.
+#: Allowed choices of experiments for a fit: bench tests, forced runs, or both.
 Choice = Literal["bench", "runs", "all"]
 CHOICES: tuple[Choice, ...] = get_args(Choice)
 
@@ -21,7 +21,7 @@ Shared = TypeVar("Shared")
 
 
 def select_tables(rig: Rig, experiments: Choice) -> list[Table]:
-    """The rig's tables that ``experiments`` names; may be empty.
+    """Return the rig's tables that ``experiments`` selects; may be empty.
 
     Raises
     ------
@@ -40,18 +40,18 @@ def make_experiments(
     registry: Registry | None = None,
     friction: "type[FrictionLaw] | None" = None,
 ) -> tuple["Experiment", ...]:
-    """The rig's experiments, in the order of ``rig.toml``.
+    """Make the rig's experiments, in the order of ``rig.toml``.
 
     Parameters
     ----------
-    experiments : which of them
-    registry : the kinds that read the rig, by default all
+    experiments : one of ``CHOICES``
+    registry : kinds of experiments of the rig, by default all
     friction : class of the friction law, by default eq. (1)
 
     Raises
     ------
     InputError
-        If nothing is left to fit, the tables of a kind cannot be fitted together, ``experiments`` is unknown, or
+        If there is nothing to fit, the tables of a kind cannot be fitted together, ``experiments`` is unknown, or
         ``friction`` cannot be fitted.
     """
     kinds = registry or default_registry()
@@ -61,7 +61,7 @@ def make_experiments(
         raise InputError(rule, f"none with --experiments {experiments}", "add one to rig.toml", rig.folder / "rig.toml")
     for name, kind in kinds.items():
         kind.check([table for table in tables if table.kind == name])
-    # The law loads JAX, which a faulty folder must not wait for.
+    # The law loads JAX, which takes seconds. A faulty folder must be reported before.
     from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 
     model = EQUATION_1 if friction is None else FrictionModel(friction)
@@ -76,7 +76,7 @@ def make_experiments(
 
 
 def paper_estimates(experiments: Sequence["Experiment"], registry: Registry | None = None) -> dict[str, float]:
-    """What the paper's own protocol gives (section 2.2), by parameter name, SI; absent where it gives nothing."""
+    """Estimates by the paper's protocol (section 2.2), by parameter name, SI; absent where it gives none."""
     estimates: dict[str, float] = {}
     for paper, together in _by_shared(lambda kind: kind.paper, experiments, registry):
         estimates |= paper(together)
@@ -89,7 +89,7 @@ def compare(
     draws: Sequence[Values],
     registry: Registry | None = None,
 ) -> tuple["Comparison", ...]:
-    """Panels of all experiments, at ``values`` by name with a band from ``draws``; shared panels come first."""
+    """Return the panels of all experiments at ``values`` by name, with bands from ``draws``; shared panels first."""
     groups = sorted(
         _by_shared(lambda kind: kind.panels, experiments, registry), key=lambda group: group[0] is own_panels
     )
@@ -99,7 +99,7 @@ def compare(
 def _by_shared(
     function: Callable[[Kind], Shared], experiments: Sequence["Experiment"], registry: Registry | None
 ) -> Iterable[tuple[Shared, list["Experiment"]]]:
-    """Experiments grouped by the function that their kinds share."""
+    """Group the experiments by the function that their kinds share."""
     kinds: Mapping[str, Kind] = registry or default_registry()
     groups: dict[Shared, list[Experiment]] = {}
     for e in experiments:

@@ -1,11 +1,11 @@
-"""What every experiment offers to inference and to the report.
+"""Base class of experiments: their interface to inference and to the report.
 
-An experiment says, for given parameters, by how much each reading misses (``misfits``): the raw misfit, how its
-standard deviation depends on a scatter, and the design of the nuisances that enter linearly. Likelihood, residuals,
-pointwise densities and the posterior predictive p-value all follow from that here, once.
+An experiment computes the misfit of each reading for given parameters (``misfits``). A misfit consists of the raw
+difference, the dependence of its standard deviation on a scatter, and the design of the linear nuisances.
+The base class derives likelihood, residuals, pointwise densities and the posterior predictive p-value from it.
 
 An experiment is a frozen tree (``equinox.Module``): its leaves are the numbers that the likelihood reads, its static
-fields are words and flags. Whatever no likelihood reads lies in ``About``.
+fields are strings and flags. ``About`` holds all other data.
 """
 
 from abc import abstractmethod
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 
 require_float64()
 
-#: Parameter values and constants, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, ``g``, ``m1``): what one experiment
-#: sees. ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
+#: Parameter values and constants of one experiment, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, ``g``, ``m1``).
+#: ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
 ValuesBySymbol = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit may start: ``centre`` (SI) and how far starts are dispersed, natural-log units where positive."""
+    """Starting value of a parameter: ``centre`` (SI) and dispersion of starts, natural-log units where positive."""
 
     centre: float
     spread: float
@@ -49,15 +49,15 @@ class Start:
 
 @dataclass(frozen=True)
 class About:
-    """What an experiment was made of; no likelihood reads it.
+    """Inputs of an experiment that no likelihood reads.
 
-    All of these compare as equal. Experiments that differ only in numbers and labels have therefore equal tree
+    All instances compare as equal. Experiments that differ only in numbers and labels therefore have equal tree
     structures: they can be stacked, and they share compiled programs.
 
     Attributes
     ----------
-    table, rig : the readings as they were read, with units and row numbers, and the constants of the rig
-    parameters : those sampled for the experiment (masses are the rig's)
+    table, rig : the readings as read, with units and row numbers, and the constants of the rig
+    parameters : parameters sampled for the experiment, without masses, which belong to the rig
     """
 
     table: Table = field(compare=False)
@@ -66,18 +66,18 @@ class About:
 
 
 class Experiment(eqx.Module):
-    """One rig test: its readings, the paper's estimator, its likelihood, its checks, its part of the report.
+    """One rig test: readings, the paper's estimator, likelihood, checks and part of the report.
 
     Subclasses set ``about`` and their own fields in ``__init__(table, rig)``.
     """
 
     about: About = eqx.field(static=True)
 
-    #: Readings follow each other in time: residuals must be white.
+    #: Whether the readings form a time series, so that residuals must be white.
     time_series: ClassVar[bool] = False
-    #: The forward model is the event-driven capsule: differentiable in forward mode only, and slow (milliseconds).
+    #: Whether the forward model is the event-driven capsule: forward-mode derivatives only, and slow (milliseconds).
     event_driven: ClassVar[bool] = False
-    #: An estimate from these readings alone may be negative, as the slope of a falling line is.
+    #: Whether an estimate from these readings alone may be negative, as the slope of a falling line is.
     estimates_may_be_negative: ClassVar[bool] = False
     #: Checks of the fitted experiments that declare them, and tables of the report; each is called once.
     checks: ClassVar[tuple[Check, ...]] = ()
@@ -85,9 +85,9 @@ class Experiment(eqx.Module):
 
     @classmethod
     def make(cls, table: Table, rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":
-        """The experiments of one table: one, or the parts of a record that is to be cut.
+        """Make the experiments of one table: one, or several parts of a divided record.
 
-        ``friction`` is the law that the experiments of a fit share; a kind without a sliding capsule has no use for it.
+        ``friction`` is the law that the experiments of a fit share; a kind without a sliding capsule ignores it.
         """
         del friction
         return (cls(table, rig),)  # type: ignore[call-arg, arg-type]  # pyright: ignore
@@ -110,12 +110,12 @@ class Experiment(eqx.Module):
 
     @property
     def bench(self) -> bool:
-        """A test on the bench, as against a recorded run of the capsule."""
+        """Whether this is a bench test, not a forced run."""
         return self.table.bench
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Those sampled for this experiment (masses are the rig's)."""
+        """Parameters sampled for this experiment, without masses, which belong to the rig."""
         return self.about.parameters
 
     @property
@@ -125,7 +125,7 @@ class Experiment(eqx.Module):
 
     @property
     def scale_known(self) -> bool:
-        """The sd of every misfit is known beforehand: chi-square has a meaning of its own."""
+        """Whether the sd of every misfit is known, so that chi-square tests the fit."""
         return False
 
     @property
@@ -139,14 +139,14 @@ class Experiment(eqx.Module):
         return ()
 
     def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values by symbol out of values by name."""
+        """Select values by symbol from values by name."""
         own = {row.symbol: values[row.name] for row in self.parameters}
         return own | {name: values[name] for name in (*self.masses, "g") if name in values}
 
     @property
     @abstractmethod
     def observed(self) -> np.ndarray:
-        """(n,) the readings that the likelihood is a density of, SI."""
+        """(n,) readings that enter the likelihood, SI."""
 
     @abstractmethod
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
@@ -156,11 +156,11 @@ class Experiment(eqx.Module):
         """
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
-        """The same for the likelihood alone: moments where they say it all."""
+        """Misfits for the likelihood alone: moments where they are sufficient."""
         return tuple(misfit.summary() for misfit in self.misfits(theta, xp))
 
     def misfit(self, theta: ValuesBySymbol) -> ScaledMisfit:
-        """All groups together at the scatters of ``theta``, NumPy."""
+        """Misfit of all groups together at the scatters of ``theta``, NumPy."""
         parts = self.scaled(theta, np)
         return ScaledMisfit(
             np.concatenate([part.raw for part in parts]),
@@ -170,20 +170,20 @@ class Experiment(eqx.Module):
         )
 
     def scaled(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> list[ScaledMisfit]:
-        """The misfits at the scatters of ``theta``."""
+        """Misfits of each group at the scatters of ``theta``."""
         pairs = zip(self.misfits(theta, xp), self.scatters, strict=True)
         return [misfit.at(theta[symbol] if symbol else 0.0, xp) for misfit, symbol in pairs]
 
     @abstractmethod
     def starts(self) -> dict[str, Start]:
-        """A start for every parameter of this experiment, by name, from rough estimates out of its own readings."""
+        """Start of every parameter of this experiment, by name, estimated roughly from its own readings."""
 
     @abstractmethod
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        """Measured beside predicted at the point fit ``theta``, with a band from posterior ``draws`` (may be [])."""
+        """Compare readings and prediction at the point fit ``theta``, with a band from ``draws`` (may be [])."""
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-        """All panels of the experiment."""
+        """Return all panels of the experiment."""
         return (self.comparison(theta, draws),)
 
     # -- likelihood -------------------------------------------------------------------------------------------------
@@ -194,9 +194,9 @@ class Experiment(eqx.Module):
         return sum(part.log_density(theta[symbol] if symbol else 0.0, xp) for part, symbol in pairs)
 
     def residuals(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
-        """(n + p,) residuals in units of the noise at the conditional mean of the p linear nuisances, then those.
+        """(n + p,) residuals in units of the noise at the conditional mean of the p linear nuisances, then that mean.
 
-        Half their sum of squares is the parameter-dependent part of -log_likelihood but for its log-determinant.
+        Half their sum of squares is the parameter-dependent part of -log_likelihood without its log-determinant.
         """
         parts = [part.at_nuisance_mean(xp) for part in self.scaled(theta, xp)]
         return xp.concatenate([rest for rest, _ in parts] + [b for _, b in parts])
@@ -218,54 +218,54 @@ class Experiment(eqx.Module):
     def predictive_p(self, draws: list[ValuesBySymbol], rng: np.random.Generator) -> float | None:
         """Posterior predictive p-value of the chi-square discrepancy; None without draws.
 
-        Given the parameters the discrepancy of a replicate is chi-square with n degrees of freedom exactly, so no
-        replicate needs to be drawn.
+        Given the parameters the discrepancy of a replicate is exactly chi-square with n degrees of freedom, so no
+        replicate is drawn.
         """
         if not draws:
             return None
         squares = [np.sum(self.misfit(theta).at_nuisance_draw(rng) ** 2) for theta in draws]
         return float(np.mean(stats.chi2.sf(squares, self.n)))
 
-    # -- what a kind may offer beside its likelihood ----------------------------------------------------------------
+    # -- optional methods of a kind ---------------------------------------------------------------------------------
 
     def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[Experiment, ...], list[Finding]]":
-        """The experiment in parts, where one initial state cannot predict all of it at ``theta``; and what was done."""
+        """Divide the experiment where one initial state cannot predict all of it at ``theta``; also return findings."""
         del theta
         return (self,), []
 
     def corrected_start(self, theta: ValuesBySymbol) -> tuple[Self, dict[str, float]] | None:
-        """The experiment with another kind of initial state, where the readings contradict that of ``theta``.
+        """Replace the kind of initial state where the readings contradict that of ``theta``.
 
-        Also the values, SI, by name, from which a fit continues. None: the initial state stands.
+        Return the new experiment and the values, SI, by name, from which a fit continues. None: no contradiction.
         """
         del theta
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
-        """Largest ratio of a noise level of ``theta`` to the one that the record itself shows; 0 where it shows none."""
+        """Largest ratio of a noise level of ``theta`` to its estimate from the record alone; 0 without an estimate."""
         del theta
         return 0.0
 
     def with_smoothing(self, widths: "Smoothing | None") -> Self:
-        """The same readings with the smoothed capsule model of these ``widths``; the same where no capsule is modelled."""
+        """Return the same readings with the smoothed capsule model of ``widths``; unchanged without a capsule model."""
         del widths
         return self
 
     def noise_facts(self) -> Facts:
-        """What the report's advice needs where the residuals are not white: ``model``, and what drifts in the record."""
+        """Facts for the report's advice where residuals are not white: ``model``, and drifting quantities."""
         return {}
 
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        """The record as the paper looks at it; None where there is no such view."""
+        """Record for comparison with the figures of the paper; None where there is none."""
         del theta
 
 
 def no_design(n: int, xp: ModuleType = jnp) -> Any:
-    """Design of an experiment without linear nuisances, (n, 0)."""
+    """Return the design of an experiment without linear nuisances, (n, 0)."""
     return xp.zeros((n, 0))
 
 
 def axis_label(column: Column, symbol: str = "") -> str:
-    """``name, unit`` for an axis."""
+    """Return the axis label ``name, unit``."""
     return f"{symbol or column.name} [{column.unit}]"
 
 

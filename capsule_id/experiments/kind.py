@@ -1,7 +1,7 @@
-"""The declaration of one kind of experiment: everything that the rest of the package must know of it.
+"""Declaration of one kind of experiment: its complete interface to the rest of the package.
 
-A kind is a folder with a ``declaration.py`` whose ``KIND`` is a ``Kind``. Declarations load no JAX: what needs it is
-imported where it is used.
+A kind is a folder with a ``declaration.py`` whose ``KIND`` is a ``Kind``. Declarations do not load JAX. Functions that
+need JAX import it when they run.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 #: Parameter values, SI, by name (``k1``, ``k2[soft]``).
 Values = Mapping[str, float]
-#: A rough value, SI, by parameter name, and whether a bench test of the rig gave it (else the prior's median).
+#: Parameter name -> rough value, SI, and whether it comes from a bench test of the rig (else: prior median).
 Estimate = Callable[[str], tuple[float, bool]]
 
-#: The experiments of one table of a rig, with the friction law of the fit.
+#: (table, rig, friction law of the fit) -> experiments of the table.
 Maker = Callable[[Table[Any], Rig, "FrictionModel"], tuple["Experiment", ...]]
 
 
@@ -35,7 +35,7 @@ class TwinTable:
 
     Attributes
     ----------
-    file : its name
+    file : file name
     columns : (n,) by header cell, e.g. ``x_rel [mm]``, in the header's unit
     settings : lines of its entry in ``rig.toml``
     """
@@ -47,13 +47,13 @@ class TwinTable:
 
 @dataclass(frozen=True)
 class Twin:
-    """What ``synthesize`` writes for one kind.
+    """Synthetic data of one kind for ``synthesize``.
 
     Attributes
     ----------
-    tables : in the order of ``rig.toml``
+    tables : tables in the order of ``rig.toml``
     priors : lines of its ``[prior]``
-    truth : what lies behind each table beyond the parameters, by label
+    truth : true values of each table in addition to the parameters, by label
     """
 
     tables: tuple[TwinTable, ...]
@@ -62,13 +62,13 @@ class Twin:
 
 
 def own_panels(experiments: Sequence["Experiment"], values: Values, draws: Sequence[Values]) -> Iterable["Comparison"]:
-    """Panels of experiments that share none, one after the other."""
+    """Return the panels of experiments without shared panels, one after the other."""
     for e in experiments:
         yield from e.comparisons(e.local(values), [e.local(draw) for draw in draws])
 
 
 def made_by(reference: str, capsule: str = "") -> Maker:
-    """``make`` of the experiment class at ``reference``, ``module:class``; it is imported when it is called.
+    """Return ``make`` of the experiment class at ``reference`` (``module:class``); the call imports the class.
 
     ``capsule`` is the class where the setting ``forward`` is "capsule".
     """
@@ -82,25 +82,25 @@ def made_by(reference: str, capsule: str = "") -> Maker:
 
 @dataclass(frozen=True, kw_only=True)
 class Kind(KindRule):
-    """One kind of experiment; the attributes of ``KindRule`` besides these.
+    """One kind of experiment; it adds these attributes to those of ``KindRule``.
 
     Attributes
     ----------
-    make : the experiments of one table, several where a record is cut into parts; ``made_by`` names a class. The third
-        argument is the friction law of the fit
-    template : the commented lines of ``rig.toml`` that ``capsule-id init`` writes
-    informs : the parameters that it measures, for tables
-    captions : of its panels in the report, by ``Comparison.kind``
-    messages : words of its own checks and tables in the report, by code
-    lint : what deserves attention in a table before a fit, a line each
-    lint_rig : the same, where it takes the rest of the rig or rough values
-    describe : what ``capsule-id check`` says of a table, a line each
+    make : makes the experiments of one table, several for a divided record; see ``made_by``. The third argument is the
+        friction law of the fit
+    template : commented lines of ``rig.toml`` that ``capsule-id init`` writes
+    informs : parameters that it measures, for tables
+    captions : captions of its panels in the report, by ``Comparison.kind``
+    messages : texts of its own checks and tables in the report, by code
+    lint : problems of a table before a fit, one line each
+    lint_rig : problems that depend on the rest of the rig or on rough values, one line each
+    describe : description of a table for ``capsule-id check``, one line each
     check : raises an ``InputError`` where all tables of the kind together cannot be fitted
-    paper : estimates by the paper's own protocol, by parameter name. Kinds with the same function are evaluated together
-    rough : better rough values than the paper's, before a fit, by parameter name
-    panels : predictions beside readings, with a band from draws. Kinds with the same function share their panels
-    twin : tables measured on true values, SI by name, with reading errors from a generator (shared by all bench kinds)
-        or from a seed. None: ``synthesize`` leaves the kind out
+    paper : estimates by the paper's protocol, by parameter name. Kinds with the same function are evaluated together
+    rough : less biased rough values than the paper's, before a fit, by parameter name
+    panels : predictions and readings, with a band from draws. Kinds with the same function share their panels
+    twin : simulates tables from true values, SI by name, with errors from a generator (shared by all bench kinds) or
+        from a seed. None: ``synthesize`` omits the kind
     truth : true values, SI by name, that only this kind adds to a synthetic rig
     """
 

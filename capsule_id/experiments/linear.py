@@ -1,4 +1,4 @@
-"""Nuisances that enter a Gaussian likelihood linearly are integrated out in closed form.
+"""Integration of linear nuisances of a Gaussian likelihood in closed form.
 
 Model, in units of the noise: y = A b + e, e ~ N(0, I), b ~ N(0, I) (the prior's widths are absorbed in A). Then
 y ~ N(0, I + A A'), and only the moments y'y, A'y, A'A are needed (matrix inversion and determinant lemmas).
@@ -10,15 +10,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-#: A linear nuisance has a normal prior of this many times the range of its record: wide, but proper.
+#: sd of the normal prior of a linear nuisance relative to the range of its record, dimensionless; wide but proper.
 NUISANCE_WIDTH = 10.0
+#: log(2 pi), from the normalisation of a normal density.
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp) -> Any:
     """log N(y; 0, I + A A') from the moments, (...).
 
-    There are few nuisances, so that the elimination is written out: one expression for any number of leading axes.
+    Explicit elimination is efficient for few nuisances and works for any number of leading axes.
 
     Parameters
     ----------

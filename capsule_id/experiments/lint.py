@@ -1,4 +1,4 @@
-"""What a valid rig folder deserves attention for before a fit."""
+"""Warnings on a valid rig folder before a fit."""
 
 from collections.abc import Iterable, Mapping
 
@@ -7,12 +7,12 @@ from capsule_id.rig.model import Rig, Table
 
 
 def lint(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> list[str]:
-    """Findings on a valid rig, a line each: the experiment, what was found, what to do.
+    """Return warnings on a valid rig, one line each: experiment, problem, remedy.
 
     Parameters
     ----------
-    rig : as ``read_rig`` returns it
-    kinds : the kinds that read it
+    rig : rig as ``read_rig`` returns it
+    kinds : kinds of experiments of the rig
     estimate : rough values, computed only where a kind needs them
     """
     findings = [
@@ -37,13 +37,13 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> list[str]:
 
 
 def lint_rows(table: Table, fewest: int) -> Iterable[str]:
-    """A finding where a table has fewer than ``fewest`` rows: the unknowns of its law, and three more."""
+    """Warn where a table has fewer than ``fewest`` rows: the number of unknowns of its law plus three."""
     if len(table.rows) < fewest:
         yield f"{len(table.rows)} rows, too few to estimate the scatter; measure {fewest} or more"
 
 
 def lint_reading_errors(table: Table) -> Iterable[str]:
-    """A finding where columns have no reading error."""
+    """Warn where columns have no reading error."""
     unstated = [name for name, column in table.columns.items() if column.reading_sd == 0.0]
     if unstated:
         yield f"no reading error stated for {' and '.join(unstated)}; add {unstated[0]}_sd"

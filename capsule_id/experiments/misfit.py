@@ -1,7 +1,7 @@
-"""By how much readings miss a model, and their density as a function of one scatter.
+"""Misfit between readings and model, and the density of readings as a function of one scatter.
 
-The forward model is evaluated once; a scatter only changes standard deviations, so that the density of the readings at
-many values of it costs little more than at one.
+The forward model is evaluated once, because a scatter only changes standard deviations. The density at many values of
+the scatter therefore takes little more time than at one.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class ScaledMisfit:
     raw : (n,) measured minus predicted
     sd : (n,) its standard deviation
     design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
-    log_measure : (n,) what the measure of an integrated true abscissa adds to the log-density of each reading
+    log_measure : (n,) contribution of an integrated true abscissa to the log-density of each reading
     """
 
     raw: Any
@@ -32,7 +32,7 @@ class ScaledMisfit:
     log_measure: Any
 
     def moments(self) -> tuple[Any, Any, Any]:
-        """y'y, A'y, A'A in units of the noise."""
+        """Moments y'y, A'y, A'A in units of the noise."""
         y, a = self.raw / self.sd, self.design / self.sd[:, None]
         return y @ y, a.T @ y, a.T @ a
 
@@ -55,7 +55,7 @@ class ScaledMisfit:
 
 @dataclass(frozen=True)
 class Moments:
-    """Readings of one common variance, ``fixed_variance + (scale scatter)^2``: their moments say it all.
+    """Sufficient moments of readings with one common variance, ``fixed_variance + (scale scatter)^2``.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Moments:
 
 @dataclass(frozen=True)
 class Misfit:
-    """By how much the readings of one group miss a model, at any value of their scatter.
+    """Difference between the readings of one group and a model, at any value of their scatter.
 
     Variance of a reading: fixed_variance + (scale scatter)^2.
 
@@ -94,8 +94,8 @@ class Misfit:
     raw : (n,) measured minus predicted
     fixed_variance, scale : () or (n,); both () where all readings have one variance
     design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
-    ordinate : fixed variance and scale of the readings' own error where true abscissas were integrated out along the
-        model (errors in both columns, see ``capsule_id.experiments.families.line_experiment``): it normalises the density
+    ordinate : fixed variance and scale of the readings' own error where true abscissas are integrated out along the
+        model; they normalise the density (see ``capsule_id.experiments.families.line_experiment``)
     """
 
     raw: Any
@@ -105,14 +105,14 @@ class Misfit:
     ordinate: tuple[Any, Any] | None = None
 
     def at(self, scatter: Any, xp: ModuleType = jnp) -> ScaledMisfit:
-        """At one value of the scatter, ()."""
+        """Return the misfit at one value of the scatter, ()."""
         one = xp.ones(self.raw.shape[0])
         variance = _variance(self.fixed_variance, self.scale, scatter) * one
         own = variance if self.ordinate is None else _variance(*self.ordinate, scatter) * one
         return ScaledMisfit(self.raw, xp.sqrt(variance), self.design, 0.5 * xp.log(variance / own))
 
     def summary(self) -> "Misfit | Moments":
-        """Moments, where all readings have one variance."""
+        """Return the moments where all readings have one variance, else the misfit."""
         numbers = (self.fixed_variance, self.scale, *(self.ordinate or ()))
         if any(np.ndim(number) for number in numbers):
             return self
@@ -143,7 +143,7 @@ def _variance(fixed: Any, scale: Any, scatter: Any) -> Any:
 
 
 def innovations(raw: Any, variance: Any, design: Any, rho: Any, xp: ModuleType) -> Misfit:
-    """Readings with AR(1) noise as their innovations: e_t = rho e_(t-1) + N(0, variance + scatter^2), stationary."""
+    """Transform readings with stationary AR(1) noise e_t = rho e_(t-1) + N(0, variance + scatter^2) to innovations."""
 
     def whiten(y: Any) -> Any:
         return xp.concatenate([y[:1], y[1:] - rho * y[:-1]])

@@ -1,4 +1,4 @@
-"""Every kind of experiment, by name: the built-in ones and those of installed packages.
+"""Registry of all kinds of experiments, by name: built-in kinds and those of installed packages.
 
 A package adds kinds through the entry-point group ``capsule_id.experiments``; each entry point names a ``Kind``.
 """
@@ -15,6 +15,7 @@ from capsule_id.parameters import Parameter
 from capsule_id.rig.schema import parameter_rows
 from capsule_id.views import Message
 
+#: Entry-point group of installed packages with further kinds.
 GROUP = "capsule_id.experiments"
 
 #: Folders of the built-in kinds, in the order of templates and synthetic rigs.
@@ -36,9 +37,9 @@ class Registry(Mapping[str, Kind]):
     Raises
     ------
     ValueError
-        If two kinds have one name, or declare one parameter differently.
+        If two kinds have the same name, or declare the same parameter differently.
     TypeError
-        If a type of a setting states no rule.
+        If the type of a setting has no rule.
     """
 
     kinds: tuple[Kind, ...]
@@ -68,7 +69,7 @@ class Registry(Mapping[str, Kind]):
 
     @property
     def messages(self) -> Mapping[str, Message]:
-        """Words of the checks and tables of all kinds, by code."""
+        """Texts of the checks and tables of all kinds, by code."""
         return {code: message for kind in self.kinds for code, message in kind.messages.items()}
 
     def __getitem__(self, name: str) -> Kind:
@@ -83,12 +84,12 @@ class Registry(Mapping[str, Kind]):
 
 @cache
 def default_registry() -> Registry:
-    """The built-in kinds and those of installed packages; made once.
+    """Return the built-in kinds and those of installed packages; the result is cached.
 
     Raises
     ------
     InputError
-        If a package's kind does not load or clashes with another one; the error names the package.
+        If a package's kind does not load or conflicts with another one; the error names the package.
     """
     registry = Registry(tuple(import_module(f"{__package__}.{folder}.declaration").KIND for folder in BUILT_IN))
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):

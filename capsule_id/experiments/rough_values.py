@@ -10,10 +10,10 @@ from capsule_id.rig.model import Rig
 
 
 def rough_values(rig: Rig, registry: Registry | None = None) -> Estimate:
-    """A function of a parameter's name: (rough value, SI; whether a bench test of ``rig`` gave it).
+    """Return a function from parameter name to (rough value, SI; whether it comes from a bench test of ``rig``).
 
-    A value is the kind's own rough value, else the paper's estimate, else the stated prior's median, else the default
-    prior's. The bench tests are evaluated at the first call.
+    The sources in order of preference are: the kind's rough value, the paper's estimate, the median of the stated
+    prior, that of the default prior. The first call evaluates the bench tests.
     """
     kinds = registry or default_registry()
 

@@ -1,1 +1,1 @@
-"""From experiments to a joint posterior, its point fit, its sample and its checks."""
+"""Bayesian inference: log-posterior, point fit, sample and checks."""

@@ -1,4 +1,4 @@
-"""The path from a rig to a result, stage by stage. Each stage is a frozen value made from the one before.
+"""Stages from a rig to a result. Each stage returns a frozen value computed from the previous one.
 
     kinds = default_registry()                                   # kinds of experiments
     rig = read_rig(folder, kinds)                                # folder -> Rig
@@ -10,7 +10,7 @@
     checked = check_fit(sampled)                                 # posterior -> checks
     result = make_result(checked, kinds, seeds.report, provenance(rig, 0, "all"))
 
-``capsule_id.fit`` runs all of them.
+``capsule_id.fit`` runs all stages.
 """
 
 import platform
@@ -38,17 +38,18 @@ from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison
 
-#: Posterior draws behind bands and predictive p-values, and prior draws in the saved sample.
+#: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
-#: Pointwise log-likelihoods kept: of every walker's last draw, or of fewer walkers where there are many readings.
+#: Largest number of stored pointwise log-likelihoods. It limits the number of walkers where there are many readings.
 POINTWISE_SIZE = 2_000_000
+#: Packages whose versions the provenance records.
 PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
 AnyResult = TypeVar("AnyResult", bound=Result)
 
 
 class StageSeeds(NamedTuple):
-    """Seeds of the random numbers of each stage: starts of the point fit, walkers, draws for checks and files."""
+    """Seeds of each stage: starting points of the point fit, walkers, draws for checks and files."""
 
     starts: int
     walkers: int
@@ -56,7 +57,7 @@ class StageSeeds(NamedTuple):
 
 
 def stage_seeds(seed: int) -> StageSeeds:
-    """The seeds of the stages of a fit with ``seed``."""
+    """Return the seeds of the stages of a fit with ``seed``."""
     return StageSeeds(*(int(s) for s in np.random.SeedSequence(seed).generate_state(3)))
 
 
@@ -67,12 +68,12 @@ def sample_posterior(
     store: Path | None = None,
     progress: OnProgress | None = None,
 ) -> Setting:
-    """The point fit with its sample, not checked yet.
+    """Sample the posterior; return the point fit with its sample, without checks.
 
     Parameters
     ----------
     budget : emcee steps of an ensemble after burn-in; None draws no sample
-    store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
+    store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
     progress : see ``capsule_id.inference.sampling.ensembles.sample``
     """
     target, posterior = point.target, None
@@ -83,7 +84,7 @@ def sample_posterior(
 
 
 def check_fit(sampled: Setting) -> Setting:
-    """``sampled`` with the findings of all checks, those of the point fit included, and with the outliers flagged."""
+    """Run all checks: return ``sampled`` with all findings, those of the point fit included, and flagged outliers."""
     checked = run_checks(sampled)
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
     return replace(checked, findings=(*checked.findings, *sampled.findings, *agreement))
@@ -92,9 +93,9 @@ def check_fit(sampled: Setting) -> Setting:
 def make_result(
     checked: Setting, registry: Registry, seed: int, made_from: Provenance, kind: type[AnyResult] = Result
 ) -> AnyResult:
-    """What the report needs: tables, panels, records, and the arrays that are saved with the sample.
+    """Assemble the result: tables, panels, records, and the arrays that are saved with the sample.
 
-    ``kind`` is the class of the result: the interface adds a method that writes it.
+    ``kind`` is the class of the result; the interface passes a subclass with a method that writes it.
     """
     target, posterior = checked.target, checked.posterior
     rng = np.random.default_rng(seed)
@@ -121,7 +122,7 @@ def make_result(
 
 
 def provenance(rig: Rig, seed: int, experiments: Choice) -> Provenance:
-    """What a fit of ``rig`` with ``seed`` and these ``experiments`` is made from."""
+    """Return the provenance of a fit of ``rig`` with ``seed`` and these ``experiments``."""
     return Provenance(seed, experiments, package_versions(PACKAGES), dict(rig.files))
 
 
@@ -131,7 +132,7 @@ def package_versions(packages: Sequence[str]) -> dict[str, str]:
 
 
 def _draws(target: LogPosterior, posterior: Posterior | None) -> list[dict[str, float]]:
-    """``BAND_DRAWS`` draws, evenly spaced over the sample, by parameter name."""
+    """Return ``BAND_DRAWS`` draws, evenly spaced over the sample, by parameter name."""
     if posterior is None:
         return []
     flat = posterior.draws.reshape(-1, len(posterior.names))
@@ -141,7 +142,7 @@ def _draws(target: LogPosterior, posterior: Posterior | None) -> list[dict[str, 
 def _comparisons(
     checked: Setting, predictive: Mapping[str, float | None], registry: Registry
 ) -> tuple[Comparison, ...]:
-    """Panels with flagged rows marked and predictive p-values filled in."""
+    """Return the panels, with flagged rows and predictive p-values."""
     panels = []
     for panel in compare(checked.experiments, checked.values, checked.draws, registry):
         points = []
@@ -154,7 +155,7 @@ def _comparisons(
 
 
 def _pointwise(target: LogPosterior, posterior: Posterior, rng: np.random.Generator) -> PointwiseLogLikelihood:
-    """Of every walker's last draw, or of fewer walkers where there are many readings."""
+    """Pointwise log-likelihood of every walker's last draw, or of fewer walkers where there are many readings."""
     ensembles, draws, walkers, _ = posterior.draws.shape
     every = max(1, ensembles * walkers * sum(e.n for e in target.experiments) // POINTWISE_SIZE)
     chains = np.arange(0, ensembles * walkers, every)

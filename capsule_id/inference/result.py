@@ -1,4 +1,4 @@
-"""The frozen values that inference hands on; the report renders them and computes nothing."""
+"""Frozen results of inference; the report renders them without further computation."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class PointFit:
     standard_errors : by name, SI: from the Jacobian of the standardised residuals
     starts, ends : (s, d) in u
     log_posterior : (s,) at the ends
-    elsewhere : (s,) bool: this start ended at another maximum than the best one
+    at_other_maximum : (s,) bool: this start ended at a maximum other than the best one
     stalled : (s,) bool: the solver reported no convergence from this start
     """
 
@@ -44,18 +44,18 @@ class PointFit:
     starts: np.ndarray
     ends: np.ndarray
     log_posterior: np.ndarray
-    elsewhere: np.ndarray
+    at_other_maximum: np.ndarray
     stalled: np.ndarray
 
     @property
     def agree(self) -> bool:
-        """Every start ended at the same maximum."""
-        return not self.elsewhere.any()
+        """Whether every start ended at the same maximum."""
+        return not self.at_other_maximum.any()
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """The sample.
+    """The posterior sample.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Posterior:
     tau : (d,) largest integrated autocorrelation time over the ensembles, in stored draws
     rhat, ess : (d,)
     converged : every parameter has N > 50 tau and R-hat <= 1.01
-    moves : what the pilot run measured: move -> largest tau (steps); the first is the one used
+    moves : pilot measurement: move -> largest tau, steps; the first move is used
     steps, thin : emcee steps after burn-in, and steps per stored draw
     """
 
@@ -90,7 +90,7 @@ class PointwiseLogLikelihood:
     Attributes
     ----------
     values : (chain, draw, n) by label of the experiment
-    chain, draw : which walkers and which stored draws
+    chain, draw : indices of the walkers and of the stored draws
     """
 
     values: Mapping[str, np.ndarray]
@@ -100,7 +100,7 @@ class PointwiseLogLikelihood:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a result was made from: the seed, the chosen experiments, versions of packages, SHA-256 of the files."""
+    """Inputs of a result: the seed, the chosen experiments, versions of packages, SHA-256 of the files."""
 
     seed: int
     experiments: Choice
@@ -110,17 +110,17 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Result:
-    """What a fit has found, complete for the report.
+    """Complete result of a fit, as the report needs it.
 
     Attributes
     ----------
-    registry : the kinds of the rig's experiments, which declare the words of their panels and checks
+    registry : kinds of the rig's experiments, which declare the texts of their panels and checks
     summary : a row per physical parameter (index ``name``), SI, missing numbers NaN; columns unit, meaning, paper, map,
         standard_error, mean, sd, median, lower, upper, ess, rhat, informed
-    nuisances : the same table for scatters and noise
+    nuisances : the same columns for scatters and noise
     fixed : constants by name, SI
     observed : (n,) readings that enter the likelihood, SI, by label
-    prior : (draws,) of the prior by parameter name, SI
+    prior : (draws,) prior draws by parameter name, SI
     log_likelihood : None without a sample
     """
 
@@ -142,5 +142,5 @@ class Result:
 
     @property
     def clean(self) -> bool:
-        """No finding of level ``fail``."""
+        """Whether there is no finding of level ``fail``."""
         return all(finding.level != "fail" for finding in self.findings)

@@ -1,1 +1,1 @@
-"""Checks and tables that several kinds of experiments share, and what a fit offers to them."""
+"""Checks and tables that several kinds of experiments share, and their interface to a fit."""

@@ -1,4 +1,4 @@
-"""What a fit offers to the checks and tables of an experiment, and what an experiment offers to the report."""
+"""Interface between a fit and the checks and tables of an experiment."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tension:
-    """Whether two groups of experiments agree on their shared parameters.
+    """Likelihood-ratio test that two groups of experiments share their parameters.
 
     Attributes
     ----------
-    statistic : twice the increase of the log-posterior when the two groups may differ
-    p : from chi-square with 1 degree of freedom
-    one, other : the estimates of each group alone, SI, by name
+    statistic : twice the increase of the log-posterior when each group has its own parameters
+    p : p-value from chi-square with 1 degree of freedom
+    one, other : estimates from each group alone, SI, by name
     """
 
     statistic: float
@@ -37,7 +37,7 @@ class Refit:
     Attributes
     ----------
     values, standard_errors : SI, by name
-    agree : every start ended at the same maximum
+    agree : whether every start ended at the same maximum
     bic : Schwarz's criterion
     """
 
@@ -49,7 +49,7 @@ class Refit:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A recorded run as the paper looks at it, ``force`` (n,) N: the fitted drive at its samples."""
+    """A recorded run as in the figures of the paper; ``force`` (n,) is the fitted drive at its samples, N."""
 
     name: str
     view: RecordView
@@ -64,7 +64,7 @@ class Fitted(Protocol):
     values : the point fit and the constants, SI, by name
     flagged : row indices of the outliers, by label
     draws : posterior draws, SI, by name; [] without a sample
-    findings : of the checks so far
+    findings : findings of the checks so far
     """
 
     @property
@@ -88,6 +88,6 @@ class Fitted(Protocol):
         ...
 
 
-#: The experiments of a fit that declare a check, and the fit -> findings. Tables likewise.
+#: A check maps the experiments that declare it, and the fit, to findings; a table function maps them to tables.
 Check = Callable[[Sequence[Any], Fitted], list[Finding]]
 TableMaker = Callable[[Sequence[Any], Fitted], list[ResultTable]]

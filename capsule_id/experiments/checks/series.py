@@ -1,11 +1,11 @@
-"""Statistics of a recorded series: its autocorrelation, and whether its residuals are white."""
+"""Statistics of a time series: autocorrelation and a test of whiteness."""
 
 import numpy as np
 from scipy import stats
 
-#: Family-wise false-alarm rate of a check over the experiments that it judges.
+#: Family-wise false-alarm rate of a check over its experiments, dimensionless.
 LEVEL = 0.002
-#: Lags of the whiteness test, and the shortest record per lag, samples.
+#: Number of lags of the whiteness test, and smallest number of samples per lag.
 LAGS, SAMPLES_PER_LAG = 20, 5
 
 

@@ -30,7 +30,7 @@ SPEED_SD, DISTANCE_SD, SURFACE_SCATTER = 5e-3, 0.3e-3, 0.015
 
 @dataclass(frozen=True, kw_only=True)
 class PushSettings(Settings):
-    """``forward``: the closed form of a locked rod, or the capsule model of a free one."""
+    """Settings of pushes; ``forward`` selects the closed form of a locked rod or the capsule model of a free rod."""
 
     forward: Literal["closed", "capsule"] = "closed"
 
@@ -45,7 +45,7 @@ def pushes(
     distance_sd: float = DISTANCE_SD,
     surface_scatter: float = SURFACE_SCATTER,
 ) -> dict[str, np.ndarray]:
-    """A synthetic table: pushes at ``speeds`` (n,) m/s, read with ``speed_sd`` m/s and ``distance_sd`` m.
+    """Simulate a table of pushes at ``speeds`` (n,) m/s with errors ``speed_sd`` m/s and ``distance_sd`` m.
 
     The surface's mu scatters by ``surface_scatter`` (relative) from push to push. Each argument is one quantity of the
     protocol, so there are more than six.

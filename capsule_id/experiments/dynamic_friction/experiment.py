@@ -16,10 +16,11 @@ from capsule_id.rig.model import Rig, Table
 
 
 class DynamicFriction(FrictionExperiment):
-    """d = slide_distance(v): the paper reads mu_d = v^2/(2gd) as mu at speed v, but it is an average over the slide.
+    """Pushes with d = slide_distance(v).
 
-    Variance of d: its reading error, that of v through dd/dv = v/(g mu_d(v)), and the surface's scatter of mu from
-    push to push, to first order (d is proportional to 1/mu).
+    The paper uses mu_d = v^2/(2gd) as mu at speed v, but it is an average over the slide.
+    The variance of d has three terms: its reading error, that of v through dd/dv = v/(g mu_d(v)), and the scatter of
+    mu from push to push. The last one is first order (d is proportional to 1/mu).
     """
 
     speed: np.ndarray
@@ -49,13 +50,13 @@ class DynamicFriction(FrictionExperiment):
         return (Misfit(self.distance - distance, variance, distance, no_design(self.n, xp)),)
 
     def locked_slide(self, theta: ValuesBySymbol) -> tuple[Any, Any]:
-        """Distance, m, with the rod locked, and its variance by the reading errors, m^2; (n,) each."""
+        """Slide distance with the rod locked, m, and its variance from the reading errors, m^2; (n,) each."""
         law, g = self.friction.coefficient(theta), theta["g"]
         slope = self.speed / (g * law.forward(self.speed))
         return slide_distance(law, 1.0 / g, self.speed), self.distance_sd**2 + (slope * self.speed_sd) ** 2
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pushes are read as mu = v^2/(2gd) at their initial speed."""
+        """Points by the paper's formula: mu = v^2/(2gd) at the initial speed."""
         return self.speed, self.speed**2 / (2.0 * self.rig.g.value * self.distance)
 
     def starts(self) -> dict[str, Start]:

@@ -1,1 +1,1 @@
-"""What kinds of experiments share with each other."""
+"""Code that several kinds of experiments share."""

@@ -1,8 +1,8 @@
 """Bench tests with the capsule model as their forward model (``forward = "capsule"`` in rig.toml).
 
 The closed forms hold where the capsule stays at rest, and where the rod is locked to it. A rod released from farther
-away than F_b/k1 moves its capsule; a rod that is not locked rings on k1 and c while the capsule slides. There the closed
-form is biased and the capsule model, the one of the forced runs with the drive off, is not.
+away than F_b/k1 moves its capsule. An unlocked rod oscillates on k1 and c while the capsule slides. In both cases the
+closed form is biased. The capsule model of the forced runs, with the drive off, is not.
 """
 
 from types import ModuleType
@@ -24,19 +24,19 @@ from capsule_id.parameters import Prior, parameter
 from capsule_id.physics.model import Excitation
 from capsule_id.rig.model import Rig, Table
 
-#: No drive: its frequency means nothing then.
+#: Zero drive; its frequency has no effect.
 OFF = Excitation(0.0, 1.0)
-#: A push is followed for this many times the slide that its distance stands for, and then until the rod has come to rest:
-#: a surface this much slipperier than the readings say is far outside the posterior.
+#: Simulated duration of a push relative to the duration of a slide over the recorded distance, before the rod's decay.
+#: A surface with this much less friction than the readings imply is far outside the posterior.
 SLIDES, REST = 6.0, 0.5
-#: Spring out of reach, m.
+#: Gap of a support spring out of reach, m.
 FAR = 1e3
 
 
 class CapsuleDecay(CapsuleForward, FreeVibration):
-    """x_rel(t) of a rod released at the first sample, drive off, the capsule at rest there and free to slip.
+    """x_rel(t) of a rod released at the first sample, drive off, with the capsule at rest there and free to slip.
 
-    Start of the motion and offset are the record's own; with ``spring`` and ``gap`` the rod may hit the support spring.
+    Initial conditions and offset belong to the record. With ``spring`` and ``gap`` the rod may hit the support spring.
     """
 
     gap: float
@@ -67,7 +67,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         return "capsule model"
 
     def motion_of(self, theta: ValuesBySymbol) -> Any:
-        """(n,) x_rel of the model."""
+        """(n,) x_rel of the model, m."""
         p = self.parameters_of(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
         t = self.simulated(theta, p, OFF, self.time, initial)
@@ -88,15 +88,15 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
 
 class CapsulePushes(CapsuleForward, DynamicFriction):
-    """Pushes with the rod free on k1 and c: both masses start at speed v; the distance is the capsule's, once at rest.
+    """Pushes with the rod free on k1 and c: both masses start at speed v, and the capsule's final distance is recorded.
 
     Variances are those of the locked rod (first order in reading errors and scatter).
     """
 
-    #: (n,) s at which every push has come to rest.
+    #: (n,) time at which each push is at rest, s.
     horizon: np.ndarray
 
-    # A push with the capsule model depends on k1 and c too: by itself it is no friction test.
+    # A push with the capsule model depends on k1 and c too, so it is no friction test alone.
     checks = ()
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
@@ -106,7 +106,7 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         self.about = About(table, rig, (parameter("k1"), parameter("c"), *friction.parameters, PUSH_SCATTER))
 
     def slide(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
-        """(n,) m that the capsule goes."""
+        """(n,) slide distance of the capsule, m."""
         still, v = xp.zeros(self.n), xp.asarray(self.speed)
         times = xp.stack([xp.zeros(self.n), xp.asarray(self.horizon)], axis=1)
         t = self.simulated(theta, self.parameters_of(theta, 0.0, FAR), OFF, times, (still, v, still, v))

@@ -1,4 +1,4 @@
-"""The capsule as a forward model: the exact one, or the smoothed one. Mixed into the experiments that it predicts."""
+"""Mixin for experiments whose forward model is the capsule model, exact or smoothed."""
 
 from typing import Any, Self
 
@@ -29,11 +29,11 @@ class CapsuleForward(SurfaceExperiment):
         return ("m1", "m2")
 
     def with_smoothing(self, widths: Smoothing | None) -> Self:
-        """The same readings with the smoothed model of these ``widths`` as forward model; None: the exact one."""
+        """Return the same readings with the smoothed model of ``widths``; None: the exact model."""
         return eqx.tree_at(lambda e: e.smoothing, self, widths, is_leaf=lambda x: x is None)
 
     def parameters_of(self, theta: ValuesBySymbol, k2: Any, gap: Any) -> CapsuleParameters:
-        """The capsule at ``theta``; mu and v_s are placeholders where another friction law replaces them."""
+        """Capsule parameters at ``theta``; mu and v_s are placeholders where another friction law replaces them."""
         return CapsuleParameters(
             m1=theta["m1"],
             m2=theta["m2"],
@@ -49,7 +49,7 @@ class CapsuleForward(SurfaceExperiment):
     def simulated(
         self, theta: ValuesBySymbol, p: CapsuleParameters, e: Excitation, times: ArrayLike, initial: Any = None
     ) -> Trajectory:
-        """``simulate`` by this experiment's model, with the friction law at ``theta``."""
+        """Call ``simulate`` with this experiment's model and the friction law at ``theta``."""
         model, law = "exact" if self.smoothing is None else "smooth", self.friction.force(theta)
         return simulate(p, e, times, initial, model=model, smoothing=self.smoothing, friction=law)
 

@@ -1,4 +1,4 @@
-"""Friction experiments share eq. (1), the paper's fit of it, one panel, and one condition on their readings."""
+"""Shared declarations of friction experiments: eq. (1), the paper's fit, one panel, one rule on readings."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ MESSAGES = {
 
 
 def friction_estimates(experiments: Sequence["FrictionExperiment"]) -> Values:
-    """The paper's mu and v_s: eq. (1) fitted to the points of all friction experiments."""
+    """Estimate mu and v_s as in the paper: fit eq. (1) to the points of all friction experiments."""
     from capsule_id.experiments.families.friction_experiment import paper_friction_fit
 
     points = [e.paper_points() for e in experiments]
@@ -42,21 +42,21 @@ def friction_estimates(experiments: Sequence["FrictionExperiment"]) -> Values:
 def friction_panels(
     experiments: Sequence["FrictionExperiment"], values: Values, draws: Sequence[Values]
 ) -> tuple["Comparison"]:
-    """One panel of all friction experiments."""
+    """Return one panel for all friction experiments."""
     from capsule_id.experiments.families.friction_experiment import friction_comparison
 
-    # Local values differ in scatters only; together they have both mu and v_s where one experiment has them.
+    # Local values differ in scatters only. Merged, they contain mu and v_s if any experiment has both.
     points: list[Values] = [{k: v for e in experiments for k, v in e.local(p).items()} for p in (values, *draws)]
     return (friction_comparison(list(experiments), points[0], points[1:]),)
 
 
 def check_scatter(tables: Sequence[Table[Any]]) -> None:
-    """Refuse readings that are all the same and have no reading error: their scatter could be 0, no proper posterior.
+    """Reject equal readings without reading error: a scatter of 0 makes the posterior improper.
 
     Raises
     ------
     InputError
-        If they are.
+        If all readings are equal and no reading error is stated.
     """
     if len({tuple(table.columns) for table in tables}) != 1:
         return

@@ -1,4 +1,4 @@
-"""Friction experiments: the coefficient against velocity (Fig. 2), the paper's protocol, the check of one surface."""
+"""Friction experiments: coefficient against velocity (Fig. 2), the paper's protocol, consistency of the surface."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from capsule_id.views import Comparison, Curve, Finding, Points
 
 
 def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
-    """Eq. (1) for a normal force of 1 N: its resistance is the friction coefficient, its mass is 1/g."""
+    """Return eq. (1) for a normal force of 1 N: its resistance is the friction coefficient, its mass is 1/g."""
     return CoulombStribeck(mu, 1.0, v_s)
 
 
 def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, float]:
-    """The paper's protocol: least squares of eq. (1) on points (speed, coefficient); static points at speed 0.
+    """Fit eq. (1) by least squares to points (speed, coefficient), as in the paper; static points have speed 0.
 
-    Returns mu and, where at least one point slides, v_s; empty where the fit does not converge.
+    Return mu and, with at least one sliding point, v_s; empty if the fit does not converge.
     """
     sliding = speed > 0.0
     if not sliding.any():
@@ -45,7 +45,7 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
 
 
 def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> list[Finding]:
-    """Expected: tilts and slides agree on the coefficient at break-away."""
+    """Check that tilts and slides agree on the coefficient at break-away."""
     tilts = [e for e in experiments if e.role == "static"]
     slides = [e for e in experiments if e.role != "static"]
     if not tilts or not slides:
@@ -65,7 +65,7 @@ def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) 
 
 
 class FrictionExperiment(SurfaceExperiment):
-    """An experiment on the surface: it shares the friction law, the paper's protocol and one panel with the others."""
+    """A friction experiment; all of them share the friction law, the paper's protocol and one panel."""
 
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
     checks = (check_one_surface,)
@@ -76,10 +76,10 @@ class FrictionExperiment(SurfaceExperiment):
 
     @abstractmethod
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Speed, m/s, and coefficient, as the paper reads them, (n,) each."""
+        """Speed, m/s, and friction coefficient by the paper's formulas, (n,) each."""
 
     def rough_starts(self) -> dict[str, Start]:
-        """Starts of mu and v_s, from the readings as the paper reads them; another law starts at its prior medians."""
+        """Starts of mu and v_s from the paper's estimates; another law starts at its prior medians."""
         speed, coefficient = self.paper_points()
         return {"mu": Start(float(np.max(coefficient)), 0.3), "v_s": Start(float(np.median(speed)), 0.5)}
 
@@ -90,14 +90,14 @@ class FrictionExperiment(SurfaceExperiment):
 def friction_comparison(
     experiments: list[FrictionExperiment], theta: ValuesBySymbol, draws: list[ValuesBySymbol]
 ) -> Comparison:
-    """Friction coefficient against velocity: readings, the paper's curve, ours with its band (paper, Fig. 2)."""
+    """Plot data of friction coefficient against velocity: readings, the paper's curve, this fit (paper, Fig. 2)."""
     friction = experiments[0].friction
     points = [Points(e.label, *e.paper_points(), role=e.role) for e in experiments]
     top = max(float(np.max(p.x)) for p in points)
     speed = np.linspace(0.0, 1.15 * top if top > 0 else 1.0, 161)
 
     def curve(values: ValuesBySymbol) -> np.ndarray:
-        # Tilts alone say nothing of sliding: the line through them is level.
+        # Tilts alone do not determine the sliding friction, so their line is horizontal.
         known = all(row.symbol in values for row in friction.parameters)
         return np.asarray(friction.coefficient(values).forward(speed if known else 0.0 * speed))
 

@@ -1,4 +1,4 @@
-"""The friction law of a fit: which parameters are sampled for it, and the law at their values."""
+"""Friction law of a fit: its sampled parameters, and the law at given values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -70,12 +70,12 @@ class FrictionModel:
 
     @property
     def name(self) -> str:
-        """For legends."""
+        """Name for legends."""
         return "eq. (1)" if self.is_proportional else self.law.__name__
 
     @property
     def is_proportional(self) -> bool:
-        """The law is eq. (1): proportional to the normal force, so that a coefficient needs no mass."""
+        """Whether the law is eq. (1): proportional to the normal force, so that a coefficient needs no mass."""
         return self.law is CoulombStribeck
 
     @property
@@ -85,7 +85,7 @@ class FrictionModel:
 
     @property
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
-        """Those that the break-away force depends on, by their effect at the prior medians: mu alone in eq. (1)."""
+        """Parameters that change the break-away force at the prior medians: mu alone in eq. (1)."""
         medians = {row.symbol: _prior_of(row).median for row in self.parameters}
         force = self._at(medians, 1.0).forward(0.0)
 
@@ -101,7 +101,7 @@ class FrictionModel:
         return () if self.is_proportional else ("m1", "m2")
 
     def check(self, known: Mapping[str, Parameter]) -> None:
-        """Refuse a law with a parameter that has the symbol of another one of ``known``, the package's and its kinds'.
+        """Reject a law that has the symbol of a different parameter in ``known`` (package and kinds).
 
         Raises
         ------
@@ -124,7 +124,7 @@ class FrictionModel:
         return PerWeight(self.force(theta), _weight(theta))
 
     def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
-        # What tilts alone do not sample has no effect at rest: any value serves there.
+        # Parameters that tilts do not sample have no effect at rest, so any value is valid there.
         known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in self.parameters}
         constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
         return cast(Any, self.law)(**known, **constant)
@@ -139,12 +139,12 @@ def _weight(theta: ValuesBySymbol) -> Any:
     return normal_force(theta["m1"], theta["m2"], theta["g"])
 
 
-#: The paper's law, for experiments of a fit without another one.
+#: Default friction law: eq. (1) of the paper.
 EQUATION_1 = FrictionModel()
 
 
 class SurfaceExperiment(Experiment):
-    """An experiment of a capsule that slides; its constructor takes the friction law besides table and rig.
+    """An experiment with a sliding capsule; its constructor takes a friction law in addition to table and rig.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Calibration lines share the rule on their reading errors, the paper's straight line and their lint."""
+"""Shared declarations of calibration lines: rule on reading errors, the paper's straight line, lint."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -38,7 +38,7 @@ MESSAGES = {
 
 
 def line_estimates(experiments: Sequence["Line"]) -> Values:
-    """The slopes of ordinary straight lines, by name; the mean over tables."""
+    """Return the slopes of ordinary straight lines, by name; the mean over tables."""
     slopes: dict[str, list[float]] = {}
     for e in experiments:
         slopes.setdefault(e.slope.name, []).append(e.ordinary_line()[0])
@@ -46,12 +46,12 @@ def line_estimates(experiments: Sequence["Line"]) -> Values:
 
 
 def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
-    """Two stated reading errors already have a ratio.
+    """Reject ``sd_ratio`` where both reading errors are stated, because they already define the ratio.
 
     Raises
     ------
     InputError
-        At ``sd_ratio``.
+        If ``sd_ratio`` and both reading errors are stated.
     """
     columns = entry.table.columns
     if entry.table.settings.sd_ratio is not None and all(column.sd is not None for column in columns.values()):
@@ -61,7 +61,7 @@ def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
 
 
 def lint_line(table: Table[Any]) -> Iterable[str]:
-    """Few rows, and reading errors that are not stated."""
+    """Report few rows and missing reading errors."""
     yield from lint_rows(table, 5)
     if table.settings.sd_ratio is None:
         yield from lint_reading_errors(table)

@@ -1,10 +1,10 @@
-"""A calibration line y = y0 + slope x: motor current and support spring share it.
+"""Calibration line y = y0 + slope x, shared by motor current and support spring.
 
-Errors in both columns where both reading errors are stated, or their ratio; otherwise one total scatter about the line
-(the reading errors that are stated come on top of it). The true point of a reading is integrated out along the line
-with a prior that is flat in its length, measured in units of the reading errors: then neither column is preferred, and
-the slope is that of orthogonal (Deming) regression (Hogg, Bovy & Lang 2010, section 7; Fuller 1987, section 1.3). A
-prior flat in x instead would draw the slope to that of ordinary least squares, low by (sd_x / sd of the x's)^2. The
+Both columns have errors where both reading errors, or their ratio, are stated. Otherwise the model has one total
+scatter about the line, in addition to any stated reading error. The true point of a reading is integrated out along
+the line. Its prior is flat in length, in units of the reading errors, so that neither column is preferred.
+The slope is then that of orthogonal (Deming) regression (Hogg, Bovy & Lang 2010, section 7; Fuller 1987, section 1.3).
+A prior flat in x would bias the slope towards ordinary least squares, by -(sd_x / sd of the x's)^2 relative. The
 intercept is integrated out under a wide normal prior.
 """
 
@@ -32,11 +32,11 @@ SCATTER_MEDIAN, SCATTER_FACTOR = 0.01, 100.0
 
 
 def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
-    """Expected: calibration lines that rise and are straight, flagged rows left out."""
+    """Check that calibration lines rise and are straight, without flagged rows."""
     findings = []
     for e in lines:
         theta, left_out = e.local(fit.values), fit.flagged.get(e.label, [])
-        # A single wild reading can tilt the whole line: that is the outlier's finding, not this one's.
+        # One outlier can tilt the whole line. The outlier check reports it, so it is excluded here.
         slope = refit(e, theta, left_out)[e.symbol][0]
         if slope <= 0.0:
             facts = {"name": e.slope.name, "slope": slope, "unit": e.slope.unit, "x": e.x_name, "y": e.y_name}
@@ -50,7 +50,7 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
 
 
 def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int]) -> tuple[float, float]:
-    """Is a calibration line bent? Relative departure at mid range of the best parabola, and the p-value of "none"."""
+    """Test a calibration line for curvature: relative deviation of the best parabola at mid range, and p-value."""
     misfit = line.misfit(theta)
     keep = np.setdiff1d(np.arange(line.n), left_out)
     x, sd = line.x[keep], misfit.sd[keep]
@@ -70,7 +70,7 @@ def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int])
 
 
 def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
-    """Slopes with and without flagged rows, beside the paper's ordinary line."""
+    """Compare the slopes with and without flagged rows and the paper's ordinary line."""
     rows = []
     for e in lines:
         theta, left_out = e.local(fit.values), fit.flagged.get(e.label, [])
@@ -90,16 +90,16 @@ def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
 
 
 class Line(Experiment):
-    """y against x; subclasses name the columns and the slope.
+    """A line y against x; subclasses name the columns and the slope.
 
     Attributes
     ----------
-    x, y : (n,) the readings, SI
+    x, y : (n,) readings, SI
     x_sd, y_sd : stated reading errors, SI
-    width : sd of the intercept's prior
+    width : sd of the intercept's prior, SI
     sd_ratio : stated ratio of both errors; None: not stated
-    symbol : of the slope
-    errors_known : both reading errors are stated
+    symbol : symbol of the slope
+    errors_known : whether both reading errors are stated
     """
 
     x: np.ndarray
@@ -151,7 +151,7 @@ class Line(Experiment):
 
     @property
     def errors(self) -> str:
-        """How the errors are modelled, in words for the report."""
+        """Error model in words, for the report."""
         if self.errors_known:
             return "errors in both columns, as stated"
         if self.sd_ratio is not None:
@@ -159,7 +159,7 @@ class Line(Experiment):
         return "one total scatter about the line (the reading errors of both columns are not stated)"
 
     def table_extras(self) -> dict[str, float]:
-        """Further columns of the table of calibration lines, name with unit -> number."""
+        """Additional columns of the table of calibration lines, name with unit -> number."""
         return {}
 
     @property

@@ -1,1 +1,1 @@
-"""The capsule driven by the motor, recorded in full motion."""
+"""Forced run: the motor drives the capsule, and the full motion is recorded."""

@@ -1,4 +1,4 @@
-"""Forced runs: columns, settings, rules, template, lint and what ``check`` says of a record."""
+"""Forced runs: columns, settings, rules, template, lint and description of a record."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod",
 
 CURRENT_AMPLITUDE = nuisance("I_d", "A", "amplitude of the current in a run", "I_d")
 CAPSULE_START = nuisance("capsule_start", "m/s", "speed of the capsule at the start of a run", "v_0")
-#: Noise and atanh of the noise's correlation, by channel.
+#: Parameters of each channel: noise level and atanh of the noise correlation.
 NOISE = {
     name: scatter(f"noise_{name}", unit, f"noise of {name} in a run", rf"\sigma_{{{index}}}")
     for name, unit, index in _CHANNELS
@@ -35,13 +35,13 @@ CORRELATION = {
 
 Gain = Annotated[float | None, QuantityRule("1")]
 Delay = Annotated[float | None, QuantityRule("s")]
-#: The hard spring of the paper's Fig. 10, N/m: only runs meet it.
+#: Stiffness of the hard spring of the paper's Fig. 10, N/m; it has no static test.
 RUN_SPRINGS = {"hard": 59410.0}
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(Settings):
-    """Settings of a forced run, SI. ``<channel>_gain_sd`` and ``<channel>_delay_sd``: sds of a gain and of a delay."""
+    """Settings of a forced run, SI; ``<channel>_gain_sd`` and ``<channel>_delay_sd`` are sds of gain and delay."""
 
     spring: Annotated[str, NameRule()]
     gap: Annotated[Quantity, QuantityRule("m", NOT_NEGATIVE, has_sd=True)]
@@ -62,7 +62,7 @@ class RunSettings(Settings):
 
     @property
     def angular_frequency(self) -> float:
-        """Stated frequency of the drive, rad/s; the reader has checked that there is one."""
+        """Stated frequency of the drive, rad/s; the reader ensures that it is stated."""
         if self.Omega is not None:
             return self.Omega
         assert self.f is not None, "a forced run has Omega or f"
@@ -70,7 +70,7 @@ class RunSettings(Settings):
 
 
 def _check_drive(entry: Entry[RunSettings]) -> None:
-    """One frequency; and an amplitude, from P_d or from the recorded current."""
+    """Require one frequency, and an amplitude from P_d or from the recorded current."""
     settings, columns = entry.table.settings, entry.table.columns
     stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
     if len(stated) != 1:
@@ -86,7 +86,7 @@ def _check_drive(entry: Entry[RunSettings]) -> None:
 
 
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
-    """What the run cannot measure, at rough values."""
+    """Report quantities that the run cannot measure, at rough values."""
     from capsule_id.experiments.families.friction_model import EQUATION_1
     from capsule_id.experiments.forced_run.feasibility import feasibility
 
@@ -106,7 +106,7 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
 
 
 def _lint_drive(table: Table[RunSettings]) -> Iterable[str]:
-    """A stated frequency that the current does not have."""
+    """Report a stated frequency that differs from that of the current."""
     return filter(None, [run_warning(table)])
 
 
@@ -216,7 +216,7 @@ KIND = Kind(
     columns={
         "time": ColumnRule("s", increasing=True),
         "x_rel": ColumnRule("m", varies=True),
-        "x_capsule": ColumnRule("m"),  # may be constant: a capsule that never moves is a result
+        "x_capsule": ColumnRule("m"),  # may be constant: a capsule that never moves is a valid result
         "acceleration_rod": ColumnRule("m/s^2", varies=True),
         "current": ColumnRule("A", varies=True),
     },

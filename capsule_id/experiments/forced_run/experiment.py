@@ -1,10 +1,10 @@
-"""Forced runs: the capsule driven by the motor, recorded in full motion (paper, sections 3 and 4).
+"""Likelihood of forced runs: the motor drives the capsule (paper, sections 3 and 4).
 
     theta -> capsule model from the first sample on -> channels -> misfit of each channel
 
-The channels that are recorded (x_rel, x_capsule, acceleration_rod, current) are independent given the motion; each has
-its own noise, and an offset that enters linearly and is integrated out (a gain and, to first order, a delay too, where
-their sd is stated). X2 = 0 at the first sample by convention: X2 and the offset of x_capsule cannot both be free.
+The recorded channels (x_rel, x_capsule, acceleration_rod, current) are independent given the motion. Each has its own
+noise, and an offset that enters linearly and is integrated out. A gain and, to first order, a delay are integrated
+out too where their sd is stated. X2 = 0 at the first sample, because the offset of x_capsule is free.
 """
 
 from dataclasses import replace
@@ -38,22 +38,22 @@ from capsule_id.records.view import view_record
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Finding
 
-#: Periods from rest after which a motion counts as settled (start = "settled").
+#: Excitation periods from rest after which the motion counts as periodic (start = "settled").
 SETTLING_PERIODS = 40
 
 
 class ForcedRun(CapsuleForward):
     """One record of the driven capsule.
 
-    Initial state, by ``start`` in rig.toml: "stuck" (capsule at rest and held: Y2 = 0), "moving" (Y2 sampled too),
-    "settled" (the periodic motion that the capsule settles on from rest), or "auto": stuck or moving, as the record
-    shows it.
+    The setting ``start`` in rig.toml selects the initial state: "stuck" (capsule at rest and held: Y2 = 0), "moving"
+    (Y2 sampled too), "settled" (the periodic motion reached from rest), or "auto". "auto" estimates stuck or moving
+    from the record.
 
-    The drive is K times the recorded current, whose amplitude and phase are sampled; without a current it is the stated
-    P_d. Where both are there, P_d is a second reading of the same amplitude.
+    The drive is K times the recorded current, whose amplitude and phase are sampled. Without a current it is the
+    stated P_d. Where both exist, P_d is a second reading of the same amplitude.
 
-    A part of a record (``parts``) has an initial state and offsets of its own; gap, drive, noise and delays are the
-    record's.
+    Each part of a record (``parts``) has its own initial state and offsets. All parts share gap, drive, noise and
+    delays.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class ForcedRun(CapsuleForward):
     widths : (channels,) sds of the offsets' priors, SI
     gain_sd, delay_sd : (channels,) stated, 1 and s
     reading_variance : (channels,) stated, SI
-    moves : factor of ``capsule_start``, 0 or 1: runs of both kinds are computed together
+    moves : factor of ``capsule_start``, 0 or 1, so that one program computes runs of both kinds
     """
 
     about: AboutRun = eqx.field(static=True)
@@ -98,14 +98,14 @@ class ForcedRun(CapsuleForward):
         leads: bool = True,
         capsule_rate: float | None = None,
     ) -> None:
-        """One record, or a part of one.
+        """Make one record, or a part of one.
 
         Parameters
         ----------
         part_of : label of the record; None: the table is a whole record
-        leads : False for a part in the middle of a record. The kind of its initial state is found anew, and a P_d that
-            is a second reading of the current's amplitude counts in the first part only.
-        capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or read off the record
+        leads : False for later parts of a record. The kind of their initial state is estimated again. A P_d that is a
+            second reading of the current's amplitude counts in the first part only.
+        capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or estimated
         """
         settings, gap = table.settings, table.settings.gap
         self.friction, self.smoothing = friction, None
@@ -119,7 +119,7 @@ class ForcedRun(CapsuleForward):
         self.drive_known = drive is not None and drive.sd == 0.0
         reading_sd = np.array([table.columns[name].reading_sd for name in self.channels])
         self.reading_variance = reading_sd**2
-        # A channel that does not vary has the size of its reading step, or next to none.
+        # A constant channel has zero range, so its scale is the reading error, or 1e-9 in SI units.
         ranges = np.maximum(np.ptp(self.values, axis=1), np.maximum(reading_sd, 1e-9))
         self.widths = NUISANCE_WIDTH * ranges
         self.gain_sd, self.has_gain = self._stated(settings, "gain")
@@ -138,19 +138,19 @@ class ForcedRun(CapsuleForward):
 
     @classmethod
     def make(cls, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> "tuple[ForcedRun, ...]":
-        """A run, or its parts where ``segment`` is stated."""
+        """Make a run, or its parts where ``segment`` is stated."""
         run, seconds = cls(table, rig, friction), table.settings.segment
         return (run,) if seconds is None else run.parts(seconds)
 
     def parts(self, seconds: float) -> "tuple[ForcedRun, ...]":
-        """The record in parts of about ``seconds``; the run itself where it is no longer than that."""
+        """Divide the record into parts of about ``seconds``; return the run itself if it is not longer."""
         tables = parts_of(self.table, seconds)
         if len(tables) == 1:
             return (self,)
         return tuple(self._remade(table, self.about.leads and i == 0) for i, table in enumerate(tables))
 
     def restarted(self, capsule_rate: float) -> "ForcedRun":
-        """The same record with its capsule at this speed, m/s, at the first sample; 0: stuck."""
+        """Return the same record with this capsule speed at the first sample, m/s; 0: stuck."""
         return self._remade(self.table, self.about.leads, capsule_rate)
 
     def _remade(self, table: Table, leads: bool, capsule_rate: float | None = None) -> "ForcedRun":
@@ -158,7 +158,7 @@ class ForcedRun(CapsuleForward):
         return run.with_smoothing(self.smoothing)
 
     def _stated(self, settings: Any, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
-        """Stated sd of a gain or delay by channel, and whether there is one."""
+        """Stated sd of a gain or delay by channel, and whether it is stated."""
         sds = [getattr(settings, f"{name}_{nuisance}_sd") for name in self.channels]
         return np.array([sd or 0.0 for sd in sds]), tuple(sd is not None for sd in sds)
 
@@ -176,7 +176,7 @@ class ForcedRun(CapsuleForward):
 
     @property
     def observed(self) -> np.ndarray:
-        """Channel after channel, then the stated P_d where the current is recorded too."""
+        """Readings channel by channel, then the stated P_d where the current is recorded too, SI."""
         readings = list(self.values)
         return np.concatenate([*readings, [self.drive]] if self.second_reading else readings)
 
@@ -188,17 +188,17 @@ class ForcedRun(CapsuleForward):
     def starts(self) -> dict[str, Start]:
         return run_starts(self)
 
-    # -- the motion and what is seen of it --------------------------------------------------------------------------
+    # -- the motion and its recorded channels -----------------------------------------------------------------------
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Excitation]:
-        """Parameters and drive of this run; leaves as in ``theta``."""
+        """Return parameters and drive of this run; leaves as in ``theta``."""
         gap = self.gap if self.gap_known else theta["G"]
         stated: Any = self.drive if self.drive_known else theta.get("P_d")
         force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
         return self.parameters_of(theta, theta["k2"], gap), Excitation(force, self.Omega, theta["phase"])
 
     def motion(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Trajectory:
-        """The model's motion at the samples (n,), X2 = 0 at the first."""
+        """Simulate the motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
         if self.settled:
             early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
@@ -211,15 +211,15 @@ class ForcedRun(CapsuleForward):
         return self.simulated(theta, p, e, self.time, initial)
 
     def predict(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> list[Any]:
-        """Noise-free channels (n,), offsets and gains left out, in the order of ``channels``.
+        """Predict noise-free channels (n,), without offsets and gains, in the order of ``channels``.
 
-        Concrete values in ``theta`` may carry a batch axis (draws,): then (draws, n).
+        Concrete values in ``theta`` may have a batch axis (draws,); the result is then (draws, n).
         """
         p, e = self.capsule(theta)
         run = self.motion(theta, xp)
         x_rel, rate = xp.asarray(run.X1 - run.X2), xp.asarray(run.Y1 - run.Y2)
 
-        # A batch axis of the leaves stands before the samples.
+        # A batch axis of the leaves precedes the axis of the samples.
         p, e, I_d = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], (p, e, theta.get("I_d", 0.0)))
         seen: list[Any] = []
         for name in self.channels:
@@ -240,7 +240,7 @@ class ForcedRun(CapsuleForward):
             if self.has_gain[i]:
                 columns.append(self.gain_sd[i] * seen)
             if self.has_delay[i]:
-                # To first order in the delay, which is a part of a sampling step.
+                # First order in the delay suffices, because the delay is shorter than a sampling step.
                 columns.append(-self.delay_sd[i] * xp.gradient(seen) / xp.gradient(xp.asarray(self.time)))
             raw, design = self.values[i] - seen, xp.stack(columns, axis=1)
             if self.coloured:
@@ -252,7 +252,7 @@ class ForcedRun(CapsuleForward):
             parts.append(Misfit(xp.reshape(raw, (1,)), self.drive_sd**2, 0.0, xp.zeros((1, 0))))
         return tuple(parts)
 
-    # -- what the fit, the checks and the report see -----------------------------------------------------------------
+    # -- interface to the fit, the checks and the report -------------------------------------------------------------
 
     def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[ForcedRun, ...], list[Finding]]":
         return predictable_parts(self, theta)
@@ -261,14 +261,14 @@ class ForcedRun(CapsuleForward):
         return corrected_start(self, theta)
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
-        # Coloured noise does not show in a record by itself.
+        # A record alone does not determine the level of coloured noise.
         if self.coloured:
             return 0.0
         shown = [max(self.rough.noise[name], self.table.columns[name].reading_sd) for name in self.channels]
         return max(float(theta[f"noise_{name}"]) / sd for name, sd in zip(self.channels, shown, strict=True))
 
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        """Through the filter, where x_rel is recorded and sampled evenly."""
+        """Filtered record, where x_rel is recorded and sampled evenly."""
         _, e = self.capsule(theta)
         try:
             view = view_record(self.table, K=theta["K"] if self.driven_by_current else None)

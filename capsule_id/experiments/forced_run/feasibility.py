@@ -1,7 +1,7 @@
-"""Whether a forced run can tell what it is made for: contact, a moving capsule, samples and length enough.
+"""Feasibility of a forced run: contact, motion of the capsule, sampling rate and length of the record.
 
-It judges settings, not readings, of a run that starts from rest: before a fit with rough values out of the same folder
-(``rough_values.py``), and just as well at fitted ones.
+The test uses settings, not readings, of a run that starts from rest. It runs before a fit with rough values of the same
+folder (``rough_values.py``), and after a fit with fitted values.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,16 +22,16 @@ from capsule_id.views import Finding
 if TYPE_CHECKING:
     from capsule_id.experiments.forced_run.experiment import ForcedRun
 
-#: Fewer samples than this in one touch of the support spring draw no impact.
+#: Smallest number of samples per contact with the support spring that resolves an impact.
 SAMPLES_PER_CONTACT = 10
-#: A run shows the settled motion in this many excitation periods ...
+#: Smallest number of excitation periods of periodic motion in a record, after the transient.
 SETTLED_PERIODS = 8
-#: ... after the start has died out: this many times 2 m1/c leave exp(-4) = 2 % of it.
+#: Duration of the transient in units of 2 m1/c; exp(-4) = 2 % of it remains.
 DECAY_TIMES = 4.0
-#: Excitation periods over which the rod on a held capsule is followed, the tolerance of that run, and the largest
-#: number of steps that it is made to take for the sake of its contacts (a drive of years has no contacts to miss).
+#: Simulated excitation periods of the rod on a held capsule, relative tolerance, and largest number of steps imposed to
+#: resolve contacts. The limit bounds the effort for drives of extremely long period.
 HELD_PERIODS, HELD_TOLERANCE, HELD_STEPS = 12, 1e-6, 20_000
-#: ... and no longer than this many times 2 m1/c.
+#: Largest simulated duration of the rod on a held capsule, in units of 2 m1/c.
 HELD_DECAYS = 50.0
 
 
@@ -45,14 +45,14 @@ class RunConditions:
 
 
 def stated_conditions(table: Table, K: float) -> RunConditions:
-    """Of a forced run: P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
+    """Conditions of a forced run; P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
     Omega, stated = table.settings.angular_frequency, table.settings.P_d
     P_d = K * tone_at(table["time"], table["current"], Omega)[0] if stated is None else stated.value
     return RunConditions(Omega, P_d, table.settings.gap.value)
 
 
 def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
-    """Expected: every run can determine what it is made for, at the point fit."""
+    """Check that the settings of every run allow it to determine its parameters, at the point fit."""
     findings = []
     for run in runs:
         theta = run.local(fit.values)
@@ -66,7 +66,7 @@ def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
 def feasibility(
     table: Table, theta: Mapping[str, float], F_b: float, conditions: RunConditions | None = None
 ) -> list[Finding]:
-    """Findings, level ``warn``, on one forced run; none where its settings can do what they are for.
+    """Return findings of level ``warn`` on the settings of one forced run; none where they are feasible.
 
     Parameters
     ----------
@@ -90,9 +90,9 @@ def feasibility(
 
 
 def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, bool]:
-    """Largest |f|, N, that the rod puts on a capsule held at rest, starting from rest, and whether it ever touches.
+    """Largest force |f| of the rod on a capsule held at rest, N, and whether the rod touches the spring.
 
-    A capsule at rest stays there while |f| <= F_b, so this is exact for the question whether it sets off.
+    The rod starts from rest. A capsule at rest sticks while |f| <= F_b, so the test for its motion is exact.
     """
     m1, k1, c, k2 = (float(theta[name]) for name in ("m1", "k1", "c", "k2"))
     held = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=drive.G)
@@ -103,7 +103,7 @@ def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, b
         return [y, float(rod_acceleration(held, e, t, x, y))]
 
     period = 2.0 * np.pi / drive.Omega
-    # The drive begins at its peak: once a slow one's start has died out, nothing larger comes.
+    # The drive begins at its peak. After the transient of a slow drive the force never exceeds that maximum.
     span = min(HELD_PERIODS * period, HELD_DECAYS * 2.0 * m1 / c)
     touch = max(0.25 * contact_time(m1, float("inf"), k2), span / HELD_STEPS)
     step = min(period / 40.0, touch)
@@ -112,12 +112,12 @@ def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, b
 
 
 def contact_time(m1: float, m2: float, k2: float) -> float:
-    """Half a period of the rod on the support spring, pi sqrt(m*/k2), s; m* the reduced mass, m1 where m2 is infinite."""
+    """Half a period of the rod on the support spring, pi sqrt(m*/k2), s; m* is the reduced mass (m1 for infinite m2)."""
     return float(np.pi * np.sqrt(1.0 / ((1.0 / m1 + 1.0 / m2) * k2)))
 
 
 def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[Finding]:
-    """Samples within a touch, where there are touches; the shortest is that of a capsule which gives way."""
+    """Check the number of samples per contact; the shortest contact is that with a sliding capsule."""
     step = float(np.median(np.diff(table["time"])))
     touch = contact_time(theta["m1"], theta["m2"], theta["k2"])
     if not touches or touch / step >= SAMPLES_PER_CONTACT:
@@ -132,7 +132,7 @@ def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[F
 
 
 def _length(table: Table, theta: Mapping[str, float], drive: RunConditions) -> list[Finding]:
-    """Excitation periods left once the start has died out."""
+    """Check the number of excitation periods after the transient."""
     time, start = table["time"], DECAY_TIMES * 2.0 * theta["m1"] / theta["c"]
     period = 2.0 * np.pi / drive.Omega
     settled = (float(time[-1] - time[0]) - start) / period

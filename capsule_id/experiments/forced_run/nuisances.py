@@ -1,4 +1,4 @@
-"""The parameters of a forced run with their priors, and where a fit of them may start."""
+"""Parameters of a forced run with their priors and starting values."""
 
 from typing import TYPE_CHECKING
 
@@ -12,16 +12,16 @@ from capsule_id.parameters import Parameter, Prior, parameter
 if TYPE_CHECKING:
     from capsule_id.experiments.forced_run.experiment import ForcedRun
 
-#: Default prior of a channel's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
+#: Default prior of a channel's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 #: Default prior of the current's amplitude: log-normal about half its range.
 AMPLITUDE_FACTOR = 3.0
-#: sd of the normal prior of the drive's phase, rad: wide, and proper.
+#: sd of the normal prior of the drive's phase, rad; wide but proper.
 PHASE_WIDTH = np.pi
 
 
 def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...]:
-    """Those sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
+    """Return the parameters sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
     of, whole, settings = run.label, run.about.record, run.table.settings
     rows = [parameter("k1"), parameter("c"), *run.friction.parameters, parameter("k2", run.spring)]
     if not run.gap_known:
@@ -46,7 +46,7 @@ def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...
 
 
 def run_starts(run: "ForcedRun") -> dict[str, Start]:
-    """From the record: nuisances alone; what the bench measures has its start there, or at its prior's centre."""
+    """Starts of the nuisances from the record; other parameters start at bench estimates or prior centres."""
     rough, of = run.rough, run.label
     starts = _starts_of_record(run) if run.about.leads else {}
     if not run.settled:

@@ -1,4 +1,4 @@
-"""What the report shows of a forced run: every channel with its residuals, and the phase portrait."""
+"""Plot data of a forced run: every channel with its residuals, and the phase portrait."""
 
 from typing import TYPE_CHECKING
 
@@ -13,18 +13,18 @@ from capsule_id.views import Comparison, Curve, Points
 if TYPE_CHECKING:
     from capsule_id.experiments.forced_run.experiment import ForcedRun
 
-#: Channels that the motion moves; the current is the drive itself.
+#: Channels that depend on the motion; the current is the drive itself.
 SHOWN = {"x_rel": "x_rel", "x_capsule": "capsule", "acceleration_rod": "rod's acceleration"}
-#: Posterior draws behind a band; lags of an autocorrelation.
+#: Largest number of posterior draws for a band; number of lags of an autocorrelation.
 BAND_DRAWS, LAGS = 50, 60
-#: Order of the Savitzky–Golay filter behind the measured phase portrait.
+#: Polynomial order of the Savitzky–Golay filter for the measured phase portrait.
 PORTRAIT_ORDER = 3
 
 
 def run_comparisons(run: "ForcedRun", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-    """A panel per channel with prediction, 95 % band, residuals and their autocorrelation; then the phase portrait.
+    """Return a panel per channel (prediction, 95 % band, residuals, autocorrelation), then the phase portrait.
 
-    ``theta`` is the point fit; bands come from at most ``BAND_DRAWS`` of ``draws`` and leave the noise out.
+    ``theta`` is the point fit. Bands use at most ``BAND_DRAWS`` of ``draws`` and exclude the noise.
     """
     predicted = run.predict(theta, np)
     scaled = run.scaled(theta, np)
@@ -37,7 +37,7 @@ def run_comparisons(run: "ForcedRun", theta: ValuesBySymbol, draws: list[ValuesB
         column, part = run.table.columns[name], scaled[i]
         residuals, nuisance = part.at_nuisance_mean(np)
         fitted = run.values[i] - part.raw + part.design @ nuisance
-        # Offset and gain of a draw hardly differ from those of the fit: the band shows the motion's uncertainty.
+        # The band represents the uncertainty of the motion: offset and gain of a draw hardly differ from the fit.
         shift = fitted - predicted[i]
         lower, upper = band((bands[i] + shift) * column.to_display) if draws else (None, None)
         panels.append(
@@ -61,7 +61,7 @@ def run_comparisons(run: "ForcedRun", theta: ValuesBySymbol, draws: list[ValuesB
 
 
 def _portrait(run: "ForcedRun", theta: ValuesBySymbol) -> list[Comparison]:
-    """Rate of x_rel against x_rel, [] where the record is sampled unevenly: measured through Savitzky–Golay."""
+    """Phase portrait, rate of x_rel by Savitzky–Golay against x_rel; [] for a record sampled unevenly."""
     index = run.channels.index("x_rel")
     values, unit = run.values[index], run.table.columns["x_rel"].to_display
     motion = run.motion(theta, np)
@@ -93,7 +93,7 @@ def _portrait(run: "ForcedRun", theta: ValuesBySymbol) -> list[Comparison]:
 
 
 def _filtered(time: np.ndarray, values: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
-    """(value, rate), without the half window at both ends where the derivative is that of a polynomial's edge."""
+    """Smoothed value and rate, without the half window at both ends, where the derivative is inaccurate."""
     half = window_samples(window, sampling_step(time)) // 2
     inside = slice(half, len(time) - half)
     value, rate = (savitzky_golay(time, values, window, PORTRAIT_ORDER, derivative=n) for n in (0, 1))

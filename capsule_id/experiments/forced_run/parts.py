@@ -1,7 +1,7 @@
-"""Multiple shooting: a record cut into parts, each with an initial state of its own.
+"""Multiple shooting: division of a record into parts, each with its own initial state.
 
-Where a motion amplifies small errors, one initial state cannot predict a whole record; parts of a few periods can be
-predicted. Gap, drive, noise and delays stay the record's.
+Where a motion amplifies small errors, one initial state cannot predict a whole record. It can predict a part of a few
+periods. All parts share gap, drive, noise and delays.
 """
 
 from dataclasses import replace
@@ -12,14 +12,14 @@ from capsule_id.experiments.forced_run.start import PARABOLA_SAMPLES
 from capsule_id.rig.model import Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 
-#: Labels of parts: the record's, this mark (no file name has it), a number.
+#: Separator between record label and number in the label of a part. File names do not contain it.
 PART_MARK = "~"
-#: A cut may move by this share of a part's length to where the motion is smooth.
+#: Largest shift of a cut towards smooth motion, as a fraction of a part's length.
 LEEWAY = 0.3
 
 
 def parts_of(table: Table, seconds: float) -> list[Table]:
-    """The record in parts of about ``seconds``; [``table``] where it is no longer than that."""
+    """Divide the record into parts of about ``seconds``; return [``table``] if it is not longer."""
     time = table["time"]
     count = max(1, min(round((time[-1] - time[0]) / seconds), len(time) // SHORTEST_RECORD))
     if count == 1:
@@ -31,8 +31,8 @@ def parts_of(table: Table, seconds: float) -> list[Table]:
 def _edges(table: Table, count: int) -> list[int]:
     """First samples of ``count`` parts, and the end.
 
-    The state at a first sample is read off a parabola through the samples that follow, so that a cut falls where no
-    contact begins or ends and the capsule neither stops nor sets off within them.
+    The state at a first sample comes from a parabola through the next samples. A cut therefore avoids samples where a
+    contact begins or ends, or where the capsule sticks or slips.
     """
     samples = len(table["time"])
     length, rough = samples / count, _roughness(table)
@@ -47,10 +47,10 @@ def _edges(table: Table, count: int) -> list[int]:
 
 
 def _roughness(table: Table) -> np.ndarray:
-    """(n,) by how much the samples from each on miss a parabola, summed over the places, each in its own noise."""
+    """(n,) residual of a parabola through the samples from each one on, summed over positions, in units of noise."""
     time, n = table["time"], PARABOLA_SAMPLES
     total = np.zeros(len(time))
-    # Even samples: the same projection everywhere; for uneven ones nearly so, which is enough to choose by.
+    # One projection serves all samples. It is approximate for uneven sampling, which suffices to choose a cut.
     design = np.vander(np.arange(n) - 0.5 * (n - 1), 3)
     rest = np.eye(n) - design @ np.linalg.pinv(design)
     for name in ("x_rel", "x_capsule"):

@@ -1,4 +1,4 @@
-"""Whether one initial state predicts the motion of a whole record."""
+"""Test whether one initial state predicts the motion of a whole record."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -16,16 +16,16 @@ from capsule_id.views import Finding
 if TYPE_CHECKING:
     from capsule_id.experiments.forced_run.experiment import ForcedRun
 
-#: An error in the initial state that grows by this factor within the record makes an open-loop fit meaningless.
+#: Largest growth factor of an initial error within the record, dimensionless. Above it one initial state cannot fit it.
 LARGEST_GROWTH = 1e3
-#: A part of a cut record may amplify an error of its start this much, and is no shorter than so many periods.
+#: Target growth factor of an initial error within a part, dimensionless; shortest part, excitation periods.
 PART_GROWTH, PART_PERIODS = 30.0, 2.0
 
 
 def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
-    """Largest factor by which a small error of the initial state has grown at the end of the record, 1.
+    """Largest growth factor of a small initial error at the end of the record, dimensionless.
 
-    Positions count in units of the motion's length, velocities in that times Omega.
+    Positions are scaled by the amplitude of the motion, velocities by amplitude times Omega.
     """
     size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
     motion = run.motion(theta, np)
@@ -50,7 +50,7 @@ def _derivative_of_end(
 
 
 def predictable_parts(run: "ForcedRun", theta: ValuesBySymbol) -> "tuple[tuple[ForcedRun, ...], list[Finding]]":
-    """``run`` in parts, where it amplifies an error of its initial state too much at ``theta``; and what was done."""
+    """Divide ``run`` where it amplifies errors of its initial state too much at ``theta``; also return findings."""
     if run.settled:
         return (run,), []
     factor = growth(run, theta)
@@ -65,7 +65,7 @@ def predictable_parts(run: "ForcedRun", theta: ValuesBySymbol) -> "tuple[tuple[F
 
 
 def _part_length(run: "ForcedRun", factor: float) -> float:
-    """s over which errors grow about ``PART_GROWTH`` times."""
+    """Duration over which errors grow about ``PART_GROWTH`` times, s."""
     shortest = PART_PERIODS * 2.0 * np.pi / run.Omega
     duration = float(run.time[-1] - run.time[0])
     if not np.isfinite(factor):
@@ -74,7 +74,7 @@ def _part_length(run: "ForcedRun", factor: float) -> float:
 
 
 def check_predictable(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
-    """Expected: every run's motion predictable over its record, and complete."""
+    """Check that the motion of every run is predictable over its record, and complete."""
     findings = []
     for run in runs:
         local = run.local(fit.values)

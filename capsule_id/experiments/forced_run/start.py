@@ -1,4 +1,4 @@
-"""Where the fit of a forced run may start: state and drive at the first sample, read off the record itself."""
+"""Starting values of a forced run: state and drive at the first sample, estimated from the record."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,28 +10,28 @@ from capsule_id.experiments.base import About
 from capsule_id.records.noise import noise_level
 from capsule_id.records.tone import tone_at
 
-#: Samples of the polynomials through the start of the record: a straight line tells whether the capsule moves, a
-#: parabola where the rod is and how fast.
+#: Number of samples of the polynomials through the start of the record. A line gives the capsule's speed, a parabola
+#: position and speed of the rod.
 LINE_SAMPLES, PARABOLA_SAMPLES = 4, 9
-#: The capsule counts as moving where its rate at the start stands out of its standard error by this factor.
+#: The capsule counts as moving where its initial speed exceeds its standard error by this factor.
 MOVING = 4.0
-#: Without a current the drive's phase is that of x_rel's fundamental, ahead by the lag of a rod of this frequency, rad/s,
-#: and damping ratio (the middle of the default priors): rough, and good enough for a start.
+#: Frequency, rad/s, and damping ratio of the rod at the medians of the default priors. Without a current they give the
+#: lag of x_rel's fundamental behind the drive, which suffices as a starting value.
 ROD_FREQUENCY, ROD_DAMPING = 115.0, 0.16
 
 
 @dataclass(frozen=True)
 class RunStart:
-    """Read off a record, SI.
+    """Starting values estimated from a record, SI.
 
     Attributes
     ----------
-    kind : "moving" where the capsule visibly moves at the first sample, else "stuck"
+    kind : "moving" where the capsule moves significantly at the first sample, else "stuck"
     x_rel, rate, capsule_rate : m, m/s, m/s at the first sample; 0 where the channel is missing
-    length : size of the rod's motion, m
-    amplitude : of the current, A (NaN where it is not recorded)
-    phase : of the drive, rad, in (-pi, pi]
-    noise : by channel
+    length : amplitude of the rod's motion, m
+    amplitude : amplitude of the current, A (NaN where it is not recorded)
+    phase : phase of the drive, rad, in (-pi, pi]
+    noise : noise level by channel
     """
 
     kind: Literal["stuck", "moving"]
@@ -46,15 +46,15 @@ class RunStart:
 
 @dataclass(frozen=True)
 class AboutRun(About):
-    """What a run was made of.
+    """Inputs of a run that no likelihood reads.
 
     Attributes
     ----------
-    record : label of the record that the run is, or is a part of
-    leads : the run is a whole record, or the first part of one
-    start : the kind of initial state
-    start_is_open : no kind of initial state was stated
-    rough : state and drive at the first sample, read off the record (the speed by the model, where that found one)
+    record : label of the whole record
+    leads : whether the run is a whole record, or the first part of one
+    start : kind of initial state
+    start_is_open : whether no kind of initial state is stated
+    rough : state and drive at the first sample, estimated from the record (the speed by the model, where available)
     """
 
     record: str = field(compare=False)
@@ -65,13 +65,13 @@ class AboutRun(About):
 
 
 def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: float) -> RunStart:
-    """Start of a run.
+    """Estimate the starting values of a run.
 
     Parameters
     ----------
     time : (n,) s
     channels : by column name, (n,) each, SI; at least one
-    Omega : of the drive, rad/s
+    Omega : excitation frequency, rad/s
     """
     noise = {name: max(noise_level(y), 1e-5 * float(np.ptp(y)), 1e-12) for name, y in channels.items()}
     amplitude, phase = float("nan"), 0.0
@@ -86,7 +86,7 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
         x_rel, rate = _polynomial(time, channels["x_rel"], PARABOLA_SAMPLES, 2)[0]
         length = 0.5 * float(np.ptp(channels["x_rel"]))
     elif "acceleration_rod" in channels:
-        # Contacts are spikes: the quartiles are those of the flight between them.
+        # Contacts are short spikes, and quartiles are robust against them.
         length = float(np.subtract(*np.quantile(channels["acceleration_rod"], [0.75, 0.25]))) / Omega**2
     elif "x_capsule" in channels:
         length = max(float(np.ptp(channels["x_capsule"])), 1e-4)
@@ -101,7 +101,7 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
 
 
 def _polynomial(time: np.ndarray, values: np.ndarray, samples: int, order: int) -> tuple[tuple[float, float], float]:
-    """(value, rate) at the first sample of a polynomial through the first ``samples``, and sd of the rate per noise sd."""
+    """Value and rate at the first sample, of a polynomial through ``samples`` samples; sd of the rate per noise sd."""
     samples = min(samples, len(time))
     design = np.vander(time[:samples] - time[0], order + 1, increasing=True)
     inverse = np.linalg.pinv(design)

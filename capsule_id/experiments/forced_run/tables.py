@@ -1,4 +1,4 @@
-"""Tables of forced runs: nondimensional groups, and the motion that the model predicts."""
+"""Tables of forced runs: nondimensional groups and predicted motion."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
-    """The paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
+    """Return the paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
 
     Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0. Omega0 = sqrt(k1/m1); F_b is the break-away force.
     """
@@ -52,7 +52,7 @@ def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
 
 
 def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
-    """Contacts and mean velocity of the capsule over the record: observed, at the point fit, 95 % band of the draws."""
+    """Contacts and mean velocity of the capsule over the record: observed, point fit, 95 % credible interval."""
     rows = {}
     for run in runs:
         best = run.motion(run.local(fit.values), np)

@@ -1,4 +1,4 @@
-"""Forced runs with known truth: the exact model, cut out of full motion, as the channels of the rig would record it."""
+"""Synthetic forced runs with known truth: samples of the exact model after its transient, with sensor errors."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -15,7 +15,7 @@ from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simu
 
 @dataclass(frozen=True)
 class RunSetup:
-    """What the experimenter sets for one run, SI: the spring by name, the drive and the gap."""
+    """Settings of one run, SI: the spring by name, the drive and the gap."""
 
     spring: str
     Omega: float
@@ -23,27 +23,30 @@ class RunSetup:
     G: float
 
 
-#: One run near the paper's Fig. 6, one of its Fig. 11, two of its Fig. 10.
+#: Runs of the synthetic rig: one near the paper's Fig. 6, one of its Fig. 11, two of its Fig. 10.
 RUNS = (
     RunSetup("medium", 34.56, 4.0, 1.0e-3),
     RunSetup("stiff", 73.58, 1.2, 1.0e-3),
     RunSetup("hard", 26.58, 2.5, 1.5e-3),
     RunSetup("hard", 46.0, 2.5, 1.5e-3),
 )
-#: The springs that only runs meet have no static test but a prior with this factor.
+#: Factor of the prior of springs without a static test, dimensionless.
 SPRING_FACTOR = 1.5
-#: Excitation periods from rest that are left out before the cut; the cut itself falls at a random phase.
+#: Excitation periods from rest before the record starts; the record starts at a random phase.
 SETTLED = 40
+#: Number of samples and sampling rate, Hz, of a record.
 SAMPLES, RATE = 2000, 1000.0
+#: Noise level of each channel, SI (m, m, m/s^2, A).
 NOISE_SD = {"x_rel": 10e-6, "x_capsule": 5e-6, "acceleration_rod": 1.0, "current": 5e-3}
-#: Zero errors of the channels, sd. The capsule's place has none: it counts from the first sample of the run.
+#: Standard deviation of the channels' zero errors, SI. x_capsule has none, because it is zero at the first sample.
 OFFSET_SD = {"x_rel": 20e-6, "acceleration_rod": 0.5, "current": 20e-3}
+#: Standard deviation of the measured gap, m.
 GAP_SD = 0.02e-3
 
 
 @dataclass(frozen=True)
 class RunTruth:
-    """Everything behind one run, SI. ``x_rel``, ``Y1``, ``Y2``: the state at the first sample, where X2 = 0."""
+    """True values of one run, SI; ``x_rel``, ``Y1``, ``Y2`` are the state at the first sample, where X2 = 0."""
 
     spring: str
     G: float
@@ -60,7 +63,7 @@ class RunTruth:
 
 @dataclass(frozen=True)
 class SyntheticRun:
-    """A run as measured: ``channels`` of (n,) SI beside ``time``, the gap as read off, and the truth."""
+    """A measured run: ``time`` and ``channels`` (n,) SI, the measured gap, and the truth."""
 
     time: np.ndarray
     channels: dict[str, np.ndarray]
@@ -68,7 +71,7 @@ class SyntheticRun:
     truth: RunTruth
 
     def table(self) -> dict[str, np.ndarray]:
-        """Columns of the file, in the order and the units of its header; digits far below the noise are not written."""
+        """Columns of the file, in the order and units of its header, rounded to digits above the noise."""
         return {
             "time [s]": self.time,
             "x_rel [mm]": np.round(1e3 * self.channels["x_rel"], 5),
@@ -84,7 +87,7 @@ class SyntheticRun:
 
 
 def measure(values: Values, seed: int) -> Twin:
-    """The runs, priors of the springs that only they meet, and the truth of every run by label.
+    """Simulate the runs, with priors of springs without a static test and the truth of every run by label.
 
     Raises
     ------
@@ -97,12 +100,12 @@ def measure(values: Values, seed: int) -> Twin:
 
 
 def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, ...] = RUNS) -> list[SyntheticRun]:
-    """Simulate and measure every run; each has a generator of its own, none is the bench's.
+    """Simulate and measure every run; each has its own random generator, independent of the bench tests.
 
     Parameters
     ----------
-    parameters : true values by name, SI: m1 m2 k1 c mu v_s g K, and k2[spring] of every spring that a run meets
-    seed : of the rig
+    parameters : true values by name, SI: m1 m2 k1 c mu v_s g K, and k2[spring] of every spring of the runs
+    seed : seed of the rig
     runs : settings; the current is set so that K times its amplitude is P_d
 
     Raises
@@ -141,7 +144,7 @@ def _measure(
     state: np.ndarray,
     phase: float,
 ) -> SyntheticRun:
-    """One run through its sensors: state (4, n) is the exact motion from the cut on."""
+    """Apply the sensors to one run; state (4, n) is the exact motion from the first sample on."""
     X1, Y1, X2, Y2 = state
     x_rel, e = X1 - X2, Excitation(run.P_d, run.Omega, phase)
     p = _capsule(parameters, parameters[f"k2[{run.spring}]"], run.G)
@@ -164,9 +167,9 @@ def _measure(
 
 
 def spring_priors(parameters: Mapping[str, float], seed: int) -> tuple[str, ...]:
-    """Lines of ``[prior]`` for the springs that only runs meet, each off its truth as its factor says."""
+    """Lines of ``[prior]`` for springs without a static test; medians scatter about the truth by the prior's factor."""
     spread = np.log(SPRING_FACTOR) / QUANTILE_975
-    # a key that no run's generator has, so that neither depends on how many there are of the other
+    # A key that no run uses makes the priors independent of the number of runs.
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**20,)))
     lines = []
     for spring in RUN_SPRINGS:

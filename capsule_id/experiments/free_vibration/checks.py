@@ -1,4 +1,4 @@
-"""Checks of free decays: one stiffness at every amplitude, and a decay that is free."""
+"""Checks of free decays: equal stiffness at every amplitude, no slip and no contact."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def check_stiffness(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
-    """The paper's "linear near the working point": k1 of single records against release amplitude."""
+    """Check that k1 of single records does not depend on amplitude (the paper's "linear near the working point")."""
     if len(records) < 2:
         return []
     k1, sd, _ = stiffness_by_record(records, fit.values)
@@ -32,14 +32,14 @@ def check_stiffness(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
 def stiffness_by_record(
     records: "Sequence[FreeVibration]", values: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """k1, its standard error and the largest deflection of every record, (records,) SI."""
+    """Estimate k1, its standard error and the largest deflection of every record, (records,) SI."""
     estimates = [refit(e, e.local(values), [])["k1"] for e in records]
     k1, sd = (np.array(column) for column in zip(*estimates, strict=True))
     return k1, sd, np.array([e.largest_deflection for e in records])
 
 
 def check_free_decay(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
-    """Expected: a free capsule that does not slip, and a rod that does not reach the support spring."""
+    """Check that a free capsule does not slip and that the rod does not touch the support spring."""
     findings, theta = [], fit.values
     for e in records:
         needed = {"m2", *(row.symbol for row in e.friction.parameters_at_rest)}

@@ -1,7 +1,7 @@
-"""Free decays in closed form, or as near to it as the damping allows: viscous, viscous + dry, viscous + quadratic.
+"""Models of free decays with viscous, viscous and dry (closed forms), or viscous and quadratic damping (numerical).
 
 m1 x'' + c x' + [F_dry sign(x')] + [c_q x'|x'|] + k1 x = 0, capsule at rest, x = x_rel about its equilibrium.
-gamma = c/(2 m1), omega = sqrt(k1/m1 - gamma^2); only underdamped decays oscillate and are modelled.
+gamma = c/(2 m1), omega = sqrt(k1/m1 - gamma^2). Only underdamped decays are modelled.
 """
 
 from functools import partial
@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-#: Largest phase, rad, that one Runge–Kutta step of the quadratically damped decay may cover: its error per period is
-#: then below 1e-6 of the amplitude.
+#: Largest phase of one Runge–Kutta step of the quadratically damped decay, rad. The error per period is then below 1e-6
+#: of the amplitude.
 STEP_PHASE = 0.1
 
 
 def rates(k1: Any, c: Any, m1: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
-    """gamma, 1/s, and omega, rad/s (NaN where overdamped)."""
+    """Decay rate gamma, 1/s, and frequency omega, rad/s (NaN where overdamped)."""
     gamma = c / (2.0 * m1)
     return gamma, xp.sqrt(k1 / m1 - gamma**2)
 
@@ -34,7 +34,7 @@ def viscous_basis(time: Any, k1: Any, c: Any, m1: Any, xp: ModuleType = jnp) -> 
 def dry_decay(
     time: np.ndarray, k1: Any, c: Any, m1: Any, F_dry: Any, amplitude: Any, turning_time: Any, half_cycles: int
 ) -> Any:
-    """Viscous and dry damping: turning points stay pi/omega apart, and each half cycle is a viscous one about F_dry/k1.
+    """Decay with viscous and dry damping: each half cycle lasts pi/omega and is viscous about +-F_dry/k1.
 
     Parameters
     ----------
@@ -44,14 +44,14 @@ def dry_decay(
 
     Returns
     -------
-    (n,) m. Samples before ``turning_time`` lie on the half cycle that leads to it.
+    x_rel (n,), m. Samples before ``turning_time`` lie on the half cycle that ends there.
     """
     gamma, omega = rates(k1, c, m1)
     half_period = jnp.pi / omega
     ratio, shift = jnp.exp(-gamma * half_period), F_dry / k1
 
     def next_amplitude(a: Any, _: None) -> tuple[Any, Any]:
-        # Amplitudes count positive on the side of their own half cycle; a rod that has stopped stays where it is.
+        # Amplitudes are positive on the side of their own half cycle. A stuck rod keeps its position.
         return jnp.where(a > shift, ratio * a - shift * (1.0 + ratio), -a), a
 
     before = (amplitude + shift * (1.0 + ratio)) / ratio
@@ -71,7 +71,7 @@ def dry_decay(
 def quadratic_decay(
     time: np.ndarray, k1: Any, c: Any, m1: Any, c_q: Any, x_start: Any, y_start: Any, substeps: int
 ) -> Any:
-    """Viscous and quadratic damping by Runge–Kutta of order 4, ``substeps`` equal steps between two samples, (n,) m."""
+    """Decay with viscous and quadratic damping (n,), m, by Runge–Kutta 4 with ``substeps`` steps between samples."""
 
     def rate(state: Any) -> Any:
         x, y = state

@@ -1,8 +1,8 @@
-"""Moments of a uniformly sampled decay in O(sqrt(n)) transcendental functions, to rounding the same as by summation.
+"""Moments of a uniformly sampled decay with O(sqrt(n)) transcendental functions, equal to sums up to rounding.
 
 The two viscous solutions at t_j = j h are the real and the imaginary part of z^j, z = exp((-gamma + i omega) h). Their
-sums and products are geometric series; sum_j y_j z^j is a polynomial, evaluated with j = B a + b (baby and giant
-steps): one matrix product instead of n complex exponentials.
+sums and products are geometric series. The polynomial sum_j y_j z^j is evaluated with j = B a + b (baby-step
+giant-step). This needs one matrix product instead of n complex exponentials.
 """
 
 from typing import Any
@@ -12,14 +12,14 @@ import numpy as np
 
 
 def fold(values: np.ndarray) -> np.ndarray:
-    """(giant, baby) the record (n,) in rows of about sqrt(n), the last one filled with zeros."""
+    """Reshape the record (n,) to (giant, baby), rows of about sqrt(n); the last row is padded with zeros."""
     baby = max(int(np.sqrt(len(values))), 1)
     giant = -(-len(values) // baby)
     return np.pad(values, (0, baby * giant - len(values))).reshape(giant, baby)
 
 
 def decay_moments(folded: Any, n: int, step: Any, gamma: Any, omega: Any) -> tuple[Any, Any, Any]:
-    """y'y (), A'y (3,) and A'A (3, 3) for A = [Re z^j, Im z^j, 1], j = 0 .. n-1.
+    """Moments y'y (), A'y (3,) and A'A (3, 3) for A = [Re z^j, Im z^j, 1], j = 0 .. n-1.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def _series(exponent: Any, n: int) -> Any:
 
 
 def uniform_step(time: np.ndarray) -> float | None:
-    """The sampling step, s, where every sample stands on the grid to 1e-9 of it (file rounding excluded); else None."""
+    """Sampling step, s, where every sample lies on the grid to 1e-9 of a step plus file rounding; else None."""
     step = float((time[-1] - time[0]) / (len(time) - 1))
     grid = time[0] + step * np.arange(len(time))
     return step if np.max(np.abs(time - grid)) < 1e-9 * step + 1e-12 else None

@@ -1,8 +1,8 @@
-"""Do damping and frequency of a decay stay the same while it dies away? A hint out of its peaks, no test.
+"""Trend of damping and frequency over the amplitude of a decay, from its peaks; an indication, not a test.
 
-A viscous decay about a linear spring has one logarithmic decrement and one frequency at every amplitude. Quadratic
-damping has a decrement that falls with the amplitude, dry friction one that rises, and a frequency that drifts means a
-stiffness that depends on the amplitude.
+A viscous decay with a linear spring has the same logarithmic decrement and frequency at every amplitude. As the
+amplitude falls, quadratic damping decreases the decrement, and dry friction increases it. A drift of the frequency
+indicates a stiffness that depends on the amplitude.
 """
 
 import numpy as np
@@ -10,17 +10,19 @@ import numpy as np
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.views import Facts
 
-#: A drift is reported where it exceeds this many standard errors: neighbouring peaks are not independent.
+#: Smallest reported drift, in standard errors; the limit is high because neighbouring peaks are correlated.
 REPORTED = 5.0
-#: Peaks of a parabola through fewer half cycles say nothing of its scatter.
+#: Smallest number of peaks; fewer do not determine the scatter about a parabola.
 FEWEST_HALF_CYCLES = 6
-#: Peaks lower than this many noise sds are lifted by the noise.
+#: Smallest peak in noise standard deviations; noise biases lower peaks upwards.
 PEAK_NOISE_RATIO = 20.0
 
 
 def _drift(values: np.ndarray) -> tuple[float, float, bool]:
-    """Slope per half cycle of a parabola through ``values`` (p,) at its first and last point, and whether they differ
-    by more than their scatter explains."""
+    """Slopes per half cycle of a parabola through ``values`` (p,) at both ends, and whether they differ.
+
+    The difference counts where it exceeds the scatter of the values.
+    """
     index = np.arange(len(values)) - 0.5 * (len(values) - 1)
     coefficients = np.polyfit(index, values, 2)
     rest = values - np.polyval(coefficients, index)
@@ -31,12 +33,12 @@ def _drift(values: np.ndarray) -> tuple[float, float, bool]:
 
 
 def trend(decrement: Decrement, noise: float) -> Facts:
-    """What drifts while the amplitude falls, SI; empty where nothing does or too few peaks stand out.
+    """Report quantities that drift as the amplitude falls, SI; empty without drift or with too few peaks.
 
     Parameters
     ----------
-    decrement : of the smoothed record
-    noise : sd, m: later peaks, once they are lower than ``PEAK_NOISE_RATIO`` of it, are left out
+    decrement : decrement of the smoothed record
+    noise : noise sd, m; peaks after the first one below ``PEAK_NOISE_RATIO`` times it are ignored
 
     Returns
     -------
@@ -47,7 +49,7 @@ def trend(decrement: Decrement, noise: float) -> Facts:
     count = int(low[0]) if len(low) else len(height)
     if count < FEWEST_HALF_CYCLES:
         return {}
-    # Means of neighbours stand on opposite sides of the equilibrium, so an error of that drops out.
+    # Neighbouring peaks lie on opposite sides of the equilibrium, so their mean cancels its error.
     size = 0.5 * (height[1:count] + height[: count - 1])
     middle = 0.5 * (decrement.times[1:count] + decrement.times[: count - 1])
     facts = {}

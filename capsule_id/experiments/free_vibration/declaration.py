@@ -21,9 +21,9 @@ from capsule_id.views import Facts, Message
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
 
-#: Samples per period below which the highest sample misses the peak by more than 1 - cos(pi/20) = 1.2 %.
+#: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
-#: Periods below which the damping rests on one peak.
+#: Smallest number of periods; with fewer, one peak determines the damping.
 FEWEST_PERIODS = 2
 
 NOISE_SD = scatter("noise_sd", "m", "noise of a record", r"\sigma")
@@ -46,7 +46,7 @@ class DecaySettings(Settings):
 
 
 def _check_spring_with_gap(entry: Entry[DecaySettings]) -> None:
-    """A spring within reach has a gap."""
+    """Require a gap where a spring is within reach."""
     spring, gap = entry.table.settings.spring, entry.table.settings.gap
     if (spring is None) != (gap is None):
         one, other = ("spring", "gap") if gap is None else ("gap", "spring")
@@ -55,10 +55,10 @@ def _check_spring_with_gap(entry: Entry[DecaySettings]) -> None:
 
 
 def _check_window(entry: Entry[DecaySettings]) -> None:
-    """start < stop, both inside the record to one sampling step, and enough samples between them."""
+    """Require start < stop, both inside the record to one sampling step, and enough samples between them."""
     entry.check_length()
     time, settings = entry.table["time"], entry.table.settings
-    # A record of n steps is often said to last n steps: one sample more than it has.
+    # The stated duration of n samples is often n steps, one more than the record has.
     step = float(np.median(np.diff(time)))
     edges = {"start": float(time[0]), "stop": float(time[-1])}
     for key, value in (("start", settings.start), ("stop", settings.stop)):
@@ -79,7 +79,7 @@ def _check_window(entry: Entry[DecaySettings]) -> None:
 
 
 def _check_forward(entry: Entry[DecaySettings]) -> None:
-    """The capsule model needs a capsule that is free to move, and has viscous damping only."""
+    """Require a free capsule and viscous damping for the capsule model."""
     settings = entry.table.settings
     if settings.forward != "capsule":
         return
@@ -92,13 +92,13 @@ def _check_forward(entry: Entry[DecaySettings]) -> None:
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
-    """The rod's mass; the capsule's where it may move."""
+    """Symbols of the required masses: the rod, and the capsule where it may move."""
     moves = table.settings.capsule == "free" or table.settings.forward == "capsule"
     return ("m1", "m2") if moves else ("m1",)
 
 
 def _lint(table: Table[DecaySettings]) -> Iterable[str]:
-    """Sampling and length of a free decay."""
+    """Report low sampling rate and short length of a free decay."""
     time, x_rel = decay_window(table)
     try:
         period = 1.0 / dominant_frequency(time, x_rel)
@@ -113,13 +113,13 @@ def _lint(table: Table[DecaySettings]) -> Iterable[str]:
 
 
 def _paper(experiments: Sequence["FreeVibration"]) -> Values:
-    """The paper's k1 = m1 Omega_o^2 and c of the logarithmic decrement after Savitzky–Golay; the mean over records."""
+    """Estimate k1 = m1 Omega_o^2 and c by logarithmic decrement after Savitzky–Golay, as in the paper; record means."""
     found = [d for d in (e.paper_decrement() for e in experiments) if d is not None]
     return {"k1": float(np.mean([d.k1 for d in found])), "c": float(np.mean([d.c for d in found]))} if found else {}
 
 
 def _rough(experiments: Sequence["FreeVibration"], rig: Rig) -> Values:
-    """k1 and c without the paper's bias: m1 (Omega_o^2 + gamma^2) and 2 m1 gamma, gamma = delta Omega_o / 2 pi."""
+    """Estimate k1 = m1 (Omega_o^2 + gamma^2) and c = 2 m1 gamma without bias; gamma = delta Omega_o / 2 pi."""
     decays = [e.paper_decrement() for e in experiments]
     found = [(d.Omega_o, d.delta * d.Omega_o / (2.0 * np.pi)) for d in decays if d is not None and d.delta > 0.0]
     if not found or rig.m1 is None:
@@ -159,7 +159,7 @@ _DAMPING = {
 
 
 def _damping_caption(facts: Facts) -> str:
-    """The best of the three models, and whether any of them is good enough."""
+    """Caption with the best of the three models, and whether it fits."""
     rest = "" if facts["any_white"] else " None of the three leaves white residuals: another effect is present."
     return (
         "The damping model of the fit leaves structure in the residuals. Here all three models are fitted to the decays "

@@ -1,4 +1,4 @@
-"""The paper's estimator of k1 and c: observed frequency and logarithmic decrement of the peaks (section 2.2)."""
+"""The paper's estimator of k1 and c by observed frequency and logarithmic decrement of the peaks (section 2.2)."""
 
 import itertools
 from dataclasses import dataclass
@@ -7,24 +7,24 @@ import numpy as np
 
 from capsule_id.records.noise import noise_level
 
-#: A peak counts while it stands out of the noise by this many standard deviations.
+#: Smallest peak in standard deviations of the noise.
 PEAK_NOISE_RATIO = 4.0
-#: ... and by this part of the record's range, so that a noiseless tail does not count.
+#: Smallest peak as a fraction of the record's range, which excludes a noiseless tail.
 PEAK_RANGE_RATIO = 0.005
-#: The end of a record still swings where its range is this part of the whole record's.
+#: The end of a record still oscillates where its range exceeds this fraction of the whole record's range.
 SWINGING_RATIO = 0.05
 
 
 @dataclass(frozen=True)
 class Decrement:
-    """What the peaks say.
+    """Peaks of a decay and the paper's estimates from them.
 
     Attributes
     ----------
-    times, peaks : (p,) s and m: the extreme of every half cycle, measured from the equilibrium
+    times, peaks : (p,) s and m, extremum of every half cycle relative to the equilibrium
     Omega_o : observed (damped) frequency, rad/s
     delta : logarithmic decrement per period
-    k1, c : m1 Omega_o^2, N/m, and 2 (delta/2 pi) sqrt(k1 m1), N s/m: as the paper reads them, with their biases
+    k1, c : m1 Omega_o^2, N/m, and 2 (delta/2 pi) sqrt(k1 m1), N s/m: the paper's estimates, with relative biases
         -zeta^2 and about +zeta^2/2
     """
 
@@ -37,10 +37,9 @@ class Decrement:
 
 
 def equilibrium(values: np.ndarray) -> float:
-    """Rest position: the mean of the last fifth of the record, a whole number of its swings where it still swings.
+    """Rest position: mean of the last fifth of the record, over whole periods where it still oscillates.
 
-    A record of few cycles that is cut before it comes to rest holds no whole swing in its last fifth: as much more of
-    it is taken as one whole swing needs.
+    The last fifth of a short record may contain less than one period. The mean then covers one whole period.
     """
     length = max(len(values) // 5, 4)
     while True:
@@ -57,11 +56,11 @@ def equilibrium(values: np.ndarray) -> float:
 def half_cycle_extremes(
     time: np.ndarray, guide: np.ndarray, values: np.ndarray, noise: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Time and signed height of the extreme of ``values`` in every half cycle of ``guide``, (p,) each.
+    """Time and signed value of the extremum of ``values`` in every half cycle of ``guide``, (p,) each.
 
-    ``guide`` (smoothed, about its equilibrium) only says where the half cycles are. Half cycles are taken from the
-    start of the record while they stand out; the first and the last may be cut by the record's ends, so an extreme on
-    an end does not count.
+    ``guide`` (smoothed, about its equilibrium) only locates the half cycles. They count from the start of the record
+    until the first peak below the limits. The first and the last may be incomplete, so an extremum at an end of the
+    record does not count.
     """
     threshold = max(PEAK_NOISE_RATIO * noise, PEAK_RANGE_RATIO * float(np.ptp(guide)))
     edges = np.concatenate([[0], np.flatnonzero(np.diff(np.signbit(guide))) + 1, [len(guide)]])
@@ -81,13 +80,13 @@ def half_cycle_extremes(
 def logarithmic_decrement(
     time: np.ndarray, values: np.ndarray, m1: float, smoothed: np.ndarray | None = None
 ) -> Decrement | None:
-    """The paper's estimator on ``values``; None where fewer than three half cycles stand out.
+    """Apply the paper's estimator to ``values``; None where fewer than three half cycles exceed the limits.
 
     Parameters
     ----------
     time, values : (n,) s and m
-    m1 : kg
-    smoothed : (n,) the record after Savitzky–Golay, the guide to its half cycles (default: ``values``)
+    m1 : mass of the rod, kg
+    smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles (default: ``values``)
     """
     rest = equilibrium(values)
     guide = (values if smoothed is None else smoothed) - rest

@@ -32,17 +32,17 @@ from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Points
 
-#: Default prior of a record's noise: log-normal, median 1 % of its range, factor 100, beside the reading error.
+#: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
-#: Polynomial order of the Savitzky–Golay filter that serves the paper's estimator.
+#: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
 SMOOTHING_ORDER = 3
 
 
 class FreeVibration(SurfaceExperiment):
-    """x_rel(t) of one record: the whole record, raw, white noise; k1 and c are shared by all records.
+    """x_rel(t) of one raw record with white noise; all records share k1 and c.
 
-    Viscous damping: the two solutions and the offset enter linearly and are integrated out. Dry or quadratic damping
-    (``damping`` in rig.toml) act beside the viscous one; then the start of the motion is sampled with the rest.
+    For viscous damping the two solutions and the offset enter linearly and are integrated out. Dry or quadratic
+    damping (``damping`` in rig.toml) adds to the viscous one. The initial conditions are then sampled too.
     """
 
     time: np.ndarray
@@ -64,7 +64,7 @@ class FreeVibration(SurfaceExperiment):
     def __init__(
         self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1, damping: str | None = None
     ) -> None:
-        """``damping`` None: as stated in the settings."""
+        """Make one record; ``damping`` None: as stated in the settings."""
         self.friction = friction
         time, self.values = decay_window(table)
         self.time = time - float(time[0])
@@ -85,7 +85,7 @@ class FreeVibration(SurfaceExperiment):
         rough, last = self.rough_decrement(), float(self.time[-1])
         if self.damping == "dry":
             self.side = float(np.sign(rough.peaks[0]))
-            # The frequency may turn out half as high again.
+            # The margin allows for a frequency 1.5 times the rough estimate.
             self.half_cycles = int(1.5 * rough.Omega_o * last / np.pi) + 4
             amplitude = AMPLITUDE.named(table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH))
             turning = TURNING_TIME.named(table.label, Prior("normal", 0.0, last))
@@ -95,7 +95,7 @@ class FreeVibration(SurfaceExperiment):
             self.about = About(table, rig, (*rows, parameter("c_q"), noise, *self.motion_parameters(rough)))
 
     def with_damping(self, damping: str) -> "FreeVibration":
-        """The same record under another damping model."""
+        """Return the same record with another damping model."""
         return FreeVibration(self.table, self.rig, self.friction, damping)
 
     def noise_prior(self) -> Prior:
@@ -103,7 +103,7 @@ class FreeVibration(SurfaceExperiment):
         return Prior("lognormal", NOISE_MEDIAN * float(np.ptp(self.values)), NOISE_FACTOR)
 
     def motion_parameters(self, rough: Decrement) -> tuple[Parameter, Parameter]:
-        """x_rel and its rate at the first sample, with wide priors."""
+        """Parameters for x_rel and its rate at the first sample, with wide priors."""
         x_start = parameter("x_start", self.label, Prior("normal", 0.0, self.width))
         return x_start, parameter("y_start", self.label, Prior("normal", 0.0, self.width * rough.Omega_o))
 
@@ -125,7 +125,7 @@ class FreeVibration(SurfaceExperiment):
 
     @property
     def model_name(self) -> str:
-        """For the legend."""
+        """Name for the legend."""
         return f"{self.damping} damping"
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
@@ -160,7 +160,7 @@ class FreeVibration(SurfaceExperiment):
     # -- the paper's estimator and starts ---------------------------------------------------------------------------
 
     def smoothed(self) -> np.ndarray:
-        """(n,) the record after Savitzky–Golay; a record sampled unevenly, which that filter refuses, stays raw."""
+        """(n,) the record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
         try:
             sampling_step(self.time)
         except InputError:
@@ -171,18 +171,18 @@ class FreeVibration(SurfaceExperiment):
         return savitzky_golay(self.time, self.values, window, SMOOTHING_ORDER)
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
-        """The paper's k1 and c of this record, from the smoothed or the raw peaks."""
+        """Estimate k1 and c of this record as in the paper, from the smoothed or the raw peaks."""
         smoothed = self.smoothed()
         return logarithmic_decrement(self.time, smoothed if smooth else self.values, self.mass, smoothed)
 
     @property
     def mass(self) -> float:
-        """Weighed mass of the rod, kg (the schema asks for it beside a free vibration)."""
+        """Measured mass of the rod, kg; the schema requires it for a free vibration."""
         assert self.rig.m1 is not None
         return self.rig.m1.value
 
     def rough_decrement(self) -> Decrement:
-        """The paper's estimate, or, where too few peaks stand out, one from the first zero crossings."""
+        """The paper's estimate, or one from the first zero crossings where there are too few peaks."""
         decrement = self.paper_decrement()
         if decrement is not None and decrement.delta > 0.0:
             return decrement
@@ -195,7 +195,7 @@ class FreeVibration(SurfaceExperiment):
 
     def starts(self) -> dict[str, Start]:
         rough = self.rough_decrement()
-        # A start must keep in step with the record for as long as it rings, or it falls into a side lobe.
+        # A phase error of the start over the decay leads the fit to a side lobe, a local maximum.
         ringing = min(self.time[-1], 4.0 * self.mass / rough.c)
         spread = min(0.3, 1.0 / (rough.Omega_o * ringing))
         noise = max(noise_level(self.values), 1e-4 * float(np.ptp(self.values)))
@@ -215,7 +215,7 @@ class FreeVibration(SurfaceExperiment):
         return starts
 
     def starts_of_motion(self, rough: Decrement) -> dict[str, Start]:
-        """Of x_rel and its rate at the first sample."""
+        """Starts of x_rel and its rate at the first sample."""
         size = abs(float(rough.peaks[0]))
         rate = np.polyfit(self.time[:5], self.values[:5], 1)[0]
         return {
@@ -223,7 +223,7 @@ class FreeVibration(SurfaceExperiment):
             f"y_start[{self.label}]": Start(float(rate), 0.05 * rough.Omega_o * size),
         }
 
-    # -- what the report and the checks see -------------------------------------------------------------------------
+    # -- interface to the report and the checks ---------------------------------------------------------------------
 
     @property
     def largest_deflection(self) -> float:
@@ -231,12 +231,12 @@ class FreeVibration(SurfaceExperiment):
         return float(np.max(np.abs(self.values - equilibrium(self.values))))
 
     def damping_trend(self) -> Facts:
-        """How damping and frequency of the peaks vary with amplitude, see ``trend``; empty where nothing drifts."""
+        """Drift of damping and frequency of the peaks with amplitude, see ``trend``; empty without drift."""
         decrement = self.paper_decrement()
         return {} if decrement is None else trend(decrement, noise_level(self.values))
 
     def largest_force(self, theta: ValuesBySymbol) -> float:
-        """max |f|, f = k1 x_rel + c d(x_rel)/dt, over the record, N."""
+        """Largest |f| over the record, N; f = k1 x_rel + c d(x_rel)/dt."""
         x = self.smoothed() - equilibrium(self.values)
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.time))))
 

@@ -1,4 +1,4 @@
-"""Tables of free decays: record by record, and the damping models side by side."""
+"""Tables of free decays: estimates by record, and comparison of damping models."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -15,12 +15,12 @@ from capsule_id.views import ResultTable
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
 
-#: The damping models that are compared when the residuals of a decay are not white.
+#: Damping models for comparison when the residuals of a decay are not white.
 DAMPING_MODELS = ("viscous", "dry", "quadratic")
 
 
 def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
-    """k1 and c of every record alone, beside the paper's protocol."""
+    """Compare k1 and c of every record alone with the paper's protocol."""
     k1, k1_sd, deflection = stiffness_by_record(records, fit.values)
     rows = []
     for i, record in enumerate(records):
@@ -43,7 +43,7 @@ def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultT
 
 
 def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
-    """The decays alone under each damping model, ranked by BIC; [] where their residuals are white."""
+    """Fit the decays alone with each damping model and rank by BIC; [] where their residuals are white."""
     labels = {record.label for record in records}
     if not any(f.code == "residuals.white" and f.level == "fail" and f.experiment in labels for f in fit.findings):
         return []

@@ -4,13 +4,13 @@ import numpy as np
 
 from capsule_id.experiments.kind import Twin, TwinTable, Values
 
-#: Releases of the paper's protocol, m, and the noise as a share of the release.
+#: Release amplitudes of the paper's protocol, m, and noise sd relative to the release.
 RELEASES = (1.5e-3, 2.0e-3, 2.5e-3)
 DECAY_NOISE = 0.01
 
 
 def measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
-    """A record per release."""
+    """Simulate one record per release amplitude."""
     del seed
     decays = [decay(rng, values["k1"], values["c"], values["m1"], release, DECAY_NOISE) for release in RELEASES]
     return Twin(tuple(TwinTable(f"free_vibration_{n}.csv", columns) for n, columns in enumerate(decays, start=1)))
@@ -26,7 +26,7 @@ def decay(
     duration: float = 0.5,
     rate: float = 2000.0,
 ) -> dict[str, np.ndarray]:
-    """A decay, released at rest from ``release`` m at time 0; noise is ``relative_sd`` of the release."""
+    """Simulate a decay from rest at ``release`` m at time 0; the noise sd is ``relative_sd`` of the release."""
     from capsule_id.experiments.free_vibration.decay_models import rates, viscous_basis
 
     time = np.arange(round(duration * rate)) / rate

@@ -1,4 +1,4 @@
-"""The part of a free-vibration record that is free decay."""
+"""Window of a free-vibration record that contains the free decay."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from capsule_id.rig.model import Table
 
 
 def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
-    """(time, x_rel) of a free vibration, SI, from ``start`` to ``stop``, both included; by default the whole record."""
+    """Return (time, x_rel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
     time, settings = table["time"], table.settings
     start = time[0] if settings.start is None else settings.start
     stop = time[-1] if settings.stop is None else settings.stop

@@ -1,1 +1,1 @@
-"""Force of the motor against its current: K."""
+"""Motor force against current, which determines K."""

@@ -17,7 +17,7 @@ FORCE_SD, CURRENT_SD = 0.03, 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class MotorSettings(Settings):
-    """``sd_ratio``: the force's reading error per the current's, N/A."""
+    """Settings of a motor calibration; ``sd_ratio``: reading error of force / reading error of current, N/A."""
 
     sd_ratio: Annotated[float | None, QuantityRule("N/A")] = None
 
@@ -25,7 +25,7 @@ class MotorSettings(Settings):
 def calibration(
     rng: np.random.Generator, K: float, currents: np.ndarray, force_sd: float, current_sd: float
 ) -> dict[str, np.ndarray]:
-    """A synthetic calibration at ``currents`` (n,) A, both columns read with errors, N and A."""
+    """Simulate a calibration at ``currents`` (n,) A, with reading errors in both columns, N and A."""
     n = len(currents)
     return {
         "force [N]": K * currents + force_sd * rng.standard_normal(n),

@@ -17,9 +17,9 @@ from capsule_id.rig.model import Rig, Table
 
 
 class SlidingFriction(FrictionExperiment):
-    """y = w mu_d(v), w = (m1 + m2) g for a force and 1 for a coefficient.
+    """Steady sliding, y = w mu_d(v), with w = (m1 + m2) g for a force and 1 for a coefficient.
 
-    Variance: reading errors of y and of v (through the slope of the friction law) and the relative scatter of mu.
+    The variance has reading errors of y and of v (through the slope of the friction law) and relative scatter of mu.
     """
 
     speed: np.ndarray
@@ -57,12 +57,12 @@ class SlidingFriction(FrictionExperiment):
         return (Misfit(self.values - predicted, variance, predicted, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Steady sliding is read as measured."""
+        """Measured points (speed, coefficient)."""
         if self.quantity == "coefficient":
             return self.speed, self.values
         m1, m2 = self.rig.m1, self.rig.m2
-        assert m1 is not None, "the schema asks for both masses beside a sliding force"
-        assert m2 is not None, "the schema asks for both masses beside a sliding force"
+        assert m1 is not None, "the schema requires both masses for a sliding force"
+        assert m2 is not None, "the schema requires both masses for a sliding force"
         return self.speed, self.values / normal_force(m1.value, m2.value, self.rig.g.value)
 
     def starts(self) -> dict[str, Start]:

@@ -24,19 +24,19 @@ from capsule_id.rig.schema import ColumnRule
 TILT_SD = scatter(
     "tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", Prior("halfnormal", 0.0, np.deg2rad(1.0))
 )
-#: Trials of the twin, and their scatter, rad.
+#: Number of trials of the twin, and their scatter, rad.
 TRIALS, TRIAL_SD = 4, np.deg2rad(0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TiltSettings(Settings):
-    """``length_is``: the side of the triangle that the column length is; None beside a column angle."""
+    """Settings of tilts; ``length_is``: side of the triangle in the column length; None with a column angle."""
 
     length_is: Literal["board", "base"] | None = None
 
 
 def _check_tilt(entry: Entry[TiltSettings]) -> None:
-    """Height and length make an angle only where the meaning of length is stated."""
+    """Require ``length_is`` where height and length are recorded, because the angle depends on it."""
     table, meaning = entry.table, entry.table.settings.length_is
     if "angle" in table.columns:
         if meaning is not None:
@@ -61,7 +61,7 @@ def _check_tilt(entry: Entry[TiltSettings]) -> None:
 def tilts(
     rng: np.random.Generator, mu: float, trials: int = TRIALS, tilt_sd: float = TRIAL_SD
 ) -> dict[str, np.ndarray]:
-    """A synthetic table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
+    """Simulate a table by the paper's protocol: ``trials`` tilts with scatter ``tilt_sd``, rad."""
     angle = np.arctan(mu) + tilt_sd * rng.standard_normal(trials)
     return {"angle [deg]": np.rad2deg(angle)}
 

@@ -18,8 +18,8 @@ class StaticFriction(FrictionExperiment):
 
     mu_0 is the coefficient at break-away. A capsule that slides down counts as one that slides forward.
 
-    Where height and length are recorded instead of the angle, ``length_is`` says which side of the triangle the length
-    is: the tilted board (sin = height/length) or the base (tan = height/length).
+    Where height and length are recorded instead of the angle, ``length_is`` selects the side of the triangle. This is
+    the tilted board (sin = height/length) or the base (tan = height/length).
     """
 
     angle: np.ndarray
@@ -45,7 +45,7 @@ class StaticFriction(FrictionExperiment):
         return (Misfit(self.angle - angle, self.reading_sd**2, 1.0, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Tilts are read as mu = tan(angle) at speed 0."""
+        """Points by the paper's formula: mu = tan(angle) at speed 0."""
         return np.zeros(self.n), np.tan(self.angle)
 
     def starts(self) -> dict[str, Start]:

@@ -1,4 +1,4 @@
-"""The cantilever law between support springs of stated length."""
+"""Check of the cantilever law for support springs of stated length."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 def cantilever_exponent(
     length: np.ndarray, length_sd: np.ndarray, k2: np.ndarray, log_k2_sd: np.ndarray
 ) -> tuple[float, float, float]:
-    """Exponent of k2 ~ L^p by weighted least squares on logarithms, its sd, and the p-value of p = -3.
+    """Estimate the exponent of k2 ~ L^p by weighted least squares on logarithms, its sd, and the p-value of p = -3.
 
-    A cantilever has p = -3 (Euler–Bernoulli; clamped end, tip load). Arrays are (springs,); the error of the length
-    counts with the exponent -3 of the hypothesis.
+    A cantilever has p = -3 (Euler–Bernoulli; clamped end, tip load). Arrays are (springs,). The error of the length
+    is propagated with the exponent -3 of the hypothesis.
     """
     weight = 1.0 / (log_k2_sd**2 + (3.0 * length_sd / length) ** 2)
     x = np.log(length) - np.average(np.log(length), weights=weight)
@@ -31,7 +31,7 @@ def cantilever_exponent(
 
 
 def check_cantilever(springs: "Sequence[SupportSpring]", fit: Fitted) -> list[Finding]:
-    """Expected, where lengths are stated: k2 ~ L^-3 over the springs."""
+    """Check k2 ~ L^-3 over the springs, where lengths are stated."""
     pairs = [(e, e.length) for e in springs if e.length is not None]
     if len({e.slope.name for e, _ in pairs}) < 2:
         return []

@@ -12,16 +12,16 @@ from capsule_id.rig.model import Quantity, Settings
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Message
 
-#: The twin's deflections, m, and the noise of the force as a share of full scale.
+#: Deflections of the twin, m, and noise of the force relative to full scale.
 DEFLECTIONS = np.linspace(0.0, 1e-3, 11)
 SPRING_NOISE = 0.002
-#: The twin's lengths follow the cantilever law from this one, m, which belongs to this k2, N/m; read with this sd, m.
+#: Reference length, m, and its k2, N/m, for the cantilever law of the twin; sd of a measured length, m.
 LENGTH, LENGTH_OF, LENGTH_SD = 60e-3, 18960.0, 0.1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpringSettings(Settings):
-    """The spring's name; its free length, m; the force's reading error per the deflection's, N/m."""
+    """Settings of a spring: name; free length, m; reading error of force / reading error of deflection, N/m."""
 
     spring: Annotated[str, NameRule()]
     length: Annotated[Quantity | None, QuantityRule("m", has_sd=True)] = None
@@ -31,7 +31,7 @@ class SpringSettings(Settings):
 def static_test(
     rng: np.random.Generator, k2: float, deflections: np.ndarray, relative_sd: float
 ) -> dict[str, np.ndarray]:
-    """A synthetic static test at ``deflections`` (n,) m; the force is read with ``relative_sd`` of full scale."""
+    """Simulate a static test at ``deflections`` (n,) m; the force has noise ``relative_sd`` of full scale."""
     force = k2 * deflections
     noise = relative_sd * np.max(np.abs(force)) * rng.standard_normal(len(force))
     return {"deflection [mm]": 1e3 * deflections, "force [N]": force + noise}

@@ -1,4 +1,4 @@
-"""Whether forced runs agree with the bench tests."""
+"""Check that forced runs and bench tests give consistent parameters."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.views import Finding
 
-#: Family-wise false-alarm rate of the comparison of bench and runs.
+#: Family-wise false-alarm rate of the comparison between bench tests and runs, dimensionless.
 LEVEL = 0.02
 
 
 @dataclass(frozen=True)
 class RunsAlone:
-    """What runs and priors tell without the bench: ``names`` of the located parameters, u (p,), covariance (p, p)."""
+    """Estimate from runs and priors only: ``names`` of the located parameters, u (p,), covariance (p, p)."""
 
     names: tuple[str, ...]
     u: np.ndarray
@@ -26,7 +26,7 @@ class RunsAlone:
 
 
 def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
-    """One Gauss–Newton step from the joint ``fit`` with the bench's residuals left out."""
+    """Estimate from runs and priors: one Gauss–Newton step from the joint ``fit`` without bench residuals."""
     located = target.located
     misses, jacobian = linearised(HeldResiduals(target, jnp.asarray(fit.u)), fit.u[located])
     rows = np.array([owner is None or not owner.bench for owner in target.residual_owners(fit.u)])
@@ -38,13 +38,13 @@ def runs_alone(target: LogPosterior, fit: PointFit) -> RunsAlone:
 
 @dataclass(frozen=True)
 class Distance:
-    """Bench less runs in one parameter.
+    """Bench estimate minus run estimate of one parameter.
 
     Attributes
     ----------
-    sd : over the sd of the difference as the curvature has it
-    z : standard normal quantile of how rare that is: the tails of what few trials tell are those of the bench's sample,
-        where there is one
+    sd : difference in units of its Laplace standard deviation
+    z : standard normal quantile of the tail probability of the difference. The tails are those of the bench sample,
+        where one exists.
     """
 
     sd: float
@@ -54,14 +54,14 @@ class Distance:
 def disagreement(
     shared: Sequence[str], runs: RunsAlone, bench: PointFit, sample: Posterior | None
 ) -> dict[str, Distance]:
-    """Of every ``shared`` parameter by name; bench and runs know nothing of each other."""
+    """Return the distance of every ``shared`` parameter, by name; bench and runs are independent."""
     found = {}
     for name in shared:
         i, j = runs.names.index(name), bench.names.index(name)
         own = runs.covariance[i, i]
         z = sd = float((bench.u[j] - runs.u[i]) / np.sqrt(bench.covariance[j, j] + own))
         if sample is not None:
-            # Every parameter that bench and runs share is positive: u is its logarithm.
+            # Every shared parameter is positive: u is its logarithm.
             draws = np.log(sample.draws[..., j].ravel())
             blurred = draws + np.sqrt(own) * np.random.default_rng(j).standard_normal(draws.size)
             z = _by_sample(blurred, float(runs.u[i]), sd)
@@ -70,9 +70,9 @@ def disagreement(
 
 
 def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
-    """Standard normal quantile of where ``value`` lies among ``draws``, sign as ``laplace``.
+    """Standard normal quantile of the rank of ``value`` among ``draws``, with the sign of ``laplace``.
 
-    Beyond the outermost hundredth the tail is continued as that of a Student t with the sample's own reach.
+    Beyond the outermost 1 % a Student t tail, fitted to the outer quantiles, extrapolates the sample.
     """
     below = np.mean(draws < value)
     if 0.005 < below < 0.995:
@@ -88,7 +88,7 @@ def _by_sample(draws: np.ndarray, value: float, laplace: float) -> float:
 
 
 def _freedom(ratio: float) -> float:
-    """Degrees of freedom of a Student t whose 0.5 % and 5 % points stand in ``ratio``."""
+    """Degrees of freedom of a Student t whose 0.5 % and 5 % points have this ``ratio``."""
     grid = np.geomspace(1.0, 1e3, 200)
     return float(grid[np.argmin(np.abs(stats.t.isf(0.005, grid) / stats.t.isf(0.05, grid) - ratio))])
 
@@ -102,9 +102,9 @@ def _quantile_of_log_tail(log_tail: float) -> float:
 def check_agreement(
     target: LogPosterior, joint: PointFit, bench: PointFit | None, sample: Posterior | None
 ) -> list[Finding]:
-    """Expected: bench and runs tell of one capsule (two-sided, Šidák over the shared parameters).
+    """Check that bench tests and runs are consistent (two-sided, Šidák over the shared parameters).
 
-    Masses are left out: their weighings stand on both sides.
+    Masses are excluded, because both estimates contain their weighings.
     """
     known = {row.name for e in target.experiments if not e.bench for row in e.parameters}
     shared = [] if bench is None else [name for name in bench.names if name in known]
@@ -113,11 +113,11 @@ def check_agreement(
 
 
 def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
-    """The finding on what ``disagreement`` found; without a bench sample the worst is a suspicion.
+    """Convert the distances of ``disagreement`` to a finding, at most a warning without a bench sample.
 
-    Named is the farthest, in sd, of the parameters that are too rarely so far off to be chance: sd say how much the
-    error of one parameter alone would explain. An error in one draws along what the bench measures together with it
-    (v_s after mu), and heavy tails hide which came first.
+    Among the parameters that disagree significantly, the largest disagreement, in sd, is reported.
+    The distance in sd measures how much the error of one parameter explains. An error in one parameter also shifts
+    the parameters correlated with it (v_s with mu). Heavy tails make z a poor measure of its origin.
     """
     p = {name: _family_wise(one.z, len(found)) for name, one in found.items()}
     lost = [name for name, one in found.items() if not (np.isfinite(one.sd) and np.isfinite(one.z))]
@@ -125,7 +125,7 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     far.sort(key=lambda name: -abs(found[name].sd))
     if lost and not far:
         return Finding("bench_and_runs.estimates", "warn", {"shared": len(found), "missing": lost})
-    # The curvature of few trials understates their tails.
+    # The Laplace approximation of few trials underestimates their tails.
     level = "ok" if not far else "fail" if sampled else "warn"
     named = far or [min(p, key=lambda name: p[name])]
     facts = {

@@ -1,6 +1,6 @@
-"""Checks of the residuals of every experiment at the point fit.
+"""Residual checks of every experiment at the point fit.
 
-Every check that can fail has a family-wise false-alarm rate of ``LEVEL`` over its experiments (Bonferroni).
+Every check of level ``fail`` has a family-wise false-alarm rate of ``LEVEL`` over its experiments (Bonferroni).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from capsule_id.views import Finding
 
 
 def check_whiteness(s: Setting) -> list[Finding]:
-    """Expected: residuals of every record white (Ljung–Box)."""
+    """Check that the residuals of every record are white (Ljung–Box)."""
     records = [
         (e, label, residuals)
         for e in s.experiments
@@ -33,7 +33,7 @@ def check_whiteness(s: Setting) -> list[Finding]:
 
 
 def check_outliers(s: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
-    """Expected: no reading far from the rest of its table; also the rows (indices) flagged, by label."""
+    """Check every table for outliers; also return the flagged row indices, by label."""
     tables = [e for e in s.experiments if not e.time_series]
     findings, flagged = [], {}
     for e in tables:
@@ -59,7 +59,7 @@ def check_outliers(s: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
 
 
 def check_stated_errors(s: Setting) -> list[Finding]:
-    """Expected: where reading errors are stated, they explain the scatter (chi-square)."""
+    """Check that stated reading errors explain the scatter (chi-square)."""
     known = [e for e in s.experiments if e.scale_known and e.label not in s.flagged]
     findings = []
     for e in known:

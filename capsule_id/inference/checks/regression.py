@@ -1,8 +1,8 @@
-"""Local regression diagnostics of one experiment at the point fit: outliers.
+"""Outliers by local regression diagnostics of one experiment at the point fit.
 
-Everything is linearised: r is the vector of residuals in units of the noise, J its Jacobian with respect to the
-experiment's own parameters and linear nuisances, and the hat matrix J (J'J)^-1 J' says how far a reading pulls the fit
-towards itself (Cook & Weisberg 1982, section 2.2).
+The model is linearised at the point fit: r is the vector of residuals in units of the noise. J is its Jacobian with
+respect to the experiment's own parameters and linear nuisances. The hat matrix J (J'J)^-1 J' gives the leverage of
+each reading (Cook & Weisberg 1982, section 2.2).
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from scipy import stats
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.inference.fit.curvature import jacobian
 
-#: Relative step of difference quotients.
+#: Relative step of difference quotients, dimensionless.
 DIFFERENCE = 1e-5
-#: Rows that one experiment may have flagged before it is the model, not the rows, that is in question.
+#: Largest number of flagged rows per experiment. More outliers indicate a wrong model, not wrong rows.
 MOST_FLAGGED = 3
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A reading that the others do not expect: ``row`` index, ``score`` its studentised residual, ``p`` corrected."""
+    """An outlying reading: ``row`` index, ``score`` (studentised residual), corrected p-value ``p``."""
 
     row: int
     score: float
@@ -29,7 +29,7 @@ class Outlier:
 
 
 def moving_symbols(experiment: Experiment) -> list[str]:
-    """Symbols of the parameters that move the experiment's prediction (scatters do not)."""
+    """Symbols of the parameters that change the experiment's prediction (scatters do not)."""
     return [row.symbol for row in experiment.parameters if not row.scatter]
 
 
@@ -52,8 +52,8 @@ def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, n
 def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> list[Outlier]:
     """Readings whose externally studentised residual is too large at family-wise ``level`` (Bonferroni over rows).
 
-    The largest is taken out and the rest judged again, up to ``MOST_FLAGGED`` rows. Where the noise is known the
-    score is standard normal; otherwise Student's t with n - p - 1 degrees of freedom, the reading left out.
+    The largest is removed and the test repeats, up to ``MOST_FLAGGED`` rows. The score is standard normal where the
+    noise is known. Otherwise it follows Student's t with n - p - 1 degrees of freedom, the reading left out.
     """
     r, columns = design(experiment, theta)
     keep = np.arange(len(r))

@@ -1,4 +1,4 @@
-"""A finished fit as checks and tables see it."""
+"""Data of a finished fit that checks and tables read."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,12 +16,12 @@ from capsule_id.views import Finding
 
 @dataclass(frozen=True)
 class Setting:
-    """The fit, and what the checks have found so far; see ``capsule_id.experiments.checks.context.Fitted``.
+    """A fit and its findings so far; see ``capsule_id.experiments.checks.context.Fitted``.
 
     Attributes
     ----------
-    bench : what the bench tests determine by themselves, where runs were fitted too
-    seed : of the starts of further point fits
+    bench : fit of the bench tests alone, where runs were fitted too
+    seed : seed of the starting points of further point fits
     """
 
     target: LogPosterior

@@ -1,4 +1,4 @@
-"""Do the experiments agree on a parameter that they share? Friction on the bench: tilts against slides."""
+"""Likelihood-ratio test of a parameter that two groups of experiments share (friction: tilts and slides)."""
 
 from collections.abc import Sequence
 
@@ -15,8 +15,8 @@ from capsule_id.rig.model import Rig
 def tension(rig: Rig, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
     """Likelihood-ratio test that two groups of experiments share their parameters (one shared parameter: mu).
 
-    Priors regularise both sides (a scatter from four trials needs one) and enter without their normalisation, so that
-    a second copy of a vague prior costs nothing.
+    Priors regularise both fits (a scatter from four trials needs one). They enter without their normalisation, so that
+    a second copy of a vague prior does not change the statistic.
     """
     joint, *apart = (_maximum(LogPosterior(rig, group)) for group in ([*one, *other], one, other))
     statistic = max(2.0 * (apart[0][0] + apart[1][0] - joint[0]), 0.0)
@@ -24,10 +24,10 @@ def tension(rig: Rig, one: Sequence[Experiment], other: Sequence[Experiment]) ->
 
 
 def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
-    """Largest penalised log-likelihood and where, by name; NumPy only, for a handful of readings."""
+    """Largest penalised log-likelihood and its parameters, by name; NumPy suffices for a few readings."""
     proposed = target.starts()
     start = target.unconstrain(np.array([proposed[name].centre for name in target.names]))
-    # The masses move nothing here but a steady force; they stay where they were weighed.
+    # The masses change only a steady force here, so they keep their measured values.
     free = np.array([row.symbol not in ("m1", "m2") for row in target.parameters])
 
     def objective(v: np.ndarray) -> float:

@@ -1,6 +1,6 @@
-"""Checks and verdict: each finding names the experiment, what was expected, what was seen, and what to do.
+"""All checks of a fit: each finding states the experiment, the expected value, the observed value and a remedy.
 
-A clean rig passes all of them together in more than 95 of 100 cases (measured in the calibration study).
+A rig without faults passes all checks together in more than 95 of 100 cases (measured in the calibration study).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,16 +18,16 @@ from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.views import Finding
 
-#: A parameter is informed where its posterior sd (in u) is at most this part of its prior's.
+#: The data inform a parameter where posterior sd / prior sd (in u) is at most this, dimensionless.
 INFORMED_RATIO = 0.9
-#: A maximum lower than the best by this much in log-posterior holds no mass worth the name.
+#: A local maximum this far below the best one in log-posterior holds negligible posterior mass.
 NEGLIGIBLE_MODE = 20.0
-#: A physical parameter that ends this many prior sds from the prior's centre is pulled by it.
+#: A physical parameter this many prior sds from the prior's centre is biased by the prior.
 PRIOR_PULL = 2.5
 
 
 def run_checks(setting: Setting) -> Setting:
-    """``setting`` with all findings, and with the outliers flagged."""
+    """Run all checks: return ``setting`` with all findings and flagged outliers."""
     whiteness = check_whiteness(setting)
     outliers, flagged = check_outliers(setting)
     setting = replace(setting, flagged=flagged)
@@ -48,7 +48,7 @@ def run_checks(setting: Setting) -> Setting:
 def declared(
     experiments: Sequence[Experiment], what: Literal["checks", "tables"], bench: bool
 ) -> list[Callable[[Setting], list[Any]]]:
-    """Every check (or table) that bench tests, or runs, declare, each with the experiments that declare it."""
+    """Return every check (or table) that bench tests or runs declare, with the experiments that declare it."""
     members: dict[Callable[..., list[Any]], list[Experiment]] = {}
     for experiment in experiments:
         for function in getattr(experiment, what) if experiment.bench == bench else ():
@@ -57,23 +57,23 @@ def declared(
 
 
 def check_starts(fit: PointFit) -> list[Finding]:
-    """Expected: every start of the point fit ends at one maximum, or at one that holds no mass."""
+    """Check that every start of the point fit ends at the same maximum, or at one with negligible mass."""
     facts: dict[str, Any] = {"starts": len(fit.starts)}
     if fit.agree and not fit.stalled.any():
         return [Finding("starts.agree", "ok", facts)]
-    elsewhere = fit.elsewhere
-    facts |= {"stalled": int(fit.stalled.sum()), "elsewhere": int(elsewhere.sum())}
-    if not elsewhere.any():
+    at_other_maximum = fit.at_other_maximum
+    facts |= {"stalled": int(fit.stalled.sum()), "elsewhere": int(at_other_maximum.sum())}
+    if not at_other_maximum.any():
         return [Finding("starts.agree", "fail", facts)]
     distance = np.abs(fit.ends - fit.u) / np.sqrt(np.diag(fit.covariance))
     away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
-    worst = int(np.argmax(np.where(elsewhere, away, -np.inf)))
+    worst = int(np.argmax(np.where(at_other_maximum, away, -np.inf)))
     facts |= {"distance": away[worst], "name": fit.names[int(np.argmax(distance[worst]))]}
-    # How much less probable the other ends are: a mode that far down holds no posterior mass.
+    # A local maximum far below the best one in log-posterior holds no posterior mass.
     below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
-    negligible = np.all(below[elsewhere] > NEGLIGIBLE_MODE)
-    if negligible and np.sum(~elsewhere) >= 2 and not fit.stalled[~elsewhere].any():
-        return [Finding("starts.agree", "warn", {**facts, "below": np.min(below[elsewhere])})]
+    negligible = np.all(below[at_other_maximum] > NEGLIGIBLE_MODE)
+    if negligible and np.sum(~at_other_maximum) >= 2 and not fit.stalled[~at_other_maximum].any():
+        return [Finding("starts.agree", "warn", {**facts, "below": np.min(below[at_other_maximum])})]
     return [Finding("starts.agree", "fail", facts)]
 
 
@@ -95,7 +95,7 @@ def _chains(s: Setting) -> list[Finding]:
 
 
 def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -> np.ndarray:
-    """(d,) posterior sd of u at most ``INFORMED_RATIO`` of its prior's (Laplace where there is no sample)."""
+    """(d,) whether posterior sd / prior sd of u is at most ``INFORMED_RATIO`` (Laplace without a sample)."""
     if posterior is None:
         sd = np.sqrt(np.diag(fit.covariance))
     else:
@@ -106,7 +106,7 @@ def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -
 
 def _informed(s: Setting) -> list[Finding]:
     known = informed(s.target, s.posterior, s.fit)
-    # A weighing is not narrowed by anything else, nor need it be; a scatter whose reading error is stated may vanish.
+    # No other reading narrows a weighed mass. A scatter with a stated reading error may be zero.
     names = [
         row.name
         for row, ok in zip(s.target.parameters, known, strict=True)
@@ -116,7 +116,7 @@ def _informed(s: Setting) -> list[Finding]:
 
 
 def _boundary(s: Setting) -> list[Finding]:
-    """Posteriors in the tail of a prior."""
+    """Find parameters whose posterior lies in the tail of the prior."""
     z = np.abs(s.target.prior_residuals(s.fit.u))
     names = [row.name for row, pull in zip(s.target.parameters, z, strict=True) if pull > PRIOR_PULL]
     return [Finding("priors.tails", "warn" if names else "ok", {"names": ", ".join(names)})]

@@ -1,1 +1,1 @@
-"""The maximum of the log-posterior: of bench tests (``point_fit``), of bench tests and forced runs (``joint_fit``)."""
+"""Maximum of the log-posterior: for bench tests (``point_fit``), for bench tests and forced runs (``joint_fit``)."""

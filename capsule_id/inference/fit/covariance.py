@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from capsule_id.errors import InputError
 
-#: Derivatives of n residuals by d parameters.
+#: Derivatives of n residuals with respect to d parameters.
 Jacobian = Float[np.ndarray, "n d"]
 #: n residuals.
 Residuals = Float[np.ndarray, " n"]
@@ -15,13 +15,13 @@ Residuals = Float[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance of the parameters at a minimum, and whether the data determine them at all.
+    """Covariance of the parameters at a minimum, and the rank of their Jacobian.
 
     Attributes
     ----------
     matrix : (d, d), units of the parameters; every entry is inf where the Jacobian is rank deficient
     rank : numerical rank of the Jacobian, its columns scaled to unit length; 0 where it is not finite
-    residual_sd : σ that the matrix was multiplied with, units of the residuals
+    residual_sd : σ that scales the matrix, units of the residuals
     """
 
     matrix: np.ndarray
@@ -30,7 +30,7 @@ class Covariance:
 
     @property
     def rank_deficient(self) -> bool:
-        """Some combination of the parameters leaves the residuals unchanged: no standard error exists."""
+        """Whether some combination of the parameters leaves the residuals unchanged: no standard error exists."""
         return self.rank < self.matrix.shape[0]
 
     @property
@@ -40,7 +40,9 @@ class Covariance:
 
 
 def covariance(jacobian: Jacobian, residuals: Residuals, residual_sd: float | None = None) -> Covariance:
-    """σ² (JᵀJ)⁻¹ from the singular values of J, never by a pseudo-inverse: a direction without data has no variance.
+    """σ² (JᵀJ)⁻¹ from the singular values of J, infinite where J is rank deficient.
+
+    A pseudo-inverse would give a direction without data zero variance.
 
     The columns are scaled to unit length first, so that the rank does not depend on the units of the parameters.
 
@@ -48,12 +50,12 @@ def covariance(jacobian: Jacobian, residuals: Residuals, residual_sd: float | No
     ----------
     jacobian : (n, d) of the residuals at the minimum
     residuals : (n,) at the minimum
-    residual_sd : σ where it is known, 1 for residuals in units of their own sd; None estimates it from the residuals
+    residual_sd : σ where it is known (1 for standardised residuals); None estimates it from the residuals
 
     Raises
     ------
     InputError
-        σ is to be estimated and there are not more residuals than parameters.
+        If σ is None and there are not more residuals than parameters.
     """
     count, parameters = jacobian.shape
     if residual_sd is None:

@@ -1,8 +1,8 @@
-"""Second derivatives of the log-posterior from its batched values, and what follows from them.
+"""Gradient and Hessian of the log-posterior by central differences of its batched values.
 
-The log-posterior is compiled once, for the sampler; its Hessian by automatic differentiation would cost another, far
-longer compilation. Central differences with steps of a fraction of a posterior standard deviation, extrapolated
-(Richardson), agree with it to 1e-6 relative (tested).
+The sampler needs the log-posterior compiled anyway. Its Hessian by automatic differentiation needs another, far longer
+compilation. Central differences with Richardson extrapolation agree with that Hessian to 1e-6 relative (tested).
+Their steps are fractions of a posterior standard deviation.
 """
 
 from collections.abc import Callable
@@ -18,17 +18,17 @@ Matrix = Float[np.ndarray, "d d"]
 
 #: Steps of the differences in units of the scale given, and their ratio for Richardson extrapolation.
 STEP, RATIO = 0.05, 2.0
-#: Step of the gradient's central differences, in standard deviations: an error of 1e-7 where curvature changes by half
-#: over one of them.
+#: Step of the gradient's central differences, in standard deviations. Its error is 1e-7 where the curvature changes
+#: by half over one standard deviation.
 GRADIENT_STEP = 1e-3
-#: A batch has this many rows always, so that it is compiled for one shape.
+#: Rows of every batch. A fixed number needs one compilation only.
 BATCH = 32
 
 
 def in_batches(
     function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "m d"]
 ) -> Float[np.ndarray, "m ..."]:
-    """``function`` of points (m, d), called with exactly ``BATCH`` rows at a time, on all cores; (m, ...)."""
+    """Evaluate ``function`` at points (m, d) in batches of exactly ``BATCH`` rows, on all cores; (m, ...)."""
     padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % BATCH, axis=0)])
     chunks = [padded[i : i + BATCH] for i in range(0, len(padded), BATCH)]
     parts = list(pool().map(lambda chunk: np.asarray(function(chunk)), chunks))
@@ -36,7 +36,7 @@ def in_batches(
 
 
 def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector) -> Matrix:
-    """(d, d) Hessian of ``function`` ((m, d) -> (m,)) at u (d,); ``scale`` (d,) a rough sd of each parameter."""
+    """(d, d) Hessian of ``function`` ((m, d) -> (m,)) at u (d,); ``scale`` (d,) is a rough sd of each parameter."""
     d = len(u)
     rows, columns = np.triu_indices(d)
     unit = np.diag(scale)
@@ -55,16 +55,16 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vect
 
 
 def gradient(function: Callable[[np.ndarray], np.ndarray], v: Vector) -> Vector:
-    """(d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates of which a standard deviation is 1."""
+    """(d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates with unit standard deviation."""
     offsets = GRADIENT_STEP * np.eye(len(v))
     plus, minus = np.split(function(np.concatenate([v + offsets, v - offsets])), 2)
     return (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
 def root_of_inverse(hessian: Matrix) -> Matrix:
-    """R (d, d) with R R' = H^-1; directions without positive curvature get the weakest positive one instead.
+    """R (d, d) with R R' = H^-1; directions without positive curvature get the weakest positive curvature.
 
-    Away from the maximum H may be indefinite; it only serves as a metric there.
+    Away from the maximum H may be indefinite. There it serves as a metric only.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), 1e-12))
     eigenvalues, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))

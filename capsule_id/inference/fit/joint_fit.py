@@ -1,11 +1,11 @@
-"""Point fit of rigs with forced runs: bench first, then everything together.
+"""Joint point fit of bench tests and forced runs.
 
-    bench experiments -> their own point fit -> starts about it (``joint_starts``), runs started from their records
-    -> (Levenberg–Marquardt on the located parameters <-> scatters at their conditional maxima) until neither moves
-    -> repeated from any better point that one parameter alone reaches
+    bench tests -> bench point fit -> starting points around it (``joint_starts``), initial conditions from the records
+    -> alternate Levenberg–Marquardt on the located parameters and conditional maxima of the scatters until converged
+    -> repeat from any better point that a change of one parameter reaches
 
-Derivatives of the event-driven model are exact and forward; the Hessian is Gauss–Newton's, for the residuals are small
-and the parameters well known. The likelihood has local maxima (a contact more or less), hence several starts and moves.
+Derivatives of the event-driven model are exact, in forward mode. The Hessian is that of Gauss–Newton, because the
+residuals are small. The likelihood has local maxima (one contact more or less), so the fit needs several starts.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,30 +26,30 @@ from capsule_id.inference.fit.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
-#: Of one descent: dimensionless tolerance and solver steps.
+#: Tolerance, dimensionless, and largest number of solver steps of one descent.
 SOLVER = Solver(tolerance=1e-7, max_steps=80, normal_equations=True, heavy=True)
-#: Rounds of least squares and scatters, and how little either may still move, in standard deviations.
+#: Largest number of rounds of least squares and scatters. Convergence tolerance of a round, in standard deviations.
 ROUNDS, SMALL_MOVE_IN_SD = 8, 0.01
-#: After a descent each parameter alone is moved by these numbers of standard deviations. A point whose log-posterior is
-#: higher by more than ``LEAST_INCREASE`` starts another descent, at most ``MAX_RESTARTS`` times.
+#: Single-parameter steps after a descent, in standard deviations. A point whose log-posterior is higher by more than
+#: ``LEAST_INCREASE`` starts another descent, at most ``MAX_RESTARTS`` times.
 MOVES_IN_SD, LEAST_INCREASE, MAX_RESTARTS = 2.0 ** np.arange(8), 1.0, 4
-#: No such move changes a positive parameter by more than this, natural logarithm.
+#: Largest such step of a positive parameter, natural logarithm.
 FARTHEST = 2.0
-#: Differences in log-posterior below this count as equal. A contact that moves over a sample gives the likelihood a
-#: kink, and so local maxima less than a standard deviation apart, which count as one. At a maximum on a kink no
-#: gradient vanishes: a descent ends where its Gauss–Newton step promises no more than this.
+#: Differences in log-posterior below this count as equal. A contact that crosses a sample gives the likelihood a kink.
+#: Kinks produce local maxima less than a standard deviation apart, which count as one. The gradient does not vanish
+#: at a kink, so a descent ends where the predicted Gauss–Newton increase is below this.
 NEGLIGIBLE_INCREASE = 0.1
 #: Stop refining a start whose cost exceeds this many times the best.
 COST_RATIO_TO_ABANDON = 3.0
 #: Try starts until two of them fit every channel within this many times its noise.
 NOISE_RATIO_OF_A_GOOD_FIT = 1.2
-#: A scatter's conditional maximum is searched for within this natural logarithm of its value.
+#: Search range of a scatter's conditional maximum about its value, natural logarithm.
 SCATTER_SEARCH = 6.0
 
 
 @dataclass(frozen=True)
 class _End:
-    """End of a descent: u (d,), the last least-squares fit, whether it converged, log-posterior."""
+    """End point of a descent: u (d,), the last least-squares fit, convergence, log-posterior."""
 
     u: np.ndarray
     fit: LeastSquaresFit
@@ -64,9 +64,9 @@ def joint_fit(
 
     Parameters
     ----------
-    known : values by name of what is known before: a fit of the bench, or the paper's estimates
-    seed : of the candidates
-    first : values by name that stand where the bench's would, as far as it has them
+    known : previous estimates by name: a fit of the bench tests, or the paper's estimates
+    seed : seed of the candidates
+    first : values by name that replace those of ``known`` in the first starting point
     """
     starts = choose_starts(target, known, seed, first or {})
     ends: list[_End] = []
@@ -107,13 +107,13 @@ def joint_fit(
         starts=starts[: len(ends)],
         ends=u,
         log_posterior=value,
-        elsewhere=_at_another_maximum(u, value, spread),
+        at_other_maximum=_at_another_maximum(u, value, spread),
         stalled=np.array([not end.converged for end in ends]),
     )
 
 
 def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """(s,) which of the ends u (s, d) are another maximum than the best; log-posterior (s,), posterior sd (d,)."""
+    """(s,) whether each end u (s, d) differs from the best maximum; log-posterior (s,), posterior sd (d,)."""
     best = int(np.argmax(value))
     away = np.max(np.abs(u - u[best]) / spread, axis=1)
     dent = (away < 1.0) & (value > value[best] - NEGLIGIBLE_INCREASE)
@@ -121,13 +121,13 @@ def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) ->
 
 
 def _has_excess_noise(target: LogPosterior, u: np.ndarray) -> bool:
-    """Whether at u (d,) the residuals of a record exceed its noise level: the model does not describe its motion."""
+    """Whether the residuals of a record at u (d,) exceed its noise level: the model does not fit its motion."""
     values = target.mapping(target.theta(u))
     return any(e.excess_noise(e.local(values)) > NOISE_RATIO_OF_A_GOOD_FIT for e in target.experiments)
 
 
 def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
-    """``_descend``, repeated from any better point that one parameter alone reaches."""
+    """Repeat ``_descend`` from any better point that a change of one parameter reaches."""
     end = _descend(target, start, limit)
     for _ in range(MAX_RESTARTS):
         if not np.isfinite(end.value) or end.fit.cost[0] > limit:
@@ -143,7 +143,7 @@ def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
 
 
 def _better_point(target: LogPosterior, end: _End) -> np.ndarray | None:
-    """(d,) the best point that differs from ``end`` in one located parameter; None where none is clearly better."""
+    """(d,) best point that differs from ``end`` in one located parameter; None if none is clearly better."""
     located = target.located
     sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(end.fit.jacobian[0].T @ end.fit.jacobian[0])), 0.0))
     farthest = np.where(target.positive[located], FARTHEST, np.inf)
@@ -181,7 +181,7 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
 
 
 def _is_converged(fit: LeastSquaresFit) -> bool:
-    """Whether one fit, from one start, converged or stopped where no step increases the log-posterior."""
+    """Whether a fit from one start converged, or stopped where no step increases the log-posterior."""
     step = np.linalg.lstsq(fit.jacobian[0], -fit.residuals[0])[0]
     return not fit.stalled[0] or bool(0.5 * np.sum((fit.jacobian[0] @ step) ** 2) < NEGLIGIBLE_INCREASE)
 

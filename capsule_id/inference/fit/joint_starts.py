@@ -1,8 +1,8 @@
-"""Starting points of the fit of bench and runs: the bench's estimates, and the best of many candidates about them.
+"""Starting points of the joint fit: the bench estimates and the best of many candidates around them.
 
 The likelihood of a run has local maxima far from the truth. Where bench estimates are wrong by more than their stated
-errors, a fit from them ends in one. Candidates differ from the bench's estimates (for runs alone: the estimates of the
-paper's protocol) in some parameters, by 0.3 % to 30 %. Their log-posteriors are computed in batches.
+errors, a fit from them ends in one. Candidates differ from the bench estimates in some parameters, by 0.3 % to 30 %.
+For runs alone, the estimates of the paper's protocol replace those of the bench. Log-posteriors come in batches.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ import numpy as np
 from capsule_id.inference.fit.point_fit import dispersed_starts
 from capsule_id.inference.target.log_posterior import LogPosterior
 
-#: Numbers of starting points: those that are always tried, the bench's own among them, and all.
+#: Number of starting points that are always tried (the bench estimate included), and the largest number.
 STARTS, MAX_STARTS = 3, 8
 #: Number of candidates, and rows of a batch of log-posteriors.
 CANDIDATES, ROWS_OF_A_BATCH = 1024, 64
@@ -25,7 +25,7 @@ def choose_starts(
 ) -> np.ndarray:
     """(at most MAX_STARTS, d) in u: the bench's estimates and the candidates of largest log-posterior.
 
-    The largest come first. The bench's own point, with the values of ``first``, is one of the first ``STARTS``.
+    The largest come first. The bench estimate, with the values of ``first``, is one of the first ``STARTS``.
     """
     rng = np.random.default_rng(seed)
     candidates = dispersed_starts(target, seed, CANDIDATES)

@@ -1,4 +1,4 @@
-"""Nonlinear least squares from several starts, with the covariance that the solver does not give.
+"""Nonlinear least squares from several starts, with the covariance of the parameters.
 
 Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the minimum the covariance of the parameters is
 σ² (JᵀJ)⁻¹ with σ² = Σ r² / (n − d) unless it is known (Seber & Wild, *Nonlinear Regression*, 1989, ch. 2).
@@ -28,27 +28,27 @@ Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 FIRST_DAMPING = 1e-6
 """Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
-strongly correlated, and a start near the minimum must not look converged for heavy damping."""
+strongly correlated. Heavy damping would stop a start near the minimum as if it had converged."""
 
 SMALLEST_EFFECT = 0.01
-"""Dimensionless. Where changing a parameter by 100 % of its start moves the residuals by less than this share of what
-the strongest parameter does, the parameter's scale is the step that moves them by this share: zero has no size."""
+"""Dimensionless. Smallest effect of a parameter on the residuals, relative to the strongest parameter, when it changes
+by 100 % of its start. Below it the scale is the step with this effect: a start at zero defines no scale."""
 
 LARGEST_OFFSET = 1e-3
-"""Dimensionless, in radii of the joint confidence region: how far from a stationary point an end counts as converged
-(Bates & Watts, *Technometrics* 23, 1981, 179, the relative offset)."""
+"""Largest distance of a converged end from a stationary point, in radii of the joint confidence region, dimensionless
+(relative offset; Bates & Watts, *Technometrics* 23, 1981, 179)."""
 
 
 @dataclass(frozen=True)
 class LeastSquaresFit:
-    """Where each start ended, and whether it converged there.
+    """End point and convergence of each start.
 
     Attributes
     ----------
     x : (s, d) end points, units of the parameters
     cost : (s,) ½ Σ r², units of the residuals squared
-    stalled : (s,) bool, no convergence: out of steps, numbers that are not finite, or steps that became tiny short of
-        a stationary point
+    stalled : (s,) bool, no convergence: too many steps, non-finite values, or vanishing steps away from a stationary
+        point
     steps : (s,) solver steps, rejected ones included
     message : (s,) the reason, "" where it converged
     residuals : (s, n) at the end points
@@ -65,7 +65,7 @@ class LeastSquaresFit:
 
     @property
     def best(self) -> int:
-        """The start with the smallest finite cost among those that converged, or among all where none did."""
+        """Index of the start with the smallest finite cost among those that converged, or among all if none did."""
         candidates = self.stalled if self.stalled.all() else ~self.stalled
         return int(np.argmin(np.where(candidates & np.isfinite(self.cost), self.cost, np.inf)))
 
@@ -77,16 +77,16 @@ class LeastSquaresFit:
 
 @dataclass(frozen=True)
 class Solver:
-    """How each start is solved.
+    """Settings of the least-squares solver for each start.
 
     Attributes
     ----------
     tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
         tolerance (1 + its size)
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
-    normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits in a step, and a hundred
-        times as fast where there are thousands of residuals
-    heavy : the residuals take milliseconds: compiled well, and parameters scaled by their effect (Marquardt 1963)
+    normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits, but a hundred times as
+        fast for thousands of residuals
+    heavy : residuals take milliseconds, so the code is optimised and parameters are scaled by effect (Marquardt 1963)
     """
 
     tolerance: float = 1e-9
@@ -95,6 +95,7 @@ class Solver:
     heavy: bool = False
 
 
+#: Default solver settings.
 SOLVER = Solver()
 
 
@@ -103,24 +104,23 @@ def least_squares(
 ) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
-    The damping of Levenberg-Marquardt, and its tolerance, mean something only when the parameters are of comparable
-    size, so each start is solved in v_j = x_j / scale_j with scale_j = |start_j| (``SMALLEST_EFFECT`` says what happens
-    at zero), and the residuals are divided by the largest column norm of the Jacobian in v at the start. The result
-    therefore depends on neither the units of the parameters nor those of the residuals.
+    Damping and tolerance of Levenberg-Marquardt require parameters of comparable size. Each start is therefore solved
+    in v_j = x_j / scale_j with scale_j = |start_j| (at zero: ``SMALLEST_EFFECT``). The residuals are divided by the
+    largest column norm of the Jacobian in v at the start. The result depends on no units.
 
     Parameters
     ----------
     residual : (d,) -> (n,), a JAX function; it may close over arrays. A ``jax.tree_util.Partial`` or ``equinox.Module``
-        carries its arrays as arguments instead: other numbers of the same shapes then need no new compilation
+        passes its arrays as arguments: other values of the same shapes then need no new compilation
     starts : (s, d), units of the parameters
     solver : tolerance and linear algebra of each start
-    linearise : the residuals and Jacobians that scale the starts and judge the ends, by another route; None compiles
-        forward-mode differentiation for them
+    linearise : residuals and Jacobians for scaling the starts and testing convergence; None compiles forward-mode
+        differentiation for them
 
     Raises
     ------
     ValueError
-        ``starts`` is not (s, d) with s ≥ 1, or not finite.
+        If ``starts`` is not (s, d) with s ≥ 1, or not finite.
     """
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
@@ -128,7 +128,7 @@ def least_squares(
     linearise = linearise or partial(_forward_mode, residual, solver.heavy)
     scale, unit = zip(*map(_effects if solver.heavy else _scales, linearise(starts)[1], starts), strict=True)
     solve = partial(_PROGRAMS[solver.heavy][1], residual, solver)
-    # One start after the other: batched, the solver would take twice as long to compile, and it runs for milliseconds.
+    # A batched solver takes twice as long to compile and saves only milliseconds, so starts run one by one.
     arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
     ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
     x, steps = np.stack(ends), np.array(steps, dtype=int)
@@ -147,23 +147,23 @@ def least_squares(
 
 
 def _reason(result: optx.RESULTS, jacobian: Jacobian, residuals: Residuals, rounding: float) -> str:
-    """Why an end is none, "" where it is one."""
+    """Reason why an end point is not a minimum; "" where it is one."""
     reason = optx.RESULTS[result]
     if not all_finite(jacobian, residuals):
         return "The residuals or their Jacobian are not finite where this start ended: try another start."
-    # A solver that only watches its steps takes heavy damping for convergence.
+    # The solver tests step sizes only, and heavy damping makes steps small far from a minimum.
     if not reason and not _stationary(jacobian, residuals, rounding):
         return "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
     return reason
 
 
 def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bool:
-    """The part of the residuals (n,) in the range of J (n, d) is small against the rest, or below ``rounding``."""
+    """Whether the residuals (n,) projected on the range of J (n, d) are small against the rest or ``rounding``."""
     left = column_space(jacobian)[0]
     tangential = float(np.linalg.norm(left.T @ residuals))
     normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))
     freedom = max(len(residuals) - left.shape[1], 1)
-    # Bates & Watts: both parts per degree of freedom.
+    # Bates & Watts divide both parts by their degrees of freedom.
     radius = normal * np.sqrt(max(left.shape[1], 1) / freedom)
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
@@ -195,7 +195,7 @@ def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _solve(
     residual: Residual, solver: Solver, start: jax.Array, scale: jax.Array, unit: jax.Array
 ) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
-    """From one start (d,): x (d,), steps, result code."""
+    """Solve from one start (d,): return x (d,), steps and result code."""
     function = _with_jacobian(lambda v: residual(v * scale) / unit)
     solution = optx.least_squares(
         lambda v, _: function(v),
@@ -212,10 +212,10 @@ def _solve(
 
 
 def _with_jacobian(function: Residual) -> Residual:
-    """``function`` whose tangents come from its whole Jacobian, found in one pass with its value.
+    """Return ``function`` with a tangent rule that computes value and full Jacobian in one pass.
 
-    The solver linearises and then asks for every column: this compiles a third faster than transposing its way there,
-    and an event-driven run, a loop of unknown length, cannot be transposed.
+    The solver linearises and then evaluates every column. This rule compiles a third faster than transposition.
+    An event-driven run is a loop of unknown length and cannot be transposed.
     """
     wrapped = jax.custom_jvp(function)
 
@@ -228,11 +228,11 @@ def _with_jacobian(function: Residual) -> Residual:
 
 
 def _compiled(function: Callable[..., Any], options: Mapping[str, object]) -> Callable[..., Any]:
-    # Equinox hands the options of jax.jit on; its annotations leave them out.
+    # Equinox passes the options to jax.jit, but its annotations omit them.
     return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
 
 
-#: (linearise, solve) by whether the residuals are heavy.
+#: Compiled (linearise, solve), indexed by whether the residuals are heavy.
 _PROGRAMS = {
     heavy: tuple(_compiled(function, COMPILE if heavy else COMPILE_QUICKLY) for function in (_linearise, _solve))
     for heavy in (False, True)
@@ -240,25 +240,25 @@ _PROGRAMS = {
 
 
 def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """As ``_scales``: every column of the Jacobian gets the same norm, which is then the unit of the residuals."""
+    """Scale as ``_scales`` does, but give every column of the Jacobian the same norm, the unit of the residuals."""
     column_norm = np.linalg.norm(jacobian, axis=0)
     column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
     unit = float(np.max(column_norm)) or 1.0
     scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), np.ones_like(start))
-    # The solver begins with a damping of 1: beside residuals in larger units it is weaker by their square.
+    # The solver's initial damping is 1. Larger residual units reduce its effect by their square.
     return scale, float(np.sqrt(FIRST_DAMPING)) * unit
 
 
 def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
     column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
-    # Not finite: the solver will say so.
+    # The solver reports values that are not finite.
     column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
     strongest = np.max(column_norm * size)
-    # All starts at zero: there is no size to compare with, so every parameter counts as equally strong.
+    # With all starts at zero no scale exists, so every parameter counts as equally strong.
     step = SMALLEST_EFFECT * strongest if strongest > 0 else 1.0
     scale = np.maximum(size, np.divide(step, column_norm, out=np.zeros_like(size), where=column_norm > 0))
-    # Neither a start nor an effect: any scale does, the parameter will not move.
+    # A parameter with zero start and zero effect does not change: any scale is valid.
     scale = np.where(scale > 0, scale, 1.0)
     unit = float(np.max(column_norm * scale))
     return scale, unit if unit > 0 else 1.0

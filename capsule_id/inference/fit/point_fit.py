@@ -1,9 +1,9 @@
 """Maximum of the joint log-posterior from several starts.
 
-Least squares first (it finds the basin, with the scatters held at their starting values), then quasi-Newton on the
-joint log-posterior, scatters included, in coordinates whitened by the curvature at the best least-squares end. The
-second step has its gradients from batches of log-posteriors: compiled for the Hessian anyhow, where a gradient by
-reverse mode would take seconds to compile, and milliseconds to run.
+Least squares finds the basin, with the scatters fixed at their starting values. Quasi-Newton then maximises the joint
+log-posterior, scatters included. Its coordinates are whitened by the curvature at the best least-squares end. Its
+gradients are differences of batched log-posteriors, which the Hessian needs anyway. A gradient by reverse mode takes
+seconds to compile and only milliseconds to run.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -20,38 +20,40 @@ from capsule_id.inference.fit.least_squares import Solver, least_squares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 
+#: Default number of starting points.
 STARTS = 5
-#: Ends count as the same where they differ by less than this many posterior standard deviations.
+#: Ends that differ by less than this many posterior standard deviations count as the same maximum.
 AGREEMENT = 0.05
-#: Quasi-Newton stops where the gradient, per posterior standard deviation, is below the first; its end counts as a
-#: maximum below the second (rounding of the log-posterior may stop it earlier).
+#: Gradients per posterior standard deviation: quasi-Newton stops below the first, and its end counts as a maximum
+#: below the second. Rounding of the log-posterior may stop it in between.
 TOLERANCE, MAXIMUM = 1e-5, 1e-3
+#: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
-#: Stands for the log-posterior where there is none: line searches need a number.
-NOWHERE = -1e12
-#: Least squares only has to find the basin. A damping term that is not there runs to zero, which its logarithm never
-#: reaches: the prior stops it, and quasi-Newton finds that in fewer steps.
-ROUGH = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
-#: Relative step of the difference quotients of residuals: their error is then about 1e-10 relative.
+#: Replaces a log-posterior that is not finite, because line searches need a finite number.
+LOG_POSTERIOR_FLOOR = -1e12
+#: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
+#: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
+BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
+#: Relative step of the difference quotients of residuals; their relative error is about 1e-10.
 DIFFERENCE = 1e-5
 
 
 def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -> PointFit:
-    """Fit from ``number_of_starts`` dispersed starts, none of them the truth or on a bound (there are no bounds).
+    """Maximise the log-posterior from ``number_of_starts`` dispersed starting points.
 
     Parameters
     ----------
-    seed : of the dispersal
+    seed : seed of the dispersed starting points
     """
     starts = dispersed_starts(target, seed, number_of_starts)
     located = target.located
-    # The log-posterior compiles while least squares does.
+    # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
         compiled = pool.submit(target.batch, np.repeat(starts[:1], BATCH, axis=0))
         rough = least_squares(
             HeldResiduals(target, jnp.asarray(starts[0])),
             starts[:, located],
-            ROUGH,
+            BASIN_SOLVER,
             partial(_linearise, target, starts[0]),
         )
         compiled.result()
@@ -75,19 +77,19 @@ def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -
         starts=starts,
         ends=u,
         log_posterior=value,
-        elsewhere=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
+        at_other_maximum=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
         stalled=~converged | ~np.isfinite(value),
     )
 
 
 def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray:
-    """(number, d) in u: the proposed centre, then normal draws about it with each parameter's own spread."""
+    """(number, d) in u: the proposed centre, then normal draws about it with the spread of each parameter."""
     by_name = target.starts()
     proposed = [by_name[name] for name in target.names]
     centre = target.unconstrain(np.array([start.centre for start in proposed]))
     spread = np.array([start.spread for start in proposed])
     z = np.random.default_rng(seed).standard_normal((number, target.dimension))
-    # The first start is the paper's estimate itself; the others leave it by at least a third of their spread.
+    # The first start is the paper's estimate. The others differ from it by at least a third of their spread.
     z = np.where(np.abs(z) < 1.0 / 3.0, np.copysign(1.0 / 3.0, z), z)
     z[0] = 0.0
     return centre + spread * z
@@ -97,9 +99,9 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
     """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged."""
 
     def negative(v: np.ndarray) -> np.ndarray:
-        """(m,) of whitened v (m, d)."""
+        """Negative log-posterior (m,) at whitened v (m, d)."""
         value = in_batches(target.batch, end + v @ whitening.T)
-        return -np.where(np.isfinite(value), value, NOWHERE)
+        return -np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR)
 
     solution = optimize.minimize(
         lambda v: float(negative(v[None])[0]),
@@ -109,11 +111,15 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
         options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
     )
     value = -float(solution.fun)
-    return end + whitening @ solution.x, value, value > NOWHERE and bool(np.max(np.abs(solution.jac)) < MAXIMUM)
+    return (
+        end + whitening @ solution.x,
+        value,
+        value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM),
+    )
 
 
 def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (s, n) and Jacobians (s, n, d) at located u (s, d), the scatters those of ``start``; not compiled."""
+    """Residuals (s, n) and Jacobians (s, n, d) at located u (s, d), scatters fixed at ``start``; not compiled."""
     located = target.located
 
     def residuals(v: np.ndarray) -> np.ndarray:
@@ -127,7 +133,7 @@ def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> t
 
 
 def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """(d,) rough diagonal information: squared residual Jacobian, and 2n for the scatter of n readings."""
+    """(d,) approximate diagonal information: squared residual Jacobian, and 2n for the scatter of n readings."""
     jacobian = _residual_jacobian(target, u)
     count = np.zeros(target.dimension)
     for experiment in target.experiments:
@@ -143,7 +149,7 @@ def _residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
 
 
 def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> dict[str, float]:
-    """From the Jacobian of the standardised residuals, scatters held at the fit; NaN for the scatters; SI.
+    """Standard errors from the Jacobian of the standardised residuals, scatters fixed; NaN for scatters; SI.
 
     The error of a parameter sampled through its logarithm is its relative error times its value.
     """
@@ -156,10 +162,10 @@ def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> 
 
 
 def bic(target: LogPosterior, fit: PointFit) -> float:
-    """Schwarz's criterion p log n - 2 log L at the point fit, linear nuisances at their best and counted in p.
+    """Schwarz's criterion p log n - 2 log L at the point fit, linear nuisances at their maximum and counted in p.
 
-    Likelihoods that have integrated out different numbers of nuisances must not be compared by it: each integral
-    brings its own Occam factor.
+    Integrated likelihoods with different numbers of nuisances are not comparable by this criterion: each integral
+    adds its own Occam factor.
     """
     values = target.mapping(target.theta(fit.u))
     unknowns, readings, deviance = target.dimension, 0, 0.0

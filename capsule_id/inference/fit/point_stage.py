@@ -1,6 +1,6 @@
-"""The point fit by stages: closed forms first, runs cut where they must be, then everything together.
+"""Stages of the point fit: closed forms, division of unpredictable runs, joint fit.
 
-experiments -> bench fit (closed forms) -> runs whose start is forgotten too late are cut -> LogPosterior -> joint fit
+experiments -> bench fit (closed forms) -> divide runs that amplify initial errors -> LogPosterior -> joint fit
 """
 
 from collections.abc import Mapping
@@ -19,15 +19,15 @@ from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior, compile_ahead
 from capsule_id.views import Finding
 
-#: emcee steps of the bench's own sample, which shows what the runs add and whether they agree.
+#: emcee steps of the bench sample, which measures the precision gained from runs and their agreement.
 BENCH_BUDGET = 1000
-#: Fits, each after kinds of start that the one before found wrong have been put right.
+#: Largest number of fits. Each fit follows a correction of the kinds of initial state that the last one contradicts.
 ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class BenchFit:
-    """What the closed forms tell by themselves; None where there are none, or nothing was sampled."""
+    """Fit and sample of the closed forms alone; None where there are none, or nothing was sampled."""
 
     fit: PointFit | None = None
     sample: Posterior | None = None
@@ -35,7 +35,7 @@ class BenchFit:
 
 @dataclass(frozen=True)
 class PointStage:
-    """Where the point fit stands: ``target`` holds the experiments as they were fitted, records possibly cut."""
+    """Result of the point fit; ``target`` holds the experiments as fitted, with divided records."""
 
     target: LogPosterior
     fit: PointFit
@@ -49,9 +49,9 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
 
     Parameters
     ----------
-    registry : the kinds of the rig, for rough values from bench tests that are not fitted
-    seed : of the starts, and of the bench's own sample
-    sampled : a sample will follow: its compilation begins, and the bench gets one of its own
+    registry : kinds of experiments of the rig, for rough values from bench tests that are not fitted
+    seed : seed of the starting points and of the bench sample
+    sampled : whether a sample follows: then compile it in advance and sample the bench tests alone too
     """
     closed = [e for e in target.experiments if not e.event_driven]
     with ThreadPoolExecutor(1) if sampled else nullcontext() as pool:
@@ -74,7 +74,7 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
 def _fit_with_right_starts(
     target: LogPosterior, known: Mapping[str, float], seed: int, pool: Executor | None
 ) -> tuple[LogPosterior, PointFit, list[Finding]]:
-    """The joint fit, repeated from its end while it contradicts the kind of start of a run; a finding if it still does."""
+    """Repeat the joint fit while it contradicts the kind of initial state of a run; report what remains."""
     first = None
     for remaining in reversed(range(ROUNDS)):
         _compile(pool, target)
@@ -90,13 +90,13 @@ def _fit_with_right_starts(
 
 
 def _compile(pool: Executor | None, target: LogPosterior) -> None:
-    """In another thread; what goes wrong in it comes up again where its result is used."""
+    """Compile in another thread; any error occurs again where the compiled function is used."""
     if pool is not None:
         pool.submit(compile_ahead, target)
 
 
 def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:
-    """The paper's estimates from the rig's bench tests; those that ``target`` lacks are made for it."""
+    """Return the paper's estimates from the rig's bench tests, including tests that ``target`` lacks."""
     bench = [e for e in target.experiments if e.bench]
     if not bench and select_tables(target.rig, "bench"):
         bench = make_experiments(target.rig, "bench", registry)
@@ -104,11 +104,11 @@ def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:
 
 
 def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple[LogPosterior, list[Finding]]:
-    """``target`` with every run that amplifies an error of its initial state too much in parts; and what was done.
+    """Divide every run that amplifies errors of its initial state too much; return findings too.
 
     Parameters
     ----------
-    known : estimates by name; whatever is missing has the value where a fit would start
+    known : estimates by name; a missing parameter takes the starting value of a fit
     """
     values = {**target.fixed, **{name: start.centre for name, start in target.starts().items()}, **known}
     kept: list[Experiment] = []
@@ -121,9 +121,9 @@ def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple
 
 
 def correct_starts(target: LogPosterior, fit: PointFit) -> tuple[list[Experiment], dict[str, float]] | None:
-    """Replace initial conditions that the record contradicts at ``fit``: the experiments, and values to continue from.
+    """Replace initial conditions that the record contradicts at ``fit``; return experiments and starting values.
 
-    None: all stand.
+    None: the record contradicts no initial condition.
     """
     values = target.mapping(target.theta(fit.u))
     corrected = [e.corrected_start(e.local(values)) for e in target.experiments]

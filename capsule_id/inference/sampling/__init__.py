@@ -1,1 +1,1 @@
-"""The sample: ensembles of walkers, their moves, their store on disk, and what says whether they converged."""
+"""Posterior sampling: ensembles of walkers, their moves, their storage and convergence diagnostics."""

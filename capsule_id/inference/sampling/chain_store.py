@@ -1,8 +1,8 @@
-"""Chains on disk that stay readable when the process is killed at any moment.
+"""Storage of chains on disk that survives termination of the process at any moment.
 
-emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter), so a process that dies
-between two of them leaves a file that opens and is wrong. A resumed run therefore starts from a copy made between draws,
-which carries its own digest. The file that emcee writes is never read after an interruption.
+emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter). A process killed
+between two steps leaves an inconsistent file. A resumed run therefore starts from a copy made between draws, which
+stores its own digest. The file that emcee writes is never read after an interruption.
 """
 
 import hashlib
@@ -13,22 +13,23 @@ import h5py
 
 from capsule_id.inference.sampling.ensemble import OpenBackend
 
-#: Seconds between two copies.
+#: Time between two copies, s.
 SAVE_EVERY = 5.0
+#: Length of the digest of a copy, bytes.
 _DIGEST = hashlib.sha256().digest_size
 
 
 def saved_copy(store: Path) -> Path:
-    """The copy of ``store`` from which an interrupted run resumes."""
+    """Path of the copy of ``store`` from which an interrupted run resumes."""
     return store.with_suffix(".saved")
 
 
 class ChainStore:
-    """The HDF5 file that emcee writes, open as long as this is (a context), and its copy.
+    """Context manager of the open HDF5 file that emcee writes, and of its copy.
 
     Parameters
     ----------
-    store : the file; it is replaced by the last copy, or removed where no copy has a valid digest
+    store : the file; the last copy replaces it, or it is removed if no copy has a valid digest
     """
 
     def __init__(self, store: Path) -> None:
@@ -47,16 +48,16 @@ class ChainStore:
         self._file.close()
 
     def backend(self, name: str) -> OpenBackend:
-        """The store of one ensemble's draws."""
+        """emcee backend for the draws of one ensemble."""
         return OpenBackend(self._file, name)
 
     def between_draws(self) -> None:
-        """Copy the file, if the last copy is old enough; to be called while emcee is not writing."""
+        """Copy the file if the last copy is old enough; call this only while emcee is not writing."""
         if time.monotonic() >= self._next:
             self.save()
 
     def save(self) -> None:
-        """Copy the file now; the copy appears by one rename."""
+        """Copy the file now; a single rename makes the copy atomic."""
         self._file.flush()
         content = self._store.read_bytes()
         temporary = self._copy.with_suffix(".saved-new")

@@ -1,4 +1,4 @@
-"""Convergence of ensemble samplers. Independent chains are whole ensembles, not the walkers of one."""
+"""Convergence diagnostics of ensemble samplers. Independent chains are whole ensembles, not the walkers of one."""
 
 import emcee
 import numpy as np
@@ -7,25 +7,25 @@ from jaxtyping import Float
 #: Stored draws of independent ensembles.
 Draws = Float[np.ndarray, "ensemble draw walker d"]
 
-#: Autocorrelation times after which autocovariances are noise.
+#: Summation window of autocovariances, in autocorrelation times (Sokal 1997, section 3); beyond it they are noise.
 WINDOW = 5.0
 
 
 def integrated_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
-    """(ensemble, d) integrated autocorrelation time, in draws, of every ensemble: emcee's estimator, for the ESS.
+    """(ensemble, d) integrated autocorrelation time of every ensemble, in draws, by emcee's estimator, for the ESS.
 
-    NaN where a walker never moved (a budget of a few draws).
+    NaN where a walker never moved (after a few draws only).
     """
     with np.errstate(invalid="ignore"):
         return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
 
 
 def ensemble_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
-    """(ensemble, d) integrated autocorrelation time without emcee's bias in short chains: it decides on their length.
+    """(ensemble, d) integrated autocorrelation time without emcee's bias in short chains, for the stopping rule.
 
-    Autocovariances are about the mean of the whole ensemble and averaged over its walkers. About each walker's own
-    mean, as in emcee, tau comes out low by 10 tau/N of itself: by 20 % where N is just 50 tau (tested). The sum stops
-    at the first lag above ``WINDOW`` tau (Sokal 1997, section 3).
+    Autocovariances are about the mean of the whole ensemble and averaged over its walkers. emcee takes each walker's
+    own mean, which underestimates tau by a fraction 10 tau/N: by 20 % at N = 50 tau (tested). The sum stops at the
+    first lag above ``WINDOW`` tau (Sokal 1997, section 3).
 
     Parameters
     ----------
@@ -58,6 +58,6 @@ def split_rhat(draws: Draws) -> Float[np.ndarray, " d"]:
 def effective_sample_size(draws: Draws, tau: Float[np.ndarray, "ensemble d"]) -> Float[np.ndarray, " d"]:
     """(d,) draws divided by the integrated autocorrelation time ``tau`` (ensemble, d), summed over ensembles.
 
-    Never more than there are draws: the estimate of tau from a few draws may be 0.
+    It never exceeds the number of draws, because the estimate of tau from a few draws may be 0.
     """
     return np.sum(draws.shape[1] * draws.shape[2] / np.maximum(tau, 1.0), axis=0)

@@ -1,7 +1,7 @@
-"""One emcee ensemble behind its public interface: it holds its own state, and is advanced draw by draw.
+"""One emcee ensemble that stores its own state and advances draw by draw.
 
-emcee keeps the state of a run only in ``run_mcmc``. A run that is iterated over (so that every draw can be saved) must
-carry its state from call to call itself.
+emcee keeps the state of a run only in ``run_mcmc``. Saving after every draw requires iteration, and an iterated run
+must keep its own state between calls.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,16 +21,16 @@ class Ensemble:
     Parameters
     ----------
     parts : (w, d) -> (w, blocks), the log-density of each block; their sum is the log-density
-    state : where the walkers stand, with the state of their random numbers
+    state : positions of the walkers and state of their random numbers
     moves : see ``capsule_id.inference.sampling.moves``
-    backend : where draws are stored; None: in memory
+    backend : storage of the draws; None: in memory
     """
 
     def __init__(
         self, parts: Callable[[np.ndarray], np.ndarray], state: emcee.State, moves: Moves, backend: Any = None
     ) -> None:
         def log_density(v: np.ndarray) -> np.ndarray:
-            """(w, 1 + blocks): emcee keeps what follows the log-density as blobs, and ``BlockMove`` reads them."""
+            """(w, 1 + blocks): log-density, then the blocks, which emcee stores as blobs for ``BlockMove``."""
             found = parts(v)
             return np.concatenate([np.sum(found, axis=1, keepdims=True), found], axis=1)
 
@@ -47,7 +47,7 @@ class Ensemble:
 
     @property
     def chain(self) -> np.ndarray:
-        """(draw, walker, d) the stored draws."""
+        """(draw, walker, d) stored draws."""
         return np.asarray(self._sampler.get_chain())
 
     @property
@@ -56,26 +56,26 @@ class Ensemble:
         return self._sampler.backend.accepted / self._sampler.iteration
 
     def advance(self, draws: int, thin: int = 1, store: bool = True) -> Iterator[None]:
-        """Make ``draws`` more draws of ``thin`` steps each; yields after each one, when it is stored."""
+        """Make ``draws`` more draws of ``thin`` steps each; yield after each one is stored."""
         if draws > 0:
             for state in self._sampler.sample(self.state, iterations=draws, thin_by=thin, store=store):
                 self.state = state
                 yield
 
     def run(self, steps: int, store: bool = True) -> "Ensemble":
-        """Make ``steps`` steps; returns itself."""
+        """Make ``steps`` steps and return the ensemble itself."""
         for _ in self.advance(steps, store=store):
             pass
         return self
 
 
 def initial_state(positions: np.ndarray, random: np.random.RandomState) -> emcee.State:
-    """Walkers at ``positions`` (w, d), their random numbers those of ``random`` from its present state on."""
+    """State of walkers at ``positions`` (w, d), with the current state of ``random``."""
     return emcee.State(positions, random_state=random.get_state())
 
 
 class OpenBackend(emcee.backends.HDFBackend):
-    """emcee's HDF5 backend on a file that stays open; emcee's own opens its file six times a step."""
+    """emcee's HDF5 backend on a file that stays open; emcee's own backend opens the file six times a step."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
         super().__init__(file.filename, name)
@@ -86,5 +86,5 @@ class OpenBackend(emcee.backends.HDFBackend):
         return nullcontext(self._file)
 
     def last_state(self) -> emcee.State | None:
-        """The state after the last stored draw; None without one."""
+        """State after the last stored draw; None if there is no draw."""
         return self.get_last_sample() if self.initialized and self.iteration else None

@@ -1,4 +1,4 @@
-"""Sampling by independent emcee ensembles: run until they agree or the budget is spent, saved while they run."""
+"""Sampling by independent emcee ensembles until convergence or a step limit, with regular saving."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
@@ -16,26 +16,28 @@ from capsule_id.inference.sampling.diagnostics import effective_sample_size, ens
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import LARGE, Moves, block_move, candidates
 
+#: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
-#: Walkers of an ensemble: one batch of the log-posterior, or more, and at least two for every parameter.
+#: Smallest number of walkers of an ensemble: one batch of the log-posterior. There are at least two per parameter.
 MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
-#: A sample is long enough when every parameter has more draws than this many autocorrelation times ...
+#: Convergence requires more draws than this many autocorrelation times for every parameter.
 LENGTH_IN_TAU = 50.0
-#: ... and its ensembles agree when no split R-hat is above this.
+#: Convergence requires a split R-hat of at most this for every parameter.
 MAX_RHAT = 1.01
-#: Stored draws of an ensemble before the first check, and between the checks that follow.
+#: Stored draws of an ensemble before the first convergence check, and between later checks.
 FIRST_CHECK, CHECK_EVERY = 120, 30
-#: Autocorrelation times (of the pilot) that every ensemble runs before its first stored draw.
+#: Burn-in of every ensemble before its first stored draw, in autocorrelation times of the pilot.
 BURN_IN_IN_TAU = 8.0
-#: Walkers start this much wider than the Laplace approximation.
+#: Spread of the initial walkers relative to the Laplace approximation, dimensionless.
 OVERDISPERSION = 1.2
+#: Largest number of emcee steps of an ensemble after burn-in, unless stated.
 DEFAULT_BUDGET = 20_000
-#: Stored draws per autocorrelation time of the pilot, and the most steps per stored draw: a short pilot knows that time
-#: only roughly.
+#: Stored draws per autocorrelation time of the pilot, and the largest number of steps per stored draw. The limit is
+#: needed because a short pilot estimates the autocorrelation time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
-#: Steps of the pilot's burn-in, half of which shapes the block proposal, and of the moves that it times.
+#: Steps of the pilot's burn-in, half of which determines the block proposal, and steps of each measured move (short, long).
 PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
-#: Name of the move that the pilot shapes by its own sample, the most adaptations, and the steps of each.
+#: Name of the move that the pilot adapts to its own sample, largest number of adaptations, and steps of each.
 ADAPTED, ADAPTATIONS, ADAPTING_STEPS = "adapted block independence + differential evolution", 4, 200
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
@@ -45,7 +47,7 @@ FAIR_TAU = 40.0
 
 @dataclass(frozen=True)
 class Schedule:
-    """Move, thinning and burn-in of the recorded run, as the pilot run decides."""
+    """Move, thinning and burn-in of the recorded run, chosen by the pilot run."""
 
     move: str
     moves: Moves
@@ -81,10 +83,10 @@ def sample(
 
     Parameters
     ----------
-    seed : the same seed gives the same draws, also when the run was interrupted and goes on from ``store``
+    seed : the same seed gives the same draws, also when an interrupted run resumes from ``store``
     budget : emcee steps of an ensemble after burn-in
-    store : HDF5 file that holds the chains while they run; the draws in its saved copy are taken up
-    progress : called with (draws done, draws until the next check, what is being done)
+    store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
+    progress : called with (draws done, draws until the next check, name of the stage)
     """
     report = progress or (lambda done, total, text: None)
     report(0, 1, "pilot")
@@ -130,13 +132,13 @@ def sample(
 
 
 def _converged(draws: np.ndarray) -> bool:
-    """Long enough and in agreement: (ensemble, draw, walker, d)."""
+    """Whether draws (ensemble, draw, walker, d) are long enough and their ensembles agree."""
     tau, rhat = ensemble_time(draws), split_rhat(draws)
     return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
 
 
 def pilot(target: Target, seed: int) -> Schedule:
-    """Burn in one ensemble, then measure the autocorrelation time of candidate moves on it until one is good."""
+    """Burn in one ensemble, then measure autocorrelation times of candidate moves until one is short enough."""
     start = _initial(target, np.random.RandomState(seed))
     # In 30 dimensions a proposal that is 20 % too wide is almost never accepted: large blocks are not widened.
     wider = np.ones(target.dimension)
@@ -146,8 +148,8 @@ def pilot(target: Target, seed: int) -> Schedule:
     sample = ensemble.chain[PILOT_BURN_IN // 2 :].reshape(-1, target.dimension)
     measured, moves = {}, dict(candidates(sample, target.blocks, target.centre, target.covariance))
     first, *others = moves
-    # The most promising move runs first, briefly, then for longer. Moves shaped by the sample so far follow: a posterior
-    # with kinks differs from the Laplace approximation. The other moves are the last resort.
+    # The most promising move runs first, briefly, then longer. Moves adapted to the sample follow, because a posterior
+    # with kinks differs from the Laplace approximation. All other moves come last, because they are slow.
     plan = [(first, PILOT_STEPS), (first, LONG_PILOT_STEPS), *[(ADAPTED, ADAPTING_STEPS)] * ADAPTATIONS]
     for name, steps in [*plan, *((name, LONG_PILOT_STEPS) for name in others)]:
         if name in others and min(measured.values()) < FAIR_TAU:
@@ -175,7 +177,7 @@ def _checks(last: int) -> Iterator[int]:
 
 
 def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
-    """One ensemble: burnt in from its own overdispersed start, or taken up where ``backend`` left it."""
+    """Return one ensemble: burnt in from its own overdispersed start, or resumed from ``backend``."""
     last = None if backend is None else backend.last_state()
     if last is not None:
         return Ensemble(target.parts, last, schedule.moves, backend)

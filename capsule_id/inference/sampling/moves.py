@@ -11,12 +11,12 @@ from capsule_id.inference.fit.curvature import Matrix, Vector
 
 #: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well.
 LARGE = 9
-#: Degrees of freedom of the proposal for small and for large blocks, and its widths with their weights. Small blocks may
-#: rest on four trials and need heavy tails. In many dimensions a heavier or wider proposal is almost never accepted.
+#: Degrees of freedom of the proposal for small and for large blocks, and its widths with their weights. Small blocks
+#: with few trials need heavy tails. In many dimensions a heavier or wider proposal is almost never accepted.
 FEW, MANY = 6.0, 200.0
 WIDTHS, WEIGHTS = np.array([[1.0, 2.0, 4.0], [1.0, 1.15, 1.4]]), np.array([0.85, 0.1, 0.05])
-#: A parameter of a large block is proposed wider than the Laplace approximation where a pilot finds it wider by this
-#: factor, which is beyond the noise of a short pilot.
+#: Smallest ratio of pilot sd to Laplace sd at which a large block's proposal is widened. Smaller ratios may be noise
+#: of a short pilot.
 WIDER = 1.1
 
 #: emcee's moves with their weights.
@@ -24,17 +24,17 @@ Moves = list[tuple[Any, float]]
 
 
 class BlockMove(emcee.moves.Move):
-    """Independence Metropolis–Hastings, all blocks of parameters in every step, each accepted by itself.
+    """Independence Metropolis–Hastings of all blocks of parameters in every step, each accepted separately.
 
-    Between blocks the posterior is a product, and the sampler keeps its factors (emcee's blobs), so that one evaluation
-    of it decides on every block. Each block has its own mixture of Student densities, fixed before the recorded chain
-    starts, so that detailed balance holds.
+    The posterior is a product over blocks. emcee stores its factors as blobs, so that one evaluation suffices for all
+    blocks. Each block has its own mixture of Student densities. The mixture is fixed before the recorded chain starts,
+    so that detailed balance holds.
 
     Parameters
     ----------
     blocks : indices of the parameters of each block, in the order of the factors
     centre : (d,)
-    covariance : (d, d), of which the blocks are read
+    covariance : (d, d), of which only the blocks are used
     """
 
     def __init__(self, blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix) -> None:
@@ -48,7 +48,7 @@ class BlockMove(emcee.moves.Move):
         self.freedom, self.widths = np.where(large, MANY, FEW), WIDTHS[large.astype(int)].T
 
     def log_density(self, u: Float[np.ndarray, "w d"]) -> Float[np.ndarray, "w blocks"]:
-        """(w, blocks) of the proposals, up to a constant; u (w, d)."""
+        """(w, blocks) log-density of the proposals at u (w, d), up to a constant."""
         square = ((u - self.centre) @ self._inverse.T) ** 2 @ self.member
         d = np.sum(self.member, axis=0)
         parts = [
@@ -59,14 +59,14 @@ class BlockMove(emcee.moves.Move):
         return np.logaddexp.reduce(parts, axis=0)
 
     def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
-        """(size, d)."""
+        """Draw (size, d) proposals."""
         shape = (size, self.member.shape[1])
         scale = self.widths[rng.choice(len(WEIGHTS), p=WEIGHTS, size=shape), np.arange(shape[1])]
         scale = scale * np.sqrt(self.freedom / rng.chisquare(np.broadcast_to(self.freedom, shape)))
         return self.centre + (rng.standard_normal((size, len(self.centre))) * (scale @ self.member.T)) @ self.root.T
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
-        """emcee's step: the new state and, as acceptance, the share of blocks that moved, (w,)."""
+        """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
         new = self.draw(model.random, len(state.coords))
         _, blobs = model.compute_log_prob_fn(new)
         # emcee drops the axis where there is one block only.
@@ -81,21 +81,21 @@ class BlockMove(emcee.moves.Move):
 
 
 def block_move(blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix) -> Moves:
-    """Block moves, with one step in ten of differential evolution, which needs no covariance."""
+    """Block moves, with one step in ten by differential evolution, which needs no covariance."""
     return [(BlockMove(blocks, centre, covariance), 0.9), (emcee.moves.DEMove(), 0.1)]
 
 
 def candidates(
     sample: Float[np.ndarray, "m d"], blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix
 ) -> Mapping[str, Moves]:
-    """The moves that the pilot compares, the most promising first.
+    """Return the moves that the pilot compares, the most promising first.
 
     Parameters
     ----------
-    sample : (m, d) of the pilot's burnt-in ensemble, the mean and covariance of small blocks
+    sample : (m, d) of the pilot's burnt-in ensemble, for mean and covariance of small blocks
     blocks : see ``MarginalPosterior.blocks``
-    centre, covariance : (d,), (d, d) the Laplace approximation: the correlations of large blocks, which a short pilot
-        estimates badly; their widths come from the pilot where it finds them wider
+    centre, covariance : (d,), (d, d) Laplace approximation, for the correlations of large blocks, which a short pilot
+        estimates badly; their widths come from the pilot where it finds larger ones
     """
     shape, middle = np.atleast_2d(np.cov(sample.T)), np.median(sample, axis=0)
     for block in blocks:

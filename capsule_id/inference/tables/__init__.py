@@ -1,1 +1,1 @@
-"""Small tables of a fit for the report."""
+"""Tables of a fit for the report."""

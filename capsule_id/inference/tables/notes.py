@@ -1,4 +1,4 @@
-"""The tables of the report: those that the experiments declare, and those about the fit as a whole."""
+"""Tables of the report: those of the experiments and those of the whole fit."""
 
 from collections.abc import Mapping
 
@@ -12,11 +12,11 @@ from capsule_id.views import ResultTable
 
 
 def make_notes(setting: Setting, predictive: Mapping[str, float | None]) -> list[ResultTable]:
-    """All tables; those about bench and runs together where there are runs.
+    """Return all tables; those that compare bench tests and runs only where there are runs.
 
     Parameters
     ----------
-    predictive : posterior predictive p-values by label; no table shows them where there is no sample
+    predictive : posterior predictive p-values by label; without a sample there is no such table
     """
     target, fit = setting.target, setting.fit
     of_runs, of_bench = (

@@ -17,7 +17,7 @@ SUMMARY_COLUMNS = (
 
 
 def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Physical parameters, and nuisances; see ``Result``."""
+    """Return the tables of physical parameters and of nuisances; see ``Result``."""
     target, point, posterior = setting.target, setting.fit, setting.posterior
     masses = {"m1": setting.rig.m1, "m2": setting.rig.m2}
     paper = paper_estimates(target.experiments, registry)

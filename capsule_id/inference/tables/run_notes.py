@@ -1,4 +1,4 @@
-"""Tables about bench tests and forced runs together: precision gained from the runs, what smoothing would do."""
+"""Tables for bench tests and forced runs together: precision gained from the runs, effect of smoothing."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from capsule_id.views import ResultTable
 
 
 def precision_gained(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> ResultTable:
-    """Posterior sd with bench only, runs only, both; from samples where there are any, else from point fits."""
+    """Posterior sd from bench only, runs only, and both; from samples where they exist, else from point fits."""
     shared, known = shared_symbols(target), run_parameters(target)
     alone = runs_alone(target, joint)
     sds = dict(zip(alone.names, np.sqrt(np.diag(alone.covariance)), strict=True))
@@ -31,12 +31,12 @@ def precision_gained(target: LogPosterior, joint: PointFit, sample: Posterior | 
 
 
 def run_parameters(target: LogPosterior) -> set[str]:
-    """Names of the physical parameters that a run has, masses included."""
+    """Names of the physical parameters of forced runs, masses included."""
     return {row.name for e in target.experiments if not e.bench for row in e.parameters if row.physical} | {"m1", "m2"}
 
 
 def shared_symbols(target: LogPosterior) -> set[str]:
-    """Symbols of the parameters of runs that a bench test may measure too: those that belong to no single run."""
+    """Symbols of run parameters that a bench test may measure too: those that belong to no single run."""
     runs = {e.label for e in target.experiments if not e.bench}
     known = run_parameters(target)
     return {row.symbol for row in target.parameters if row.name in known and row.of not in runs}
@@ -52,10 +52,10 @@ def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:
 
 
 def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing | None = None) -> ResultTable:
-    """By how much a fit of the smoothed model would differ from this one, in posterior sd, at ``widths``.
+    """Difference between a fit of the smoothed model with ``widths`` and this fit, in posterior sd.
 
-    One Gauss–Newton step: the difference of the residuals of both models, through the exact model's Jacobian. ``widths``
-    None: the certified ones.
+    One Gauss–Newton step maps the difference of the residuals of both models through the exact model's Jacobian.
+    ``widths`` None: the certified ones.
     """
     widths = widths or Smoothing()
     shift, sd = smoothing_shift(target, fit, widths)

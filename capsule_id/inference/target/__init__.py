@@ -1,1 +1,1 @@
-"""The log-posterior: of all parameters (``log_posterior``), and with the noise levels integrated out (``marginal``)."""
+"""Log-posterior of all parameters (``log_posterior``), and with noise levels integrated out (``marginal``)."""

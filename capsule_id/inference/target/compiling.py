@@ -1,6 +1,6 @@
-"""XLA options of what is compiled here: a fit takes seconds, and compiling was most of it."""
+"""XLA options that shorten compilation, which takes most of the time of a short fit."""
 
-#: XLA's newer emitters of fused loops take twice as long to compile, and their code runs no faster.
+#: Disable XLA's newer emitters of fused loops: they compile twice as long, and their code runs no faster.
 COMPILE = {"xla_cpu_use_fusion_emitters": False}
-#: For what runs for milliseconds in all.
+#: Options for code that runs for milliseconds in total, where compilation time dominates.
 COMPILE_QUICKLY = {**COMPILE, "xla_backend_optimization_level": 0}

@@ -1,4 +1,4 @@
-"""Experiments that differ only in numbers, stacked: each group is evaluated in one batch."""
+"""Groups of stacked experiments that differ only in numbers; each group is evaluated in one batch."""
 
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
@@ -12,13 +12,13 @@ from capsule_id.experiments.base import Experiment
 
 
 class Group(eqx.Module):
-    """Stacked experiments.
+    """Stacked experiments of equal tree structure.
 
     Attributes
     ----------
     experiments : one experiment whose leaves have a leading axis (members, ...), on the device
-    members : which of the experiments of the log-posterior they are
-    entries : symbol and, for every member, which entry of u it is (d: the member lacks it, its value is 0)
+    members : indices of these experiments in the log-posterior
+    entries : symbol and, for every member, its index in u (d: the member lacks it, its value is 0)
     """
 
     experiments: Experiment
@@ -26,7 +26,7 @@ class Group(eqx.Module):
     entries: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
 
     def local(self, values: Any, without: Sequence[str | None] = ()) -> dict[str, Any]:
-        """(members,) by symbol, out of the constrained values (d,); symbols in ``without`` are left out."""
+        """Values (members,) by symbol, from the constrained values (d,); symbols in ``without`` are omitted."""
         padded = jnp.concatenate([values, jnp.zeros(1)])
         return {symbol: padded[jnp.array(entry)] for symbol, entry in self.entries if symbol not in without}
 

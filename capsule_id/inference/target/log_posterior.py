@@ -1,7 +1,7 @@
-"""The joint log-posterior of all experiments in an unconstrained space.
+"""Joint log-posterior of all experiments in an unconstrained space.
 
 u = log(theta) for positive parameters, theta otherwise. log p(u | data) = sum of log-likelihoods + log prior density
-of theta + log |d theta / du|: natural and normalised, linear nuisances integrated out.
+of theta + log |d theta / du|. All densities are natural and normalised; linear nuisances are integrated out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,18 +23,18 @@ from capsule_id.inference.target.priors import Priors, override, prior_of, prior
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Rig
 
-#: Starts from a prior alone are dispersed by no more than this, natural-log units.
+#: Largest dispersion of starts that come from a prior alone, natural-log units.
 WIDEST_START = 0.3
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What a log-posterior was made of; no compiled program reads it, and all of these compare as equal.
+    """Inputs of a log-posterior that no compiled program reads; all instances compare as equal.
 
     Attributes
     ----------
     rig, experiments : as given
-    parameters : (d,) sampled, masses first, then in the order in which experiments name them
+    parameters : (d,) sampled parameters, masses first, then in the order of the experiments
     fixed : constants by name: g and the masses stated without an sd
     """
 
@@ -45,9 +45,9 @@ class Origin:
 
 
 class LogPosterior(eqx.Module):
-    """Experiments and priors, joined: a frozen tree of arrays.
+    """Log-posterior of experiments and priors, as a frozen tree of arrays.
 
-    Its methods are compiled once for all log-posteriors of equal structure, as in a calibration study over many rigs.
+    Log-posteriors of equal structure share compiled methods, for instance in a calibration study over many rigs.
 
     Attributes
     ----------
@@ -108,17 +108,17 @@ class LogPosterior(eqx.Module):
 
     @property
     def positive(self) -> np.ndarray:
-        """(d,) which parameters are sampled through their logarithm."""
+        """(d,) whether each parameter is sampled through its logarithm."""
         return np.array(self.are_positive, dtype=bool)
 
     @property
     def scatter(self) -> np.ndarray:
-        """(d,) which parameters are standard deviations: they scale residuals, they move no prediction."""
+        """(d,) whether each parameter is a standard deviation, which scales residuals but changes no prediction."""
         return np.array(self.are_scatters, dtype=bool)
 
     @property
     def located(self) -> np.ndarray:
-        """Indices of the parameters that move a prediction."""
+        """Indices of the parameters that change a prediction."""
         return np.flatnonzero(~self.scatter)
 
     @property
@@ -128,7 +128,7 @@ class LogPosterior(eqx.Module):
 
     @property
     def blocks(self) -> list[np.ndarray]:
-        """Indices of parameters that some experiment ties together: between blocks the posterior is a product."""
+        """Indices of the parameters of each block; the posterior is a product over blocks without common data."""
         adjacent = np.eye(self.dimension, dtype=bool)
         for experiment in self.experiments:
             own = {row.name for row in experiment.parameters} | set(experiment.masses)
@@ -139,7 +139,7 @@ class LogPosterior(eqx.Module):
 
     def constrain(self, u: Any, xp: ModuleType = jnp) -> Any:
         """(..., d) values from u (..., d)."""
-        # The unused branch must stay finite, or its infinite derivative would spoil the gradient.
+        # The unused branch must stay finite: an infinite derivative makes the gradient NaN.
         return xp.where(self.positive, xp.exp(xp.where(self.positive, u, 0.0)), u)
 
     def theta(self, u: np.ndarray) -> np.ndarray:
@@ -161,7 +161,7 @@ class LogPosterior(eqx.Module):
         return jnp.sum(self.priors.terms(u, self.constrain(u)))
 
     def log_likelihood(self, u: Any) -> Any:
-        """Sum over the experiments at u (d,); scalar."""
+        """Sum of the log-likelihoods of the experiments at u (d,); scalar."""
         return sum(jnp.sum(part) for part in self._per_group(lambda e, theta: e.log_likelihood(theta), u))
 
     def __call__(self, u: Any) -> Any:
@@ -170,16 +170,16 @@ class LogPosterior(eqx.Module):
         return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
     def batch(self, u: Any) -> Any:
-        """Compiled, (w, d) -> (w,)."""
+        """Compiled log-posterior of a batch, (w, d) -> (w,)."""
         return _batch(self, u)
 
     def residuals(self, u: Any) -> Any:
-        """All experiments' residuals and the priors', (n,): the least-squares part of -log posterior."""
+        """Residuals (n,) of all experiments and priors: the least-squares part of -log posterior."""
         parts = self._per_group(lambda e, theta: e.residuals(theta), u)
         return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.priors.residuals(u, self.constrain(u))])
 
     def residual_owners(self, u: np.ndarray) -> list[Experiment | None]:
-        """(n,) the experiment of every entry of ``residuals`` at u (d,); None: a prior."""
+        """(n,) experiment of every entry of ``residuals`` at u (d,); None: a prior."""
         values, owners = self.mapping(self.theta(u)), []
         for group in self.groups:
             first = self.experiments[group.members[0]]
@@ -192,13 +192,13 @@ class LogPosterior(eqx.Module):
         return self.priors.at(slice(None), np).residuals(u, self.theta(u), np)
 
     def plain_residuals(self, u: np.ndarray) -> np.ndarray:
-        """The same residuals as ``residuals`` in NumPy, in the order of the experiments, nothing compiled."""
+        """Residuals as in ``residuals``, by NumPy without compilation, in the order of the experiments."""
         values = self.mapping(self.theta(u))
         parts = [np.asarray(e.residuals(e.local(values), np)) for e in self.experiments]
         return np.concatenate([*parts, self.prior_residuals(u)])
 
     def _per_group(self, function: Callable[[Experiment, ValuesBySymbol], Any], u: Any) -> list[Any]:
-        """``function`` of every experiment, batched: one array (members, ...) per group."""
+        """Evaluate ``function`` for every experiment, batched: one array (members, ...) per group."""
         values = self.constrain(u)
 
         def one(experiment: Experiment, theta: ValuesBySymbol) -> Any:
@@ -209,7 +209,7 @@ class LogPosterior(eqx.Module):
     # -- starts and prior samples ---------------------------------------------------------------------------------
 
     def starts(self) -> Mapping[str, Start]:
-        """Start of every parameter: the mean (geometric where positive) of what the experiments propose."""
+        """Start of every parameter: the mean (geometric where positive) of the starts of the experiments."""
         proposed: dict[str, list[Start]] = {}
         for experiment in self.experiments:
             for name, start in experiment.starts().items():
@@ -228,7 +228,7 @@ class LogPosterior(eqx.Module):
         return merged
 
     def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, np.ndarray]:
-        """``size`` draws of every parameter, SI."""
+        """Return ``size`` prior draws of every parameter, SI."""
         return {row.name: prior_of(row).sample(rng, size) for row in self.parameters}
 
 
@@ -238,7 +238,7 @@ def _batch(target: LogPosterior, u: Any) -> Any:
 
 
 class HeldResiduals(eqx.Module):
-    """``LogPosterior.residuals`` as a function of the located entries of u, the others held at ``centre`` (d,)."""
+    """``LogPosterior.residuals`` as a function of the located entries of u; the others are fixed at ``centre``."""
 
     target: LogPosterior
     centre: Any

@@ -1,9 +1,9 @@
-"""The log-posterior with every scatter integrated out: what the sampler explores.
+"""Log-posterior with every scatter integrated out, which the sampler uses.
 
-Given all other parameters the scatters are independent, for each belongs to the readings of one kind or one record, so
-that each is a one-dimensional integral: a sum over equidistant nodes in u = log(scatter), which converges faster than
-any power of their distance. What is left has light tails and few dimensions. The scatters come back as exact draws from
-their conditional distributions: one of the nodes, drawn by weight, of a grid that was shifted at random.
+Each scatter belongs to the readings of one kind or one record. Given all other parameters the scatters are therefore
+independent, and each integral is one-dimensional. A sum over equidistant nodes in u = log(scatter) converges faster
+than any power of the node distance. The integrated posterior has light tails and few dimensions. Scatters are then
+drawn exactly from their conditional distributions: a node, drawn by weight, of a randomly shifted grid.
 """
 
 from collections.abc import Sequence
@@ -22,19 +22,19 @@ from capsule_id.inference.target.compiling import COMPILE
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.quadrature import NODES, Grid, add_to_blocks, choose_grid, log_stretch, position
 
-#: The nodes are chosen by walkers this near to and this far from the point fit, in standard deviations: the tails of
-#: what few trials tell are those of Student's t.
+#: Smallest and largest distance from the point fit of the walkers that determine the nodes, in standard deviations.
+#: The largest is wide because few trials give the heavy tails of Student's t.
 NEAREST, FARTHEST = 0.5, 500.0
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What is static in the integrated log-posterior.
+    """Static structure of the integrated log-posterior.
 
     Attributes
     ----------
-    scatter, located : which entries of u are integrated out, and which are not
-    block : of every entry of u, see ``LogPosterior.blocks``
+    scatter, located : indices of the entries of u that are integrated out, and of the others
+    block : block of every entry of u, see ``LogPosterior.blocks``
     nodes : number of nodes of every integral
     """
 
@@ -49,14 +49,14 @@ class Layout:
 
 
 class MarginalPosterior:
-    """The located parameters of ``target``, its scatters integrated out.
+    """Posterior of the located parameters of ``target``, with its scatters integrated out.
 
     Attributes
     ----------
     names : (d,) of all parameters, as in ``target``
     dimension : number of located parameters
-    blocks : indices, among the located parameters, of those that the posterior ties together
-    centre, covariance : (dimension,), (dimension, dimension) the Laplace approximation of u
+    blocks : indices, among the located parameters, of each factor of the posterior
+    centre, covariance : (dimension,), (dimension, dimension) Laplace approximation of u
     """
 
     def __init__(self, target: LogPosterior, fit: PointFit) -> None:
@@ -77,7 +77,7 @@ class MarginalPosterior:
             return add_to_blocks(known, self._label[self._scatter], integrals)
 
         values = in_batches(one, v)
-        # Scatters that nothing depends on add a constant.
+        # Scatters without located parameters in their block add a constant.
         return np.where(np.isfinite(values), values, -np.inf)[:, : len(self.blocks)]
 
     def batch(self, v: np.ndarray) -> np.ndarray:
@@ -89,17 +89,17 @@ class MarginalPosterior:
         return self.target.theta(u)
 
     def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """The whole u (..., d) of located ``draws`` (..., dimension), scatters drawn given them, and its log-posterior.
+        """Complete located ``draws`` (..., dimension) with scatters: return u (..., d) and its log-posterior.
 
-        A random shift of the grid and a node drawn by weight is a draw from the density as exactly as the sum over
-        the nodes is its integral: that does not depend on the shift.
+        A scatter is a node, drawn by weight, of a randomly shifted grid. This draw is as exact as the sum over the
+        nodes, because the sum does not depend on the shift.
         """
         flat, scatters = draws.reshape(-1, self.dimension), len(self._scatter)
         random = np.random.default_rng(seed).uniform(size=(len(flat), 2 * scatters))
         grid = self.grid
 
         def one(rows: np.ndarray) -> np.ndarray:
-            """(BATCH, scatters + 1), scatters and log-posterior, of rows: located u and 2 random numbers a scatter."""
+            """(BATCH, scatters + 1) scatters and log-posterior of rows: located u and 2 random numbers per scatter."""
             v, shift, chance = np.split(rows, [self.dimension, self.dimension + scatters], axis=1)
             shifted = grid.shifted(shift - 0.5)
             known, terms, _ = self._terms(v, shifted)
@@ -116,7 +116,7 @@ class MarginalPosterior:
         return u.reshape(*draws.shape[:-1], -1), restored[:, -1].reshape(draws.shape[:-1])
 
     def _terms(self, v: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """``conditional`` of (w, dimension), in batches."""
+        """Evaluate ``conditional`` at (w, dimension), in batches."""
         layout = replace(self._layout, nodes=grid.nodes)
         size = (len(v), len(self._scatter))
         start, step = np.broadcast_to(grid.start, size), np.broadcast_to(grid.step, size)
@@ -130,7 +130,7 @@ class MarginalPosterior:
     def _probes(self) -> np.ndarray:
         """(2 BATCH, dimension) located u: the point fit, and walkers at growing distances from it, twice.
 
-        Every block goes out by itself, measured by the Laplace approximation.
+        Distances are in Laplace standard deviations, separately for each block.
         """
         direction = np.random.default_rng(0).standard_normal((2 * BATCH, self.dimension))
         for block in self.blocks:
@@ -140,15 +140,15 @@ class MarginalPosterior:
 
 
 def compile_ahead(target: LogPosterior) -> None:
-    """Compile what a ``MarginalPosterior`` of ``target`` needs: in another thread, while the point fit is at work."""
+    """Compile the functions of a ``MarginalPosterior`` of ``target`` in advance, in parallel to the point fit."""
     layout = _layout(target)
     v, nodes = np.zeros((BATCH, len(layout.located))), np.ones((BATCH, len(layout.scatter)))
     conditional(layout, target, v, nodes, nodes, nodes[0])
 
 
 def _layout(target: LogPosterior) -> Layout:
-    """With as many nodes as will do for most rigs."""
-    # A block of scatters alone, whose readings nothing predicts, has no place among the located ones.
+    """Layout with a number of nodes that suffices for most rigs."""
+    # A block of scatters alone has no located parameter, so it follows the other blocks.
     blocks = sorted(target.blocks, key=lambda block: bool(np.all(target.scatter[block])))
     label = np.zeros(target.dimension, dtype=int)
     for i, block in enumerate(blocks):
@@ -159,17 +159,17 @@ def _layout(target: LogPosterior) -> Layout:
 
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILE)
 def conditional(layout: Layout, target: LogPosterior, v: Any, start: Any, step: Any, bend: Any) -> tuple[Any, ...]:
-    """The log-posterior of the located v (w, dimension), scatters at their nodes: the forward models run once a walker.
-
-    Returns
-    -------
-    what does not depend on scatters (w, blocks); densities of t at the nodes (w, scatters, nodes), see
-    ``capsule_id.inference.target.quadrature``; their integrals (w, scatters): logarithms all
+    """Log-posterior of the located v (w, dimension) with scatters at their nodes; one model run per walker.
 
     Parameters
     ----------
     start, step : (w, scatters) first node and distance of the nodes, in t
     bend : (scatters,)
+
+    Returns
+    -------
+    Logarithms of: terms without scatters (w, blocks); densities of t at the nodes (w, scatters, nodes), see
+    ``capsule_id.inference.target.quadrature``; their integrals (w, scatters).
     """
     return jax.vmap(partial(_conditional, layout, target, bend))(v, start, step)
 
@@ -178,7 +178,7 @@ def _conditional(
     layout: Layout, target: LogPosterior, bend: Any, v: Any, start: Any, step: Any
 ) -> tuple[Any, Any, Any]:
     scatter, located = np.array(layout.scatter, dtype=int), np.array(layout.located)
-    # Forward models do not read scatters: the zeros left for them reach nothing.
+    # Forward models do not read scatters, so their zeros have no effect.
     u = jnp.zeros(len(layout.block)).at[located].set(v)
     values = target.constrain(u)
     t = start[:, None] + step[:, None] * jnp.arange(layout.nodes)[None]
@@ -212,7 +212,7 @@ def _conditional(
 
 
 def _sum_by(values: Any, label: Sequence[int], number: int) -> Any:
-    """Sums of the rows of ``values`` (m, ...) that share a label: (number, ...), by gathering."""
+    """Sum the rows of ``values`` (m, ...) with equal label by gathering: (number, ...)."""
     members = [[i for i, own in enumerate(label) if own == j] for j in range(number)]
     width = max(map(len, members))
     index = np.array([row + [len(label)] * (width - len(row)) for row in members])

@@ -1,4 +1,4 @@
-"""The prior densities of all parameters as arrays, so that their density is one expression."""
+"""Prior densities of all parameters as arrays, so that their density is one expression."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -16,14 +16,14 @@ from capsule_id.rig.model import PriorOverride
 
 
 class Priors(eqx.Module):
-    """Normal densities of z = (value - centre)/width, one a parameter; every array is (d,).
+    """Normal densities of z = (value - centre)/width, one per parameter; every array is (d,).
 
     Attributes
     ----------
-    lognormal : the value is u = log(theta); else it is theta
+    lognormal : whether the value is u = log(theta); else it is theta
     centre, width : of the normal density
-    constant : log of what truncation adds to the density
-    jacobian : theta is sampled through its logarithm, and its prior is a density of theta: log |d theta/du| = u
+    constant : log of the normalisation factor of a truncated density
+    jacobian : whether theta is sampled through its logarithm and has a prior density in theta: log |d theta/du| = u
     """
 
     lognormal: Any
@@ -49,27 +49,27 @@ class Priors(eqx.Module):
         self.jacobian = jnp.asarray(np.array([row.positive for row in parameters]) & ~lognormal)
 
     def at(self, index: Any, xp: ModuleType = jnp) -> "Priors":
-        """Those of some parameters: arrays of the shape of ``index``, of ``xp``."""
+        """Return the priors at ``index``: arrays of the shape of ``index``, of ``xp``."""
         return jax.tree.map(lambda array: xp.asarray(array)[index], self)
 
     def terms(self, u: Any, value: Any, xp: ModuleType = jnp) -> Any:
-        """Log-density of u parameter by parameter, Jacobian included; ``value`` is the constrained u."""
+        """Log-density of u for each parameter, Jacobian included; ``value`` is the constrained u."""
         z = self.residuals(u, value, xp)
         density = -0.5 * (z**2 + LOG_2PI) - xp.log(self.width) + self.constant
         return density + xp.where(self.jacobian, u, 0.0)
 
     def residuals(self, u: Any, value: Any, xp: ModuleType = jnp) -> Any:
-        """(value - centre)/width parameter by parameter."""
+        """(value - centre)/width for each parameter."""
         return (xp.where(self.lognormal, u, value) - self.centre) / self.width
 
 
 def prior_of(row: Parameter) -> Prior:
-    """The row's prior.
+    """Return the prior of ``row``.
 
     Raises
     ------
     ValueError
-        If it has none.
+        If the row has no prior.
     """
     if row.prior is None:
         raise ValueError(f"parameter {row.name} has no prior: the experiment that names it must supply one")
@@ -77,7 +77,7 @@ def prior_of(row: Parameter) -> Prior:
 
 
 def prior_sd(row: Parameter) -> float:
-    """sd of u under the row's prior (half-normal: of its logarithm, pi/sqrt(8))."""
+    """Standard deviation of u under the row's prior (half-normal: pi/sqrt(8), that of its logarithm)."""
     prior = prior_of(row)
     if prior.kind == "lognormal":
         return float(np.log(prior.spread) / QUANTILE_975)
@@ -89,7 +89,7 @@ def prior_sd(row: Parameter) -> float:
 
 
 def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
-    """The row with the prior of ``rig.toml``, if that states one."""
+    """Return the row with the prior of ``rig.toml``, where one is stated."""
     if stated is None:
         return row
     if stated.scale is not None:

@@ -98,7 +98,7 @@ def test_starts_go_on_until_two_ends_describe_the_runs(monkeypatch: pytest.Monke
     starts = np.stack([good, late, late, good, good, good])
     monkeypatch.setattr(module, "choose_starts", lambda *_: starts)
     again = joint_fit(target, {}, 0)
-    assert again.elsewhere.tolist() == [False, True, True, False]
+    assert again.at_other_maximum.tolist() == [False, True, True, False]
     assert check_starts(again)[0].level == "warn"
 
 

@@ -69,7 +69,7 @@ def test_truth_is_within_reach(fit: PointFit) -> None:
 
 
 @pytest.mark.parametrize(
-    ("log_posterior", "elsewhere", "stalled", "level"),
+    ("log_posterior", "at_other_maximum", "stalled", "level"),
     [
         ([0.0, 0.0, 0.0], [0, 0, 0], [0, 0, 0], "ok"),
         ([0.0, 0.0, -100.0], [0, 0, 1], [0, 0, 1], "warn"),
@@ -79,14 +79,14 @@ def test_truth_is_within_reach(fit: PointFit) -> None:
     ],
 )
 def test_other_maxima_are_judged_by_the_mass_they_can_hold(
-    fit: PointFit, log_posterior: list[float], elsewhere: list[int], stalled: list[int], level: str
+    fit: PointFit, log_posterior: list[float], at_other_maximum: list[int], stalled: list[int], level: str
 ) -> None:
     other = replace(
         fit,
         starts=fit.starts[:3],
-        ends=fit.u + 3.0 * np.array(elsewhere)[:, None],
+        ends=fit.u + 3.0 * np.array(at_other_maximum)[:, None],
         log_posterior=np.array(log_posterior),
-        elsewhere=np.array(elsewhere, dtype=bool),
+        at_other_maximum=np.array(at_other_maximum, dtype=bool),
         stalled=np.array(stalled, dtype=bool),
     )
     assert [finding.level for finding in check_starts(other)] == [level]
