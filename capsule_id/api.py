@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capsule_id.console import OnProgress
+from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.pipeline import check_fit, make_result, provenance, sample_posterior, stage_seeds
@@ -87,12 +89,21 @@ def fit(
     Raises
     ------
     InputError
-        If the rig holds nothing to fit, ``experiments`` is another word, or ``friction`` cannot be fitted.
+        If the rig holds nothing to fit, ``experiments`` is another word, ``seed`` or ``budget`` is out of range, or
+        ``friction`` cannot be fitted.
     """
+    if seed < 0:
+        raise InputError("seed must not be negative", str(seed), "give 0 or more")
+    if budget is not None and budget < 1:
+        raise InputError(
+            "budget must be positive", str(budget), "give 1 or more steps, or None for the point fit alone"
+        )
+    law = EQUATION_1 if friction is None else FrictionModel(friction)
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
+    made_from = provenance(rig, seed, experiments, law.source)
     if progress:
         progress(0, 1, "point fit")
     target = LogPosterior(rig, make_experiments(rig, experiments, kinds, friction))
     point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
     checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress))
-    return make_result(checked, kinds, seeds.report, provenance(rig, seed, experiments), Fit)
+    return make_result(checked, kinds, seeds.report, made_from, Fit)

@@ -11,6 +11,8 @@ from pathlib import Path
 from capsule_id.errors import InputError
 from capsule_id.parameters import LEAVES, TABLE_1
 
+#: Name of the default friction law in the provenance of a result.
+EQUATION_1 = "eq. (1)"
 # From the paper's Table 1; other parameters have no default.
 DEFAULTS: Mapping[str, float] = {name: TABLE_1[name] for name in LEAVES if name in TABLE_1} | {"phase": 0.0}
 
@@ -105,8 +107,9 @@ def fitted_values(directory: Path) -> dict[str, float]:
     """
     file = directory / "parameters.json"
     try:
-        table = json.loads(file.read_text(encoding="utf-8"))["parameters"]
-        return {name: float(row["map"]) for name, row in table.items()}
+        saved = json.loads(file.read_text(encoding="utf-8"))
+        values = {name: float(row["map"]) for name, row in saved["parameters"].items()}
+        law = str(saved.get("provenance", {}).get("friction", EQUATION_1))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             "--result takes a result of fit-params",
@@ -114,6 +117,10 @@ def fitted_values(directory: Path) -> dict[str, float]:
             "run fit-params first, or check the path",
             file,
         ) from None
+    if law != EQUATION_1:
+        rule = "the commands compute with eq. (1), and --result must have been fitted with it"
+        raise InputError(rule, law, "call capsule_id.simulate(..., friction=law) in Python", file)
+    return values
 
 
 def _fitted(directory: Path, spring: str | None) -> dict[str, float]:

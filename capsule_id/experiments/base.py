@@ -65,6 +65,17 @@ class About:
     parameters: tuple[Parameter, ...] = field(compare=False)
 
 
+@dataclass(frozen=True)
+class Unavailable:
+    """Takes the place of ``About`` in stacked experiments: one stack serves several tables, so none can be read."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"a likelihood must not read {name} of the table or rig: make the number a field of the experiment, "
+            "or the word a field with eqx.field(static=True)"
+        )
+
+
 class Experiment(eqx.Module):
     """One rig test: readings, the paper's estimator, likelihood, checks and part of the report.
 

@@ -8,7 +8,7 @@
     point = fit_points(target, kinds, seeds.starts, True)        # log-posterior -> point fit
     sampled = sample_posterior(point, seeds.walkers)             # point fit -> posterior
     checked = check_fit(sampled)                                 # posterior -> checks
-    result = make_result(checked, kinds, seeds.report, provenance(rig, 0, "all"))
+    result = make_result(checked, kinds, seeds.report, provenance(rig, 0, "all", "eq. (1)"))
 
 ``capsule_id.fit`` runs all stages.
 """
@@ -121,9 +121,9 @@ def make_result(
     )
 
 
-def provenance(rig: Rig, seed: int, experiments: Choice) -> Provenance:
+def provenance(rig: Rig, seed: int, experiments: Choice, friction: str) -> Provenance:
     """Return the provenance of a fit of ``rig`` with ``seed`` and these ``experiments``."""
-    return Provenance(seed, experiments, package_versions(PACKAGES), dict(rig.files))
+    return Provenance(seed, experiments, friction, package_versions(PACKAGES), dict(rig.files))
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:

@@ -100,10 +100,11 @@ class PointwiseLogLikelihood:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Inputs of a result: the seed, the chosen experiments, versions of packages, SHA-256 of the files."""
+    """Inputs of a result: the seed, the chosen experiments, the friction law, versions of packages, SHA-256 of the files."""
 
     seed: int
     experiments: Choice
+    friction: str
     versions: Mapping[str, str]
     files: Mapping[str, str]
 

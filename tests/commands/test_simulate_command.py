@@ -67,6 +67,10 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     assert (values["k1"], values["k2"], values["c"], values["m1"]) == (1500.0, 2e4, 5.0, 0.11)
     with pytest.raises(InputError, match="choose from L60"):
         options.capsule_values(parser.parse_args([*drive, "--spring", "L70"]))
+    other = {"parameters": rows, "provenance": {"friction": "mine.Law"}}
+    (tmp_path / "parameters.json").write_text(json.dumps(other), encoding="utf-8")
+    with pytest.raises(InputError, match=r"compute with eq. \(1\).*mine.Law"):
+        options.capsule_values(parser.parse_args(drive))
     (tmp_path / "parameters.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="takes a result"):
         options.capsule_values(parser.parse_args(drive))

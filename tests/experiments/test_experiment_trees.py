@@ -161,3 +161,31 @@ def test_a_kind_from_elsewhere_is_fitted_checked_and_tabulated() -> None:
     (balance,) = [f for f in setting.findings if f.code == "balance"]
     assert balance.facts == {"members": 2, "load": fit.values["load"]}
     assert "weighings" in [note.code for note in make_notes(setting, {})]
+
+
+class ReadsItsTable(FreeVibration):
+    """A kind from another package whose likelihood reads the table; a stack would give every member the first table."""
+
+    def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
+        assert self.table.label
+        return super().summaries(theta, xp)
+
+
+def test_a_likelihood_cannot_read_the_table_of_one_member() -> None:
+    first = decay(1)
+    target = LogPosterior(first.rig, [ReadsItsTable(first.table, first.rig)])
+    with pytest.raises(AttributeError, match="a likelihood must not read table"):
+        target.log_likelihood(jnp.zeros(target.dimension))
+
+
+def test_a_leaf_that_is_no_number_is_named() -> None:
+    class Worded(FreeVibration):
+        word: str
+
+        def __init__(self, table: Table, rig: Rig) -> None:
+            super().__init__(table, rig)
+            self.word = "not static"
+
+    first = decay(1)
+    with pytest.raises(TypeError, match=r"Worded\.word must be a number, found 'not static'"):
+        LogPosterior(first.rig, [Worded(first.table, first.rig)])

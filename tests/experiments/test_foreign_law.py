@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -16,6 +17,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.friction_model import FrictionModel
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.inference.sampling.chain_store import ChainStore
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.friction import CoulombStribeck
@@ -184,11 +186,17 @@ class Priorless(Lorentzian):
     )
 
 
-class Taken(Lorentzian):
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        replace(Lorentzian.parameters[0], symbol="k1"),
-        *Lorentzian.parameters[1:],
-    )
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Taken:
+    k1: float
+
+    parameters: ClassVar[tuple[Parameter, ...]] = (replace(Lorentzian.parameters[0], symbol="k1"),)
+
+    def forward(self, speed: Speed) -> Speed:
+        return self.k1 + 0.0 * speed
+
+    backward = forward
 
 
 @pytest.mark.parametrize(
@@ -199,7 +207,7 @@ class Taken(Lorentzian):
         (Lorentzian, None, "the friction law Lorentzian is in N, and static_friction needs m2, not stated, add m2"),
     ],
 )
-def test_a_law_that_cannot_be_fitted_is_refused(law: type[Lorentzian], m2: Quantity | None, text: str) -> None:
+def test_a_law_that_cannot_be_fitted_is_refused(law: Any, m2: Quantity | None, text: str) -> None:
     own = replace(bench.rig(tilts(np.random.default_rng(0))), m2=m2)
     with pytest.raises(InputError) as caught:
         cid.fit(own, budget=None, friction=law)
@@ -217,6 +225,7 @@ def test_the_prior_of_its_parameters_can_be_stated(tmp_path: Path) -> None:
 def test_any_kind_of_prior_gives_a_start() -> None:
     rows = tuple(replace(row, prior=Prior("halfnormal", 0.0, 2.0)) for row in Lorentzian.parameters[1:])
     law = type("Halfnormal", (Lorentzian,), {"parameters": (Lorentzian.parameters[0], *rows)})
+    jax.tree_util.register_dataclass(law)
     rig = bench.rig(*(make(np.random.default_rng(1)) for make in (tilts, pushes)))
     starts = LogPosterior(rig, make_experiments(rig, friction=law)).starts()
     assert [starts[name].centre for name in ("F_s", "F_c", "v_0")] == pytest.approx([3.0, 1.349, 1.349], rel=1e-3)
@@ -227,3 +236,61 @@ def test_tilts_sample_what_acts_at_rest() -> None:
     assert LogPosterior(rig, make_experiments(rig, friction=Lorentzian)).names == ("F_s", "tilt_sd")
     (panel,) = cid.fit(rig, budget=None, friction=Lorentzian).comparisons
     assert len(set(panel.curves[0].y)) == 1
+
+
+class Unregistered(Lorentzian):
+    """A law that is no pytree."""
+
+
+@pytest.mark.parametrize(
+    ("law", "rule"),
+    [
+        (TRUTH, "friction must be a class"),
+        (object, "friction must be a class"),
+        (Unregistered, "must be a pytree"),
+    ],
+)
+def test_what_is_no_law_is_refused(law: type, rule: str) -> None:
+    with pytest.raises(InputError, match=rule):
+        FrictionModel(law)
+
+
+def test_a_sampled_leaf_that_would_be_the_weight_is_refused() -> None:
+    rows = (*Lorentzian.parameters[:2], Parameter("N", "1", "exponent", "N", Prior("lognormal", 2.0, 2.0)))
+    with pytest.raises(InputError, match="a leaf N of the friction law Power holds the weight"):
+        FrictionModel(type("Power", (Lorentzian,), {"parameters": rows}))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Larger:
+    """Its force at rest depends on F_c only where F_c exceeds F_s, which is not so at the prior medians."""
+
+    F_s: float
+    F_c: float
+    parameters: ClassVar = Lorentzian.parameters[:2]
+
+    def forward(self, speed: Any) -> Any:
+        return self.F_c + jnp.maximum(self.F_s - self.F_c, 0.0) / (1.0 + speed)
+
+    backward = forward
+
+
+def test_tilts_sample_every_parameter_that_can_matter_at_rest() -> None:
+    assert [row.symbol for row in FrictionModel(Larger).parameters_at_rest] == ["F_s", "F_c"]
+    assert [row.symbol for row in FrictionModel(Lorentzian).parameters_at_rest] == ["F_s"]
+
+
+def test_draws_of_another_law_are_not_resumed(tmp_path: Path) -> None:
+    """The store holds the draws of one density; another one starts anew."""
+    store = tmp_path / "chains.h5"
+    with ChainStore(store, "one") as chains:
+        chains.save()
+    with ChainStore(store, "one") as chains:
+        assert chains.backend("ensemble_0").name == "ensemble_0"
+        chains._file.create_group("kept")
+        chains.save()
+    with ChainStore(store, "one") as chains:
+        assert "kept" in chains._file
+    with ChainStore(store, "another") as chains:
+        assert "kept" not in chains._file

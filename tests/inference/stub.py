@@ -46,6 +46,7 @@ class Gaussian:
     """
 
     OFF, WIDE = 0.5, 1.3
+    fingerprint = "a known normal density"
 
     def __init__(self, mean: np.ndarray, sigma: np.ndarray, blocks: Sequence[np.ndarray] | None = None) -> None:
         self.mean, self.sigma = mean, sigma

@@ -28,7 +28,7 @@ def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None
     point = fit_points(target, kinds, seeds.starts, True)
     sampled = sample_posterior(point, seeds.walkers, BUDGET)
     checked = check_fit(sampled)
-    result = make_result(checked, kinds, seeds.report, provenance(rig, 3, "bench"))
+    result = make_result(checked, kinds, seeds.report, provenance(rig, 3, "bench", "eq. (1)"))
     assert sampled.findings == ()
     assert len(checked.findings) > 5
     for stage in (point, sampled, checked, result):

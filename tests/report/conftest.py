@@ -204,7 +204,7 @@ def make_result(seed: int = 0, ensembles: int = 4, draws: int = 60, walkers: int
         observed={item.label: item.points[0].y for item in comparisons},
         prior={name: np.exp(rng.normal(size=500)) for name in SAMPLED},
         log_likelihood=_log_likelihood(rng, comparisons),
-        provenance=Provenance(seed, "bench", versions, files),
+        provenance=Provenance(seed, "bench", "eq. (1)", versions, files),
     )
 
 

@@ -143,7 +143,7 @@ def test_hostile_text_is_escaped(result: Result, bad: str) -> None:
     frame = pd.DataFrame({bad: [bad]}, index=[bad])
     hostile = dataclasses.replace(
         result, summary=summary, notes=(ResultTable(bad, frame),), findings=(Finding(bad, "fail", {bad: bad}, bad),),
-        rig=dataclasses.replace(result.rig, name=bad), provenance=Provenance(0, "all", {bad: bad}, {bad: bad}),
+        rig=dataclasses.replace(result.rig, name=bad), provenance=Provenance(0, "all", bad, {bad: bad}, {bad: bad}),
     )  # fmt: skip
     picture = Picture("x", "measured", bad, bad, 10, 10, b"")
     page = render(hostile, (picture,))

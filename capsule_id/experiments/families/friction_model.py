@@ -6,6 +6,7 @@ from typing import Any, ClassVar, cast
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
@@ -15,6 +16,8 @@ from capsule_id.rig.model import Rig, Table
 
 #: Symbol of the leaf that holds the normal force, N.
 NORMAL_FORCE = "N"
+#: Prior draws at which a parameter may change the break-away force.
+PRIOR_DRAWS = 64
 #: Relative changes of the break-away force below this are rounding.
 ROUNDING = 1e-9
 
@@ -57,16 +60,32 @@ class FrictionModel:
     Raises
     ------
     InputError
-        If the law has a leaf other than N that is not sampled, or a sampled one without a default prior.
+        If ``law`` is no class of friction laws, if it has a leaf other than N that is not sampled, or a sampled one
+        without a default prior, or if N is sampled.
     """
 
     law: type[FrictionLaw] = CoulombStribeck
 
     def __post_init__(self) -> None:
-        for row in self.law.parameters:
+        law, wanted = self.law, ("parameters", "forward", "backward")
+        if not isinstance(law, type) or not all(hasattr(law, name) for name in wanted):
+            rule = "friction must be a class with parameters, forward(speed) and backward(speed)"
+            raise InputError(rule, repr(law), "give the class itself; see capsule_id.physics.friction.FrictionLaw")
+        for row in law.parameters:
+            if row.symbol == NORMAL_FORCE and (row.prior is not None or row.sampled):
+                rule = f"a leaf N of the friction law {law.__name__} holds the weight, N, and is not sampled"
+                raise InputError(rule, row.meaning, "give the row no prior and sampled=False, or rename the leaf")
             if row.symbol != NORMAL_FORCE and (row.prior is None or not row.sampled):
-                rule = f"every parameter of the friction law {self.law.__name__} must have a default prior"
+                rule = f"every parameter of the friction law {law.__name__} must have a default prior"
                 raise InputError(rule, f"{row.symbol} has none", f"give Parameter({row.symbol!r}, ...) a prior")
+        try:
+            leaves = jax.tree.leaves(self._at({row.symbol: _prior_of(row).median for row in self.parameters}, 1.0))
+        except TypeError as error:
+            rule = f"the friction law {law.__name__} must have one row of parameters per field"
+            raise InputError(rule, str(error), "give every field a row with the field's name as its symbol") from None
+        if len(leaves) != len(law.parameters) or any(isinstance(leaf, law) for leaf in leaves):
+            rule = f"the friction law {law.__name__} must be a pytree whose leaves are its parameters"
+            raise InputError(rule, f"{len(leaves)} leaves", "add @jax.tree_util.register_dataclass above @dataclass")
 
     @property
     def name(self) -> str:
@@ -85,13 +104,17 @@ class FrictionModel:
 
     @property
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
-        """Parameters that change the break-away force at the prior medians: mu alone in eq. (1)."""
-        medians = {row.symbol: _prior_of(row).median for row in self.parameters}
-        force = self._at(medians, 1.0).forward(0.0)
+        """Parameters that change the break-away force at some prior draw: mu alone in eq. (1)."""
+        rng = np.random.default_rng(0)
+        draws = {row.symbol: _prior_of(row).sample(rng, PRIOR_DRAWS) for row in self.parameters}
+        still = np.zeros(PRIOR_DRAWS)
+        force = np.asarray(self._at(draws, 1.0).forward(still))
 
         def matters(row: Parameter) -> bool:
-            other = 1.1 * medians[row.symbol] or _prior_of(row).spread
-            return bool(abs(self._at({**medians, row.symbol: other}, 1.0).forward(0.0) - force) > ROUNDING * force)
+            other = self._at({**draws, row.symbol: np.roll(draws[row.symbol], 1)}, 1.0)
+            change = np.abs(np.asarray(other.forward(still)) - force)
+            # A force that is not finite does not show that the parameter has no effect.
+            return not bool(np.all(change <= ROUNDING * np.abs(force)))
 
         return tuple(row for row in self.parameters if matters(row))
 
@@ -99,6 +122,11 @@ class FrictionModel:
     def masses(self) -> tuple[str, ...]:
         """Symbols of the masses that the coefficient depends on."""
         return () if self.is_proportional else ("m1", "m2")
+
+    @property
+    def source(self) -> str:
+        """Name of the law in provenance: module and class; "eq. (1)" for the paper's."""
+        return self.name if self.is_proportional else f"{self.law.__module__}.{self.law.__qualname__}"
 
     def check(self, known: Mapping[str, Parameter]) -> None:
         """Reject a law that has the symbol of a different parameter in ``known`` (package and kinds).

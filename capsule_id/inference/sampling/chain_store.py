@@ -30,9 +30,10 @@ class ChainStore:
     Parameters
     ----------
     store : the file; the last copy replaces it, or it is removed if no copy has a valid digest
+    fingerprint : of the sampled density and the seed; a copy with another one is discarded
     """
 
-    def __init__(self, store: Path) -> None:
+    def __init__(self, store: Path, fingerprint: str) -> None:
         self._store, self._copy, self._next = store, saved_copy(store), time.monotonic() + SAVE_EVERY
         store.unlink(missing_ok=True)
         saved = self._copy.read_bytes() if self._copy.exists() else b""
@@ -40,6 +41,11 @@ class ChainStore:
         if content and hashlib.sha256(content).digest() == saved[:_DIGEST]:
             store.write_bytes(content)
         self._file = h5py.File(store, "a")
+        if self._file.attrs.setdefault("fingerprint", fingerprint) != fingerprint:
+            self._file.close()
+            store.unlink()
+            self._file = h5py.File(store, "w")
+            self._file.attrs["fingerprint"] = fingerprint
 
     def __enter__(self) -> "ChainStore":
         return self

@@ -65,6 +65,11 @@ class Target(Protocol):
     centre: np.ndarray
     covariance: np.ndarray
 
+    @property
+    def fingerprint(self) -> str:
+        """Equal for equal densities: saved draws of another density are not resumed."""
+        ...
+
     def parts(self, v: np.ndarray) -> np.ndarray: ...
 
     def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]: ...
@@ -92,7 +97,7 @@ def sample(
     report(0, 1, "pilot")
     pilot_seed, restore_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 2))
     schedule = pilot(target, pilot_seed)
-    with nullcontext() if store is None else ChainStore(store) as chains:
+    with nullcontext() if store is None else ChainStore(store, f"{target.fingerprint} {seed}") as chains:
         backends = [None if chains is None else chains.backend(f"ensemble_{i}") for i in range(ENSEMBLES)]
         samplers = [_sampler(target, schedule, *one) for one in zip(seeds, backends, strict=True)]
         done = [sampler.stored for sampler in samplers]

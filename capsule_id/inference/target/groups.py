@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.base import Experiment, Unavailable
 
 
 class Group(eqx.Module):
@@ -35,6 +35,7 @@ def make_groups(experiments: Sequence[Experiment], names: Sequence[str]) -> tupl
     """Groups of ``experiments`` in the order of their first members; ``names`` (d,) of the entries of u."""
     members: dict[Hashable, list[int]] = {}
     for i, experiment in enumerate(experiments):
+        _check_leaves(experiment)
         leaves, structure = jax.tree.flatten(experiment)
         members.setdefault((structure, *(np.shape(leaf) for leaf in leaves)), []).append(i)
     place = {name: i for i, name in enumerate(names)}
@@ -47,7 +48,24 @@ def _group(experiments: Sequence[Experiment], members: Sequence[int], place: Map
     own = [{row.symbol: row.name for row in e.parameters} for e in experiments]
     sampled = [*dict.fromkeys(s for table in own for s in table), *(m for m in first.masses if m in place)]
     entries = tuple((s, tuple(place.get(table.get(s, s), len(place)) for table in own)) for s in sampled)
-    return Group(jax.tree.map(_stack, *experiments), tuple(members), entries)
+    stacked = jax.tree.map(_stack, *experiments)
+    # The stack has the static fields of its first member; no likelihood may read its table.
+    object.__setattr__(stacked, "about", Unavailable())
+    return Group(stacked, tuple(members), entries)
+
+
+def _check_leaves(experiment: Experiment) -> None:
+    """Refuse a leaf that is no number: a kind from another package may lack a static field.
+
+    Raises
+    ------
+    TypeError
+        At the first such field.
+    """
+    for path, leaf in jax.tree_util.tree_flatten_with_path(experiment)[0]:
+        if np.asarray(leaf).dtype.kind not in "fiu":
+            field = f"{type(experiment).__name__}{jax.tree_util.keystr(path)}"
+            raise TypeError(f"{field} must be a number, found {leaf!r}: declare it with eqx.field(static=True)")
 
 
 def _stack(*leaves: Any) -> jax.Array:

@@ -6,6 +6,7 @@ than any power of the node distance. The integrated posterior has light tails an
 drawn exactly from their conditional distributions: a node, drawn by weight, of a randomly shifted grid.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
+from capsule_id.experiments.families.friction_model import EQUATION_1
 from capsule_id.inference.fit.curvature import BATCH, in_batches
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.compiling import COMPILE
@@ -68,6 +70,15 @@ class MarginalPosterior:
         own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
         self.blocks = [block for block in own if len(block)]
         self.grid = choose_grid(self._terms, fit.u[self._scatter], self._label[self._scatter], self._probes())
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of names, friction laws and all numbers of the density."""
+        laws = {getattr(e, "friction", EQUATION_1).source for e in self.target.experiments}
+        digest = hashlib.sha256(repr((self.names, sorted(laws))).encode())
+        for leaf in jax.tree.leaves(self.target):
+            digest.update(np.ascontiguousarray(leaf).tobytes())
+        return digest.hexdigest()
 
     def parts(self, v: np.ndarray) -> np.ndarray:
         """(w, blocks) log-posterior of the located u (w, dimension), block by block; up to the evidence."""
