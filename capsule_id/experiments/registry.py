@@ -37,7 +37,8 @@ class Registry(Mapping[str, Kind]):
     Raises
     ------
     ValueError
-        If two kinds have the same name, or declare the same parameter differently.
+        If two kinds have the same name, or declare the same parameter differently, or if the symbol of
+        a parameter has a bracket, which names a spring or record.
     TypeError
         If the type of a setting has no rule.
     """
@@ -50,6 +51,9 @@ class Registry(Mapping[str, Kind]):
             raise ValueError(f"kind {next(n for n in names if names.count(n) > 1)} is declared twice")
         for kind in self.kinds:
             _ = kind.setting_rules
+            for row in kind.parameters:
+                if "[" in row.symbol:
+                    raise ValueError(f"symbol of parameter {row.symbol} of kind {kind.name} must have no bracket")
         _ = self.parameters
 
     @cached_property

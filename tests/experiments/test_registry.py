@@ -226,3 +226,9 @@ def test_the_choices_of_experiments(tmp_path: Path) -> None:
     assert len(chosen["bench"]) == len(TABLES) - 1
     assert rig.has_runs
     assert not replace(rig, tables=rig.tables[:-1]).has_runs
+
+
+def test_a_bracket_in_a_symbol_is_refused() -> None:
+    own = replace(KINDS["motor_current"], name="other", parameters=(scatter("sd[a]", "rad", "a scatter", "s"),))
+    with pytest.raises(ValueError, match=r"symbol of parameter sd\[a\] of kind other must have no bracket"):
+        Registry((own,))
