@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Literal
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
 from capsule_id.views import Facts, Finding, Level, Message, ResultTable
 
@@ -11,7 +12,17 @@ TEXT_ERRORS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticErr
 
 
 def messages_of(registry: Registry) -> Mapping[str, Message]:
-    """The words of every code: those of the fit as a whole, and those that the kinds of ``registry`` declare."""
+    """The words of every code: those of the fit as a whole, and those that the kinds of ``registry`` declare.
+
+    Raises
+    ------
+    InputError
+        If a kind declares a code of the fit as a whole.
+    """
+    for kind in registry.kinds:
+        if own := sorted(FIT_MESSAGES.keys() & kind.messages.keys()):
+            rule = f"the kind {kind.name} must not declare messages of the whole fit"
+            raise InputError(rule, ", ".join(own), "rename these codes in the kind's messages")
     return {**FIT_MESSAGES, **registry.messages}
 
 
