@@ -5,7 +5,7 @@ Experiments and checks make them with codes and numbers; the report adds the tex
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -28,12 +28,21 @@ class Finding:
     code : stable name of what was checked, such as ``residuals.white``; a ``Message`` gives its words
     facts : numbers and names that the text needs
     experiment : label of the experiment that the finding is about; "" where it is about the whole fit
+
+    Raises
+    ------
+    ValueError
+        If ``level`` is no ``Level``.
     """
 
     code: str
     level: Level
     facts: Facts = field(default_factory=dict)
     experiment: str = ""
+
+    def __post_init__(self) -> None:
+        if self.level not in get_args(Level):
+            raise ValueError(f"level of finding {self.code} must be one of {get_args(Level)}; found {self.level!r}")
 
 
 @dataclass(frozen=True)
@@ -62,9 +71,14 @@ class Message:
         ------
         KeyError
             If the text needs a fact that is missing.
+        TypeError
+            If a function returns no string.
         """
         text: Text = getattr(self, part)
-        return text.format_map(facts) if isinstance(text, str) else text(facts)
+        filled_in = text.format_map(facts) if isinstance(text, str) else text(facts)
+        if not isinstance(filled_in, str):
+            raise TypeError(f"the text must be a string, found {filled_in!r}")
+        return filled_in
 
 
 @dataclass(frozen=True)

@@ -62,11 +62,12 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.report.write import write_result
 
     make_experiments(rig, args.experiments, kinds)
+    messages = messages_of(kinds)  # refuses conflicting messages before the fit
     fingerprint = {
         "data": dict(rig.files),
         "seed": args.seed,
         "experiments": args.experiments,
-        "versions": package_versions(PACKAGES),
+        "versions": {**package_versions(PACKAGES), **kinds.packages},
     }
     budget = None if args.no_sample else args.max_steps
     with work_in_progress(directory, fingerprint, args.resume) as partial, Progress(not args.quiet) as progress:
@@ -78,7 +79,6 @@ def run(args: argparse.Namespace) -> int:
     say(f"{table_text(result.summary, synthetic=rig.synthetic, clean=result.clean)}\nreport: {report}")
     if result.clean:
         return 0
-    messages = messages_of(kinds)
     failed = sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
     return 3

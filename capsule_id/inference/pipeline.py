@@ -95,6 +95,7 @@ def make_result(
 ) -> AnyResult:
     """Assemble the result: tables, panels, records, and the arrays that are saved with the sample.
 
+    The versions in its provenance include those of the packages in ``registry``.
     ``kind`` is the class of the result; the interface passes a subclass with a method that writes it.
     """
     target, posterior = checked.target, checked.posterior
@@ -117,7 +118,7 @@ def make_result(
         observed={e.label: e.observed for e in target.experiments},
         prior=target.sample_prior(rng, PRIOR_DRAWS),
         log_likelihood=None if posterior is None else _pointwise(target, posterior, rng),
-        provenance=made_from,
+        provenance=replace(made_from, versions={**made_from.versions, **registry.packages}),
     )
 
 

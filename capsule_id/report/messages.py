@@ -1,13 +1,28 @@
 """The words of the report for the checks and tables of a fit, by code; kinds of experiments declare those of their own."""
 
 from collections.abc import Mapping
+from typing import Literal
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
-from capsule_id.views import Facts, Finding, Message, ResultTable
+from capsule_id.views import Facts, Finding, Level, Message, ResultTable
+
+#: Errors of a text that does not match its facts.
+TEXT_ERRORS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 
 
 def messages_of(registry: Registry) -> Mapping[str, Message]:
-    """The words of every code: those of the fit as a whole, and those that the kinds of ``registry`` declare."""
+    """The words of every code: those of the fit as a whole, and those that the kinds of ``registry`` declare.
+
+    Raises
+    ------
+    InputError
+        If a kind declares a code of the fit as a whole.
+    """
+    for kind in registry.kinds:
+        if own := sorted(FIT_MESSAGES.keys() & kind.messages.keys()):
+            rule = f"the kind {kind.name} must not declare messages of the whole fit"
+            raise InputError(rule, ", ".join(own), "rename these codes in the kind's messages")
     return {**FIT_MESSAGES, **registry.messages}
 
 
@@ -19,20 +34,34 @@ def title_of(code: str, messages: Mapping[str, Message]) -> str:
 def finding_text(finding: Finding, messages: Mapping[str, Message]) -> str:
     """The text of a finding, with its experiment in front where the text does not name it itself.
 
-    A finding whose code has no words is given by its facts.
+    A finding whose code has no words, or faulty ones, is given by its facts.
     """
     if finding.code in messages:
-        text = messages[finding.code].text(finding.level, finding.facts)
+        text = _filled_in(finding.code, finding.level, finding.facts, messages)
     else:
-        text = ", ".join(f"{name} = {value}" for name, value in finding.facts.items())
+        text = _listed(finding.facts)
     if not finding.experiment or finding.experiment in text:
         return text
     return f"{finding.experiment}: {text}"
 
 
 def caption_of(table: ResultTable, messages: Mapping[str, Message]) -> str:
-    """The caption of a table; "" where no kind declares words for it."""
-    return messages[table.code].text("caption", table.facts) if table.code in messages else ""
+    """The caption of a table; its facts where the caption is faulty, "" where no kind declares words for it."""
+    return _filled_in(table.code, "caption", table.facts, messages) if table.code in messages else ""
+
+
+def _filled_in(code: str, part: Level | Literal["caption"], facts: Facts, messages: Mapping[str, Message]) -> str:
+    """The text of a code; where the text is faulty, the error and the facts. A faulty text must not end a fit."""
+    try:
+        return messages[code].text(part, facts)
+    except TEXT_ERRORS as error:
+        return (
+            f"the words of {code} are faulty ({type(error).__name__}: {error}); the facts: {_listed(facts) or 'none'}"
+        )
+
+
+def _listed(facts: Facts) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in facts.items())
 
 
 def _disagreeing_starts(facts: Facts) -> str:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import emcee
@@ -15,6 +16,7 @@ import xarray as xr
 
 from capsule_id.cli import fit_params
 from capsule_id.commands.fit import Progress
+from capsule_id.experiments.registry import default_registry
 from tests.cli_tools import CODE, environment, listing, small_rig
 
 WORDS = ("rig", "--quiet", "--max-steps", "60")
@@ -199,6 +201,12 @@ def test_resume_refuses_what_has_changed(
     with monkeypatch.context() as patch:
         versions = {"python": "0"}
         patch.setattr("capsule_id.inference.pipeline.package_versions", lambda packages: versions)
+        assert fit_params([*WORDS, "--out", "out", "--resume"]) == 2
+        assert "the same versions" in capsys.readouterr().err
+    with monkeypatch.context() as patch:
+        kinds = default_registry()
+        with_package = replace(kinds, packages={**kinds.packages, "rolling-rig": "0.2"})
+        patch.setattr("capsule_id.commands.fit.default_registry", lambda: with_package)
         assert fit_params([*WORDS, "--out", "out", "--resume"]) == 2
         assert "the same versions" in capsys.readouterr().err
     _remove(here / "out.partial")

@@ -82,6 +82,7 @@ def test_it_is_fitted_and_reported(site: Path, folder: Path, tmp_path: Path) -> 
     done = run(site, str(folder), "--out", str(tmp_path / "out"), "--no-sample", "--quiet", name="fit_params")
     assert (done.returncode, done.stderr) == (0, "")
     saved = json.loads((tmp_path / "out" / "parameters.json").read_text())
+    assert saved["provenance"]["versions"]["rolling-rig"] == "0.1"
     fitted = saved["parameters"]
     weight = (0.110 + 0.530) * 9.81
     assert set(fitted) == {"c_rr", "m1", "m2"}
@@ -111,6 +112,7 @@ def test_its_parameters_and_settings_join_those_of_the_package(site: Path, monke
     assert list(kinds) == [*KINDS, "rolling_resistance"]
     assert set(kinds.parameters) - set(KINDS.parameters) == {"c_rr", "rolling_scatter"}
     assert kinds["rolling_resistance"].required == ("wheel",)
+    assert (kinds.packages, KINDS.packages) == ({"rolling-rig": "0.1"}, {})
 
 
 @pytest.mark.parametrize(
@@ -121,6 +123,11 @@ def test_its_parameters_and_settings_join_those_of_the_package(site: Path, monke
         (("", ""), "rolling_rig:C_RR", "TypeError: rolling_rig:C_RR is no Kind"),
         (('name="rolling_resistance"', 'name="forced_run"'), "rolling_rig:KIND", "kind forced_run is declared"),
         (('"c_rr", "1"', '"mu", "1"'), "rolling_rig:KIND", "parameter mu of kind rolling_resistance is declared"),
+        (
+            ('"rolling.speeds"', '"lines.straight"'),
+            "rolling_rig:KIND",
+            "message lines.straight of kind rolling_resistance",
+        ),
         (("Annotated[str, NameRule()]", "str"), "rolling_rig:KIND", "the type of setting wheel must be"),
     ],
 )

@@ -15,11 +15,13 @@ from capsule_id.experiments import CHOICES, make_experiments, select_tables
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.experiments.registry import BUILT_IN, Registry, default_registry
 from capsule_id.parameters import TABLE, scatter
+from capsule_id.report.messages import FIT_MESSAGES, messages_of
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
 from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ChoiceRule, ColumnRule, NameRule, QuantityRule, SettingRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.synthetic import Truth, synthesize
+from capsule_id.views import Message
 from tests.cli_tools import ROOT
 from tests.rig.folder import TABLES, write_folder
 
@@ -226,3 +228,27 @@ def test_the_choices_of_experiments(tmp_path: Path) -> None:
     assert len(chosen["bench"]) == len(TABLES) - 1
     assert rig.has_runs
     assert not replace(rig, tables=rig.tables[:-1]).has_runs
+
+
+def test_a_bracket_in_a_symbol_is_refused() -> None:
+    own = replace(KINDS["motor_current"], name="other", parameters=(scatter("sd[a]", "rad", "a scatter", "s"),))
+    with pytest.raises(ValueError, match=r"symbol of parameter sd\[a\] of kind other must have no bracket"):
+        Registry((own,))
+
+
+def test_two_contents_of_one_caption_or_message_are_refused() -> None:
+    other = replace(KINDS["motor_current"], name="other")
+    assert Registry((*KINDS.kinds, other)).messages == KINDS.messages  # the same content is fine
+    with pytest.raises(ValueError, match="caption motor_current of kind other is declared twice"):
+        Registry((*KINDS.kinds, replace(other, captions={"motor_current": "Another one."})))
+    with pytest.raises(ValueError, match=r"message lines\.straight of kind other is declared twice"):
+        Registry((*KINDS.kinds, replace(other, messages={"lines.straight": Message("another one")})))
+
+
+def test_a_kind_must_not_replace_messages_of_the_fit() -> None:
+    own = replace(KINDS["motor_current"], name="other", messages={"residuals.white": Message("mine")})
+    with pytest.raises(
+        InputError, match=r"kind other must not declare messages of the whole fit, residuals\.white, rename"
+    ):
+        messages_of(Registry((*KINDS.kinds, own)))
+    assert messages_of(KINDS).keys() == FIT_MESSAGES.keys() | KINDS.messages.keys()

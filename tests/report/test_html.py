@@ -1,6 +1,7 @@
 """The page stands alone, says loudly what must be said, and shows every number of the result."""
 
 import dataclasses
+import html
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -9,11 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from capsule_id.experiments.registry import Registry
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
 from capsule_id.report.messages import finding_text, messages_of
-from capsule_id.views import Finding, ResultTable
+from capsule_id.views import Finding, Message, ResultTable, Text
 
 EMPTY = {"meta", "img", "br"}
 
@@ -186,3 +188,40 @@ def test_minimal_result(result: Result) -> None:
     text = Page(render(bare, pictures(bare))).text
     assert "Scatters and noise" not in text
     assert "Notes" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        ("{missing} of them", "KeyError: 'missing'"),
+        ("{} of them", "ValueError"),
+        ("{number:.1q}", "ValueError"),
+        ("{pair[2]}", "IndexError"),
+        ("{pair:.2f}", "TypeError"),
+        ("{number.size}", "AttributeError"),
+        (lambda facts: None, "TypeError: the text must be a string, found None"),
+        (lambda facts: f"{1 / facts['nought']}", "ZeroDivisionError"),
+    ],
+)
+def test_faulty_words_give_the_facts(result: Result, words: Text, error: str) -> None:
+    """A faulty text of a kind must not end the run after the sampling."""
+    own = replace(result.registry["motor_current"], messages={"own": Message("own", fail=words, caption=words)})
+    facts = {"number": 3, "pair": (1, 2), "nought": 0}
+    faulty = replace(
+        result,
+        registry=Registry((own,)),
+        findings=(Finding("own", "fail", facts, "run_1"),),
+        notes=(ResultTable("own", pd.DataFrame({"a": [1]}), facts),),
+    )
+    said = [
+        " ".join(text.split()) for text in re.findall(r"the words of own are [^<]*", html.unescape(render(faulty, ())))
+    ]
+    assert len(said) == 2  # the finding and the caption
+    for text in said:
+        assert f"faulty ({error}" in text
+        assert "the facts: number = 3, pair = (1, 2), nought = 0" in text
+
+
+def test_an_unknown_level_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"level of finding own must be one of .*; found 'failed'"):
+        Finding("own", "failed")  # type: ignore[arg-type]
