@@ -82,7 +82,8 @@ def energy_balance(
     node, weight = np.polynomial.legendre.leggauss(NODES)
     t = begins[..., None] + half[..., None] * (1.0 + node)
     _, Y1, _, Y2 = (np.asarray(x) for x in values_of(jnp.asarray(rows[..., None]), jnp.asarray(t)))
-    columns_e, columns_law = jax.tree.map(lambda leaf: np.asarray(leaf)[:, None], (e, law))
+    # A law may compute with JAX: its leaves stand as (step, lane, node), like the speeds.
+    columns_e, columns_law = jax.tree.map(lambda leaf: np.asarray(leaf)[None, :, None], (e, law))
 
     def total(power: np.ndarray) -> np.ndarray:
         return np.sum(power * weight * half[..., None], axis=(0, 2))
