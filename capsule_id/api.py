@@ -9,7 +9,14 @@ from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.inference.fit.point_stage import fit_points
-from capsule_id.inference.pipeline import check_fit, make_result, provenance, sample_posterior, stage_seeds
+from capsule_id.inference.pipeline import (
+    check_fit,
+    check_readings,
+    make_result,
+    provenance,
+    sample_posterior,
+    stage_seeds,
+)
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -104,6 +111,7 @@ def fit(
     if progress:
         progress(0, 1, "point fit")
     target = LogPosterior(rig, make_experiments(rig, experiments, kinds, friction))
+    before = check_readings(rig, experiments, kinds)
     point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
-    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress))
+    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress), before)
     return make_result(checked, kinds, seeds.report, made_from, Fit)

@@ -13,7 +13,7 @@ import numpy as np
 
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import KindRule
-from capsule_id.views import Message
+from capsule_id.views import Finding, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
@@ -91,9 +91,9 @@ class Kind(KindRule):
     template : commented lines of ``rig.toml`` that ``capsule-id init`` writes
     informs : parameters that it measures, for tables
     captions : captions of its panels in the report, by ``Comparison.kind``
-    messages : texts of its own checks and tables in the report, by code
-    lint : problems of a table before a fit, one line each
-    lint_rig : problems that depend on the rest of the rig or on rough values, one line each
+    messages : texts of its own findings and tables, by code
+    lint : findings on the readings of a table; they enter the verdict of a fit too
+    lint_rig : findings at rough values, for ``capsule-id check`` alone: a fit repeats such checks at fitted values
     describe : description of a table for ``capsule-id check``, one line each
     check : raises an ``InputError`` where all tables of the kind together cannot be fitted
     paper : estimates by the paper's protocol, by parameter name. Kinds with the same function are evaluated together
@@ -109,8 +109,8 @@ class Kind(KindRule):
     informs: str
     captions: Mapping[str, str]
     messages: Mapping[str, Message] = field(default_factory=dict)
-    lint: tuple[Callable[[Table[Any]], Iterable[str]], ...] = ()
-    lint_rig: Callable[[Table[Any], Rig, Estimate], Iterable[str]] = field(default=lambda table, rig, estimate: ())
+    lint: tuple[Callable[[Table[Any]], Iterable[Finding]], ...] = ()
+    lint_rig: Callable[[Table[Any], Rig, Estimate], Iterable[Finding]] = field(default=lambda table, rig, estimate: ())
     describe: Callable[[Table[Any]], Iterable[str]] = field(default=lambda table: ())
     check: Callable[[Sequence[Table[Any]]], None] = field(default=lambda tables: None)
     paper: Callable[[Sequence[Any]], Values] = field(default=lambda experiments: {})

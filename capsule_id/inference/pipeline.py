@@ -3,11 +3,12 @@
     kinds = default_registry()                                   # kinds of experiments
     rig = read_rig(folder, kinds)                                # folder -> Rig
     seeds = stage_seeds(0)
+    before = check_readings(rig, "all", kinds)                   # Rig -> findings on the readings
     experiments = make_experiments(rig, "all", kinds)            # Rig -> experiments
     target = LogPosterior(rig, experiments)                      # experiments -> log-posterior
     point = fit_points(target, kinds, seeds.starts, True)        # log-posterior -> point fit
     sampled = sample_posterior(point, seeds.walkers)             # point fit -> posterior
-    checked = check_fit(sampled)                                 # posterior -> checks
+    checked = check_fit(sampled, before)                         # posterior -> checks
     result = make_result(checked, kinds, seeds.report, provenance(rig, 0, "all", "eq. (1)"))
 
 ``capsule_id.fit`` runs all stages.
@@ -23,7 +24,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from capsule_id.console import OnProgress
-from capsule_id.experiments import Choice, compare
+from capsule_id.experiments import Choice, compare, select_tables
+from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.setting import Setting
@@ -36,7 +38,7 @@ from capsule_id.inference.tables.parameter_table import parameter_tables
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.rig.model import Rig
-from capsule_id.views import Comparison
+from capsule_id.views import Comparison, Finding
 
 #: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
@@ -61,6 +63,11 @@ def stage_seeds(seed: int) -> StageSeeds:
     return StageSeeds(*(int(s) for s in np.random.SeedSequence(seed).generate_state(3)))
 
 
+def check_readings(rig: Rig, experiments: Choice, registry: Registry) -> tuple[Finding, ...]:
+    """Return findings on the readings that ``experiments`` selects, before anything is fitted."""
+    return lint(rig, registry, select_tables(rig, experiments))
+
+
 def sample_posterior(
     point: PointStage,
     seed: int,
@@ -83,11 +90,14 @@ def sample_posterior(
     return Setting(target, point.fit, posterior, values, draws, point.seed, findings=point.findings, bench=point.bench)
 
 
-def check_fit(sampled: Setting) -> Setting:
-    """Run all checks: return ``sampled`` with all findings, those of the point fit included, and flagged outliers."""
+def check_fit(sampled: Setting, before: Sequence[Finding] = ()) -> Setting:
+    """Run all checks: return ``sampled`` with all findings and flagged outliers.
+
+    The findings include those of the point fit and ``before``, those on the readings.
+    """
     checked = run_checks(sampled)
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
-    return replace(checked, findings=(*checked.findings, *sampled.findings, *agreement))
+    return replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
 
 
 def make_result(

@@ -27,17 +27,6 @@ def describe_run(table: Table) -> list[str]:
     return [*lines, f"Savitzky-Golay over {view.samples} samples, order {FILTER_ORDER}: gain {passed}"]
 
 
-def run_warning(table: Table) -> str | None:
-    """A warning if the stated frequency of a ``forced_run`` differs from that of its current, else None."""
-    drive = measured_motion(table).evidence.drive
-    if drive is None or not drive.disagrees:
-        return None
-    return (
-        f"Omega {drive.stated_Omega:g} rad/s is stated, the current has {drive.Omega:.6g} ± {drive.Omega_sd:.2g} rad/s; "
-        "correct one of them"
-    )
-
-
 def _evidence(motion: MeasuredMotion) -> Iterator[str]:
     evidence: Evidence = motion.evidence
     if evidence.repeat:

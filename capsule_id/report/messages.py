@@ -5,6 +5,7 @@ from typing import Literal
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
+from capsule_id.report.data_messages import DATA_MESSAGES
 from capsule_id.views import Facts, Finding, Level, Message, ResultTable
 
 #: Errors of a text that does not match its facts.
@@ -12,7 +13,7 @@ TEXT_ERRORS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticErr
 
 
 def messages_of(registry: Registry) -> Mapping[str, Message]:
-    """The words of every code: those of the fit as a whole, and those that the kinds of ``registry`` declare.
+    """The words of every code: those of the fit, of the readings, and those that the kinds of ``registry`` declare.
 
     Raises
     ------
@@ -20,10 +21,10 @@ def messages_of(registry: Registry) -> Mapping[str, Message]:
         If a kind declares a code of the fit as a whole.
     """
     for kind in registry.kinds:
-        if own := sorted(FIT_MESSAGES.keys() & kind.messages.keys()):
+        if own := sorted((FIT_MESSAGES.keys() | DATA_MESSAGES.keys()) & kind.messages.keys()):
             rule = f"the kind {kind.name} must not declare messages of the whole fit"
             raise InputError(rule, ", ".join(own), "rename these codes in the kind's messages")
-    return {**FIT_MESSAGES, **registry.messages}
+    return {**FIT_MESSAGES, **DATA_MESSAGES, **registry.messages}
 
 
 def title_of(code: str, messages: Mapping[str, Message]) -> str:

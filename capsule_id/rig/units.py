@@ -49,12 +49,13 @@ _DEFINITIONS = {
     "kN": "1e3 * N",
     "gf": "9.80665e-3 * N",
     "kgf": "9.80665 * N",
+    "g_n": "9.80665 * m / s ** 2",
     "lbf": "4.4482216152605 * N",
     "Ns": "N * s",
 }
 # Other ways to write the same symbol.
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "⋅": "·"})
-_FACTOR = r"(?:[A-Za-z]+(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
+_FACTOR = r"(?:(?:g_n|[A-Za-z]+)(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
 _GRAMMAR = re.compile(rf"{_FACTOR}(?:(?: ?[*/·] ?| ){_FACTOR})*")
 _LONGEST = 40  # characters of a unit
 _EXAMPLES = {
@@ -112,12 +113,14 @@ def factor_to_si(unit: str, si: str) -> float:
     written = unit.strip().translate(_SPELLINGS)
     if len(written) > _LONGEST or not _GRAMMAR.fullmatch(written):
         raise UnitError("a unit is a product of symbols, e.g. kN/m, N*s/m or m/s^2 (1: no unit)", remedy)
-    for symbol in re.findall(r"[A-Za-z]+", written):
+    for symbol in re.findall(r"g_n|[A-Za-z]+", written):
         if symbol not in _DEFINITIONS:
             close = get_close_matches(symbol, _DEFINITIONS, n=1)
             raise UnitError(f"unknown unit symbol {symbol}", f"{remedy}; did you mean {close[0]}?" if close else remedy)
     (factor, base), (_, wanted) = (_registry().get_base_units(each) for each in (written, si))
     if base != wanted:
+        if written == "g" and si == "m/s^2":
+            raise UnitError("g is the gram", "write g_n for standard gravity, 9.80665 m/s^2")
         raise UnitError(
             f"unit must have the dimension of {si}" if si != "1" else "unit must be 1 (a pure number)", remedy
         )

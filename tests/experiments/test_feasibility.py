@@ -11,6 +11,7 @@ from capsule_id.experiments.rough_values import rough_values
 from capsule_id.physics.grazing import grazing_load
 from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
+from capsule_id.views import Finding
 
 TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.66, "v_s": 0.3, "g": 9.81}
 
@@ -145,7 +146,7 @@ def test_rough_values_come_from_the_bench_tests_of_the_folder() -> None:
     assert rough_values(bench.rig(priors={"k1": PriorOverride(900.0, 2.0)}))("k1") == (900.0, False)
 
 
-def lint_runs(rig: Rig) -> dict[str, list[str]]:
+def lint_runs(rig: Rig) -> dict[str, list[Finding]]:
     """Feasibility of the forced runs of a rig, by label."""
     kind, estimate = default_registry()["forced_run"], rough_values(rig)
     return {table.label: list(kind.lint_rig(table, rig, estimate)) for table in rig.tables if table.kind == kind.name}
@@ -156,11 +157,11 @@ def test_runs_of_a_rig_are_judged_each_by_its_own_settings() -> None:
     findings = lint_runs(rig)
     assert findings["low"]
     assert not findings["high"]
-    assert all("prior's median" not in text for text in findings["low"])
+    assert all(found.code != "runs.rough" for found in findings["low"])
 
 
 def test_the_amplitude_comes_from_the_current_where_it_is_not_stated() -> None:
-    """2 A at the prior's 2 N/A: 4 N, enough; and the note names what was not measured."""
+    """2 A at the prior's 2 N/A: 4 N, enough; and a finding names what was not measured."""
     assert list(lint_runs(bench_rig(run_table(None, 34.56, 1e-3))).values()) == [[]]
-    ((first, *_),) = lint_runs(bench.rig(run_table(0.1, 34.56, 1e-3))).values()
-    assert first.endswith("(by the prior's median, not measured here: k1, c, mu, k2[s])")
+    ((*_, last),) = lint_runs(bench.rig(run_table(0.1, 34.56, 1e-3))).values()
+    assert (last.code, last.facts["names"]) == ("runs.rough", "k1, c, mu, k2[s]")

@@ -67,7 +67,7 @@ def test_check_reads_and_lints_it(site: Path, folder: Path) -> None:
     done = run(site, "check", str(folder))
     assert (done.returncode, done.stderr) == (0, "")
     assert "rolling_resistance rolling_resistance: 5 rows of speed [m/s], force [mN]" in done.stdout
-    assert "lint: rolling_resistance: fewer than 6 speeds; measure more" in done.stdout
+    assert "warn: rolling_resistance: fewer than 6 speeds. Measure more." in done.stdout
 
 
 def test_without_the_package_the_kind_is_unknown(folder: Path, tmp_path: Path) -> None:

@@ -11,7 +11,14 @@ import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
-from capsule_id.inference.pipeline import check_fit, make_result, provenance, sample_posterior, stage_seeds
+from capsule_id.inference.pipeline import (
+    check_fit,
+    check_readings,
+    make_result,
+    provenance,
+    sample_posterior,
+    stage_seeds,
+)
 from capsule_id.inference.target.log_posterior import LogPosterior
 from tests.cli_tools import small_rig
 
@@ -27,7 +34,10 @@ def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None
     target = LogPosterior(rig, experiments)
     point = fit_points(target, kinds, seeds.starts, True)
     sampled = sample_posterior(point, seeds.walkers, BUDGET)
-    checked = check_fit(sampled)
+    before = check_readings(rig, "bench", kinds)
+    checked = check_fit(sampled, before)
+    assert before
+    assert checked.findings[-len(before) :] == before
     result = make_result(checked, kinds, seeds.report, provenance(rig, 3, "bench", "eq. (1)"))
     assert sampled.findings == ()
     assert len(checked.findings) > 5

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.records.run_description import describe_run, run_warning
+from capsule_id.experiments.registry import default_registry
+from capsule_id.records.run_description import describe_run
 from capsule_id.records.view import SMALLEST_RATE_GAIN, RecordView, view_record
 from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
 from capsule_id.report.figures.style import new_figure, png
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import filter_gain
 from tests.records.runs import Known, noisier, reference, table_of
 
 STEP = 1e-3
+KINDS = default_registry()
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +105,13 @@ def test_check_says_it_in_a_few_lines(case: Known) -> None:
     assert drive.startswith("drive Omega 73.5")
     assert "(stated 73.58), current 0.6" in drive
     assert filtered.startswith("Savitzky-Golay over 7 samples, order 3: gain 1.000 (rate 1.000) at 11.7 Hz, drive, 0.9")
-    assert run_warning(table) is None
-    wrong = run_warning(table_of(noisier(case.run, 1.0, 0), Omega=80.0))
-    assert wrong is not None
-    assert wrong.startswith("Omega 80 rad/s is stated, the current has 73.5")
+    (lint_drive,) = KINDS["forced_run"].lint
+    assert list(lint_drive(table)) == []
+    (wrong,) = lint_drive(table_of(noisier(case.run, 1.0, 0), Omega=80.0))
+    assert wrong.level == "warn"
+    text = finding_text(wrong, messages_of(KINDS))
+    assert "stated 80 rad/s, the current has 73.5" in text
+    assert "Correct Omega." in text
 
 
 def test_check_says_why_it_cannot_tell(case: Known) -> None:

@@ -39,6 +39,7 @@ BY_HAND = {
     "gf": ("N", 0.00980665),
     "kgf": ("N", 9.80665),
     "lbf": ("N", 4.4482216152605),
+    "g_n": ("m/s^2", 9.80665),
     "Ns": ("N*s", 1.0),
 }
 
@@ -69,6 +70,7 @@ def test_every_symbol_has_its_factor_by_hand() -> None:
         ("deg/s", "rad/s", math.pi / 180.0),
         ("1", "1", 1.0),
         ("mm/m", "1", 1e-3),
+        ("g_n s", "m/s", 9.80665),
     ],
 )
 def test_products_and_spellings(unit: str, si: str, factor: float) -> None:
@@ -106,3 +108,10 @@ def test_the_same_length_in_two_units_is_the_same_float() -> None:
     millimetre = factor_to_si("mm", "m")
     assert all(scale(float(n), millimetre) == n / 1000 for n in range(2000))
     assert any(n * millimetre != n / 1000 for n in range(2000))  # what plain multiplication would do
+
+
+def test_an_acceleration_in_grams_is_told_of_standard_gravity() -> None:
+    with pytest.raises(UnitError, match=r"g is the gram, write g_n for standard gravity") as found:
+        factor_to_si("g", "m/s^2")
+    assert factor_to_si("g_n", "m/s^2") == 9.80665, found.value.remedy
+    assert factor_to_si("g", "kg") == 1e-3

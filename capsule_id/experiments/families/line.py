@@ -9,7 +9,7 @@ from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Table
-from capsule_id.views import Message
+from capsule_id.views import Finding, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.line_experiment import Line
@@ -60,7 +60,7 @@ def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
         raise entry.error("sd_ratio", rule, "all three", "remove sd_ratio", of_key=True)
 
 
-def lint_line(table: Table[Any]) -> Iterable[str]:
+def lint_line(table: Table[Any]) -> Iterable[Finding]:
     """Report few rows and missing reading errors."""
     yield from lint_rows(table, 5)
     if table.settings.sd_ratio is None:

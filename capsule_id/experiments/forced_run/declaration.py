@@ -8,12 +8,13 @@ import numpy as np
 
 from capsule_id.experiments.kind import Estimate, Kind, Twin, Values, made_by
 from capsule_id.parameters import Prior, nuisance, scatter
-from capsule_id.records.run_description import describe_run, run_warning
+from capsule_id.records.run_description import describe_run
+from capsule_id.records.tone import recorded_drive
 from capsule_id.rig.domains import NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
-from capsule_id.views import Message
+from capsule_id.views import Finding, Message
 
 #: Recorded channels: name, unit, LaTeX subscript.
 _CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
@@ -85,7 +86,7 @@ def _check_drive(entry: Entry[RunSettings]) -> None:
         raise entry.error("P_d", rule, "none", "add sd = ... to it, or leave P_d out")
 
 
-def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[str]:
+def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
     from capsule_id.experiments.families.friction_model import EQUATION_1
     from capsule_id.experiments.forced_run.feasibility import feasibility
@@ -98,16 +99,21 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
         del names["K"]
     values = {symbol: estimate(name) for symbol, name in names.items()}
     guessed = [names[symbol] for symbol, (_, measured) in values.items() if not measured]
-    note = f" (by the prior's median, not measured here: {', '.join(guessed)})" if guessed else ""
     theta = {"m1": rig.m1.value, "m2": rig.m2.value, "g": rig.g.value}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
     F_b = float(EQUATION_1.force(theta).forward(0.0))
-    return [MESSAGES[found.code].text(found.level, found.facts) + note for found in feasibility(table, theta, F_b)]
+    findings = feasibility(table, theta, F_b)
+    if findings and guessed:
+        findings.append(Finding("runs.rough", "warn", {"names": ", ".join(guessed)}, table.label))
+    return findings
 
 
-def _lint_drive(table: Table[RunSettings]) -> Iterable[str]:
+def _lint_drive(table: Table[RunSettings]) -> Iterable[Finding]:
     """Report a stated frequency that differs from that of the current."""
-    return filter(None, [run_warning(table)])
+    drive = recorded_drive(table)
+    if drive is not None and drive.disagrees:
+        facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd}
+        yield Finding("runs.frequency", "warn", facts, table.label)
 
 
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
@@ -140,6 +146,20 @@ TEMPLATE = """\
 """
 
 MESSAGES = {
+    "runs.frequency": Message(
+        "frequency of the drive",
+        warn=(
+            "the stated Omega must be that of the current; stated {stated:g} rad/s, the current has {Omega:.6g} ± {sd:.2g} "
+            "rad/s. Correct Omega."
+        ),
+    ),
+    "runs.rough": Message(
+        "feasible",
+        warn=(
+            "the findings on its settings take the prior's median of {names}: no bench test of the folder measures them. "
+            "Add these tests."
+        ),
+    ),
     "runs.contact": Message(
         "feasible",
         warn=(

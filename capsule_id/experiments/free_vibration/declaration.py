@@ -16,7 +16,7 @@ from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, sampling_step
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, NameRule, QuantityRule
-from capsule_id.views import Facts, Message
+from capsule_id.views import Facts, Finding, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -97,19 +97,21 @@ def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
     return ("m1", "m2") if moves else ("m1",)
 
 
-def _lint(table: Table[DecaySettings]) -> Iterable[str]:
-    """Report low sampling rate and short length of a free decay."""
+def _lint(table: Table[DecaySettings]) -> Iterable[Finding]:
+    """Report uneven sampling, low sampling rate and short length of a free decay."""
     time, x_rel = decay_window(table)
     try:
         period = 1.0 / dominant_frequency(time, x_rel)
         step = sampling_step(time)
     except InputError as error:
-        yield f"{error.rule} ({error.value}): the paper's estimate is left out; {error.remedy}"
+        yield Finding("decays.uneven", "warn", {"rule": error.rule, "value": error.value}, table.label)
         return
     if period / step < SAMPLES_PER_PERIOD:
-        yield f"{period / step:.1f} samples per period, {SAMPLES_PER_PERIOD} or more are wanted; sample faster"
+        facts = {"samples": period / step, "wanted": SAMPLES_PER_PERIOD}
+        yield Finding("decays.sampling", "warn", facts, table.label)
     if (time[-1] - time[0]) / period < FEWEST_PERIODS:
-        yield f"{(time[-1] - time[0]) / period:.1f} periods, {FEWEST_PERIODS} or more are wanted; record for longer"
+        facts = {"periods": (time[-1] - time[0]) / period, "wanted": FEWEST_PERIODS}
+        yield Finding("decays.length", "warn", facts, table.label)
 
 
 def _paper(experiments: Sequence["FreeVibration"]) -> Values:
@@ -169,6 +171,19 @@ def _damping_caption(facts: Facts) -> str:
 
 
 MESSAGES = {
+    "decays.uneven": Message(
+        "sampling of a decay",
+        warn=(
+            "{rule}; found {value}. The paper's estimate is left out; the fit uses the times as recorded. Resample the "
+            "record evenly to have both."
+        ),
+    ),
+    "decays.sampling": Message(
+        "sampling of a decay", warn="{samples:.1f} samples per period; {wanted} or more are wanted. Sample faster."
+    ),
+    "decays.length": Message(
+        "length of a decay", warn="{periods:.1f} periods; {wanted} or more are wanted. Record for longer."
+    ),
     "decays.stiffness": Message(
         "stiffness against amplitude",
         ok="k1 is the same in all {records} records (p = {p:.2g})",

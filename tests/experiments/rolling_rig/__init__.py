@@ -11,7 +11,7 @@ from capsule_id.parameters import Parameter, Prior, scatter
 from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.model import Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule
-from capsule_id.views import Message
+from capsule_id.views import Finding, Message
 
 C_RR = Parameter("c_rr", "1", "rolling resistance coefficient", r"c_\mathrm{rr}", Prior("lognormal", 0.01, 100.0))
 SCATTER = scatter(
@@ -31,9 +31,9 @@ def _masses(table: Table[RollingSettings]) -> tuple[str, ...]:
     return "m1", "m2"
 
 
-def _lint(table: Table[RollingSettings]) -> Iterable[str]:
+def _lint(table: Table[RollingSettings]) -> Iterable[Finding]:
     if len(np.unique(table["speed"])) < 6:
-        yield "fewer than 6 speeds; measure more"
+        yield Finding("rolling.few", "warn", experiment=table.label)
 
 
 KIND = Kind(
@@ -59,6 +59,7 @@ KIND = Kind(
             ok="the force is the same at all {speeds} speeds",
             warn="expected the same force at all {speeds} speeds; it changes by {slope:.2g} N s/m. Roll on a harder floor.",
         ),
+        "rolling.few": Message("speeds", warn="fewer than 6 speeds. Measure more."),
         "rolling.range": Message("Speeds of the wheel", caption="Where c_rr = {c_rr:.3f} was measured."),
     },
     lint=(_lint,),
