@@ -1,24 +1,20 @@
 """Entry points of the two commands ``fit-params`` and ``capsule-id``: parse, call, exit code."""
 
 import argparse
-import signal
 import sys
 import tempfile
-import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import NoReturn, TextIO
 
 from capsule_id import console
-from capsule_id.commands import bifurcate, check, fit, init, report, simulate, synthesize
 from capsule_id.errors import InputError
+from capsule_id.interruption import INTERRUPTED, interruptible
 
-BAD_INPUT, INTERNAL, INTERRUPTED = 2, 1, 130
+BAD_INPUT, INTERNAL = 2, 1
 _RESUME = "; --resume continues from the saved state"
 _LONGEST_MESSAGE = 300  # characters of an exception's message in the error line
 
@@ -33,14 +29,27 @@ class _Parser(argparse.ArgumentParser):
 
 def fit_params(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``fit-params``; returns the exit code."""
-    parser = _Parser(prog="fit-params", description="Fit the vibro-impact capsule to a folder of rig measurements.")
-    fit.add_arguments(parser)
-    return _run("fit-params", parser, fit.run, arguments)
+    return _run("fit-params", _fit_parser, arguments)
 
 
 def capsule_id(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``capsule-id``; returns the exit code."""
-    parser = _Parser(prog="capsule-id", description="Make, check, simulate and report; fit-params fits.")
+    return _run("capsule-id", _capsule_parser, arguments)
+
+
+def _fit_parser(program: str) -> argparse.ArgumentParser:
+    from capsule_id.commands import fit
+
+    parser = _Parser(prog=program, description="Fit the vibro-impact capsule to a folder of rig measurements.")
+    fit.add_arguments(parser)
+    parser.set_defaults(run=fit.run)
+    return parser
+
+
+def _capsule_parser(program: str) -> argparse.ArgumentParser:
+    from capsule_id.commands import bifurcate, check, init, report, simulate, synthesize
+
+    parser = _Parser(prog=program, description="Make, check, simulate and report; fit-params fits.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
     for name, module, text in (
         ("init", init, "an empty rig folder with a commented rig.toml"),
@@ -53,31 +62,27 @@ def capsule_id(arguments: Sequence[str] | None = None) -> int:
         sub = commands.add_parser(name, help=text, description=text)
         module.add_arguments(sub)
         sub.set_defaults(run=module.run)
-    return _run("capsule-id", parser, lambda args: args.run(args), arguments)
+    return parser
 
 
-def _run(
-    program: str,
-    parser: argparse.ArgumentParser,
-    action: Callable[[argparse.Namespace], int],
-    arguments: Sequence[str] | None,
-) -> int:
+def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], arguments: Sequence[str] | None) -> int:
     """Parse and act. Every end gives an exit code and at most one line on standard error."""
     console.prepare()
+    interrupted = f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}"
     try:
-        args = parser.parse_args(arguments)
-    except SystemExit as stop:
+        # The parsers load NumPy: an interruption must count from before that.
+        with warnings.catch_warnings(), interruptible(interrupted):
+            args = make_parser(program).parse_args(arguments)
+            warnings.showwarning = partial(_show_warning, program)
+            return args.run(args)
+    except SystemExit as stop:  # of the parser
         console.finish()
         return int(stop.code or 0)
-    try:
-        with warnings.catch_warnings(), _interruptible():
-            warnings.showwarning = partial(_show_warning, program)
-            return action(args)
     except InputError as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print(f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}", file=sys.stderr)
+        print(interrupted, file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
         print(f"{program}: internal failure: {_one_line(error)}; {_save_traceback()}", file=sys.stderr)
@@ -96,30 +101,6 @@ def _show_warning(
     """Print a warning in one line on standard error. The signature is that of ``warnings.showwarning``."""
     place = f"{Path(filename).name}:{lineno}"
     print(" ".join(f"{program}: warning: {category.__name__}: {message} ({place})".split()), file=sys.stderr)
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """SIGTERM ends the block like Ctrl-C. Later signals are ignored."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
-        for each in numbers:
-            signal.signal(each, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    before = {number: signal.getsignal(number) for number in numbers}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _one_line(error: Exception) -> str:

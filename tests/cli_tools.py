@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import xarray as xr
+
 import capsule_id
 
 ROOT = Path(capsule_id.__file__).resolve().parents[1]
@@ -57,6 +59,16 @@ def small_rig(folder: Path, name: str = "small", tables: tuple[str, ...] = ("sta
         shutil.copy(DATA / f"{table}.csv", folder)
     (folder / "rig.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
+
+
+def same_result(one: Path, other: Path) -> None:
+    """Assert that two results have the same numbers, to the last bit."""
+    for name in ("parameters.json", "parameters.csv"):
+        assert (one / name).read_bytes() == (other / name).read_bytes()
+    trees = [xr.open_datatree(folder / "posterior.nc", engine="h5netcdf") for folder in (one, other)]
+    assert trees[0].identical(trees[1])
+    for tree in trees:
+        tree.close()
 
 
 def listing(folder: Path) -> dict[str, bytes]:

@@ -37,6 +37,7 @@ from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.tables.parameter_table import parameter_tables
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
+from capsule_id.interruption import stop_if_interrupted
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison, Finding
 
@@ -95,6 +96,7 @@ def check_fit(sampled: Setting, before: Sequence[Finding] = ()) -> Setting:
 
     The findings include those of the point fit and ``before``, those on the readings.
     """
+    stop_if_interrupted()
     checked = run_checks(sampled)
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
     return replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
@@ -108,6 +110,7 @@ def make_result(
     The versions in its provenance include those of the packages in ``registry``.
     ``kind`` is the class of the result; the interface passes a subclass with a method that writes it.
     """
+    stop_if_interrupted()
     target, posterior = checked.target, checked.posterior
     rng = np.random.default_rng(seed)
     predictive = {e.label: e.predictive_p([e.local(d) for d in checked.draws], rng) for e in target.experiments}

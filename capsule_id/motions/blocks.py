@@ -17,6 +17,7 @@ import numpy as np
 
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
+from capsule_id.interruption import stop_if_interrupted
 from capsule_id.motions.points import MOTION_COLUMNS, MotionColumns, SweepPoints, settled_columns
 from capsule_id.motions.response import Settling
 
@@ -107,6 +108,7 @@ def _on_cluster(client: "Client") -> Callable[..., Iterator[tuple[int, MotionCol
 
 
 def _report(progress: OnProgress | None, done: int, total: int) -> None:
+    stop_if_interrupted()
     if progress is not None:
         progress(done, total, "points")
 

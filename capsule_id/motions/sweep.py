@@ -20,6 +20,7 @@ from scipy.stats import qmc
 
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
+from capsule_id.interruption import stop_if_interrupted
 from capsule_id.motions.attractors import attractors_of
 from capsule_id.motions.blocks import BLOCK, compute
 from capsule_id.motions.datasets import (
@@ -124,6 +125,7 @@ def continuation(
     plain = Settling(**{**vars(settling), "exponent_periods": 0})
     parts: list[MotionColumns] = []
     for i in range(len(x)):
+        stop_if_interrupted()
         if progress is not None:
             progress(i, len(x), "values")
         points = sweep_points(*single(p, e), {over: x[order[:, i]]}, state)

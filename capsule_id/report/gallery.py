@@ -8,6 +8,7 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from capsule_id.inference.result import Result, RunRecord
+from capsule_id.interruption import stop_if_interrupted
 from capsule_id.report.figures import comparisons as figures
 from capsule_id.report.figures.corner import corner
 from capsule_id.report.figures.runs import force_on_rod, run_overview
@@ -118,6 +119,7 @@ def _picture(
     caption: str,
     figure: Figure,
 ) -> Picture:
+    stop_if_interrupted()
     if result.rig.synthetic:
         mark(figure, "synthetic data")
     width, height = (round(96 * inches) for inches in figure.get_size_inches())

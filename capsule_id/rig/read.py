@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from capsule_id.errors import InputError
+from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
 from capsule_id.rig.decode import decode
 from capsule_id.rig.entry import Entry
@@ -153,6 +154,7 @@ def _read_experiments(
     tables: list[Table] = []
     files: dict[str, str] = {}
     for index, entry in enumerate(entries):
+        stop_if_interrupted()
         path: KeyPath = ("experiment", index)
         read_table(document, path, entry, "[[experiment]]")
         table, sha256 = _read_experiment(document, path, entry, kinds)

@@ -17,7 +17,7 @@ import xarray as xr
 from capsule_id.cli import fit_params
 from capsule_id.commands.fit import Progress
 from capsule_id.experiments.registry import default_registry
-from tests.cli_tools import CODE, environment, listing, small_rig
+from tests.cli_tools import CODE, environment, listing, same_result, small_rig
 
 WORDS = ("rig", "--quiet", "--max-steps", "60")
 #: A short run that is checked often and never converges, so that every ensemble goes on after several checks; and
@@ -72,12 +72,7 @@ def die_in_progress(patch: pytest.MonkeyPatch, stage: str, draws: int, death: Ca
 
 def same_as_uninterrupted(folder: Path, out: str) -> None:
     assert not (folder / f"{out}.partial").exists()
-    assert (folder / out / "parameters.json").read_bytes() == (folder / "whole" / "parameters.json").read_bytes()
-    assert (folder / out / "parameters.csv").read_bytes() == (folder / "whole" / "parameters.csv").read_bytes()
-    trees = [xr.open_datatree(folder / name / "posterior.nc", engine="h5netcdf") for name in (out, "whole")]
-    assert trees[0].identical(trees[1])
-    for tree in trees:
-        tree.close()
+    same_result(folder / out, folder / "whole")
 
 
 def test_two_runs_agree_to_the_byte(here: Path) -> None:

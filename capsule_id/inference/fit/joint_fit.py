@@ -25,6 +25,7 @@ from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, leas
 from capsule_id.inference.fit.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
+from capsule_id.interruption import stop_if_interrupted
 
 #: Tolerance, dimensionless, and largest number of solver steps of one descent.
 SOLVER = Solver(tolerance=1e-7, max_steps=80, normal_equations=True, heavy=True)
@@ -161,6 +162,7 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
     located = target.located
     u, still, fit = start.copy(), False, None
     for _ in range(ROUNDS):
+        stop_if_interrupted()
         residual = HeldResiduals(target, jnp.asarray(u))
         fit = least_squares(residual, u[located][None], SOLVER)
         if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):

@@ -19,6 +19,7 @@ from capsule_id.inference.fit.curvature import BATCH, gradient, hessian, in_batc
 from capsule_id.inference.fit.least_squares import Solver, least_squares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
+from capsule_id.interruption import stop_if_interrupted
 
 #: Default number of starting points.
 STARTS = 5
@@ -103,6 +104,7 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
         value = in_batches(target.batch, end + v @ whitening.T)
         return -np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR)
 
+    stop_if_interrupted()
     solution = optimize.minimize(
         lambda v: float(negative(v[None])[0]),
         np.zeros(len(end)),

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 
 from capsule_id.inference.sampling.moves import Moves
+from capsule_id.interruption import stop_if_interrupted
 
 
 class Ensemble:
@@ -60,6 +61,7 @@ class Ensemble:
         if draws > 0:
             for state in self._sampler.sample(self.state, iterations=draws, thin_by=thin, store=store):
                 self.state = state
+                stop_if_interrupted()
                 yield
 
     def run(self, steps: int, store: bool = True) -> "Ensemble":

@@ -1,0 +1,77 @@
+"""Interruptions by Ctrl-C or SIGTERM: the handler sets a flag, long computations read it between their steps.
+
+The handler raises nothing, so that no callback can swallow the interruption. A step may be long (a compilation).
+Therefore a thread, woken by the signal itself, ends the process if the main thread has not ended in time.
+"""
+
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+#: Exit code of an interrupted command.
+INTERRUPTED = 130
+#: Time that the main thread has to end by itself after a signal, s.
+GRACE = 4.0
+_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
+_flag = threading.Event()
+
+
+def stop_if_interrupted() -> None:
+    """Raise ``KeyboardInterrupt`` if a signal has arrived in an ``interruptible`` block; call this between steps."""
+    if _flag.is_set():
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def interruptible(message: str) -> Iterator[None]:
+    """SIGINT and SIGTERM set the flag of ``stop_if_interrupted``; after ``GRACE`` seconds they end the process.
+
+    Signals that the process ignores stay ignored. Outside the main thread the block changes nothing.
+
+    Parameters
+    ----------
+    message : line on standard error where the process is ended with exit code ``INTERRUPTED``
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    # None: installed outside Python, cannot be restored.
+    before = {n: h for n in _SIGNALS if (h := signal.getsignal(n)) not in (signal.SIG_IGN, None)}
+    ended = threading.Event()
+    watchdog = threading.Thread(target=_watch, args=(receiver, ended, message), name="watchdog", daemon=True)
+    watchdog.start()
+    wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    for number in before:
+        signal.signal(number, _set_flag)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(wakeup)
+        ended.set()
+        sender.close()
+        watchdog.join()
+        receiver.close()
+        _flag.clear()
+
+
+def _set_flag(number: int, frame: FrameType | None) -> None:
+    del number, frame
+    _flag.set()
+
+
+def _watch(receiver: socket.socket, ended: threading.Event, message: str) -> None:
+    """Wait for a signal, then for the end of the block; end the process if that takes longer than ``GRACE``."""
+    while arrived := receiver.recv(64):
+        if _SIGNALS & set(arrived):
+            if not ended.wait(GRACE):
+                os.write(2, f"{message}\n".encode())  # sys.stderr may be locked by the main thread
+                os._exit(INTERRUPTED)
+            return

@@ -1,0 +1,125 @@
+"""Interruptions of a fit at random times, some during a compilation: it ends in time, and ``--resume`` repeats it."""
+
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.interruption import GRACE, interruptible, stop_if_interrupted
+from tests.cli_tools import DATA, argv, environment, same_result, small_rig
+
+#: Longest time between a signal and the end of the process, s.
+LONGEST = 5.0
+#: A fit of a few seconds that saves its chains after every draw.
+SHORT = "from capsule_id.inference.sampling import chain_store, ensembles\nchain_store.SAVE_EVERY = 0.0\n"
+SHORT += "ensembles.FIRST_CHECK, ensembles.CHECK_EVERY, ensembles.PILOT_STEPS = 15, 15, 60\n"
+#: The step that starts the first ensemble hangs; the time until the process is ended is short.
+HANGING = "import time\nfrom capsule_id import interruption\nfrom capsule_id.inference.sampling import ensembles\n"
+HANGING += "interruption.GRACE = 0.5\nensembles.pilot = lambda *_: open('hanging', 'w').close() or time.sleep(60)\n"
+
+
+def start(folder: Path, *words: str, before: str = "", cache: bool = False) -> subprocess.Popen[str]:
+    """Start ``fit-params``, by default without compiled programs from disk; ``folder/log`` shows every compilation."""
+    env = environment(JAX_ENABLE_COMPILATION_CACHE=str(int(cache)), JAX_LOG_COMPILES="1")
+    with (folder / "log").open("w", encoding="utf-8") as log:
+        return subprocess.Popen(
+            argv(*words, before=before), cwd=folder, env=env, stdout=subprocess.DEVNULL, stderr=log, text=True
+        )
+
+
+def compilations(folder: Path) -> int:
+    """Number of compilations that the log shows."""
+    return (folder / "log").read_text(encoding="utf-8").count("with global shapes")
+
+
+def wait_until(condition: Callable[[], bool], fit: subprocess.Popen[str]) -> None:
+    """Wait until ``condition`` holds or the process has ended."""
+    while not condition() and fit.poll() is None:
+        time.sleep(0.005)
+
+
+def interrupt(fit: subprocess.Popen[str], number: signal.Signals) -> float:
+    """Send a signal; return the time until the process has ended, s. A process that has finished keeps its code."""
+    sent = time.monotonic()
+    fit.send_signal(number)
+    fit.wait(timeout=60)
+    return time.monotonic() - sent
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_read_at_the_next_step(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with interruptible("ended"):
+        stop_if_interrupted()
+        signal.raise_signal(number)  # raises nothing: a callback cannot swallow it
+        with pytest.raises(KeyboardInterrupt):
+            stop_if_interrupted()
+    stop_if_interrupted()  # the flag ends with the block
+    assert signal.getsignal(number) is before
+
+
+def test_a_step_that_does_not_end_is_ended(tmp_path: Path) -> None:
+    small_rig(tmp_path / "rig")
+    fit = start(tmp_path, "rig", "--out", "out", "--quiet", before=HANGING, cache=True)
+    wait_until((tmp_path / "hanging").exists, fit)
+    assert 0.5 <= interrupt(fit, signal.SIGTERM) < 0.5 + LONGEST - GRACE
+    assert fit.returncode == 130
+    assert (tmp_path / "log").read_text(encoding="utf-8").splitlines()[
+        -1
+    ] == "fit-params: interrupted; --resume continues from the saved state"
+
+
+def test_interrupted_in_a_compilation_and_in_the_sample(tmp_path: Path) -> None:
+    small_rig(tmp_path / "rig")
+    words = ("rig", "--quiet", "--max-steps", "60")
+    first = start(tmp_path, *words, "--out", "out", before=SHORT)
+    wait_until(lambda: compilations(tmp_path) >= 2, first)
+    assert interrupt(first, signal.SIGTERM) < LONGEST
+    assert first.returncode == 130
+    second = start(tmp_path, *words, "--out", "out", "--resume", before=SHORT, cache=True)
+    wait_until((tmp_path / "out.partial" / "chains.saved").exists, second)
+    assert interrupt(second, signal.SIGINT) < LONGEST
+    assert second.returncode == 130
+    assert start(tmp_path, *words, "--out", "out", "--resume", before=SHORT, cache=True).wait() == 3
+    assert start(tmp_path, *words, "--out", "whole", before=SHORT, cache=True).wait() == 3
+    same_result(tmp_path / "out", tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("experiments", "trials", "compiling"), [("bench", 150, 30), ("all", 20, 6)])
+def test_many_interruptions(tmp_path: Path, experiments: str, trials: int, compiling: int) -> None:
+    """Signals at random times of a fit of ``data/``; ``compiling`` of them at the beginning of a compilation."""
+    words = (str(DATA), "--experiments", experiments, "--quiet", "--max-steps", "300")
+    began = time.monotonic()
+    code = start(tmp_path, *words, "--out", "whole").wait()
+    length, compiled = time.monotonic() - began, compilations(tmp_path)
+    random = np.random.default_rng(11)
+    ends = []
+    for trial in range(trials):
+        fit = start(tmp_path, *words, "--out", "out")
+        if trial < compiling:
+            number = int(random.integers(1, compiled + 1))
+            wait_until(lambda number=number: compilations(tmp_path) >= number, fit)
+        else:
+            time.sleep(random.uniform(0.3, length))
+        if fit.poll() is None:
+            ends.append(interrupt(fit, (signal.SIGINT, signal.SIGTERM)[trial % 2]))
+            print(f"{experiments} {trial}: exit {fit.returncode} after {ends[-1]:.2f} s", flush=True)
+            assert ends[-1] < LONGEST
+        if fit.returncode == 130:
+            assert not (tmp_path / "out").exists()
+            resume = ["--resume"] if (tmp_path / "out.partial").exists() else []
+            assert start(tmp_path, *words, "--out", "out", *resume).wait() == code
+        else:
+            assert fit.returncode == code
+        same_result(tmp_path / "out", tmp_path / "whole")
+        shutil.rmtree(tmp_path / "out")
+    print(
+        f"{experiments}: {len(ends)} interrupted, longest {max(ends):.2f} s, fit {length:.0f} s, {compiled} compilations"
+    )
+    assert len(ends) > trials // 2
