@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Level = Literal["ok", "warn", "fail"]
+#: Whether a number may be quoted; "not judged" where no check could tell.
+Trust = Literal["trusted", "not judged", "not trusted"]
 #: What a check or a table has found, by name; quantities in the unit that the text prints.
 Facts = Mapping[str, Any]
 #: A format string over facts, or a function of them.
@@ -28,6 +30,7 @@ class Finding:
     code : stable name of what was checked, such as ``residuals.white``; a ``Message`` gives its words
     facts : numbers and names that the text needs
     experiment : label of the experiment that the finding is about; "" where it is about the whole fit
+    parameters : names of the parameters that it is about; () for all that its experiment informs
 
     Raises
     ------
@@ -39,6 +42,7 @@ class Finding:
     level: Level
     facts: Facts = field(default_factory=dict)
     experiment: str = ""
+    parameters: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.level not in get_args(Level):

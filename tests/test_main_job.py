@@ -54,7 +54,9 @@ def test_it_ends_clean_and_quiet(job: Job) -> None:
     assert (job.done.returncode, job.done.stderr) == (0, "")
     assert job.parameters["verdict"]["clean"] is True
     assert "SYNTHETIC" in job.done.stdout.splitlines()[0]
-    assert job.done.stdout.splitlines()[-1] == f"report: {Path('results/twin/report.html')}"
+    report, verdict = job.done.stdout.splitlines()[-2:]
+    assert report == f"report: {Path('results/twin/report.html')}"
+    assert verdict == "verdict: trusted; no check failed"
     entries = {path.name for path in job.directory.iterdir()}
     assert entries == {"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"}
     assert [path.name for path in job.directory.parent.iterdir()] == ["twin"]
@@ -65,9 +67,25 @@ def test_parameters_json_keeps_the_contract(job: Job) -> None:
     assert (content["rig"], content["synthetic"], content["provenance"]["seed"]) == ("twin", True, 0)
     springs = [f"k2[{spring}]" for spring in Truth().k2]
     assert set(content["parameters"]) == {"m1", "m2", "k1", "c", "mu", "v_s", "K", *springs}
-    keys = {"unit", "paper", "map", "mean", "sd", "median", "ci95", "ess", "rhat", "informed"}
+    keys = {
+        "unit",
+        "value",
+        "sd",
+        "basis",
+        "trust",
+        "paper",
+        "map",
+        "mean",
+        "median",
+        "ci95",
+        "ess",
+        "rhat",
+        "informed",
+    }
+    assert content["trust"] == "trusted"
     for row in content["parameters"].values():
         assert keys <= set(row)
+        assert (row["value"], row["basis"], row["trust"]) == (row["median"], "sample", "trusted")
         low, high = row["ci95"]
         assert low < row["median"] < high
     assert set(content["provenance"]["files"]) == {path.name for path in DATA.iterdir()} - {"README.md"}

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.api import fit
     from capsule_id.inference.pipeline import PACKAGES, package_versions
-    from capsule_id.report.console_table import table_text
+    from capsule_id.report.console_table import table_text, verdict_text
     from capsule_id.report.messages import messages_of, title_of
     from capsule_id.report.write import write_result
 
@@ -76,9 +76,10 @@ def run(args: argparse.Namespace) -> int:
         write_result(result, partial)
         publish(partial, directory)
     report = directory / "report.html"
-    say(f"{table_text(result.summary, synthetic=rig.synthetic, clean=result.clean)}\nreport: {report}")
+    failed = sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
+    table = table_text(result.summary, synthetic=rig.synthetic)
+    say("\n".join([table, f"report: {report}", verdict_text(result.trust, failed)]))
     if result.clean:
         return 0
-    failed = sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
     return 3

@@ -27,27 +27,29 @@ def run(args: argparse.Namespace) -> int:
         saved = json.loads(path.read_text(encoding="utf-8"))
         findings, clean = saved["verdict"]["findings"], bool(saved["verdict"]["clean"])
         rows = {name: _row(entry) for name, entry in saved["parameters"].items()}
+        trust = saved["trust"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         rule, remedy = "DIR must be a result of fit-params", "run fit-params first"
         raise InputError(rule, type(error).__name__, remedy, path) from error
     import pandas as pd
 
-    from capsule_id.report.console_table import table_text
+    from capsule_id.report.console_table import table_text, verdict_text
 
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
-    lines = [table_text(frame, synthetic=bool(saved["synthetic"]), clean=clean)]
-    say("\n".join([*lines, *(f"{finding['level']:4} {finding['check']}: {finding['text']}" for finding in findings)]))
+    failed = sorted({finding["check"] for finding in findings if finding["level"] == "fail"})
+    texts = (f"{finding['level']:4} {finding['check']}: {finding['text']}" for finding in findings)
+    say("\n".join([table_text(frame, synthetic=bool(saved["synthetic"])), *texts, verdict_text(trust, failed)]))
     return 0 if clean else 3
 
 
 def _row(entry: dict[str, Any]) -> dict[str, Any]:
     """One row of the parameter table. The file has no standard error of the point fit."""
     lower, upper = entry["ci95"] or (None, None)
-    numbers = {key: entry[key] for key in ("paper", "map", "mean", "sd", "median", "ess", "rhat")}
+    numbers = {key: entry[key] for key in ("value", "sd", "paper", "map", "mean", "median", "ess", "rhat")}
     values = {key: float("nan") if value is None else float(value) for key, value in numbers.items()}
     bounds = {
         "lower": float("nan") if lower is None else float(lower),
         "upper": float("nan") if upper is None else float(upper),
     }
-    words = {"unit": entry["unit"], "meaning": "", "standard_error": float("nan"), "informed": entry["informed"]}
-    return {**words, **values, **bounds}
+    words = {key: entry[key] for key in ("unit", "basis", "trust", "informed")}
+    return {**words, "meaning": "", "standard_error": float("nan"), **values, **bounds}

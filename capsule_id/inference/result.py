@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from capsule_id.views import Curve as Curve
 from capsule_id.views import Finding as Finding
 from capsule_id.views import Points as Points
 from capsule_id.views import ResultTable as ResultTable
+from capsule_id.views import Trust as Trust
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,9 @@ class Result:
     Attributes
     ----------
     registry : kinds of the rig's experiments, which declare the texts of their panels and checks
-    summary : a row per physical parameter (index ``name``), SI, missing numbers NaN; columns unit, meaning, paper, map,
-        standard_error, mean, sd, median, lower, upper, ess, rhat, informed
+    summary : a row per physical parameter (index ``name``), SI, missing numbers NaN; columns unit, meaning, value, sd,
+        basis, trust, paper, map, standard_error, mean, median, lower, upper, ess, rhat, informed. Quote value and sd:
+        the median and sd of the sample (basis "sample"), or the maximum and its standard error (basis "point")
     nuisances : the same columns for scatters and noise
     fixed : constants by name, SI
     observed : (n,) readings that enter the likelihood, SI, by label
@@ -145,3 +148,9 @@ class Result:
     def clean(self) -> bool:
         """Whether there is no finding of level ``fail``."""
         return all(finding.level != "fail" for finding in self.findings)
+
+    @property
+    def trust(self) -> Trust:
+        """The worst word of the physical parameters; "not trusted" where a check failed."""
+        words = {"trusted" if self.clean else "not trusted", *self.summary["trust"]}
+        return max(get_args(Trust), key=lambda word: (word in words, get_args(Trust).index(word)))

@@ -1,25 +1,26 @@
 """The parameter table for standard output."""
 
+from collections.abc import Sequence
+
 import pandas as pd
 
 from capsule_id.report.columns import columns_of, table_rows
+from capsule_id.views import Trust
 
 WIDTH = 110
 _SHORTEST_NAME = 8
 _GAP = "  "
 
 SYNTHETIC = "*** SYNTHETIC RIG: computer-made data, nothing here was measured ***"
-NOT_CLEAN = "*** VERDICT NOT CLEAN: the intervals below are not to be trusted, see the findings ***"
 
 
-def table_text(summary: pd.DataFrame, *, synthetic: bool, clean: bool) -> str:
+def table_text(summary: pd.DataFrame, *, synthetic: bool) -> str:
     """The parameter table as aligned text, at most 110 columns wide.
 
     Parameters
     ----------
     summary : as ``Result.summary``; without a sample the sampled columns are left out
     synthetic : the rig is a synthetic one: said in a line of its own
-    clean : the verdict; where it is not clean a line says so
     """
     columns = columns_of("console", summary)
     table = [["", *(column.header for column in columns)]]
@@ -32,8 +33,16 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, clean: bool) -> str:
     widths[0] = min(widths[0], max(WIDTH - others, _SHORTEST_NAME))
     lines = [_line(cells, widths) for cells in table]
     rule = "-" * max(map(len, lines))
-    loud = [text for text, on in ((SYNTHETIC, synthetic), (NOT_CLEAN, not clean)) if on]
-    return "\n".join([*loud, lines[0], rule, *lines[1:]])
+    return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:]])
+
+
+def verdict_text(trust: Trust, failed: Sequence[str]) -> str:
+    """The verdict in one line; ``failed`` are the titles of the failed checks."""
+    if failed:
+        return f"verdict: {trust}; failed: {', '.join(failed)}"
+    return f"verdict: {trust}; no check failed" + (
+        ", but not every number could be checked" if trust == "not judged" else ""
+    )
 
 
 def _line(cells: list[str], widths: list[int]) -> str:

@@ -45,6 +45,7 @@ def parameters_json(result: Result) -> dict[str, object]:
     return {
         "rig": result.rig.name,
         "synthetic": result.rig.synthetic,
+        "trust": result.trust,
         "parameters": {
             str(name): {column.key: _plain(column.of(row)) for column in columns}
             for name, row in result.summary.to_dict("index").items()
@@ -57,6 +58,8 @@ def parameters_json(result: Result) -> dict[str, object]:
                     "level": finding.level,
                     "text": finding_text(finding, messages),
                     "code": finding.code,
+                    "experiment": finding.experiment,
+                    "parameters": list(finding.parameters),
                 }
                 for finding in result.findings
             ],

@@ -46,7 +46,8 @@ def _frame(rows: dict[str, tuple[str, str, float, float, float]], rng: np.random
     for name, (unit, meaning, value, sd, paper) in rows.items():
         mean = value + 0.1 * sd * rng.normal()
         table[name] = {
-            "unit": unit, "meaning": meaning, "paper": paper, "map": value, "standard_error": 0.97 * sd, "mean": mean,
+            "unit": unit, "meaning": meaning, "value": mean, "basis": "sample", "trust": "trusted", "paper": paper,
+            "map": value, "standard_error": 0.97 * sd, "mean": mean,
             "sd": sd, "median": mean, "lower": mean - 1.96 * sd, "upper": mean + 1.96 * sd,
             "ess": 4100.0 + 100 * rng.normal(), "rhat": 1.002, "informed": name not in ("m1", "m2"),
         }  # fmt: skip
@@ -235,11 +236,13 @@ def unclean(result: Result) -> Result:
 @pytest.fixture(scope="session")
 def unsampled(result: Result) -> Result:
     """What ``--no-sample`` gives: sampled columns are NaN."""
-    columns = ["mean", "sd", "median", "lower", "upper", "ess", "rhat", "informed"]
+    columns = ["mean", "median", "lower", "upper", "ess", "rhat", "informed"]
     summary, nuisances = result.summary.copy(), result.nuisances.copy()
     for frame in (summary, nuisances):
         frame["informed"] = frame["informed"].astype(object)
         frame[columns] = np.nan
+        frame["value"], frame["sd"], frame["basis"] = frame["map"], frame["standard_error"], "point"
+        frame["trust"] = "not judged"
     return dataclasses.replace(result, summary=summary, nuisances=nuisances, posterior=None, log_likelihood=None)
 
 

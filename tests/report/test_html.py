@@ -68,11 +68,11 @@ def test_self_contained(page: str, drawn: tuple[Picture, ...]) -> None:
 def test_every_number_of_the_table_is_there(result: Result, page: str) -> None:
     text = Page(page).text
     row = result.summary.loc["k1"]
-    for number in ("1386.0", "1421.3 ± 3.0", f"{row['mean']:.1f} ± 3.1", f"{row['lower']:.1f} to {row['upper']:.1f}"):
+    for number in ("1386.0", "1421.3 ± 3.0", f"{row['value']:.1f} ± 3.1", f"{row['lower']:.1f} to {row['upper']:.1f}"):
         assert number in text
     assert "0.302 ± 0.033" in text
     # The nuisance in micrometres, its unit beside it.
-    assert re.search(r"µm 20\.20 ± 0\.45", text)
+    assert re.search(r"µm \d\d\.\d\d ± 0\.46 trusted 20\.20 ± 0\.45", text)
     assert page.count("<td>weighed</td>") == 2
 
 
@@ -112,11 +112,13 @@ def test_every_finding_is_there_in_full_worst_first(unclean: Result) -> None:
 
 
 def test_unclean_says_so_at_the_table(unclean: Result, page: str) -> None:
-    said = "intervals in this table are not to be trusted"
+    said = "A check failed: the numbers in this table that read “not trusted” must not be quoted"
     text = render(unclean, ())
     assert said in Page(text).text
     assert 'class="untrusted"' in text
-    assert text.index("<h2>Parameters") < text.index("not to be trusted") < text.index("<table")
+    assert "Verdict: not trusted. Failed: chains converged, residuals white." in Page(text).text
+    assert "Verdict: trusted. No check failed." in Page(page).text
+    assert text.index("<h2>Parameters") < text.index("A check failed") < text.index("<table")
     assert said not in Page(page).text
     assert 'class="untrusted"' not in page
 

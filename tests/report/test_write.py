@@ -78,22 +78,26 @@ def test_figures_are_those_of_the_page_at_150_dpi(folder: Path) -> None:
 
 def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> None:
     content = _strict((folder / "parameters.json").read_text(encoding="utf-8"))
-    assert list(content) == ["rig", "synthetic", "parameters", "verdict", "provenance"]
+    assert list(content) == ["rig", "synthetic", "trust", "parameters", "verdict", "provenance"]
     assert content["rig"] == "twin"
     assert content["synthetic"] is True
     assert list(content["parameters"]) == list(result.summary.index)
-    keys = ["unit", "paper", "map", "mean", "sd", "median", "ci95", "ess", "rhat", "informed"]
+    assert content["trust"] == "trusted"
+    keys = [
+        "unit", "value", "sd", "basis", "trust", "paper", "map", "mean", "median", "ci95", "ess", "rhat", "informed",
+    ]  # fmt: skip
     for name, entry in content["parameters"].items():
         row = result.summary.loc[name]
         assert list(entry) == keys
-        for key in ("map", "mean", "sd", "median", "ess", "rhat"):
+        for key in ("value", "sd", "basis", "trust", "map", "mean", "median", "ess", "rhat"):
             assert entry[key] == row[key]  # not one digit is lost
         assert entry["ci95"] == [row["lower"], row["upper"]]
         assert entry["unit"] == row["unit"]
         assert entry["informed"] is bool(row["informed"])
         assert entry["paper"] == (None if np.isnan(row["paper"]) else row["paper"])
     assert content["verdict"]["clean"] is True
-    assert all(list(finding) == ["check", "level", "text", "code"] for finding in content["verdict"]["findings"])
+    keys = ["check", "level", "text", "code", "experiment", "parameters"]
+    assert all(list(finding) == keys for finding in content["verdict"]["findings"])
     assert content["provenance"]["files"] == dict(result.rig.files)
     assert content["provenance"]["seed"] == 0
     assert content["provenance"]["versions"] == dict(result.provenance.versions)
@@ -122,7 +126,8 @@ def test_a_finding_without_words_is_given_by_its_facts(result: Result) -> None:
     content = parameters_json(dataclasses.replace(result, findings=(Finding("balance", "ok", {"kg": 2.5}, "run_1"),)))
     verdict = content["verdict"]
     assert isinstance(verdict, dict)
-    assert verdict["findings"] == [{"check": "balance", "level": "ok", "text": "run_1: kg = 2.5", "code": "balance"}]
+    said = {"check": "balance", "level": "ok", "text": "run_1: kg = 2.5", "code": "balance"}
+    assert verdict["findings"] == [{**said, "experiment": "run_1", "parameters": []}]
 
 
 def test_a_column_declared_once_is_in_every_output(
@@ -144,7 +149,7 @@ def test_a_column_declared_once_is_in_every_output(
         entry = json.loads((folder / "parameters.json").read_text(encoding="utf-8"))["parameters"]["k1"]
         table = pd.read_csv(folder / "parameters.csv", index_col="name")
         page = (folder / "report.html").read_text(encoding="utf-8")
-        console = table_text(result.summary, synthetic=False, clean=True)
+        console = table_text(result.summary, synthetic=False)
         number = f"{row['paper'] - row['mean']:+.9f}"
         assert ("z_paper" in entry) == ("z_paper" in table) == bool(times)
         # The page has a table of physical parameters and one of nuisances, and the paper estimates no nuisance.
@@ -161,7 +166,8 @@ def test_point_fit_only_is_null_and_has_no_posterior(unsampled: Result, tmp_path
     entry = _strict((tmp_path / "parameters.json").read_text(encoding="utf-8"))["parameters"]["k1"]
     assert entry["map"] == 1421.3
     assert entry["paper"] == 1386.0
-    assert [entry[key] for key in ("mean", "sd", "median", "ci95", "ess", "rhat", "informed")] == [None] * 7
+    assert [entry[key] for key in ("value", "sd", "basis", "trust")] == [1421.3, 0.97 * 3.1, "point", "not judged"]
+    assert [entry[key] for key in ("mean", "median", "ci95", "ess", "rhat", "informed")] == [None] * 6
 
 
 def test_infinite_numbers_become_null(result: Result) -> None:

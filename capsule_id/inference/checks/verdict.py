@@ -3,7 +3,7 @@
 A rig without faults passes all checks together in more than 95 of 100 cases (measured in the calibration study).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
@@ -37,17 +37,25 @@ def run_checks(setting: Setting) -> Setting:
         *whiteness,
         *outliers,
         *check_stated_errors(setting),
-        *(finding for check in declared(setting.experiments, "checks", bench=True) for finding in check(setting)),
+        *_declared_findings(setting, bench=True),
         *_informed(setting),
         *_boundary(setting),
-        *(finding for check in declared(setting.experiments, "checks", bench=False) for finding in check(setting)),
+        *_declared_findings(setting, bench=False),
     ]
     return replace(setting, findings=tuple(findings))
 
 
+def _declared_findings(setting: Setting, bench: bool) -> Iterator[Finding]:
+    """Findings of the checks that experiments declare; one without an experiment is about those that declare it."""
+    for check in declared(setting.experiments, "checks", bench):
+        names = dict.fromkeys(row.name for e in check.args[0] for row in e.parameters)
+        for finding in check(setting):
+            yield finding if finding.experiment or finding.parameters else replace(finding, parameters=tuple(names))
+
+
 def declared(
     experiments: Sequence[Experiment], what: Literal["checks", "tables"], bench: bool
-) -> list[Callable[[Setting], list[Any]]]:
+) -> list[partial[list[Any]]]:
     """Return every check (or table) that bench tests or runs declare, with the experiments that declare it."""
     members: dict[Callable[..., list[Any]], list[Experiment]] = {}
     for experiment in experiments:

@@ -6,13 +6,14 @@ import pandas as pd
 from capsule_id.experiments import paper_estimates
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.trust import trust_words
 from capsule_id.inference.checks.verdict import informed
 from capsule_id.inference.result import Posterior
 from capsule_id.parameters import Parameter, parameter
 
 SUMMARY_COLUMNS = (
-    "unit", "meaning", "paper", "map", "standard_error", "mean", "sd", "median", "lower", "upper", "ess", "rhat",
-    "informed",
+    "unit", "meaning", "value", "sd", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
+    "upper", "ess", "rhat", "informed",
 )  # fmt: skip
 
 
@@ -23,12 +24,17 @@ def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame
     paper = paper_estimates(target.experiments, registry)
     paper |= {name: mass.value for name, mass in masses.items() if mass is not None}
     known = informed(target, posterior, point)
+    words = trust_words(setting, known)
     rows: list[tuple[Parameter, dict[str, object]]] = []
     for i, row in enumerate(target.parameters):
         entry: dict[str, object] = {
             "unit": row.unit,
             "meaning": row.meaning,
             "paper": paper.get(row.name, np.nan),
+            "value": point.values[row.name],
+            "sd": point.standard_errors[row.name],
+            "basis": "point",
+            "trust": words[row.name],
             "map": point.values[row.name],
             "standard_error": point.standard_errors[row.name],
             "informed": bool(known[i]),
@@ -36,9 +42,14 @@ def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame
         rows.append((row, entry | ({} if posterior is None else _sample_columns(posterior, i))))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
-        exact = dict.fromkeys(("paper", "map", "mean", "median", "lower", "upper"), value)
+        exact = dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value)
         errors = {"standard_error": 0.0, "sd": 0.0}
-        rows.append((row, {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact, **errors}))
+        said = {
+            "basis": "point" if posterior is None else "sample",
+            "trust": "not judged" if posterior is None else "trusted",
+        }
+        entry = {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact, **errors, **said}
+        rows.append((row, entry))
     physical, nuisances = (
         pd.DataFrame.from_dict({row.name: entry for row, entry in rows if row.physical == chosen}, orient="index")
         .reindex(columns=list(SUMMARY_COLUMNS))
@@ -52,8 +63,10 @@ def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
     draws = posterior.draws[..., i].ravel()
     lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
     return {
-        "mean": np.mean(draws),
+        "value": median,
         "sd": np.std(draws, ddof=1),
+        "basis": "sample",
+        "mean": np.mean(draws),
         "median": median,
         "lower": lower,
         "upper": upper,

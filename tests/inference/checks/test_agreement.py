@@ -52,6 +52,11 @@ def test_false_alarms_keep_to_their_level_and_a_shift_is_named() -> None:
     assert all(found.level == "warn" and "largest disagreement in k1" in words(found) for found in planted)
 
 
+def test_without_a_sample_a_gross_disagreement_fails_and_a_moderate_one_warns() -> None:
+    levels = {sd: agreement({"K": Distance(sd, sd), "c": Distance(0.0, 0.0)}, False).level for sd in (1.0, 5.0, 70.0)}
+    assert levels == {1.0: "ok", 5.0: "warn", 70.0: "fail"}
+
+
 def test_named_is_where_the_error_came_from() -> None:
     """Heavy tails make nothing of what lies between 19 and 7 sd; a parameter that is no surprise is not named at all."""
     found = {"k1": Distance(30.0, 1.0), "v_s": Distance(-6.6, -4.1), "mu": Distance(18.6, 4.0), "c": Distance(2.0, 2.0)}

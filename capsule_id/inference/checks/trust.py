@@ -1,0 +1,43 @@
+"""Which numbers of a fit may be quoted, from its findings.
+
+A failed check makes the parameters that its experiment informs not trusted. Without a sample, and where the data do
+not inform a parameter, its number is not judged: no check can tell.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from capsule_id.experiments.base import Experiment
+from capsule_id.inference.checks.setting import Setting
+from capsule_id.views import Finding, Trust
+
+#: Weighed constants: their prior is a reading.
+MASSES = ("m1", "m2")
+
+
+def concerned(finding: Finding, experiments: Sequence[Experiment]) -> frozenset[str] | None:
+    """Names of the parameters that ``finding`` is about; None for all."""
+    if finding.parameters:
+        return frozenset(finding.parameters)
+    named = [e for e in experiments if finding.experiment in (e.label, e.table.label)]
+    return frozenset(row.name for e in named for row in e.parameters) if named else None
+
+
+def trust_words(setting: Setting, informed: np.ndarray) -> dict[str, Trust]:
+    """Word of every sampled parameter, by name.
+
+    Parameters
+    ----------
+    informed : (d,) whether the data narrow the prior of each parameter
+    """
+    failed = [concerned(f, setting.experiments) for f in setting.findings if f.level == "fail"]
+    words: dict[str, Trust] = {}
+    for row, known in zip(setting.target.parameters, informed, strict=True):
+        if any(names is None or row.name in names for names in failed):
+            words[row.name] = "not trusted"
+        else:
+            words[row.name] = (
+                "trusted" if setting.posterior is not None and (known or row.name in MASSES) else "not judged"
+            )
+    return words
