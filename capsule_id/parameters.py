@@ -172,6 +172,9 @@ TABLE: Mapping[str, Parameter] = {
         Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
+        Parameter(
+            "k_cubic", "N/m^3", "cubic stiffness between rod and capsule", r"k_\mathrm{cubic}", sign="any",
+        ),
         nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
         nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
         scatter("scatter", "N", "scatter about a calibration line", "s"),

@@ -81,6 +81,25 @@ class ChoiceRule:
 
 
 @dataclass(frozen=True)
+class WordsRule:
+    """One of a few words, or a list of some of them."""
+
+    choices: tuple[str, ...]
+
+    def read(self, document: TomlDocument, path: KeyPath, value: object) -> tuple[str, ...]:
+        """See ``SettingRule``."""
+        if not isinstance(value, list):
+            return (read_choice(document, path, value, self.choices),)
+        if not value:
+            known = " ".join(self.choices)
+            raise document.error(path, f"{path[-1]} must not be empty", "[]", f"write some of {known}")
+        # Words of a list have no place of their own.
+        for word in value:
+            read_choice(document, path, word, self.choices)
+        return tuple(value)
+
+
+@dataclass(frozen=True)
 class NameRule:
     """A name of letters, digits, dot, underscore, hyphen."""
 

@@ -1,15 +1,18 @@
-"""Decays and their moments: against direct sums and against SciPy's DOP853 with event location."""
+"""Decays and their moments: against direct sums and against SciPy's DOP853 with located turning points."""
 
 from collections.abc import Callable
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from bench import K1, M1, C, released
 from scipy.integrate import solve_ivp
 
-from capsule_id.experiments.free_vibration.decay_models import dry_decay, quadratic_decay, rates, viscous_basis
+from capsule_id.experiments.free_vibration.decay_models import decay, rates, viscous_basis
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
+from tests.scipy_decay import scipy_decay
 
 TIME = np.arange(900) / 2000.0
 GAMMA, OMEGA = C / (2 * M1), np.sqrt(K1 / M1 - (C / (2 * M1)) ** 2)
@@ -50,69 +53,75 @@ def test_viscous_decay(xp: object) -> None:
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-12)
 
 
-def dry_reference(time: np.ndarray, F_dry: float, amplitude: float) -> np.ndarray:
-    """Half cycle by half cycle: integrate to the turning point (an event), stop where the spring cannot move it."""
-    x, start, state, side = np.full(len(time), np.nan), 0.0, [amplitude, 0.0], -1.0
-    while abs(state[0]) > F_dry / K1 and start < time[-1]:
-
-        def rate(t: float, s: np.ndarray, side: float = side) -> list[float]:
-            return [s[1], -(K1 * s[0] + C * s[1] + F_dry * side) / M1]
-
-        def turning(t: float, s: np.ndarray, start: float = start, away: float = side) -> float:
-            return s[1] if t > start + 1e-3 else away
-
-        turning.terminal = True  # type: ignore[attr-defined]
-        part = solve_ivp(
-            rate,
-            (start, start + 1.0),
-            state,
-            method="DOP853",
-            rtol=1e-11,
-            atol=1e-16,
-            events=turning,
-            dense_output=True,
-        )
-        inside = (time >= start) & (time <= part.t[-1])
-        assert part.sol is not None
-        x[inside] = part.sol(time[inside])[0]
-        start, state, side = part.t[-1], [float(part.y[0, -1]), 0.0], -side
-    x[np.isnan(x)] = state[0]
-    return x
+#: Forces besides viscous damping and linear spring, all signs and sums.
+FORCES = [
+    {},
+    {"F_dry": 0.05},
+    {"F_dry": 0.4},
+    {"c_q": 20.0},
+    {"k_cubic": 1e8},
+    {"k_cubic": -1e8},
+    {"F_dry": 0.05, "c_q": 20.0, "k_cubic": 5e7},
+    {"F_dry": 0.3, "c_q": 20.0, "k_cubic": -1e8},
+]
 
 
-@pytest.mark.parametrize("F_dry", [0.0, 0.05, 0.4])
-def test_dry_decay(F_dry: float) -> None:
-    """With 0.4 N the rod stops for good within the record."""
-    x = dry_decay(TIME, K1, C, M1, F_dry, 2e-3, 0.0, half_cycles=20)
-    np.testing.assert_allclose(x, dry_reference(TIME, F_dry, 2e-3), rtol=0, atol=1e-12)
+@pytest.mark.parametrize("extra", FORCES, ids=str)
+def test_decay_against_scipy(extra: dict[str, float]) -> None:
+    """x_rel, rate and acceleration; dry friction stops the rod within the record."""
+    forces = {"k1": K1, "c": C, "m1": M1, **extra}
+    found = decay(TIME, forces, 2e-3, 0.0, 20)
+    expected = scipy_decay(TIME, forces, 2e-3, 0.0)
+    unit = np.sqrt(K1 / M1) ** np.arange(3)
+    for values, own, bound in zip(found, expected / unit[:, None], (1e-8, 1e-7, 5e-6), strict=True):
+        np.testing.assert_allclose(np.asarray(values) / unit[0], own, rtol=0, atol=bound * 2e-3)
+        unit = unit[1:]
+    assert ("F_dry" in extra) == bool(np.all(np.asarray(found.velocity)[-100:] == 0.0))
 
 
-def test_dry_decay_before_its_turning_point() -> None:
-    """Turned back in time: the half cycle that leads to the turning point, on the other side."""
-    x = np.asarray(dry_decay(TIME, K1, C, M1, 0.05, 2e-3, 0.012, half_cycles=20))
-    later = dry_reference(TIME[TIME >= 0.012] - 0.012, 0.05, 2e-3)
-    np.testing.assert_allclose(x[TIME >= 0.012], later, rtol=0, atol=1e-12)
-    back = integrate(
-        lambda t, s: [s[1], -(K1 * s[0] + C * s[1] + 0.05) / M1],
-        [2e-3, 0.0],
-        np.append(0.012, TIME[TIME < 0.012][::-1]),
-    )
-    np.testing.assert_allclose(x[TIME < 0.012][::-1], back[1:], rtol=0, atol=1e-12)
+def test_strong_quadratic_damping() -> None:
+    """A half cycle loses three quarters of the amplitude; the phase still increases."""
+    forces = {"k1": K1, "c": C, "m1": M1, "c_q": 200.0}
+    x = np.asarray(decay(TIME, forces, 2e-3, 0.0, 20).x_rel)
+    np.testing.assert_allclose(x, scipy_decay(TIME, forces, 2e-3, 0.0)[0], rtol=0, atol=3e-4 * 2e-3)
 
 
-@pytest.mark.parametrize("c_q", [0.0, 20.0, 200.0])
-@pytest.mark.parametrize("substeps", [1, 4])
-def test_quadratic_decay(c_q: float, substeps: int) -> None:
-    """x'|x'| has a kink in its second derivative at every turning point; the bound is that of its documentation."""
-    x = quadratic_decay(TIME, K1, C, M1, c_q, 2e-3, -0.05, substeps=substeps)
-    expected = integrate(
-        lambda t, s: [s[1], -(K1 * s[0] + C * s[1] + c_q * s[1] * abs(s[1])) / M1], [2e-3, -0.05], TIME
-    )
-    np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * 2e-3 / substeps**2)
+@pytest.mark.parametrize("extra", [{"F_dry": 0.05}, {"F_dry": 0.3, "c_q": 20.0, "k_cubic": -1e8}], ids=str)
+def test_forward_derivatives_of_a_decay(extra: dict[str, float]) -> None:
+    """Against central differences of SciPy's solution, in every force, the amplitude and the turning time."""
+    forces = {"k1": K1, "c": C, "m1": M1, **extra}
+    place = {**forces, "amplitude": 2e-3, "turning_time": -0.003}
+    time = TIME[::7]
+
+    def model(v: Any) -> Any:
+        values = dict(zip(place, v, strict=True))
+        return decay(
+            time, {name: values[name] for name in forces}, values["amplitude"], values["turning_time"], 20
+        ).x_rel
+
+    found = np.asarray(jax.jacfwd(model)(np.array(list(place.values()))))
+    for column, (name, value) in enumerate(place.items()):
+        step = 1e-4 * value
+        ends = []
+        for moved in (value + step, value - step):
+            own = {**place, name: moved}
+            ends.append(scipy_decay(time, own, own["amplitude"], own["turning_time"])[0])
+        expected = (ends[0] - ends[1]) / (2.0 * step)
+        np.testing.assert_allclose(found[:, column], expected, rtol=0, atol=1e-4 * np.max(np.abs(expected)))
+
+
+def test_samples_before_the_turning_point_continue_the_motion() -> None:
+    """To the second order they mirror the samples after it."""
+    forces = {"k1": K1, "c": C, "m1": M1, "F_dry": 0.05}
+    time = 0.002 + np.array([-1e-3, 1e-3])
+    before, after = np.asarray(decay(time, forces, 2e-3, 0.002, 5).x_rel)
+    assert before == pytest.approx(after, abs=1e-3 * 2e-3)
+    assert after < 2e-3 * (1.0 - 4e-3)
 
 
 def test_dry_is_not_viscous() -> None:
     """Negative control of the bounds above: 1 % of the smallest dry force moves the record by 1e-7 m."""
-    x = dry_decay(TIME, K1, C, M1, 0.05, 2e-3, 0.0, half_cycles=20)
-    moved = dry_decay(TIME, K1, C, M1, 0.0505, 2e-3, 0.0, half_cycles=20)
+    x, moved = (
+        np.asarray(decay(TIME, {"k1": K1, "c": C, "m1": M1, "F_dry": F}, 2e-3, 0.0, 20).x_rel) for F in (0.05, 0.0505)
+    )
     assert 1e-8 < np.max(np.abs(x - moved)) < 1e-5

@@ -17,6 +17,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
@@ -65,7 +66,7 @@ def test_they_share_a_compiled_program_and_others_do_not() -> None:
 
     assert float(likelihood(decay(1))) != float(likelihood(decay(2)))
     assert len(traced) == 1
-    likelihood(decay(2).with_damping("dry"))
+    likelihood(decay(2).with_model(DecayModel(("dry",))))
     assert len(traced) == 2
 
 
@@ -104,7 +105,7 @@ def test_log_posteriors_of_many_rigs_share_one_program(tmp_path: Path) -> None:
     assert sizes[0] == sizes[1] == sizes[2]
     assert len(set(values)) == 3
     # Negative control: another damping model is another structure.
-    others = [e.with_damping("dry") if isinstance(e, FreeVibration) else e for e in make_experiments(rig)]
+    others = [e.with_model(DecayModel(("dry",))) if isinstance(e, FreeVibration) else e for e in make_experiments(rig)]
     other = LogPosterior(rig, others)
     other.batch(np.zeros((1, other.dimension)))
     assert log_posterior._batch._cache_size() == sizes[0] + 1

@@ -11,9 +11,9 @@ from scipy import integrate, stats
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.experiments.free_vibration.decay_models import dry_decay, quadratic_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.rig.model import Table
+from tests.scipy_decay import scipy_decay
 
 MASSES = {"m1": bench.M1, "m2": bench.M2, "g": bench.G}
 RNG = np.random.default_rng(41)
@@ -146,7 +146,7 @@ def basis(time: np.ndarray, k1: float, c: float) -> np.ndarray:
     return np.stack([z.real, z.imag, np.ones(len(time))], axis=1)
 
 
-def record(time: np.ndarray, damping: str = "viscous", sd: float | None = None) -> FreeVibration:
+def record(time: np.ndarray, *damping: str, sd: float | None = None) -> FreeVibration:
     noise = 2e-5 * np.random.default_rng(5).standard_normal(len(time))
     columns = [bench.column("time", time), bench.column("x_rel", bench.released(time, 2e-3) + 1e-4 + noise, sd)]
     table = bench.table("free_vibration", columns, damping=damping)
@@ -177,23 +177,15 @@ def test_decay_at_its_true_noise(time: np.ndarray) -> None:
     assert_log_likelihood(experiment, {"k1": 1430.0, "c": 3.8, "noise_sd": sd, **MASSES}, expected)
 
 
-def test_decay_with_dry_friction() -> None:
-    experiment = record(UNIFORM, "dry")
-    theta = {"k1": 1430.0, "c": 3.8, "F_dry": 0.02, "noise_sd": 1e-3, "amplitude": 1.9e-3, "turning_time": 0.001}
-    moving = [theta[name] for name in ("F_dry", "amplitude", "turning_time")]
-    x = experiment.side * np.asarray(dry_decay(UNIFORM, 1430.0, 3.8, bench.M1, *moving, half_cycles=12))
+@pytest.mark.parametrize("damping", [("dry",), ("dry", "quadratic")], ids=str)
+def test_decay_by_the_integrator(damping: tuple[str, ...]) -> None:
+    experiment = record(UNIFORM, *damping)
+    forces = {"k1": 1430.0, "c": 3.8, "m1": bench.M1, "F_dry": 0.02} | ({"c_q": 5.0} if "quadratic" in damping else {})
+    theta = {**forces, "noise_sd": 1e-3, "amplitude": 1.9e-3, "turning_time": -0.001}
+    x = experiment.side * scipy_decay(UNIFORM, forces, 1.9e-3, -0.001)[0]
     assert experiment.half_cycles >= 6  # the record's length, in half cycles of 28 ms
     expected = wide(1e-3 * np.ones(160), np.ones((160, 1)), experiment.values).logpdf(experiment.values - x)
-    assert_log_likelihood(experiment, {**theta, **MASSES}, expected)
-
-
-def test_decay_with_quadratic_damping() -> None:
-    experiment = record(UNIFORM, "quadratic")
-    theta = {"k1": 1430.0, "c": 3.8, "c_q": 5.0, "noise_sd": 1e-3, "x_start": 2e-3, "y_start": 0.01}
-    x = quadratic_decay(UNIFORM, 1430.0, 3.8, bench.M1, 5.0, 2e-3, 0.01, substeps=experiment.substeps)
-    sd = 1e-3 * np.ones(160)
-    expected = wide(sd, np.ones((160, 1)), experiment.values).logpdf(experiment.values - np.asarray(x))
-    assert_log_likelihood(experiment, {**theta, **MASSES}, expected)
+    assert_log_likelihood(experiment, {**MASSES, **theta}, expected)
 
 
 def test_a_wrong_width_is_seen() -> None:

@@ -18,7 +18,7 @@ from capsule_id.parameters import TABLE, scatter
 from capsule_id.report.messages import FIT_MESSAGES, messages_of
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
 from capsule_id.rig.model import Settings
-from capsule_id.rig.schema import ChoiceRule, ColumnRule, NameRule, QuantityRule, SettingRule
+from capsule_id.rig.schema import ChoiceRule, ColumnRule, NameRule, QuantityRule, SettingRule, WordsRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Message
@@ -36,7 +36,8 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "start": (QuantityRule("s", ANY), None),
         "stop": (QuantityRule("s", ANY), None),
         "capsule": (ChoiceRule(("held", "free")), "held"),
-        "damping": (ChoiceRule(("viscous", "dry", "quadratic")), "viscous"),
+        "damping": (WordsRule(("viscous", "dry", "quadratic")), ("viscous",)),
+        "stiffness": (ChoiceRule(("linear", "cubic")), "linear"),
         "smoothing_window": (QuantityRule("s"), None),
         "spring": (NameRule(), None),
         "gap": (_GAP, None),

@@ -10,7 +10,7 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.window import decay_window
+from capsule_id.experiments.free_vibration.settings import decay_window
 from capsule_id.experiments.registry import default_registry
 from capsule_id.rig.model import PriorOverride, Quantity, Table
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
@@ -53,7 +53,8 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "start": 0.0,
         "stop": 0.009,
         "capsule": "held",
-        "damping": "dry",
+        "damping": ("dry",),
+        "stiffness": "linear",
         "smoothing_window": 0.005,
         "forward": "closed",
     }

@@ -1,21 +1,19 @@
 """Free vibration: columns, settings, rules, template, lint and the paper's estimates."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings, decay_window
 from capsule_id.experiments.free_vibration.twin import measure
-from capsule_id.experiments.free_vibration.window import decay_window
 from capsule_id.experiments.kind import Kind, Values, made_by
 from capsule_id.parameters import nuisance, scatter
-from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, sampling_step
-from capsule_id.rig.model import Quantity, Rig, Settings, Table
-from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, NameRule, QuantityRule
+from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
 from capsule_id.views import Facts, Finding, Message
 
 if TYPE_CHECKING:
@@ -29,20 +27,6 @@ FEWEST_PERIODS = 2
 NOISE_SD = scatter("noise_sd", "m", "noise of a record", r"\sigma")
 AMPLITUDE = nuisance("amplitude", "m", "first turning point of a decay", "a_0")
 TURNING_TIME = nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DecaySettings(Settings):
-    """Settings of a free vibration, SI."""
-
-    start: Annotated[float | None, QuantityRule("s", ANY)] = None
-    stop: Annotated[float | None, QuantityRule("s", ANY)] = None
-    capsule: Literal["held", "free"] = "held"
-    damping: Literal["viscous", "dry", "quadratic"] = "viscous"
-    smoothing_window: Annotated[float | None, QuantityRule("s")] = None
-    spring: Annotated[str | None, NameRule()] = None
-    gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
-    forward: Literal["closed", "capsule"] = "closed"
 
 
 def _check_spring_with_gap(entry: Entry[DecaySettings]) -> None:
@@ -79,16 +63,17 @@ def _check_window(entry: Entry[DecaySettings]) -> None:
 
 
 def _check_forward(entry: Entry[DecaySettings]) -> None:
-    """Require a free capsule and viscous damping for the capsule model."""
+    """Require a free capsule, viscous damping and a linear spring for the capsule model."""
     settings = entry.table.settings
     if settings.forward != "capsule":
         return
     if settings.capsule == "held":
         remedy = 'add capsule = "free", or write forward = "closed" where the capsule was held'
         raise entry.error("forward", "forward capsule needs a capsule that is free to move", "held", remedy)
-    if settings.damping != "viscous":
-        remedy = 'remove damping, or write forward = "closed"'
-        raise entry.error("forward", "forward capsule has viscous damping only", settings.damping, remedy)
+    model = DecayModel.stated(settings)
+    if model != DecayModel():
+        rule, remedy = "forward capsule has viscous damping and a linear spring only", 'write forward = "closed"'
+        raise entry.error("forward", rule, model.name, f"{remedy}, or remove damping and stiffness")
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
@@ -143,8 +128,10 @@ TEMPLATE = """\
 # stop = { value = 0.5, unit = "s" }
 #: "held" (default) or "free"
 # capsule = "held"
-#: "viscous" (default); "dry" or "quadratic" add this damping to the viscous one
-# damping = "viscous"
+#: "viscous" (default); "dry", "quadratic" or a list of them add to the viscous damping: F_dry, c_q
+# damping = ["viscous", "dry"]
+#: "linear" (default) or "cubic": force k1 x_rel + k_cubic x_rel^3
+# stiffness = "linear"
 #: "closed" form (default), or the "capsule" model: a free capsule may slip, and the rod may hit the support spring
 # forward = "closed"
 #: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record

@@ -11,19 +11,13 @@ from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.free_vibration.checks import check_free_decay, check_stiffness
-from capsule_id.experiments.free_vibration.decay_models import (
-    STEP_PHASE,
-    dry_decay,
-    quadratic_decay,
-    rates,
-    viscous_basis,
-)
+from capsule_id.experiments.free_vibration.decay_models import decay, rates, viscous_basis
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
 from capsule_id.experiments.free_vibration.decay_trend import trend
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement
+from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_table
-from capsule_id.experiments.free_vibration.window import decay_window
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -34,15 +28,17 @@ from capsule_id.views import Comparison, Curve, Facts, Points
 
 #: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
+#: Latest first turning point after the first sample, in half periods.
+LATEST_TURNING_POINT = 0.1
 #: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
 SMOOTHING_ORDER = 3
 
 
 class FreeVibration(SurfaceExperiment):
-    """x_rel(t) of one raw record with white noise; all records share k1 and c.
+    """x_rel(t) of one raw record with white noise; all records share k1, c and the parameters of further forces.
 
-    For viscous damping the two solutions and the offset enter linearly and are integrated out. Dry or quadratic
-    damping (``damping`` in rig.toml) adds to the viscous one. The initial conditions are then sampled too.
+    For viscous damping and a linear spring the two solutions and the offset enter linearly and are integrated out. Any
+    other decay starts at its last turning point before the record, which is sampled; the offset is integrated out.
     """
 
     time: np.ndarray
@@ -52,9 +48,8 @@ class FreeVibration(SurfaceExperiment):
     side: float
     folded: np.ndarray
     step: float
-    damping: str = eqx.field(static=True)
+    model: DecayModel = eqx.field(static=True)
     half_cycles: int = eqx.field(static=True)
-    substeps: int = eqx.field(static=True)
     uniform: bool = eqx.field(static=True)
 
     time_series = True
@@ -62,41 +57,43 @@ class FreeVibration(SurfaceExperiment):
     tables = (decay_table, damping_table)
 
     def __init__(
-        self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1, damping: str | None = None
+        self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1, model: DecayModel | None = None
     ) -> None:
-        """Make one record; ``damping`` None: as stated in the settings."""
+        """Make one record; ``model`` None: as stated in the settings."""
         self.friction = friction
         time, self.values = decay_window(table)
         self.time = time - float(time[0])
-        self.damping = damping or table.settings.damping
+        self.model = model or DecayModel.stated(table.settings)
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.reading_sd = table.columns["x_rel"].reading_sd
         step = uniform_step(self.time)
-        self.uniform = step is not None and self.damping == "viscous"
+        self.uniform = step is not None and self.closed
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
-        self.side, self.half_cycles, self.substeps = 1.0, 0, 0
+        self.side, self.half_cycles = 1.0, 0
         self.about = About(table, rig, ())
-        rows = (parameter("k1"), parameter("c"))
-        noise = NOISE_SD.named(table.label, self.noise_prior())
-        if self.damping == "viscous":
-            self.about = About(table, rig, (*rows, noise))
-            return
-        rough, last = self.rough_decrement(), float(self.time[-1])
-        if self.damping == "dry":
-            self.side = float(np.sign(rough.peaks[0]))
+        rows = [parameter("k1"), parameter("c"), NOISE_SD.named(table.label, self.noise_prior())]
+        if not self.closed:
+            rough, turning = self.rough_decrement(), self.first_turning_point()
+            self.side = float(np.sign(turning[1]))
             # The margin allows for a frequency 1.5 times the rough estimate.
-            self.half_cycles = int(1.5 * rough.Omega_o * last / np.pi) + 4
-            amplitude = AMPLITUDE.named(table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH))
-            turning = TURNING_TIME.named(table.label, Prior("normal", 0.0, last))
-            self.about = About(table, rig, (*rows, parameter("F_dry"), noise, amplitude, turning))
-        else:
-            self.substeps = max(1, int(np.ceil(rough.Omega_o * np.max(np.diff(self.time)) / STEP_PHASE)))
-            self.about = About(table, rig, (*rows, parameter("c_q"), noise, *self.motion_parameters(rough)))
+            self.half_cycles = int(1.5 * rough.Omega_o * float(self.time[-1]) / np.pi) + 5
+            hardening = Prior("normal", 0.0, rough.k1 / self.largest_deflection**2)
+            rows += [parameter(s, prior=hardening if s == "k_cubic" else None) for s in self.model.symbols]
+            rows += [
+                AMPLITUDE.named(table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH)),
+                TURNING_TIME.named(table.label, Prior("normal", 0.0, float(self.time[-1]))),
+            ]
+        self.about = About(table, rig, tuple(rows))
 
-    def with_damping(self, damping: str) -> "FreeVibration":
-        """Return the same record with another damping model."""
-        return FreeVibration(self.table, self.rig, self.friction, damping)
+    def with_model(self, model: DecayModel) -> "FreeVibration":
+        """Return the same record with another model."""
+        return FreeVibration(self.table, self.rig, self.friction, model)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the solution is closed and linear in its initial conditions."""
+        return self.model == DecayModel()
 
     def noise_prior(self) -> Prior:
         """Default prior of the record's noise sd, m."""
@@ -126,29 +123,17 @@ class FreeVibration(SurfaceExperiment):
     @property
     def model_name(self) -> str:
         """Name for the legend."""
-        return f"{self.damping} damping"
+        return self.model.name
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        k1, c, m1 = theta["k1"], theta["c"], theta["m1"]
         one = xp.ones((len(self.time), 1))
-        raw, design = self.values, one
-        if self.damping == "dry":
-            raw = raw - self.side * dry_decay(
-                self.time,
-                k1,
-                c,
-                m1,
-                theta["F_dry"],
-                theta["amplitude"],
-                theta["turning_time"],
-                half_cycles=self.half_cycles,
-            )
-        elif self.damping == "quadratic":
-            start = theta["x_start"], theta["y_start"]
-            raw = raw - quadratic_decay(self.time, k1, c, m1, theta["c_q"], *start, substeps=self.substeps)
-        else:
-            design = xp.concatenate([viscous_basis(self.time, k1, c, m1, xp), one], axis=1)
-        return (Misfit(raw, self.reading_sd**2, 1.0, self.width * design),)
+        if self.closed:
+            basis = viscous_basis(self.time, theta["k1"], theta["c"], theta["m1"], xp)
+            return (Misfit(self.values, self.reading_sd**2, 1.0, self.width * xp.concatenate([basis, one], axis=1)),)
+        forces = {symbol: theta[symbol] for symbol in ("k1", "c", "m1", *self.model.symbols)}
+        motion = decay(self.time, forces, theta["amplitude"], theta["turning_time"], self.half_cycles)
+        raw = self.values - self.side * xp.asarray(motion.x_rel)
+        return (Misfit(raw, self.reading_sd**2, 1.0, self.width * one),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         if not self.uniform or xp is np:
@@ -204,15 +189,26 @@ class FreeVibration(SurfaceExperiment):
             "c": Start(rough.c, 0.3),
             f"noise_sd[{self.label}]": Start(noise, 0.2),
         }
-        if self.damping == "dry":
-            starts["F_dry"] = Start(0.02 * rough.k1 * abs(float(rough.peaks[0])), 0.3)
-            starts[f"amplitude[{self.label}]"] = Start(abs(float(rough.peaks[0])), 0.05)
-            starts[f"turning_time[{self.label}]"] = Start(float(rough.times[0]), 0.05 / rough.Omega_o)
-        elif self.damping == "quadratic":
-            speed = rough.Omega_o * abs(float(rough.peaks[0]))
-            starts["c_q"] = Start(0.5 * rough.c / speed, 0.3)
-            starts |= self.starts_of_motion(rough)
+        if not self.closed:
+            time, peak = self.first_turning_point()
+            size = abs(peak)
+            forces = {
+                "F_dry": Start(0.02 * rough.k1 * size, 0.3),
+                "c_q": Start(0.5 * rough.c / (rough.Omega_o * size), 0.3),
+                "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
+            }
+            starts |= {symbol: forces[symbol] for symbol in self.model.symbols}
+            starts[f"amplitude[{self.label}]"] = Start(size, 0.05)
+            starts[f"turning_time[{self.label}]"] = Start(time, 0.05 / rough.Omega_o)
         return starts
+
+    def first_turning_point(self) -> tuple[float, float]:
+        """Rough time, s, and signed x_rel, m, of the last turning point before the record, or at its first samples."""
+        rough = self.rough_decrement()
+        half_period = np.pi / rough.Omega_o
+        back = int(np.ceil(rough.times[0] / half_period - LATEST_TURNING_POINT))
+        growth = float(np.exp(0.5 * max(rough.delta, 0.0) * back))
+        return float(rough.times[0] - back * half_period), float(rough.peaks[0] * (-1.0) ** back * growth)
 
     def starts_of_motion(self, rough: Decrement) -> dict[str, Start]:
         """Starts of x_rel and its rate at the first sample."""

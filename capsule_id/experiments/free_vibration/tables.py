@@ -10,6 +10,7 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
 from capsule_id.experiments.free_vibration.checks import stiffness_by_record
+from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
 from capsule_id.views import ResultTable
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Resul
         return []
     rows = []
     for damping in DAMPING_MODELS:
-        others = [record.with_damping(damping) for record in records]
+        others = [record.with_model(DecayModel((damping,) if damping in DAMPING else ())) for record in records]
         found = fit.refit(others)
         residuals = [series for e in others for _, series in e.records(e.local(found.values))]
         white = all(ljung_box(series)[1] * len(records) >= LEVEL for series in residuals)

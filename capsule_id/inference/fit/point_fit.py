@@ -130,8 +130,13 @@ def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> t
         with np.errstate(all="ignore"):
             return target.plain_residuals(u)
 
-    step = np.full(len(located), DIFFERENCE)
+    step = _steps(target)[located]
     return np.stack([residuals(v) for v in points]), np.stack([jacobian(residuals, v, step) for v in points])
+
+
+def _steps(target: LogPosterior) -> np.ndarray:
+    """(d,) steps of difference quotients: relative, or fractions of the prior's sd where u is not a logarithm."""
+    return DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd)
 
 
 def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
@@ -147,7 +152,7 @@ def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
 
 def _residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """(n, d) Jacobian of the standardised residuals, scatters in the denominator included."""
-    return jacobian(target.plain_residuals, u, np.full(len(u), DIFFERENCE))
+    return jacobian(target.plain_residuals, u, _steps(target))
 
 
 def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> dict[str, float]:

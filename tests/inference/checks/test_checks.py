@@ -10,7 +10,7 @@ import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.line_experiment import Line, curvature_test
-from capsule_id.experiments.free_vibration.decay_models import dry_decay
+from capsule_id.experiments.free_vibration.decay_models import decay as rubbed_decay
 from capsule_id.experiments.free_vibration.twin import DECAY_NOISE, RELEASES, decay
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.static_friction.declaration import tilts as tilted
@@ -54,7 +54,8 @@ def dry_friction(folder: Path) -> None:
     header, values = read(folder / "free_vibration_2.csv")
     clean = decay(np.random.default_rng(0), TRUTH.k1, TRUTH.c, TRUTH.m1, RELEASES[1], 0.0)
     time = clean["time [s]"]
-    rubbed = dry_decay(time, TRUTH.k1, TRUTH.c, TRUTH.m1, DRY_FORCE, RELEASES[1], 0.0, half_cycles=40)
+    forces = {"k1": TRUTH.k1, "c": TRUTH.c, "m1": TRUTH.m1, "F_dry": DRY_FORCE}
+    rubbed = rubbed_decay(time, forces, RELEASES[1], 0.0, 40).x_rel
     noise = DECAY_NOISE * RELEASES[1] * np.random.default_rng(SEED).standard_normal(len(time))
     write(folder / "free_vibration_2.csv", header, np.stack([time, 1e3 * (np.asarray(rubbed) + noise)], axis=1))
     assert len(values) == len(time)
