@@ -30,8 +30,9 @@ from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
+from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import PointStage
-from capsule_id.inference.result import PointwiseLogLikelihood, Posterior, Provenance, Result
+from capsule_id.inference.result import PointFit, PointwiseLogLikelihood, Posterior, Provenance, Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, sample
 from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.tables.parameter_table import parameter_tables
@@ -87,8 +88,21 @@ def sample_posterior(
     target, posterior = point.target, None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point.fit), seed, budget, store, progress)
-    values, draws = {**target.fixed, **point.fit.values}, _draws(target, posterior)
-    return Setting(target, point.fit, posterior, values, draws, point.seed, findings=point.findings, bench=point.bench)
+    fit = point.fit if posterior is None else higher_maximum(point, posterior)
+    values, draws = {**target.fixed, **fit.values}, _draws(target, posterior)
+    return Setting(target, fit, posterior, values, draws, point.seed, findings=point.findings, bench=point.bench)
+
+
+def higher_maximum(point: PointStage, posterior: Posterior) -> PointFit:
+    """Repeat the point fit from the best draw where the sample has found a higher point than its starts did.
+
+    Fits of forced runs stay as they are: they take minutes, and ``check_maximum`` reports the difference.
+    """
+    best = np.unravel_index(np.argmax(posterior.lp), posterior.lp.shape)
+    if posterior.lp[best] <= np.max(point.fit.log_posterior) or any(e.event_driven for e in point.target.experiments):
+        return point.fit
+    again = point_fit(point.target, point.seed, further=point.target.unconstrain(posterior.draws[best]))
+    return again if np.max(again.log_posterior) > np.max(point.fit.log_posterior) else point.fit
 
 
 def check_fit(sampled: Setting, before: Sequence[Finding] = ()) -> Setting:

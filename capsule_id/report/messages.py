@@ -72,10 +72,40 @@ def _disagreeing_starts(facts: Facts) -> str:
     )
     if "name" not in facts:
         return f"{seen}. Look at the residuals, and at parameters that the data hardly determine."
-    seen += f", the furthest {facts['distance']:.2g} posterior sd away in {facts['name']}"
-    if "below" in facts:
-        return f"{seen}. Those ends are lower by {facts['below']:.0f} in log-posterior, so they hold no mass."
-    return f"{seen}. Look for a second explanation of the records, or narrow the prior of that parameter in rig.toml."
+    return f"{seen}, the furthest {facts['distance']:.2g} posterior sd away in {facts['name']}"
+
+
+def _maxima_without_mass(facts: Facts) -> str:
+    return (
+        f"{_disagreeing_starts(facts)}. Those ends are lower by {facts['below']:.0f} in log-posterior or lie within the "
+        "sample, so they change no number."
+    )
+
+
+def _maxima_with_mass(facts: Facts) -> str:
+    if "name" not in facts:
+        return _disagreeing_starts(facts)
+    return (
+        f"{_disagreeing_starts(facts)}. Look for a second explanation of the records, or narrow the prior of that parameter "
+        "in rig.toml."
+    )
+
+
+def _modes(facts: Facts) -> str:
+    """The modes of a parameter with their weights, or how far its maximum lies from the sample."""
+    name, unit = facts["name"], facts["unit"]
+    if "modes" in facts:
+        seen = " and ".join(f"{value:.4g} {unit} with weight {weight:.2f}" for value, weight in facts["modes"])
+        return (
+            f"expected one mode of the posterior of {name}; found {seen}. Median and sd describe none of them. Add a test "
+            f"that tells them apart, or state [prior] {name} from what you know of the rig."
+        )
+    return (
+        f"expected the maximum of the posterior within 3 sd of its sample; {name} = {facts['maximum']:.4g} {unit} at the "
+        f"maximum, {facts['median']:.4g} ± {facts['sd']:.2g} {unit} in the sample ({facts['distance']:.1f} sd apart). The "
+        f"residuals and curves are those of the maximum, so no check covers the quoted number. Add readings that determine "
+        f"{name}, or state its [prior]."
+    )
 
 
 _CHAINS = (
@@ -160,9 +190,13 @@ FIT_MESSAGES: Mapping[str, Message] = {
     "starts.agree": Message(
         "starts agree",
         ok="all {starts} starts of the point fit ended at the same maximum",
-        warn=_disagreeing_starts,
-        fail=_disagreeing_starts,
+        warn=_maxima_without_mass,
+        fail=_maxima_with_mass,
     ),
+    "sample.maximum": Message(
+        "maximum and sample", ok="the sample of every physical parameter has one mode, at the maximum", fail=_modes
+    ),
+    "sample.modes": Message("maximum and sample", fail=_modes),
     "chains.converged": Message(
         "chains converged",
         ok=_CHAINS,

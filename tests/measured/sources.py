@@ -57,3 +57,8 @@ def load_cells() -> tuple[np.ndarray, np.ndarray]:
 def tilt_notes() -> str:
     """The notes with heights at sliding and board lengths, cm."""
     return _file("tilt_upright/object-parameters_2fb69b9.ql").read_text(encoding="utf-8")
+
+
+def rack_friction() -> tuple[np.ndarray, np.ndarray]:
+    """Speed, m/s, and friction coefficient of a rack-and-pinion drive, (6,) averages each."""
+    return tuple(np.loadtxt(_file("rack_friction_mnich/slide.csv"), delimiter=",", skiprows=1).T)

@@ -12,6 +12,7 @@ import numpy as np
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.experiment_checks import check_outliers, check_stated_errors, check_whiteness
+from capsule_id.inference.checks.modes import check_maximum, check_starts
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
@@ -20,8 +21,6 @@ from capsule_id.views import Finding
 
 #: The data inform a parameter where posterior sd / prior sd (in u) is at most this, dimensionless.
 INFORMED_RATIO = 0.9
-#: A local maximum this far below the best one in log-posterior holds negligible posterior mass.
-NEGLIGIBLE_MODE = 20.0
 #: A physical parameter this many prior sds from the prior's centre is biased by the prior.
 PRIOR_PULL = 2.5
 
@@ -32,7 +31,8 @@ def run_checks(setting: Setting) -> Setting:
     outliers, flagged = check_outliers(setting)
     setting = replace(setting, flagged=flagged)
     findings = [
-        *check_starts(setting.fit),
+        *check_starts(setting.fit, setting.target, setting.posterior),
+        *check_maximum(setting),
         *_chains(setting),
         *whiteness,
         *outliers,
@@ -62,27 +62,6 @@ def declared(
         for function in getattr(experiment, what) if experiment.bench == bench else ():
             members.setdefault(function, []).append(experiment)
     return [partial(function, own) for function, own in members.items()]
-
-
-def check_starts(fit: PointFit) -> list[Finding]:
-    """Check that every start of the point fit ends at the same maximum, or at one with negligible mass."""
-    facts: dict[str, Any] = {"starts": len(fit.starts)}
-    if fit.agree and not fit.stalled.any():
-        return [Finding("starts.agree", "ok", facts)]
-    at_other_maximum = fit.at_other_maximum
-    facts |= {"stalled": int(fit.stalled.sum()), "elsewhere": int(at_other_maximum.sum())}
-    if not at_other_maximum.any():
-        return [Finding("starts.agree", "fail", facts)]
-    distance = np.abs(fit.ends - fit.u) / np.sqrt(np.diag(fit.covariance))
-    away = np.where(np.isfinite(distance), distance, np.inf).max(axis=1)
-    worst = int(np.argmax(np.where(at_other_maximum, away, -np.inf)))
-    facts |= {"distance": away[worst], "name": fit.names[int(np.argmax(distance[worst]))]}
-    # A local maximum far below the best one in log-posterior holds no posterior mass.
-    below = np.max(fit.log_posterior) - np.where(np.isfinite(fit.log_posterior), fit.log_posterior, -np.inf)
-    negligible = np.all(below[at_other_maximum] > NEGLIGIBLE_MODE)
-    if negligible and np.sum(~at_other_maximum) >= 2 and not fit.stalled[~at_other_maximum].any():
-        return [Finding("starts.agree", "warn", {**facts, "below": np.min(below[at_other_maximum])})]
-    return [Finding("starts.agree", "fail", facts)]
 
 
 def _chains(s: Setting) -> list[Finding]:

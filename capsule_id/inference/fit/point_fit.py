@@ -39,14 +39,19 @@ BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
 DIFFERENCE = 1e-5
 
 
-def point_fit(target: LogPosterior, seed: int, number_of_starts: int = STARTS) -> PointFit:
+def point_fit(
+    target: LogPosterior, seed: int, number_of_starts: int = STARTS, further: np.ndarray | None = None
+) -> PointFit:
     """Maximise the log-posterior from ``number_of_starts`` dispersed starting points.
 
     Parameters
     ----------
     seed : seed of the dispersed starting points
+    further : (d,) u of one more starting point
     """
     starts = dispersed_starts(target, seed, number_of_starts)
+    if further is not None:
+        starts = np.concatenate([starts, further[None]])
     located = target.located
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:

@@ -11,7 +11,7 @@ from scipy import optimize
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.inference.checks.verdict import check_starts
+from capsule_id.inference.checks.modes import check_starts
 from capsule_id.inference.fit import joint_fit as module
 from capsule_id.inference.fit.joint_fit import (
     LEAST_INCREASE,

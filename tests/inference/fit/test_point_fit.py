@@ -9,7 +9,7 @@ from scipy import optimize
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.verdict import check_starts
+from capsule_id.inference.checks.modes import check_starts
 from capsule_id.inference.fit.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -75,7 +75,8 @@ def test_truth_is_within_reach(fit: PointFit) -> None:
         ([0.0, 0.0, -100.0], [0, 0, 1], [0, 0, 1], "warn"),
         ([0.0, 0.0, -5.0], [0, 0, 1], [0, 0, 0], "fail"),
         ([0.0, -100.0, -100.0], [0, 1, 1], [0, 0, 0], "fail"),
-        ([0.0, 0.0, 0.0], [0, 0, 0], [0, 1, 0], "fail"),
+        ([0.0, 0.0, 0.0], [0, 0, 0], [0, 1, 0], "ok"),
+        ([0.0, 0.0, 0.0], [0, 0, 0], [1, 1, 1], "fail"),
     ],
 )
 def test_other_maxima_are_judged_by_the_mass_they_can_hold(
