@@ -146,10 +146,10 @@ def basis(time: np.ndarray, k1: float, c: float) -> np.ndarray:
     return np.stack([z.real, z.imag, np.ones(len(time))], axis=1)
 
 
-def record(time: np.ndarray, *damping: str, sd: float | None = None) -> FreeVibration:
+def record(time: np.ndarray, *damping: str, sd: float | None = None, **settings: str) -> FreeVibration:
     noise = 2e-5 * np.random.default_rng(5).standard_normal(len(time))
     columns = [bench.column("time", time), bench.column("x_rel", bench.released(time, 2e-3) + 1e-4 + noise, sd)]
-    table = bench.table("free_vibration", columns, damping=damping)
+    table = bench.table("free_vibration", columns, damping=damping, **settings)
     return FreeVibration(table, bench.rig(table))
 
 
@@ -186,6 +186,50 @@ def test_decay_by_the_integrator(damping: tuple[str, ...]) -> None:
     assert experiment.half_cycles >= 6  # the record's length, in half cycles of 28 ms
     expected = wide(1e-3 * np.ones(160), np.ones((160, 1)), experiment.values).logpdf(experiment.values - x)
     assert_log_likelihood(experiment, {**MASSES, **theta}, expected)
+
+
+def covariance(time: np.ndarray, noise: str, drift: str, theta: dict[str, float]) -> np.ndarray:
+    """(n, n) of noise and drift, whose innovations have the geometric mean variance 1: by the kernels' definitions."""
+    lag = np.abs(time[:, None] - time[None])
+    own = np.zeros_like(lag) if noise == "white" else np.exp(-lag / theta["noise_time"])
+    own = own + {"white": 1.0, "ar1": 0.0, "arma": theta["white_ratio"] ** 2}[noise] * np.eye(len(time))
+    if drift == "gp":
+        scaled = np.sqrt(3.0) * lag / theta["drift_time"]
+        own = own + theta["drift_ratio"] ** 2 * (1.0 + scaled) * np.exp(-scaled)
+    return own / np.exp(np.linalg.slogdet(own)[1] / len(time))
+
+
+@pytest.mark.parametrize("time", [UNIFORM, UNEVEN], ids=["even", "uneven"])
+@pytest.mark.parametrize(
+    ("noise", "drift"), [("white", "linear"), ("ar1", "none"), ("arma", "linear"), ("white", "gp"), ("arma", "gp")]
+)
+def test_coloured_noise_and_drift(time: np.ndarray, noise: str, drift: str) -> None:
+    experiment = record(time, "viscous", noise=noise, drift=drift)
+    shape = {"noise_time": 0.004, "white_ratio": 0.7, "drift_ratio": 3.0, "drift_time": 0.1}
+    theta = {"k1": 1430.0, "c": 3.8, "noise_sd": 1e-3, **shape, **MASSES}
+    assert {row.symbol for row in experiment.parameters} - {"k1", "c", "noise_sd"} == {
+        *(["noise_time"] if noise != "white" else []),
+        *(["white_ratio"] if noise == "arma" else []),
+        *(["drift_ratio", "drift_time"] if drift == "gp" else []),
+    }
+    own = basis(experiment.time, 1430.0, 3.8)
+    if drift == "linear":
+        own = np.column_stack([own, experiment.time / experiment.time[-1] - 0.5])
+    width = 10.0 * np.ptp(experiment.values)
+    whole = 1e-6 * covariance(experiment.time, noise, drift, theta) + width**2 * own @ own.T
+    expected = stats.multivariate_normal(np.zeros(len(time)), whole).logpdf(experiment.values)
+    assert_log_likelihood(experiment, theta, expected)
+
+
+def test_ar1_innovations() -> None:
+    """Evenly sampled, the Ornstein–Uhlenbeck process is AR(1): innovations e_i - rho e_(i-1), the first one aside."""
+    experiment = record(UNIFORM, "viscous", noise="ar1")
+    theta = {"k1": 1430.0, "c": 3.8, "noise_sd": 1e-3, "noise_time": 0.004, **MASSES}
+    raw, design = experiment.unwhitened(theta, np)
+    e = raw - experiment.width * design @ experiment.nuisance_mean(theta)
+    found = np.asarray(experiment.residuals(theta, np))[: len(e)]
+    expected = e[1:] - np.exp(-1e-3 / 0.004) * e[:-1]
+    np.testing.assert_allclose(found[1:] / found[1], expected / expected[0], rtol=1e-8)
 
 
 def test_a_wrong_width_is_seen() -> None:

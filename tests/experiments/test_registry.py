@@ -38,6 +38,8 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "capsule": (ChoiceRule(("held", "free")), "held"),
         "damping": (WordsRule(("viscous", "dry", "quadratic")), ("viscous",)),
         "stiffness": (ChoiceRule(("linear", "cubic")), "linear"),
+        "drift": (ChoiceRule(("none", "linear", "gp")), "none"),
+        "noise": (ChoiceRule(("white", "ar1", "arma")), "white"),
         "smoothing_window": (QuantityRule("s"), None),
         "spring": (NameRule(), None),
         "gap": (_GAP, None),

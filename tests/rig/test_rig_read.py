@@ -55,6 +55,8 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "capsule": "held",
         "damping": ("dry",),
         "stiffness": "linear",
+        "drift": "none",
+        "noise": "white",
         "smoothing_window": 0.005,
         "forward": "closed",
     }

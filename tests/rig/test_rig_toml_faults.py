@@ -69,7 +69,7 @@ TOML_FAULTS = [
     (
         'capsule = "held"',
         'capsule = "free"\nforward = ‸"capsule"',
-        "viscous damping and a linear spring only, viscous + dry damping",
+        "viscous damping, a linear spring and white noise only, viscous + dry",
     ),
     ('damping = "dry"', "damping = ‸[]", "damping must not be empty"),
     ('damping = "dry"', 'damping = ‸["dry", "wet"]', 'must be "viscous" or "dry" or "quadratic"'),

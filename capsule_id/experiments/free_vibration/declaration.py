@@ -9,7 +9,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings, decay_window
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.kind import Kind, Values, made_by
-from capsule_id.parameters import nuisance, scatter
+from capsule_id.parameters import Parameter, Prior, nuisance, scatter
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, sampling_step
 from capsule_id.rig.model import Rig, Table
@@ -26,6 +26,14 @@ FEWEST_PERIODS = 2
 
 NOISE_SD = scatter("noise_sd", "m", "noise of a record", r"\sigma")
 AMPLITUDE = nuisance("amplitude", "m", "first turning point of a decay", "a_0")
+NOISE_TIME = Parameter("noise_time", "s", "correlation time of a record's noise", r"\tau", physical=False)
+WHITE_RATIO = Parameter(
+    "white_ratio", "1", "white noise over correlated noise", "w", Prior("lognormal", 1.0, 100.0), physical=False
+)
+DRIFT_RATIO = Parameter(
+    "drift_ratio", "1", "drift over noise of a record", "d", Prior("lognormal", 3.0, 100.0), physical=False
+)
+DRIFT_TIME = Parameter("drift_time", "s", "correlation time of a record's drift", r"\tau_d", physical=False)
 TURNING_TIME = nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0")
 
 
@@ -63,7 +71,7 @@ def _check_window(entry: Entry[DecaySettings]) -> None:
 
 
 def _check_forward(entry: Entry[DecaySettings]) -> None:
-    """Require a free capsule, viscous damping and a linear spring for the capsule model."""
+    """Require a free capsule and the default model of the decay for the capsule model."""
     settings = entry.table.settings
     if settings.forward != "capsule":
         return
@@ -72,8 +80,9 @@ def _check_forward(entry: Entry[DecaySettings]) -> None:
         raise entry.error("forward", "forward capsule needs a capsule that is free to move", "held", remedy)
     model = DecayModel.stated(settings)
     if model != DecayModel():
-        rule, remedy = "forward capsule has viscous damping and a linear spring only", 'write forward = "closed"'
-        raise entry.error("forward", rule, model.name, f"{remedy}, or remove damping and stiffness")
+        rule = "forward capsule has viscous damping, a linear spring and white noise only"
+        remedy = 'write forward = "closed", or remove damping, stiffness, drift and noise'
+        raise entry.error("forward", rule, model.name, remedy)
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
@@ -132,6 +141,11 @@ TEMPLATE = """\
 # damping = ["viscous", "dry"]
 #: "linear" (default) or "cubic": force k1 x_rel + k_cubic x_rel^3
 # stiffness = "linear"
+#: drift of the zero: "none" (default), "linear", or "gp", a slow Gaussian process; both are integrated out
+# drift = "none"
+#: "white" (default), "ar1" (correlated, one correlation time) or "arma" (correlated and white). The last two include
+#: stated reading errors
+# noise = "white"
 #: "closed" form (default), or the "capsule" model: a free capsule may slip, and the rod may hit the support spring
 # forward = "closed"
 #: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record
@@ -212,7 +226,7 @@ KIND = Kind(
     settings=DecaySettings,
     rules=(_check_spring_with_gap, _check_window, _check_forward),
     masses=_masses,
-    parameters=(NOISE_SD, AMPLITUDE, TURNING_TIME),
+    parameters=(NOISE_SD, AMPLITUDE, TURNING_TIME, NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME),
     make=made_by(
         "capsule_id.experiments.free_vibration.experiment:FreeVibration",
         capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",

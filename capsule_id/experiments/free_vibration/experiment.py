@@ -1,6 +1,7 @@
 """Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
 
 from types import ModuleType
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from capsule_id.experiments.free_vibration.decay_moments import decay_moments, f
 from capsule_id.experiments.free_vibration.decay_trend import trend
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement
+from capsule_id.experiments.free_vibration.noise import noise_parameters, whiten
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
@@ -35,10 +37,10 @@ SMOOTHING_ORDER = 3
 
 
 class FreeVibration(SurfaceExperiment):
-    """x_rel(t) of one raw record with white noise; all records share k1, c and the parameters of further forces.
+    """x_rel(t) of one raw record; all records share k1, c and the parameters of further forces.
 
-    For viscous damping and a linear spring the two solutions and the offset enter linearly and are integrated out. Any
-    other decay starts at its last turning point before the record, which is sampled; the offset is integrated out.
+    For viscous damping and a linear spring the two solutions enter linearly and are integrated out. Any other decay
+    starts at its last turning point before the record, which is sampled. Offset and linear drift are integrated out.
     """
 
     time: np.ndarray
@@ -67,12 +69,15 @@ class FreeVibration(SurfaceExperiment):
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.reading_sd = table.columns["x_rel"].reading_sd
         step = uniform_step(self.time)
-        self.uniform = step is not None and self.closed
+        self.uniform = step is not None and self.model == DecayModel()
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side, self.half_cycles = 1.0, 0
         self.about = About(table, rig, ())
         rows = [parameter("k1"), parameter("c"), NOISE_SD.named(table.label, self.noise_prior())]
+        if self.model.whitened:
+            period = 2.0 * np.pi / self.rough_decrement().Omega_o
+            rows += noise_parameters(self.model, self.time, period, table.label)
         if not self.closed:
             rough, turning = self.rough_decrement(), self.first_turning_point()
             self.side = float(np.sign(turning[1]))
@@ -93,7 +98,7 @@ class FreeVibration(SurfaceExperiment):
     @property
     def closed(self) -> bool:
         """Whether the solution is closed and linear in its initial conditions."""
-        return self.model == DecayModel()
+        return not self.model.symbols
 
     def noise_prior(self) -> Prior:
         """Default prior of the record's noise sd, m."""
@@ -125,15 +130,25 @@ class FreeVibration(SurfaceExperiment):
         """Name for the legend."""
         return self.model.name
 
-    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        one = xp.ones((len(self.time), 1))
+    def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
+        """Measured minus predicted (n,), and the design (n, p) of the nuisances in units of ``width``."""
+        trend = xp.ones((self.n, 1))
+        if self.model.drift == "linear":
+            trend = xp.stack([xp.ones(self.n), xp.asarray(self.time) / self.time[-1] - 0.5], axis=1)
         if self.closed:
             basis = viscous_basis(self.time, theta["k1"], theta["c"], theta["m1"], xp)
-            return (Misfit(self.values, self.reading_sd**2, 1.0, self.width * xp.concatenate([basis, one], axis=1)),)
+            return self.values, xp.concatenate([basis, trend], axis=1)
         forces = {symbol: theta[symbol] for symbol in ("k1", "c", "m1", *self.model.symbols)}
         motion = decay(self.time, forces, theta["amplitude"], theta["turning_time"], self.half_cycles)
-        raw = self.values - self.side * xp.asarray(motion.x_rel)
-        return (Misfit(raw, self.reading_sd**2, 1.0, self.width * one),)
+        return self.values - self.side * xp.asarray(motion.x_rel), trend
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        raw, design = self.unwhitened(theta, xp)
+        if not self.model.whitened:
+            return (Misfit(raw, self.reading_sd**2, 1.0, self.width * design),)
+        columns = xp.concatenate([xp.reshape(raw, (-1, 1)), self.width * design], axis=1)
+        white = xp.asarray(whiten(self.time, columns, self.model, theta))
+        return (Misfit(white[:, 0], 0.0, 1.0, white[:, 1:]),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         if not self.uniform or xp is np:
@@ -241,8 +256,8 @@ class FreeVibration(SurfaceExperiment):
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         def curve(values: ValuesBySymbol) -> np.ndarray:
-            misfit = self.misfit(values)
-            return self.values - misfit.raw + misfit.design @ misfit.at_nuisance_mean(np)[1]
+            raw, design = self.unwhitened(values, np)
+            return self.values - raw + self.width * design @ self.nuisance_mean(values)
 
         unit, time = self.column.to_display, self.time + float(decay_window(self.table)[0][0])
         lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)

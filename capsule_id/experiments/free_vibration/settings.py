@@ -12,6 +12,9 @@ from capsule_id.rig.schema import NameRule, QuantityRule, WordsRule
 #: Parameter of every damping term besides the viscous one, and of the cubic spring.
 DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 
+_DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
+_NOISES = {"ar1": "AR(1) noise", "arma": "ARMA noise"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class DecaySettings(Settings):
@@ -22,6 +25,8 @@ class DecaySettings(Settings):
     capsule: Literal["held", "free"] = "held"
     damping: Annotated[tuple[str, ...], WordsRule(("viscous", *DAMPING))] = ("viscous",)
     stiffness: Literal["linear", "cubic"] = "linear"
+    drift: Literal["none", "linear", "gp"] = "none"
+    noise: Literal["white", "ar1", "arma"] = "white"
     smoothing_window: Annotated[float | None, QuantityRule("s")] = None
     spring: Annotated[str | None, NameRule()] = None
     gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
@@ -30,21 +35,25 @@ class DecaySettings(Settings):
 
 @dataclass(frozen=True)
 class DecayModel:
-    """Forces of a free decay besides the viscous damping and the linear spring.
+    """Forces of a free decay besides the viscous damping and the linear spring, drift and noise of its record.
 
     Attributes
     ----------
     damping : words of ``DAMPING``, in that order
     cubic : whether the spring has a cubic term
+    drift, noise : as in ``DecaySettings``
     """
 
     damping: tuple[str, ...] = ()
     cubic: bool = False
+    drift: str = "none"
+    noise: str = "white"
 
     @classmethod
     def stated(cls, settings: DecaySettings) -> "DecayModel":
         """Return the model that ``settings`` state."""
-        return cls(tuple(word for word in DAMPING if word in settings.damping), settings.stiffness == "cubic")
+        damping = tuple(word for word in DAMPING if word in settings.damping)
+        return cls(damping, settings.stiffness == "cubic", settings.drift, settings.noise)
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -52,9 +61,18 @@ class DecayModel:
         return (*(DAMPING[word] for word in self.damping), *(("k_cubic",) if self.cubic else ()))
 
     @property
+    def whitened(self) -> bool:
+        """Whether noise or drift correlate the readings."""
+        return self.noise != "white" or self.drift == "gp"
+
+    @property
     def name(self) -> str:
         """Words for tables and legends."""
-        return " + ".join(("viscous", *self.damping)) + (" damping, cubic spring" if self.cubic else " damping")
+        words = [" + ".join(("viscous", *self.damping)) + " damping"]
+        words += ["cubic spring"] if self.cubic else []
+        words += [_DRIFTS[self.drift]] if self.drift != "none" else []
+        words += [_NOISES[self.noise]] if self.noise != "white" else []
+        return ", ".join(words)
 
 
 def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
