@@ -70,6 +70,8 @@ class Parameter:
     sign : the sign that the model admits
     scatter : a standard deviation, absolute or relative; it scales residuals and changes no prediction
     sampled : False for constants, which a fit never samples
+    default : value of the model where none is given, SI, or the symbol of the parameter that it equals then; None: a
+        value must be given. A fit samples a row with a default and a prior where ``[model] free`` names it
     table_1 : the paper's value (Table 1), SI
     """
 
@@ -85,6 +87,7 @@ class Parameter:
     scatter: bool = False
     sampled: bool = True
     table_1: float | None = None
+    default: float | str | None = None
 
     @property
     def name(self) -> str:
@@ -109,11 +112,21 @@ class Parameter:
         """Whether ``[prior]`` in rig.toml may override the default prior."""
         return self.prior is not None and self.prior.kind in ("lognormal", "halfnormal")
 
+    @property
+    def optional(self) -> bool:
+        """Whether a fit samples it only where ``[model] free`` names it."""
+        return self.default is not None and self.prior is not None
+
+    def describe_default(self) -> str:
+        """The default in one phrase, SI."""
+        return f"as {self.default}" if isinstance(self.default, str) else f"{self.default:g}"
+
     def describe_prior(self) -> str:
         """The default prior in one phrase, SI; "constant" if it is not sampled."""
         if not self.sampled:
             return "constant"
-        return "by the experiment" if self.prior is None else self.prior.describe()
+        described = "by the experiment" if self.prior is None else self.prior.describe()
+        return f"{self.describe_default()}; if free: {described}" if self.optional else described
 
     def admits(self, value: Any) -> Any:
         """Whether ``value`` is finite and has an admissible sign, elementwise; number, NumPy or JAX array."""
@@ -159,6 +172,18 @@ TABLE: Mapping[str, Parameter] = {
         Parameter(
             "v_s", "m/s", "Stribeck velocity, eq. (1)", "v_s", _lognormal(0.3, 10.0), leaf="capsule", table_1=0.30
         ),
+        Parameter(
+            "mu_back", "1", "static friction coefficient of backward sliding", r"\mu_-", _lognormal(0.4, 5.0),
+            leaf="capsule", sign="not negative", default="mu",
+        ),
+        Parameter(
+            "ratio", "1", "kinetic over static friction", r"\rho", _lognormal(0.7, 2.0),
+            leaf="capsule", sign="not negative", default=0.5,
+        ),
+        Parameter(
+            "viscous", "N s/m", "viscous friction of the ground", r"b_\mathrm{g}", _lognormal(1.0, 100.0),
+            leaf="capsule", sign="not negative", default=0.0,
+        ),
         Parameter("G", "m", "gap between rod and support spring", "G", leaf="capsule", sign="not negative"),
         Parameter(
             "g", "m/s^2", "acceleration of gravity", "g",
@@ -168,7 +193,7 @@ TABLE: Mapping[str, Parameter] = {
         Parameter(
             "Omega", "rad/s", "angular frequency of the drive", r"\Omega", leaf="drive", sign="any", sampled=False
         ),
-        Parameter("phase", "rad", "phase of the drive", r"\varphi", physical=False, leaf="drive", sign="any"),
+        Parameter("phase", "rad", "phase of the drive", r"\varphi", physical=False, leaf="drive", sign="any", default=0.0),
         Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),

@@ -169,7 +169,7 @@ def _dataset(
             raise InputError("k2 must be given", "the posterior has several springs or none", "add --spring or --k2")
         given = {name for name in LEAVES if getattr(args, name) is not None}
         leaves |= {name: column for name, column in draws.items() if name not in given}
-    p = CapsuleParameters(**{name: leaves[name] for name in CAPSULE_LEAVES})
+    p = CapsuleParameters(**{name: leaves[name] for name in CAPSULE_LEAVES if name in leaves})
     e = Excitation(**{name: leaves[name] for name in DRIVE_LEAVES})
     x = {axis.name: axis.values() for axis in axes}
     (over, grid), *_ = x.items()
@@ -233,9 +233,10 @@ def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points
     n = _whole_number(f"{prefix}points", points)
     if not 2 <= n <= MOST_POINTS:
         raise InputError(f"--{prefix}points must lie between 2 and {MOST_POINTS}", points, "give e.g. 500")
-    if name in ("Omega", "f", "m1", "m2", "v_s") and not low > 0.0:
+    positive = SWEPT[name].sign == "positive" or name in ("Omega", "f")
+    if positive and not low > 0.0:
         raise InputError(f"{name} must be positive", f"--{prefix}from {low:g}", "begin above 0")
-    if name not in ("phase", "P_d") and low < 0.0:
+    if SWEPT[name].sign == "not negative" and low < 0.0:
         raise InputError(f"{name} must not be negative", f"--{prefix}from {low:g}", "begin at 0 or above")
     return Axis(name, low, high, n, unit if unit is not None else si, factor)
 

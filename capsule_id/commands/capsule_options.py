@@ -9,12 +9,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import LEAVES, TABLE_1
+from capsule_id.parameters import LEAVES, TABLE_1, Parameter
 
 #: Name of the default friction law in the provenance of a result.
 EQUATION_1 = "eq. (1)"
-# From the paper's Table 1; other parameters have no default.
-DEFAULTS: Mapping[str, float] = {name: TABLE_1[name] for name in LEAVES if name in TABLE_1} | {"phase": 0.0}
+# From the paper's Table 1, or the default of the parameter table; other parameters have no default.
+DEFAULTS: Mapping[str, float] = {
+    **{name: leaf.default for name, leaf in LEAVES.items() if isinstance(leaf.default, float)},
+    **{name: TABLE_1[name] for name in LEAVES if name in TABLE_1},
+}
 
 # XLA then compiles each loop of an engine as one function: a single run is several times faster. CPU only.
 XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
@@ -24,7 +27,7 @@ def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str
     """Add an option per parameter, in SI, and the options for fitted values. ``capsule_values`` parses the numbers."""
     group = parser.add_argument_group("parameters", "plain numbers in SI units")
     for name, leaf in LEAVES.items():
-        text = f"default {defaults[name]:g}" if name in defaults else "required"
+        text = f"default {defaults[name]:g}" if name in defaults else _without_default(leaf)
         group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text})")
     group.add_argument(
         "--result", metavar="DIR", type=Path, help="result directory of fit-params, for its fitted parameters"
@@ -36,6 +39,8 @@ def capsule_values(
     args: argparse.Namespace, defaults: Mapping[str, float] = DEFAULTS, free: frozenset[str] = frozenset()
 ) -> dict[str, float]:
     """Every parameter by symbol, SI. Those of ``free`` are optional: their value is the default or 1.
+
+    A parameter that equals another one by default is absent where nothing gives it.
 
     Raises
     ------
@@ -49,6 +54,8 @@ def capsule_values(
         value = number(name, text) if text is not None else fitted.get(name, defaults.get(name))
         if value is None and name in free:
             value = 1.0
+        if value is None and isinstance(leaf.default, str):
+            continue
         if value is None:
             raise InputError(
                 f"{name} ({leaf.meaning}) must be given", "it is missing", f"add --{name} X, in {leaf.unit}"
@@ -56,6 +63,11 @@ def capsule_values(
         _check_sign(name, value, f"--{name}" if text is not None else "the value")
         values[name] = value
     return values
+
+
+def _without_default(leaf: Parameter) -> str:
+    """The default of a parameter without a default value, in words."""
+    return "required" if leaf.default is None else f"default {leaf.describe_default()}"
 
 
 def _check_sign(name: str, value: float, place: str) -> None:

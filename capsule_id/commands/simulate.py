@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.physics.smooth.engine import Smoothing
     from capsule_id.report.motion_files import write_motion
 
-    p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES})
+    p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
     e = Excitation(**{name: values[name] for name in DRIVE_LEAVES})
     grid = np.linspace(0.0, end, samples)
     section = _section(values["Omega"], end)

@@ -67,7 +67,7 @@ def provenance(
     """Attributes: every parameter that is not swept, and how the motions were settled."""
     swept = {"Omega" if name == "f" else name for name in over}
     given = {**vars(p), **vars(e)}
-    held = {name: float(np.asarray(value)) for name, value in given.items() if name not in swept}
+    held = {name: float(np.asarray(value)) for name, value in given.items() if name not in swept and value is not None}
     return {**held, **asdict(settling), "method": method, "model": "exact", "semantics": "stick-slip"}
 
 

@@ -51,49 +51,68 @@ class FrictionLaw(Protocol):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CoulombStribeck:
-    """The paper's eq. (1): mu/2 (1 + exp(-|Y2| / v_s)) N, both ways; mu in 1, N in N, v_s in m/s.
+    """Eq. (1) generalised: mu N (ratio + (1 - ratio) exp(-|Y2| / v_s)) + viscous |Y2|, with mu_back backward.
 
-    At speed 0: F_b = mu N with slope -F_b / (2 v_s). At infinite speed: F_b / 2 with slope 0. With N = 1 N the value
-    is the friction coefficient.
+    The paper's eq. (1) is the default: ratio 1/2, no viscous part, mu_back as mu. Units: N in N, v_s in
+    m/s, viscous in N s/m, mu, mu_back and ratio in 1. With N = 1 N, and viscous divided by the weight, the value is the
+    friction coefficient.
+
+    At speed 0: F_b = mu N with slope viscous - (1 - ratio) F_b / v_s. At infinite speed: ratio F_b + viscous |Y2|.
     """
 
     mu: NumberOrBatch
     N: NumberOrBatch
     v_s: NumberOrBatch
+    mu_back: NumberOrBatch | None = None
+    ratio: NumberOrBatch = 0.5
+    viscous: NumberOrBatch = 0.0
 
     parameters: ClassVar[tuple[Parameter, ...]] = (
         TABLE["mu"],
         Parameter("N", "N", "normal force of capsule and rod on the ground", "N", sign="not negative", sampled=False),
         TABLE["v_s"],
+        TABLE["mu_back"],
+        TABLE["ratio"],
+        TABLE["viscous"],
     )
+
+    def __post_init__(self) -> None:
+        if self.mu_back is None:
+            object.__setattr__(self, "mu_back", self.mu)
 
     def forward(self, speed: Any) -> Any:
         """Resistance at ``speed``, N; NumPy and JAX."""
-        ratio = -speed / self.v_s
-        return 0.5 * self.mu * self.N * (1.0 + array_module(ratio).exp(ratio))
+        return self._resistance(self.mu, speed)
 
     def backward(self, speed: Any) -> Any:
-        """Resistance at ``speed``, N: the same both ways."""
-        return self.forward(speed)
+        """Resistance at ``speed``, N; NumPy and JAX."""
+        return self._resistance(self.mu_back, speed)
+
+    def _resistance(self, mu: Any, speed: Any) -> Any:
+        exponent = -speed / self.v_s
+        weakening = self.ratio + (1.0 - self.ratio) * array_module(exponent).exp(exponent)
+        return mu * self.N * weakening + self.viscous * speed
 
     def series(self, sigma: jax.Array, v: jax.Array, breakaway: tuple[jax.Array, jax.Array]) -> FrictionSeries:
         """Friction along a step: u = exp(-sigma v/v_s) obeys u' = -sigma v' u / v_s, one Cauchy product per order."""
         sliding = sigma != 0.0
-        half = sigma * (0.5 * breakaway[0])
+        direction = jnp.where(sliding, sigma, jnp.inf)
+        F_b = jnp.where(sigma < 0.0, breakaway[1], breakaway[0])
+        kinetic, fading = F_b * sigma * self.ratio, divide((1.0 - self.ratio) * F_b, direction)
+        viscous = divide(self.viscous, jnp.abs(direction))
         v_s = jnp.where(sliding, -sigma * self.v_s, jnp.inf)
         u = [jnp.exp(-sigma * v / self.v_s)]
 
         def rate(acceleration: jax.Array, mass: jax.Array) -> jax.Array:
-            del mass
-            return jnp.where(sliding, u[0] * jnp.abs(acceleration) / self.v_s, 0.0)
+            return jnp.where(sliding, u[0] * jnp.abs(acceleration) / self.v_s, 0.0) + viscous / mass
 
         def extend(v: Series) -> jax.Array:
             k = len(v) - 1
             product = sum((j * v[j] * u[k - j] for j in range(2, k + 1)), v[1] * u[k - 1])
             u.append(divide(product, k * v_s))
-            return half * u[k]
+            return fading * u[k] + viscous * v[k]
 
-        return FrictionSeries(half * (1.0 + u[0]), rate, extend)
+        return FrictionSeries(kinetic + fading * u[0] + viscous * v, rate, extend)
 
 
 def normal_force(m1: Any, m2: Any, g: Any) -> Any:
@@ -102,8 +121,11 @@ def normal_force(m1: Any, m2: Any, g: Any) -> Any:
 
 
 def friction_law(p: "CapsuleParameters", friction: FrictionLaw | None = None) -> FrictionLaw:
-    """``friction``, or eq. (1) with the capsule's mu, v_s and weight."""
-    return CoulombStribeck(p.mu, normal_force(p.m1, p.m2, p.g), p.v_s) if friction is None else friction
+    """``friction``, or eq. (1) with the capsule's parameters and weight."""
+    if friction is not None:
+        return friction
+    own = {row.symbol: getattr(p, row.symbol) for row in CoulombStribeck.parameters if row.symbol != "N"}
+    return CoulombStribeck(N=normal_force(p.m1, p.m2, p.g), **own)
 
 
 def sliding_friction(law: FrictionLaw, sigma: Any, v: Any) -> jax.Array:

@@ -8,10 +8,11 @@ State (X1, Y1, X2, Y2): absolute position and velocity of the rod (m1) and of th
     m2 X2'' = f - F_s(Y2)                         F_s = mu/2 (1 + exp(-|Y2|/v_s)) (m1 + m2) g sign(Y2)
     stuck while Y2 = 0 and |f| <= F_b = mu (m1 + m2) g
 
-(the paper's eqs. (1) and (2), read as the text below eq. (1) says: "stick-slip" semantics).
+(the paper's eqs. (1) and (2), read as the text below eq. (1) says: "stick-slip" semantics). ``CoulombStribeck``
+generalises F_s by mu_back, ratio and viscous.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import reduce
 from operator import and_
@@ -52,6 +53,8 @@ class CapsuleParameters:
     c : damping of the rod's spring, N s/m        mu : static friction coefficient, 1
     v_s : Stribeck velocity, m/s                  G : gap between rod and support spring, m
     g : acceleration of gravity, m/s^2
+    mu_back : static friction coefficient of backward sliding, 1; None: as mu
+    ratio : kinetic over static friction, 1       viscous : viscous friction of the ground, N s/m
     """
 
     m1: NumberOrBatch
@@ -63,12 +66,15 @@ class CapsuleParameters:
     v_s: NumberOrBatch
     G: NumberOrBatch
     g: NumberOrBatch = 9.81
+    mu_back: NumberOrBatch | None = None
+    ratio: NumberOrBatch = 0.5
+    viscous: NumberOrBatch = 0.0
 
 
 def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:
     """(L,) bool: every leaf (L,) is finite and of the sign that its row of the parameter table admits.
 
-    The break-away forces are N >= 0 too. mu and v_s are judged where they are leaves of the law.
+    The break-away forces are N >= 0 too. The parameters of eq. (1) are judged where they are leaves of the law.
     """
     own = tuple(row for symbol, row in CAPSULE_LEAVES.items() if symbol not in _OWN_FRICTION)
     leaves = [
@@ -78,7 +84,7 @@ def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:
     ]
     still = jnp.zeros_like(jnp.asarray(p.m1))
     leaves += [(TABLE["mu"], threshold(still)) for threshold in (law.forward, law.backward)]
-    return reduce(and_, (row.admits(jnp.asarray(leaf)) for row, leaf in leaves))
+    return reduce(and_, (row.admits(jnp.asarray(leaf)) for row, leaf in leaves if leaf is not None))
 
 
 def _signs() -> str:
@@ -219,7 +225,8 @@ def simulate(
     """
     _check_choices(model, semantics, smoothing)
     (p, e, friction, initial), grid, batched = lanes_of((p, e, friction, initial or (0.0, 0.0, 0.0, 0.0)), times)
-    lanes = (p, e, friction_law(p, friction), initial)
+    # JAX cannot batch and differentiate a function of a tree that holds None.
+    lanes = (p if p.mu_back is not None else replace(p, mu_back=p.mu), e, friction_law(p, friction), initial)
     if model == "exact":
         from capsule_id.physics.exact import engine as exact
 

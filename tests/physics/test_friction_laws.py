@@ -118,7 +118,7 @@ def test_eq_1_without_its_own_recursion_is_the_same_motion(cases: Cases) -> None
 def test_a_recursion_of_a_law_is_used_and_a_wrong_one_is_seen() -> None:
     """The negative control: the same values with slopes that are 1 % off miss the motion of the functions of speed."""
     times = T * np.linspace(0.0, 4.0, 33)
-    slopes = simulate(P, E, times, friction=EasierBackward(0.66, NORMAL_FORCE, 0.3, np.array([1.0, 1.01])))
+    slopes = simulate(P, E, times, friction=EasierBackward(0.66, NORMAL_FORCE, 0.3, slope=np.array([1.0, 1.01])))
     F_b = 0.66 * NORMAL_FORCE
     expected = simulate(P, E, times, friction=in_a_batch(TwoWay(F_b, 0.5 * F_b, 0.3, 0.0, 0.45, 0.0)))
     right, wrong = np.abs(states_of(slopes) - states_of(expected)).max(axis=1)[:, [0, 2]].max(axis=1)
@@ -143,11 +143,11 @@ def test_the_general_reference_case_that_differs_by_friction_alone() -> None:
 @pytest.mark.parametrize(
     "law",
     [
-        pytest.param(EasierBackward(0.66, NORMAL_FORCE, 0.3), id="own recursion"),
+        pytest.param(CoulombStribeck(0.66, NORMAL_FORCE, 0.3, 0.45, 0.7, 1.5), id="own recursion"),
         pytest.param(replace(LORENTZIAN, share=0.8), id="functions of speed", marks=pytest.mark.slow),
     ],
 )
-def test_derivatives_in_every_parameter_of_a_law_and_vmap(law: EasierBackward | TwoWay) -> None:
+def test_derivatives_in_every_parameter_of_a_law_and_vmap(law: CoulombStribeck | TwoWay) -> None:
     """One program: a lane per parameter, whose tangent is that parameter's own; against differences of a plain batch."""
     times, start = np.linspace(0.0, 2.5 * T, 7), (2e-4, 1e-2, 0.0, 3e-3)
     names = [row.symbol for row in law.parameters]

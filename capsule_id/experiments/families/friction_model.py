@@ -56,6 +56,7 @@ class FrictionModel:
     Attributes
     ----------
     law : its class; eq. (1) by default
+    free : symbols of the optional parameters that are sampled; the others keep their defaults
 
     Raises
     ------
@@ -65,6 +66,7 @@ class FrictionModel:
     """
 
     law: type[FrictionLaw] = CoulombStribeck
+    free: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         law, wanted = self.law, ("parameters", "forward", "backward")
@@ -90,17 +92,20 @@ class FrictionModel:
     @property
     def name(self) -> str:
         """Name for legends."""
-        return "eq. (1)" if self.is_proportional else self.law.__name__
+        if self.law is not CoulombStribeck:
+            return self.law.__name__
+        return ", ".join(["eq. (1)", *(f"free {symbol}" for symbol in self.free)])
 
     @property
     def is_proportional(self) -> bool:
-        """Whether the law is eq. (1): proportional to the normal force, so that a coefficient needs no mass."""
-        return self.law is CoulombStribeck
+        """Whether the law is proportional to the normal force, so that a coefficient needs no mass."""
+        return self.law is CoulombStribeck and "viscous" not in self.free
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The sampled parameters."""
-        return tuple(row for row in self.law.parameters if row.symbol != NORMAL_FORCE)
+        rows = (row for row in self.law.parameters if row.symbol != NORMAL_FORCE)
+        return tuple(row for row in rows if not row.optional or row.symbol in self.free)
 
     @property
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
@@ -125,8 +130,8 @@ class FrictionModel:
 
     @property
     def source(self) -> str:
-        """Name of the law in provenance: module and class; "eq. (1)" for the paper's."""
-        return self.name if self.is_proportional else f"{self.law.__module__}.{self.law.__qualname__}"
+        """Name of the law in provenance: module and class; "eq. (1)" for the paper's, with its free parameters."""
+        return self.name if self.law is CoulombStribeck else f"{self.law.__module__}.{self.law.__qualname__}"
 
     def check(self, known: Mapping[str, Parameter]) -> None:
         """Reject a law that has the symbol of a different parameter in ``known`` (package and kinds).
