@@ -40,15 +40,16 @@ def whiten(time: np.ndarray, columns: Any, model: DecayModel, theta: ValuesBySym
     The map has determinant 1: the density of the readings is that of the whitened readings.
     """
     shape = {row.symbol: theta[row.symbol] for row in noise_parameters(model, time, 1.0, "")}
-    return _whiten(jnp.asarray(time), jnp.asarray(columns), model.noise, shape)
+    return whiten_by_shape(jnp.asarray(time), jnp.asarray(columns), model.noise, shape)
 
 
 @partial(jax.jit, static_argnames="noise")
-def _whiten(time: Any, columns: Any, noise: str, shape: ValuesBySymbol) -> Any:
+def whiten_by_shape(time: Any, columns: Any, noise: str, shape: ValuesBySymbol) -> Any:
+    """Whiten as ``whiten``, with the shape parameters of ``noise`` and, where it has some, of the drift."""
     kernels: list[Any] = [Exp(scale=shape["noise_time"])] if noise != "white" else []
     if "drift_time" in shape:
         kernels.append(Matern32(scale=shape["drift_time"], sigma=shape["drift_ratio"]))
-    covariance = sum((kernel.to_symm_qsm(time) for kernel in kernels[1:]), kernels[0].to_symm_qsm(time))
+    covariance: Any = sum((kernel.to_symm_qsm(time) for kernel in kernels[1:]), kernels[0].to_symm_qsm(time))
     white = {"white": 1.0, "ar1": 0.0, "arma": shape.get("white_ratio", 0.0) ** 2}[noise]
     factor = (covariance + DiagQSM(d=jnp.full(time.shape[0], white))).cholesky()
     return factor.solve(columns) * jnp.exp(jnp.mean(jnp.log(factor.diag.d)))
