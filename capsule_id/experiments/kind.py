@@ -92,7 +92,7 @@ class Kind(KindRule):
     informs : parameters that it measures, for tables
     captions : captions of its panels in the report, by ``Comparison.kind``
     messages : texts of its own findings and tables, by code
-    lint : findings on the readings of a table; they enter the verdict of a fit too
+    lint : findings on the readings of a table, from the table and its rig; they enter the verdict of a fit too
     lint_rig : findings at rough values, for ``capsule-id check`` alone: a fit repeats such checks at fitted values
     describe : description of a table for ``capsule-id check``, one line each
     check : raises an ``InputError`` where all tables of the kind together cannot be fitted
@@ -109,7 +109,7 @@ class Kind(KindRule):
     informs: str
     captions: Mapping[str, str]
     messages: Mapping[str, Message] = field(default_factory=dict)
-    lint: tuple[Callable[[Table[Any]], Iterable[Finding]], ...] = ()
+    lint: tuple[Callable[[Table[Any], Rig], Iterable[Finding]], ...] = ()
     lint_rig: Callable[[Table[Any], Rig, Estimate], Iterable[Finding]] = field(default=lambda table, rig, estimate: ())
     describe: Callable[[Table[Any]], Iterable[str]] = field(default=lambda table: ())
     check: Callable[[Sequence[Table[Any]]], None] = field(default=lambda tables: None)

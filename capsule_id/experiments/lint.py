@@ -3,7 +3,10 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from capsule_id.experiments.kind import Estimate, Kind
+from capsule_id.records.faults.duplicates import Readings, repeated_blocks
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Finding
 
@@ -21,8 +24,8 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     exact = [name for name, mass in masses if mass is not None and mass.sd == 0.0]
     findings = [Finding("masses.exact", "warn", {"name": name}) for name in exact]
     for table in tables:
-        findings += [found for lint_table in kinds[table.kind].lint for found in lint_table(table)]
-    return (*findings, *_same_files(rig, tables))
+        findings += [found for lint_table in kinds[table.kind].lint for found in lint_table(table, rig)]
+    return (*findings, *_same_files(rig, tables), *_repeated_blocks(rig, tables))
 
 
 def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tuple[Finding, ...]:
@@ -32,23 +35,51 @@ def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tu
 
 def _same_files(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
     """Report tables whose files have the same bytes."""
-    by_content: dict[str, list[str]] = {}
+    by_content: dict[str, list[Table[Any]]] = {}
     for table in tables:
         if table.file in rig.files:
-            by_content.setdefault(rig.files[table.file], []).append(table.label)
+            by_content.setdefault(rig.files[table.file], []).append(table)
     for first, *others in by_content.values():
         for other in others:
-            yield Finding("readings.repeated", "fail", {"first": first}, other)
+            facts = {"file": other.file, "first": first.label, "rows": list(range(len(other.rows)))}
+            yield Finding("readings.repeated_file", "fail", facts, other.label)
 
 
-def lint_rows(table: Table, fewest: int) -> Iterable[Finding]:
+def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
+    """Report rows that occur twice, within a table or across tables with the same columns; equal files are left out."""
+    groups: dict[tuple[str, ...], list[Table[Any]]] = {}
+    for table in {rig.files.get(table.file, table.label): table for table in reversed(tables)}.values():
+        groups.setdefault(tuple(sorted(set(table.columns) - {"time"})), []).insert(0, table)
+    for names, members in groups.items():
+        by_label = {table.label: table for table in members}
+        readings = [
+            Readings(table.label, np.stack([table[name] for name in names], axis=1), "time" in table.columns)
+            for table in members
+        ]
+        for block in repeated_blocks(readings):
+            later, first = by_label[block.label], by_label[block.first]
+            facts = {
+                "file": later.file,
+                "line": int(later.rows[block.row]),
+                "last": int(later.rows[block.row + block.count - 1]),
+                "first": first.file,
+                "first_line": int(first.rows[block.first_row]),
+                "first_last": int(first.rows[block.first_row + block.count - 1]),
+                "rows": list(range(block.row, block.row + block.count)),
+            }
+            yield Finding("readings.repeated", "fail", facts, block.label)
+
+
+def lint_rows(table: Table[Any], rig: Rig, fewest: int) -> Iterable[Finding]:
     """Warn where a table has fewer than ``fewest`` rows: the number of unknowns of its law plus three."""
+    del rig
     if len(table.rows) < fewest:
         yield Finding("readings.few", "warn", {"rows": len(table.rows), "wanted": fewest}, table.label)
 
 
-def lint_reading_errors(table: Table) -> Iterable[Finding]:
+def lint_reading_errors(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where columns have no reading error."""
+    del rig
     unstated = [name for name, column in table.columns.items() if column.reading_sd == 0.0]
     if unstated:
         facts = {"names": " and ".join(unstated), "first": unstated[0]}

@@ -15,8 +15,58 @@ DATA_MESSAGES: Mapping[str, Message] = {
     "readings.errors": Message(
         "reading errors", warn="no reading error is stated for {names}. Add {first}_sd to the experiment."
     ),
+    "readings.repeated_file": Message(
+        "repeated readings",
+        fail=(
+            "{file} has the same content as the file of {first}, so each reading counts twice. Remove one of the two "
+            "experiments."
+        ),
+    ),
     "readings.repeated": Message(
         "repeated readings",
-        fail="its file has the same content as that of {first}, so each reading counts twice. Remove one of the two.",
+        fail=(
+            "{file}:{line}: each reading must stand once; lines {line} to {last} repeat lines {first_line} to {first_last} of "
+            "{first}. Delete the repeated rows."
+        ),
+    ),
+    "readings.gaps": Message(
+        "gaps in a record",
+        warn=(
+            "{file}:{line}: the times must be evenly spaced; found {gaps} gaps, the first after {time:.6g} s, and {lost} lost "
+            "samples of {step:.4g} s. The fit uses the times as recorded. Record without gaps."
+        ),
+    ),
+    "readings.rounded_times": Message(
+        "rounded times",
+        warn="{file}: the times are rounded to {step:g} s, a large part of a sampling step. Export more digits.",
+    ),
+    "readings.clipped": Message(
+        "clipped samples",
+        fail=(
+            "{file}:{line}: {column} is clipped: {samples} samples ({share:.2g} of the record) lie at its {side} limit "
+            "{level:.5g} {unit}, the last at {time:.5g} s. Repeat with a wider range of the sensor, or use the record after "
+            "the clipped part only."
+        ),
+    ),
+    "readings.dropouts": Message(
+        "drop-outs",
+        fail=(
+            "{file}:{line}: {column} drops out: {samples} samples have a value far from both neighbours, the first "
+            "{value:.6g} {unit} at {time:.5g} s. Delete these rows."
+        ),
+    ),
+    "readings.frozen": Message(
+        "frozen channel",
+        fail=(
+            "{file}:{line}: {column} freezes: {samples} samples keep the value before them, the first {value:.6g} {unit} at "
+            "{time:.5g} s. Delete these rows."
+        ),
+    ),
+    "readings.jump": Message(
+        "lost samples",
+        fail=(
+            "{file}:{line}: {column} must be smooth; it jumps at {time:.5g} s by {size:.2g} of its amplitude, and the times "
+            "are even: samples were lost. Use the record on one side of the jump only, or repeat it."
+        ),
     ),
 }

@@ -134,9 +134,7 @@ def test_lint(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     ]
     twice = rows + '[[experiment]]\nkind = "motor_current"\nfile = "copy.csv"\n'
     found = findings(write_folder(tmp_path / "rig", twice, {"copy.csv": TABLES["motor_current.csv"]}), capsys)
-    assert found[-1].startswith(
-        "copy: its file has the same content as that of motor_current, so each reading counts twice"
-    )
+    assert any(line.startswith("copy.csv has the same content as the file of motor_current") for line in found)
 
 
 def test_check_says_what_a_forced_run_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -15,6 +15,7 @@ from capsule_id.experiments import CHOICES, make_experiments, select_tables
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.experiments.registry import BUILT_IN, Registry, default_registry
 from capsule_id.parameters import TABLE, scatter
+from capsule_id.report.data_messages import DATA_MESSAGES
 from capsule_id.report.messages import FIT_MESSAGES, messages_of
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
 from capsule_id.rig.model import Settings
@@ -254,4 +255,4 @@ def test_a_kind_must_not_replace_messages_of_the_fit() -> None:
         InputError, match=r"kind other must not declare messages of the whole fit, residuals\.white, rename"
     ):
         messages_of(Registry((*KINDS.kinds, own)))
-    assert messages_of(KINDS).keys() == FIT_MESSAGES.keys() | KINDS.messages.keys()
+    assert messages_of(KINDS).keys() == FIT_MESSAGES.keys() | DATA_MESSAGES.keys() | KINDS.messages.keys()

@@ -15,6 +15,6 @@ def test_a_file_that_is_entered_twice_is_not_clean(tmp_path: Path) -> None:
     entry = toml[toml.index("[[experiment]]") :].replace("motor_current.csv", "copy.csv")
     (folder / "rig.toml").write_text(toml + "\n" + entry)
     result = cid.fit(cid.read_rig(folder), budget=None)
-    (found,) = [f for f in result.findings if f.code == "readings.repeated"]
+    (found,) = [f for f in result.findings if f.code == "readings.repeated_file"]
     assert (found.level, found.experiment) == ("fail", "copy")
-    assert "that of motor_current" in result.text(found)
+    assert "the file of motor_current" in result.text(found)

@@ -14,6 +14,7 @@ from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_
 from capsule_id.report.figures.style import new_figure, png
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import filter_gain
+from tests.experiments import bench
 from tests.records.runs import Known, noisier, reference, table_of
 
 STEP = 1e-3
@@ -105,9 +106,9 @@ def test_check_says_it_in_a_few_lines(case: Known) -> None:
     assert drive.startswith("drive Omega 73.5")
     assert "(stated 73.58), current 0.6" in drive
     assert filtered.startswith("Savitzky-Golay over 7 samples, order 3: gain 1.000 (rate 1.000) at 11.7 Hz, drive, 0.9")
-    (lint_drive,) = KINDS["forced_run"].lint
-    assert list(lint_drive(table)) == []
-    (wrong,) = lint_drive(table_of(noisier(case.run, 1.0, 0), Omega=80.0))
+    (lint_run,) = KINDS["forced_run"].lint
+    assert list(lint_run(table, bench.rig())) == []
+    (wrong,) = lint_run(table_of(noisier(case.run, 1.0, 0), Omega=80.0), bench.rig())
     assert wrong.level == "warn"
     text = finding_text(wrong, messages_of(KINDS))
     assert "stated 80 rad/s, the current has 73.5" in text

@@ -8,7 +8,7 @@ import numpy as np
 from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Finding, Message
 
 if TYPE_CHECKING:
@@ -60,8 +60,8 @@ def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
         raise entry.error("sd_ratio", rule, "all three", "remove sd_ratio", of_key=True)
 
 
-def lint_line(table: Table[Any]) -> Iterable[Finding]:
+def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Report few rows and missing reading errors."""
-    yield from lint_rows(table, 5)
+    yield from lint_rows(table, rig, 5)
     if table.settings.sd_ratio is None:
-        yield from lint_reading_errors(table)
+        yield from lint_reading_errors(table, rig)

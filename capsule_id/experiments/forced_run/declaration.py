@@ -6,10 +6,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from capsule_id.experiments.forced_run.lint import MESSAGES as LINT_MESSAGES
+from capsule_id.experiments.forced_run.lint import lint_run
 from capsule_id.experiments.kind import Estimate, Kind, Twin, Values, made_by
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.run_description import describe_run
-from capsule_id.records.tone import recorded_drive
 from capsule_id.rig.domains import NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
@@ -108,14 +109,6 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
     return findings
 
 
-def _lint_drive(table: Table[RunSettings]) -> Iterable[Finding]:
-    """Report a stated frequency that differs from that of the current."""
-    drive = recorded_drive(table)
-    if drive is not None and drive.disagrees:
-        facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd}
-        yield Finding("runs.frequency", "warn", facts, table.label)
-
-
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     from capsule_id.experiments.forced_run.twin import measure
 
@@ -146,13 +139,7 @@ TEMPLATE = """\
 """
 
 MESSAGES = {
-    "runs.frequency": Message(
-        "frequency of the drive",
-        warn=(
-            "the stated Omega must be that of the current; stated {stated:g} rad/s, the current has {Omega:.6g} ± {sd:.2g} "
-            "rad/s. Correct Omega."
-        ),
-    ),
+    **LINT_MESSAGES,
     "runs.rough": Message(
         "feasible",
         warn=(
@@ -255,7 +242,7 @@ KIND = Kind(
     },
     messages=MESSAGES,
     bench=False,
-    lint=(_lint_drive,),
+    lint=(lint_run,),
     lint_rig=_lint_feasibility,
     describe=describe_run,
     twin=_measure,

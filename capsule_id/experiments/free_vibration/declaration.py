@@ -1,28 +1,23 @@
 """Free vibration: columns, settings, rules, template, lint and the paper's estimates."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
+from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings, decay_window
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.kind import Kind, Values, made_by
 from capsule_id.parameters import Parameter, Prior, nuisance, scatter
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.filters import dominant_frequency, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
-from capsule_id.views import Facts, Finding, Message
+from capsule_id.views import Facts, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
-
-#: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
-SAMPLES_PER_PERIOD = 20
-#: Smallest number of periods; with fewer, one peak determines the damping.
-FEWEST_PERIODS = 2
 
 NOISE_SD = scatter("noise_sd", "m", "noise of a record", r"\sigma")
 AMPLITUDE = nuisance("amplitude", "m", "first turning point of a decay", "a_0")
@@ -91,23 +86,6 @@ def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
     return ("m1", "m2") if moves else ("m1",)
 
 
-def _lint(table: Table[DecaySettings]) -> Iterable[Finding]:
-    """Report uneven sampling, low sampling rate and short length of a free decay."""
-    time, x_rel = decay_window(table)
-    try:
-        period = 1.0 / dominant_frequency(time, x_rel)
-        step = sampling_step(time)
-    except InputError as error:
-        yield Finding("decays.uneven", "warn", {"rule": error.rule, "value": error.value}, table.label)
-        return
-    if period / step < SAMPLES_PER_PERIOD:
-        facts = {"samples": period / step, "wanted": SAMPLES_PER_PERIOD}
-        yield Finding("decays.sampling", "warn", facts, table.label)
-    if (time[-1] - time[0]) / period < FEWEST_PERIODS:
-        facts = {"periods": (time[-1] - time[0]) / period, "wanted": FEWEST_PERIODS}
-        yield Finding("decays.length", "warn", facts, table.label)
-
-
 def _paper(experiments: Sequence["FreeVibration"]) -> Values:
     """Estimate k1 = m1 Omega_o^2 and c by logarithmic decrement after Savitzky–Golay, as in the paper; record means."""
     found = [d for d in (e.paper_decrement() for e in experiments) if d is not None]
@@ -172,19 +150,7 @@ def _damping_caption(facts: Facts) -> str:
 
 
 MESSAGES = {
-    "decays.uneven": Message(
-        "sampling of a decay",
-        warn=(
-            "{rule}; found {value}. The paper's estimate is left out; the fit uses the times as recorded. Resample the "
-            "record evenly to have both."
-        ),
-    ),
-    "decays.sampling": Message(
-        "sampling of a decay", warn="{samples:.1f} samples per period; {wanted} or more are wanted. Sample faster."
-    ),
-    "decays.length": Message(
-        "length of a decay", warn="{periods:.1f} periods; {wanted} or more are wanted. Record for longer."
-    ),
+    **LINT_MESSAGES,
     "decays.stiffness": Message(
         "stiffness against amplitude",
         ok="k1 is the same in all {records} records (p = {p:.2g})",
@@ -235,7 +201,7 @@ KIND = Kind(
     informs="k1, c",
     captions={"free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation."},
     messages=MESSAGES,
-    lint=(_lint,),
+    lint=(lint_decay,),
     paper=_paper,
     rough=_rough,
     twin=measure,

@@ -75,10 +75,15 @@ class DecayModel:
         return ", ".join(words)
 
 
-def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
-    """Return (time, x_rel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
+def rows_in_window(table: Table) -> np.ndarray:
+    """(n,) bool: the rows from ``start`` to ``stop`` inclusive, which a fit reads; default: all."""
     time, settings = table["time"], table.settings
     start = time[0] if settings.start is None else settings.start
     stop = time[-1] if settings.stop is None else settings.stop
-    inside = (time >= start) & (time <= stop)
-    return time[inside], table["x_rel"][inside]
+    return (time >= start) & (time <= stop)
+
+
+def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Return (time, x_rel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
+    inside = rows_in_window(table)
+    return table["time"][inside], table["x_rel"][inside]

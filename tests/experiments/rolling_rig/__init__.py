@@ -9,7 +9,7 @@ import numpy as np
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Parameter, Prior, scatter
 from capsule_id.rig.domains import POSITIVE
-from capsule_id.rig.model import Settings, Table
+from capsule_id.rig.model import Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule
 from capsule_id.views import Finding, Message
 
@@ -31,7 +31,8 @@ def _masses(table: Table[RollingSettings]) -> tuple[str, ...]:
     return "m1", "m2"
 
 
-def _lint(table: Table[RollingSettings]) -> Iterable[Finding]:
+def _lint(table: Table[RollingSettings], rig: Rig) -> Iterable[Finding]:
+    del rig
     if len(np.unique(table["speed"])) < 6:
         yield Finding("rolling.few", "warn", experiment=table.label)
 

@@ -1,0 +1,101 @@
+"""Findings on the readings of a free decay: release, aliasing, sampling, length, and those of any record."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.settings import rows_in_window
+from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
+from capsule_id.records.faults.release import FreeDecay, find_free_decay
+from capsule_id.rig.filters import dominant_frequency, sampling_step
+from capsule_id.rig.model import Rig, Table
+from capsule_id.views import Finding, Message
+
+#: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
+SAMPLES_PER_PERIOD = 20
+#: Smallest number of periods; with fewer, one peak determines the damping.
+FEWEST_PERIODS = 2
+
+
+def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
+    """Report faults of the record, rest before the release, low sampling rate and short length."""
+    del rig
+    used = rows_in_window(table)
+    yield from lint_times(table, used)
+    channels = [name for name in table.columns if name != "time"]
+    time = table["time"]
+    decay = find_free_decay(time[used], table[channels[0]][used])
+    period = np.inf if decay is None else decay.period
+    faults = [found for name in channels for found in lint_channel(table, name, used, period)]
+    if decay is not None:
+        if not faults:
+            yield from _release(table, decay)
+        used = used & (time >= decay.start) & (time <= (np.inf if decay.stop is None else decay.stop))
+        faults = faults or [found for name in channels for found in lint_smooth(table, name, used, period)]
+    yield from faults
+    yield from _sampling(table, time[used], table[channels[0]][used])
+
+
+def _release(table: Table[Any], decay: FreeDecay) -> Iterable[Finding]:
+    """Report rest before the release, and a second excitation."""
+    digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
+    if decay.rest > 0.0:
+        facts = {"file": table.file, "rest": decay.rest, "start": round(decay.start, digits), "found": decay.start}
+        yield Finding("decays.release", "fail", facts, table.label)
+    if decay.stop is not None:
+        facts = {"file": table.file, "stop": round(decay.stop, digits), "found": decay.stop}
+        yield Finding("decays.second", "fail", facts, table.label)
+
+
+def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
+    """Report uneven sampling, and too few samples per period or periods."""
+    try:
+        period = 1.0 / dominant_frequency(time, values)
+        step = sampling_step(time)
+    except InputError as error:
+        yield Finding("decays.uneven", "warn", {"rule": error.rule, "value": error.value}, table.label)
+        return
+    if period / step < SAMPLES_PER_PERIOD:
+        facts = {"samples": period / step, "wanted": SAMPLES_PER_PERIOD}
+        yield Finding("decays.sampling", "warn", facts, table.label)
+    if (time[-1] - time[0]) / period < FEWEST_PERIODS:
+        facts = {"periods": (time[-1] - time[0]) / period, "wanted": FEWEST_PERIODS}
+        yield Finding("decays.length", "warn", facts, table.label)
+
+
+def _line(key: str) -> str:
+    """A line of rig.toml that states ``key`` of the facts."""
+    return f'{key} = {{{{ value = {{{key}:.10g}}, unit = "s" }}}}'
+
+
+MESSAGES = {
+    "decays.release": Message(
+        "release of a decay",
+        fail=(
+            "a free decay must begin with its release; found {rest:.4g} s of rest or excitation before it. Add this line to "
+            "the experiment in rig.toml: " + _line("start")
+        ),
+    ),
+    "decays.second": Message(
+        "end of a decay",
+        fail=(
+            "the energy of a free decay must not grow; it grows after {found:.5g} s. Add this line to the experiment in "
+            "rig.toml: " + _line("stop")
+        ),
+    ),
+    "decays.uneven": Message(
+        "sampling of a decay",
+        warn=(
+            "{rule}; found {value}. The paper's estimate is left out; the fit uses the times as recorded. Resample the "
+            "record evenly to have both."
+        ),
+    ),
+    "decays.sampling": Message(
+        "sampling of a decay", warn="{samples:.1f} samples per period; {wanted} or more are wanted. Sample faster."
+    ),
+    "decays.length": Message(
+        "length of a decay", warn="{periods:.1f} periods; {wanted} or more are wanted. Record for longer."
+    ),
+}

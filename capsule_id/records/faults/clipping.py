@@ -1,0 +1,59 @@
+"""Finds clipped records: flat tops, samples that share exactly the largest or smallest value."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from capsule_id.records.faults.duplicates import reading_step
+
+#: Fewest samples at the limit; how many times as many as at the neighbouring values.
+FEWEST_CLIPPED, EXCESS = 3, 5.0
+#: Number of neighbouring values. The peak of a sine that is read in steps has 3.4 times their mean number.
+NEIGHBOURS = 5
+#: A record held at its limit for longer than this fraction of a period before its release is not clipped.
+LONGEST_HOLD = 0.2
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """``rows`` (k,) of the samples at ``level``, in the unit of the record; ``side`` of the limit."""
+
+    side: Literal["upper", "lower"]
+    level: float
+    rows: np.ndarray
+
+
+def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
+    """Return the clipped samples of a record at its upper and lower limit.
+
+    Parameters
+    ----------
+    values : (n,) readings in the unit of the file
+    period : of the oscillation, samples; infinite where it is unknown
+    """
+    if np.ptp(values) == 0.0:
+        return []
+    step = reading_step(values)
+    sides: tuple[tuple[Literal["upper", "lower"], float], ...] = (("upper", 1.0), ("lower", -1.0))
+    return [
+        Clipped(side, sign * float(np.max(sign * values)), rows)
+        for side, sign in sides
+        if len(rows := _at_limit(sign * values, step, period))
+    ]
+
+
+def _at_limit(values: np.ndarray, step: float, period: float) -> np.ndarray:
+    """Indices of the samples at the maximum, () where a smooth peak has as many."""
+    tolerance = max(0.25 * step, 4e-16 * float(np.max(np.abs(values))))
+    depth = np.max(values) - values
+    rows = np.flatnonzero(depth <= tolerance)
+    near = np.sum(depth <= (NEIGHBOURS + 0.25) * step) - len(rows) if step > 0.0 else 0
+    if len(rows) < FEWEST_CLIPPED + EXCESS * near / NEIGHBOURS:
+        return rows[:0]
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    if runs[0][0] == 0 and len(runs[0]) > LONGEST_HOLD * period:
+        runs = runs[1:]
+    # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours.
+    runs = [run for run in runs if len(run) > 1]
+    return np.concatenate(runs) if sum(map(len, runs)) >= FEWEST_CLIPPED else rows[:0]

@@ -1,0 +1,70 @@
+"""Finds samples lost without a gap in the time column: jumps of an evenly sampled smooth oscillation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import ndimage
+
+from capsule_id.records.faults.duplicates import reading_step
+from capsule_id.records.noise import noise_level
+
+#: Order of the polynomials on both sides of a sample; their length, periods, with the smallest jump, rad, that they show
+#: beyond their own error. Long ones see through noise, short ones show small jumps of quiet records. A jump above LARGE
+#: may be one of the slope alone.
+ORDER, SIDES, LARGE = 3, ((0.25, 0.3), (0.125, 0.06)), 0.2
+#: Smallest jump: standard deviations of the noise, and sampling steps.
+JUMP_SDS, JUMP_STEPS = 6.0, 0.7
+#: The oscillation must be at least this many times the noise.
+AMPLITUDE_NOISE = 4.0
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump before the sample ``row``; ``size`` relative to the amplitude there."""
+
+    row: int
+    size: float
+
+
+def phase_jump(values: np.ndarray, period: float) -> Jump | None:
+    """Return the largest jump of a smooth oscillation; None where there is none.
+
+    Polynomials through the samples before and after a place agree in value and slope where no sample is lost.
+
+    Parameters
+    ----------
+    values : (n,) evenly sampled, free oscillation or forced tone
+    period : samples
+    """
+    # Errors of reading in steps are correlated in a slow record, so they do not average out.
+    noise = max(noise_level(values), reading_step(values))
+    found = [_jump(values, period, round(side * period), smallest, noise) for side, smallest in SIDES]
+    return next((jump for jump in found if jump is not None), None)
+
+
+def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float) -> Jump | None:
+    """The most significant jump by polynomials over ``side`` samples."""
+    if side < ORDER + 3 or len(values) < 2 * side:
+        return None
+    # Value and slope half a sample beyond the end of ``side`` samples, as weights of the samples.
+    design = polynomial.polyvander(np.arange(side) + 0.5, ORDER)
+    value, slope = np.linalg.pinv(design)[:2]
+    after = [np.correlate(values, weights, "valid")[side:] for weights in (value, slope)]
+    before = [np.correlate(values, weights[::-1], "valid")[:-side] for weights in (value, -slope)]
+    jumps = np.stack([one - other for one, other in zip(after, before, strict=True)])
+    weights = np.stack([np.concatenate([value, -value[::-1]]), np.concatenate([slope, slope[::-1]])])
+    precision = np.linalg.inv(weights @ weights.T * max(noise, 1e-300) ** 2)
+    deviation = np.sqrt(np.einsum("in,ij,jn->n", jumps, precision, jumps))
+    width = round(period)
+    high, low = (f(values, width, mode="nearest") for f in (ndimage.maximum_filter1d, ndimage.minimum_filter1d))
+    amplitude = 0.5 * (high - low)[side : side + len(deviation)]
+    step = 2.0 * np.pi / period
+    # Kinks of real records, as of a sensor's scale, are small; a small jump must show in the value.
+    size = np.hypot(jumps[0], jumps[1] / step) if smallest > LARGE else np.abs(jumps[0])
+    phase = size / np.maximum(amplitude, 1e-300)
+    large = (deviation > JUMP_SDS) & (phase > max(smallest, JUMP_STEPS * step)) & (amplitude > AMPLITUDE_NOISE * noise)
+    if not large.any():
+        return None
+    worst = int(np.argmax(np.where(large, deviation, 0.0)))
+    return Jump(worst + side, float(phase[worst]))

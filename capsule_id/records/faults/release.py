@@ -1,0 +1,118 @@
+"""Finds the free decay inside a record: rest before the release, and a second excitation after it."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.records.noise import NORMAL_QUARTILE
+from capsule_id.rig.filters import dominant_frequency
+
+#: Half cycles whose height is below this fraction of the largest one belong to the rest before the release.
+REST_HEIGHT = 0.2
+#: A half cycle this many times as high as an earlier one has received energy.
+GROWTH = 1.15
+#: Standard deviations of the noise below which a half cycle counts as noise.
+NOISE_HEIGHT = 5.0
+#: Shortest rest before the release that matters, in periods.
+SHORTEST_REST = 0.5
+#: The motion begins where the record leaves its first value by this fraction of its range, and by the noise above.
+DEPARTURE = 0.05
+#: The free decay begins at the first half cycle of at least this fraction of the largest one.
+FIRST_HEIGHT = 0.9
+#: A release from a held deflection: the deflection is at least this fraction of the largest half cycle.
+HELD_HEIGHT = 0.8
+
+
+@dataclass(frozen=True)
+class FreeDecay:
+    """The part of a record that is free decay.
+
+    Attributes
+    ----------
+    start : time of the highest turning point, or of the release from a held deflection, s; the first sample where the
+        record begins with free decay
+    stop : time at which another excitation begins, s; None where there is none
+    rest : duration of rest and excitation before ``start``, s; 0 where the record begins with the free decay
+    period : of the oscillation, s
+    """
+
+    start: float
+    stop: float | None
+    rest: float
+    period: float
+
+
+def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
+    """Return the free decay inside a record; None where fewer than four half cycles exceed the noise.
+
+    Parameters
+    ----------
+    time : (n,) s, increasing, evenly or unevenly spaced
+    values : (n,) displacement, velocity or acceleration
+    """
+    even = np.linspace(time[0], time[-1], len(time))
+    on_grid = np.interp(even, time, values)
+    noise = _noise(on_grid)
+    moves = _departure(on_grid, noise)
+    moving_time, moving = even[moves:], on_grid[moves:]
+    try:
+        period = 1.0 / dominant_frequency(moving_time, moving)
+    except (InputError, ZeroDivisionError):
+        return None
+    per_period = period / (even[1] - even[0])
+    if not np.isfinite(period) or per_period < 4.0 or len(moving) < 2.0 * per_period:
+        return None
+    level = _rest_level(moving, per_period)
+    times, heights = _half_cycles(moving_time, _smoothed(moving - level, per_period))
+    if len(heights) < 4:
+        return None
+    largest = int(np.argmax(heights >= FIRST_HEIGHT * np.max(heights)))
+    held = abs(float(np.median(on_grid[: moves + 1])) - level) >= HELD_HEIGHT * heights[largest]
+    start = float(moving_time[0]) if held else float(times[largest])
+    before = start - float(time[0])
+    starts_at_once = before < SHORTEST_REST * period
+    later, height = times[largest:], heights[largest:]
+    floor = max(NOISE_HEIGHT * noise, 0.25 * REST_HEIGHT * height[0])
+    # The energy of a free decay never grows. Two half cycles must show it, so that one disturbed reading does not.
+    pairs = np.maximum(height[:-1], height[1:])  # one low half cycle alone is a disturbance too
+    lowest = np.minimum.accumulate(np.concatenate([height[:1], height[:1], pairs[:-1]]))
+    grown = (height > GROWTH * lowest + floor) & (height > 2.0 * floor)
+    twice = np.flatnonzero(grown[1:] & grown[:-1])
+    stop = float(later[max(twice[0] - 1, 0)]) if len(twice) else None
+    return FreeDecay(float(time[0]) if starts_at_once else start, stop, 0.0 if starts_at_once else before, period)
+
+
+def _departure(values: np.ndarray, noise: float) -> int:
+    """Index of the last sample before the record leaves its first value for good."""
+    first = float(np.median(values[: max(3, min(len(values) // 50, 50))]))
+    limit = DEPARTURE * float(np.ptp(values)) + NOISE_HEIGHT * noise
+    away = np.abs(values - first) > limit
+    return max(int(np.argmax(away)) - 1, 0)
+
+
+def _rest_level(values: np.ndarray, per_period: float) -> float:
+    """Equilibrium: mean over whole periods at the end of the record, at most five."""
+    periods = min(5, int(len(values) / per_period))
+    return float(np.mean(values[-round(periods * per_period) :]))
+
+
+def _smoothed(values: np.ndarray, per_period: float) -> np.ndarray:
+    """Moving mean over a sixteenth of a period, which locates half cycles in noise."""
+    width = max(1, int(per_period / 16.0))
+    padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
+    return np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+
+
+def _half_cycles(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Time and height of the extremum of every half cycle, (k,) each; crossings by noise count as half cycles."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(np.signbit(values))) + 1, [len(values)]])
+    index = [left + int(np.argmax(np.abs(values[left:right]))) for left, right in itertools.pairwise(edges)]
+    return time[index], np.abs(values[index])
+
+
+def _noise(values: np.ndarray) -> float:
+    """Noise level by third differences."""
+    differences = np.abs(np.diff(values, 3))
+    return float(np.median(differences)) / (NORMAL_QUARTILE * np.sqrt(20.0))

@@ -1,0 +1,45 @@
+"""Planted faults are named in at least 95 of 100 rigs; at most 5 % of clean rigs raise any finding."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.experiments.planted import Fault, clip, duplicate, lose, named, rest, rig_of
+
+#: Fault -> codes that name it.
+FAULTS: dict[Fault, tuple[str, ...]] = {
+    duplicate: ("readings.repeated",),
+    clip: ("readings.clipped",),
+    rest: ("decays.release",),
+    lose: ("readings.gaps", "readings.jump"),
+}
+
+
+def share_named(folder: Path, fault: Fault, rigs: int) -> float:
+    """Share of ``rigs`` rigs with ``fault`` whose findings name it."""
+    hits = 0
+    for seed in range(rigs):
+        faulty = fault(rig_of(folder, seed), np.random.default_rng(1000 + seed))
+        hits += any(found.code in FAULTS[fault] for found in named(faulty))
+    return hits / rigs
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_planted_faults_are_named(tmp_path: Path, fault: Fault) -> None:
+    assert share_named(tmp_path, fault, 6) == 1.0
+
+
+def test_clean_rigs_raise_nothing(tmp_path: Path) -> None:
+    assert [found for seed in range(6) for found in named(rig_of(tmp_path, seed))] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_planted_faults_are_named_in_95_of_100_rigs(tmp_path: Path, fault: Fault) -> None:
+    assert share_named(tmp_path, fault, 100) >= 0.95
+
+
+@pytest.mark.slow
+def test_at_most_5_percent_of_clean_rigs_raise_a_finding(tmp_path: Path) -> None:
+    assert np.mean([bool(named(rig_of(tmp_path, 500 + seed))) for seed in range(200)]) <= 0.05

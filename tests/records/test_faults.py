@@ -1,0 +1,183 @@
+"""Detectors of faulty readings: each finds its fault in a decay, and finds nothing without it."""
+
+import numpy as np
+import pytest
+
+from capsule_id.records.faults.clipping import clipped_samples
+from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
+from capsule_id.records.faults.phase import phase_jump
+from capsule_id.records.faults.release import find_free_decay
+from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
+from tests.experiments.bench import K1, M1, C, released
+
+RATE = 2000.0
+PERIOD = 2.0 * np.pi / np.sqrt(K1 / M1)
+SAMPLES = PERIOD * RATE
+TIME = np.arange(1200) / RATE
+
+
+def decay(seed: int = 0, noise: float = 0.01, time: np.ndarray = TIME) -> np.ndarray:
+    """A release from 2 mm with a noise sd of ``noise`` of it, mm."""
+    return 2e3 * (released(time, 1e-3) + noise * 1e-3 * np.random.default_rng(seed).standard_normal(len(time)))
+
+
+def encoder(seed: int = 0) -> np.ndarray:
+    """The same without noise, read in steps of 0.005 mm."""
+    return 0.005 * np.round(decay(seed, 0.0) / 0.005)
+
+
+def test_the_reading_step_is_the_spacing_of_the_levels() -> None:
+    assert reading_step(np.array([1.25, 3.5, 2.75, 8.0])) == pytest.approx(0.01)
+    assert reading_step(encoder()) == pytest.approx(0.005)
+    # Steps of a third of a millimetre are no power of ten.
+    assert reading_step(np.round(decay() * 30.0) / 30.0) == pytest.approx(1.0 / 30.0)
+    assert reading_step(np.zeros(9)) == 0.0
+
+
+@pytest.mark.parametrize("level", [0.95, 0.85])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("make", [decay, encoder])
+def test_clipped_tops_are_found_and_smooth_ones_are_not(make: object, level: float, sign: float) -> None:
+    assert callable(make)
+    clear = sign * make()
+    limit = level * np.max(np.abs(clear))
+    (found,) = clipped_samples(np.clip(clear, -limit, limit), SAMPLES)
+    assert found.side == ("upper" if sign > 0 else "lower")
+    assert found.level == pytest.approx(sign * limit)
+    assert set(found.rows) <= set(np.flatnonzero(np.abs(clear) >= limit))
+    assert clipped_samples(clear, SAMPLES) == []
+
+
+def test_a_held_deflection_is_no_clipping() -> None:
+    held = np.concatenate([np.full(400, 2.0), decay(noise=0.0)])
+    assert clipped_samples(held, SAMPLES) == []
+
+
+def test_gaps_are_multiples_of_the_sampling_step() -> None:
+    kept = np.delete(TIME, [*range(300, 310), 700])
+    gaps = find_gaps(kept)
+    assert gaps is not None
+    assert gaps.rows.tolist() == [299, 689]
+    assert gaps.lost.tolist() == [10, 1]
+    assert find_gaps(TIME) is None
+    jittered = TIME + 0.2 / RATE * np.random.default_rng(0).uniform(-1, 1, len(TIME))
+    assert find_gaps(jittered) is None
+
+
+def test_rounded_times_are_found() -> None:
+    third = np.arange(900) / 3000.0
+    assert time_rounding(np.round(third, 4)) == pytest.approx(1e-4)
+    assert time_rounding(third) is None
+    assert time_rounding(TIME) is None
+
+
+def test_drop_outs_repeat_one_value_far_from_their_neighbours() -> None:
+    values = decay()
+    for value in (-8388.608, 0.0):
+        broken = values.copy()
+        places = [17, 31, 60] if value else [0, 1, 2]
+        places = [place + 5 for place in places] if value == 0.0 else places
+        broken[places] = value
+        found = dropouts(broken)
+        assert set(found) <= set(places)
+        assert len(found) == len(places)
+    assert len(dropouts(values)) == 0
+    # Impacts are short peaks of different heights.
+    hits = 0.1 * np.random.default_rng(1).standard_normal(1200)
+    hits[50::100] += np.random.default_rng(2).uniform(2.0, 6.0, 12)
+    assert len(dropouts(hits)) == 0
+
+
+def test_a_frozen_channel_keeps_its_value() -> None:
+    values = decay()
+    frozen = values.copy()
+    frozen[100:120] = frozen[99]
+    assert frozen_samples(frozen).tolist() == list(range(99, 120))
+    assert len(frozen_samples(values)) == 0
+    assert len(frozen_samples(encoder())) == 0
+
+
+@pytest.mark.parametrize("lost", [20, 40])
+@pytest.mark.parametrize("place", [40, 70, 110, 150])
+def test_lost_samples_show_as_a_jump(lost: int, place: int) -> None:
+    values = np.delete(decay(place), slice(place, place + lost))
+    jump = phase_jump(values, SAMPLES)
+    assert jump is not None
+    assert abs(jump.row - place) <= 10
+    assert phase_jump(decay(place), SAMPLES) is None
+    assert phase_jump(encoder(), SAMPLES) is None
+
+
+def test_few_lost_samples_show_in_a_quiet_record() -> None:
+    values = np.delete(decay(noise=1e-4), slice(80, 83))
+    jump = phase_jump(values, SAMPLES)
+    assert jump is not None
+    assert abs(jump.row - 80) <= 5
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_release_is_found_after_rest(held: bool) -> None:
+    before = 1.3
+    time = np.arange(round(before * RATE) + len(TIME)) / RATE
+    rest = np.full(round(before * RATE), 2.0 if held else 0.0) + 0.02 * np.random.default_rng(1).standard_normal(2600)
+    values = np.concatenate([rest, decay()])
+    found = find_free_decay(time, values)
+    assert found is not None
+    assert before - 0.05 * PERIOD <= found.start <= before + 0.6 * PERIOD
+    assert found.rest == found.start - time[0]
+    assert found.stop is None
+    assert found.period == pytest.approx(PERIOD, rel=0.05)
+    inside = time >= found.start
+    again = find_free_decay(time[inside], values[inside])
+    assert again is not None
+    assert again.rest == 0.0
+
+
+def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
+    for make in (decay, encoder):
+        found = find_free_decay(TIME, make())
+        assert found is not None
+        assert (found.start, found.rest, found.stop) == (0.0, 0.0, None)
+
+
+def test_a_second_excitation_ends_the_decay() -> None:
+    values = np.concatenate([decay(1)[:500], decay(2)])
+    time = np.arange(len(values)) / RATE
+    found = find_free_decay(time, values)
+    assert found is not None
+    assert found.stop is not None
+    assert 0.25 - PERIOD <= found.stop <= 0.25 + 0.1 * PERIOD
+    inside = time <= found.stop
+    again = find_free_decay(time[inside], values[inside])
+    assert again is not None
+    assert again.stop is None
+
+
+def rows(values: np.ndarray, label: str = "a", record: bool = True) -> Readings:
+    return Readings(label, values.reshape(len(values), -1), record)
+
+
+def test_repeated_blocks_within_and_across_records() -> None:
+    first, second = decay(1), decay(2)
+    assert repeated_blocks([rows(first), rows(second, "b")]) == []
+    second[200:260] = first[40:100]
+    (found,) = repeated_blocks([rows(first), rows(second, "b")])
+    assert (found.label, found.row, found.first, found.first_row, found.count) == ("b", 200, "a", 40, 60)
+    twice = np.concatenate([first[:300], first[200:]])
+    (found,) = repeated_blocks([rows(twice)])
+    assert (found.row, found.first_row, found.count) == (300, 200, 100)
+    assert repeated_blocks([rows(encoder())]) == []
+
+
+def test_repeated_rows_of_a_table_of_readings() -> None:
+    rng = np.random.default_rng(3)
+    table = np.stack([np.linspace(0.0, 1.0, 8), rng.standard_normal(8)], axis=1)
+    assert repeated_blocks([rows(table, record=False)]) == []
+    (found,) = repeated_blocks([rows(np.concatenate([table, table[2:3]]), record=False)])
+    assert (found.row, found.first_row, found.count) == (8, 2, 1)
+    # Coarse readings agree by chance.
+    assert repeated_blocks([rows(np.round(5.0 * rng.standard_normal(40)), record=False)]) == []
+
+
+def test_the_decay_of_these_tests_is_that_of_the_bench() -> None:
+    assert C / (2.0 * np.sqrt(K1 * M1)) == pytest.approx(0.156, abs=1e-3)
