@@ -6,6 +6,7 @@ from typing import Literal
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
 from capsule_id.report.data_messages import DATA_MESSAGES
+from capsule_id.report.posterior_messages import POSTERIOR_MESSAGES, stated_p
 from capsule_id.views import Facts, Finding, Level, Message, ResultTable
 
 #: Errors of a text that does not match its facts.
@@ -65,55 +66,6 @@ def _listed(facts: Facts) -> str:
     return ", ".join(f"{name} = {value}" for name, value in facts.items())
 
 
-def _disagreeing_starts(facts: Facts) -> str:
-    seen = (
-        f"expected {facts['starts']} starts to end at the same maximum; {facts['stalled']} stalled, {facts['elsewhere']} "
-        "ended elsewhere"
-    )
-    if "name" not in facts:
-        return f"{seen}. Look at the residuals, and at parameters that the data hardly determine."
-    return f"{seen}, the furthest {facts['distance']:.2g} posterior sd away in {facts['name']}"
-
-
-def _maxima_without_mass(facts: Facts) -> str:
-    return (
-        f"{_disagreeing_starts(facts)}. Those ends are lower by {facts['below']:.0f} in log-posterior or lie within the "
-        "sample, so they change no number."
-    )
-
-
-def _maxima_with_mass(facts: Facts) -> str:
-    if "name" not in facts:
-        return _disagreeing_starts(facts)
-    return (
-        f"{_disagreeing_starts(facts)}. Look for a second explanation of the records, or narrow the prior of that parameter "
-        "in rig.toml."
-    )
-
-
-def _modes(facts: Facts) -> str:
-    """The modes of a parameter with their weights, or how far its maximum lies from the sample."""
-    name, unit = facts["name"], facts["unit"]
-    if "modes" in facts:
-        seen = " and ".join(f"{value:.4g} {unit} with weight {weight:.2f}" for value, weight in facts["modes"])
-        return (
-            f"expected one mode of the posterior of {name}; found {seen}. Median and sd describe none of them. Add a test "
-            f"that tells them apart, or state [prior] {name} from what you know of the rig."
-        )
-    return (
-        f"expected the maximum of the posterior within 3 sd of its sample; {name} = {facts['maximum']:.4g} {unit} at the "
-        f"maximum, {facts['median']:.4g} ± {facts['sd']:.2g} {unit} in the sample ({facts['distance']:.1f} sd apart). The "
-        f"residuals and curves are those of the maximum, so no check covers the quoted number. Add readings that determine "
-        f"{name}, or state its [prior]."
-    )
-
-
-_CHAINS = (
-    "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, largest split R-hat {rhat:.4f} "
-    "({worst})"
-)
-
-
 def _coloured_residuals(facts: Facts) -> str:
     """The statistic, what drifts in the record, and the remedy of the model that predicts it."""
     seen = (
@@ -168,45 +120,22 @@ def _largest_disagreement(facts: Facts) -> str:
     (name, sd, p), *_ = facts["distances"]
     judge = " by the bench's sample" if facts["sampled"] else ""
     return (
-        f"largest disagreement in {name} ({sd:+.1f} sd of the curvature, {_stated(p)}{judge} over {facts['shared']} shared "
+        f"largest disagreement in {name} ({sd:+.1f} sd of the curvature, {stated_p(p)}{judge} over {facts['shared']} shared "
         "parameters)"
     )
 
 
 def _inconsistent(facts: Facts) -> str:
     (name, *_), *others = facts["distances"]
-    further = "".join(f", then {other} ({sd:+.1f} sd, {_stated(p)})" for other, sd, p in others)
+    further = "".join(f", then {other} ({sd:+.1f} sd, {stated_p(p)})" for other, sd, p in others)
     return (
         f"bench tests and forced runs are inconsistent: {_largest_disagreement(facts)}{further}. The bench's {name} does "
         "not fit the recorded motion. Repeat its bench test, or find what differs in the runs."
     )
 
 
-def _stated(p: float) -> str:
-    return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"
-
-
 FIT_MESSAGES: Mapping[str, Message] = {
-    "starts.agree": Message(
-        "starts agree",
-        ok="all {starts} starts of the point fit ended at the same maximum",
-        warn=_maxima_without_mass,
-        fail=_maxima_with_mass,
-    ),
-    "sample.maximum": Message(
-        "maximum and sample", ok="the sample of every physical parameter has one mode, at the maximum", fail=_modes
-    ),
-    "sample.modes": Message("maximum and sample", fail=_modes),
-    "chains.converged": Message(
-        "chains converged",
-        ok=_CHAINS,
-        warn="no sample was drawn: there are no intervals",
-        fail=(
-            "expected more than {length_wanted:.0f} autocorrelation times and R-hat <= {rhat_wanted}; found "
-            + _CHAINS
-            + " when the steps were used up. Raise --max-steps, or look for a parameter that the data do not inform."
-        ),
-    ),
+    **POSTERIOR_MESSAGES,
     "residuals.white": Message(
         "residuals white",
         ok="residuals of {records} records are white (Ljung–Box, {lags} lags)",
@@ -220,16 +149,6 @@ FIT_MESSAGES: Mapping[str, Message] = {
             "expected a chi-square of about {freedom} from the stated reading errors; found {chi_square:.0f} "
             "(p = {p:.1g}). The errors are larger than stated, or the line is not straight."
         ),
-    ),
-    "parameters.informed": Message(
-        "parameters informed",
-        ok="the data narrow the prior of every physical parameter",
-        warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
-    ),
-    "priors.tails": Message(
-        "boundary effects",
-        ok="no parameter ends in the tail of its prior",
-        warn="{names} ended in the tail of the prior, which pulls the estimate. State a wider or better placed [prior].",
     ),
     "bench_and_runs.agree": Message(
         "bench and runs agree", ok=_largest_disagreement, warn=_inconsistent, fail=_inconsistent

@@ -13,6 +13,7 @@ import numpy as np
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.experiment_checks import check_outliers, check_stated_errors, check_whiteness
 from capsule_id.inference.checks.modes import check_maximum, check_starts
+from capsule_id.inference.checks.priors import check_priors
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
@@ -39,6 +40,7 @@ def run_checks(setting: Setting) -> Setting:
         *check_stated_errors(setting),
         *_declared_findings(setting, bench=True),
         *_informed(setting),
+        *check_priors(setting),
         *_boundary(setting),
         *_declared_findings(setting, bench=False),
     ]

@@ -1,0 +1,94 @@
+"""Conflict of a stated prior, a weighing or a default prior with the rest of the data.
+
+Without the prior N(c, w²) of a parameter x with posterior N(x, S) the remaining data give the estimate
+c + (x - c)/(1 - S/w²) with variance S/(1 - S/w²). Its distance from the prior is z = (x - c)/sqrt(w² - S), standard
+normal where prior and data agree (Evans & Moshonov 2006). x is the logarithm where the prior is log-normal.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy import stats
+
+from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.trust import MASSES
+from capsule_id.inference.target.priors import prior_of
+from capsule_id.views import Finding
+
+#: Smallest part of a prior's variance that the data count as removing: below, rounding of the sample decides.
+SMALLEST_REDUCTION = 0.05
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Distance of a prior from the rest of the data.
+
+    Attributes
+    ----------
+    z : distance in sd, standard normal where both agree
+    value, sd : estimate from the rest of the data, SI
+    informed : fraction of the prior's variance that the data remove; near 0 the estimate is unreliable
+    """
+
+    z: float
+    value: float
+    sd: float
+    informed: float
+
+
+def conflicts(s: Setting) -> dict[str, Conflict]:
+    """Distance of every prior of a physical parameter and of every stated one, by name."""
+    centre, sd = _location(s)
+    found = {}
+    for i, row in enumerate(s.target.parameters):
+        if not (row.physical or row.name in s.rig.priors):
+            continue
+        prior = s.target.priors.at(i, np)
+        middle, width = float(prior.centre), float(prior.width)
+        informed = max(1.0 - float(sd[i] / width) ** 2, SMALLEST_REDUCTION)
+        alone, alone_sd = middle + (centre[i] - middle) / informed, sd[i] / np.sqrt(informed)
+        value, scale = (np.exp(alone), np.exp(alone)) if prior.lognormal else (alone, 1.0)
+        z = (centre[i] - middle) / (width * np.sqrt(informed))
+        found[row.name] = Conflict(float(z), float(value), float(scale * alone_sd), informed)
+    return found
+
+
+def check_priors(s: Setting) -> list[Finding]:
+    """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
+    findings = []
+    found = conflicts(s)
+    for name, conflict in found.items():
+        p = float(2.0 * stats.norm.sf(abs(conflict.z)))
+        if p * len(found) < LEVEL:
+            findings.append(_finding(s, name, conflict, p))
+    return findings or [Finding("priors.conflict", "ok", {"number": len(found)})]
+
+
+def _location(s: Setting) -> tuple[np.ndarray, np.ndarray]:
+    """(d,) posterior location and sd of every parameter, in the variable of its prior."""
+    lognormal = np.asarray(s.target.priors.lognormal)
+    if s.posterior is None:
+        value, sd = s.target.theta(s.fit.u), np.sqrt(np.diag(s.fit.covariance))
+        return np.where(lognormal, s.fit.u, value), sd * np.where(lognormal | ~s.target.positive, 1.0, value)
+    draws = s.posterior.draws.reshape(-1, len(s.posterior.names))
+    x = np.where(lognormal, s.target.unconstrain(draws), draws)
+    return np.median(x, axis=0), np.std(x, axis=0)
+
+
+def _finding(s: Setting, name: str, conflict: Conflict, p: float) -> Finding:
+    """The conflict of parameter ``name``; it concerns all parameters of the experiments that read it."""
+    (row,) = [row for row in s.target.parameters if row.name == name]
+    readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
+    facts = {
+        "name": name,
+        "unit": "" if row.unit == "1" else f" {row.unit}",
+        "prior": prior_of(row).describe(),
+        "stated": "rig" if name in MASSES else "prior" if name in s.rig.priors else "",
+        "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
+        "fitted": s.values[name],
+        "p": p,
+        **asdict(conflict),
+    }
+    names = dict.fromkeys([name, *(own.name for e in readers for own in e.parameters)])
+    return Finding("priors.conflict", "fail", facts, parameters=tuple(names))

@@ -1,0 +1,121 @@
+"""Texts of findings on the maximum, the sample and the priors of a fit, by code."""
+
+from collections.abc import Mapping
+
+from capsule_id.views import Facts, Message
+
+
+def stated_p(p: float) -> str:
+    """``p = 0.01``; a bound where the number underflows."""
+    return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"
+
+
+def _disagreeing_starts(facts: Facts) -> str:
+    seen = (
+        f"expected {facts['starts']} starts to end at the same maximum; {facts['stalled']} stalled, {facts['elsewhere']} "
+        "ended elsewhere"
+    )
+    if "name" not in facts:
+        return f"{seen}. Look at the residuals, and at parameters that the data hardly determine."
+    return f"{seen}, the furthest {facts['distance']:.2g} posterior sd away in {facts['name']}"
+
+
+def _maxima_without_mass(facts: Facts) -> str:
+    return (
+        f"{_disagreeing_starts(facts)}. Those ends are lower by {facts['below']:.0f} in log-posterior or lie within the "
+        "sample, so they change no number."
+    )
+
+
+def _maxima_with_mass(facts: Facts) -> str:
+    if "name" not in facts:
+        return _disagreeing_starts(facts)
+    return (
+        f"{_disagreeing_starts(facts)}. Look for a second explanation of the records, or narrow the prior of that parameter "
+        "in rig.toml."
+    )
+
+
+def _conflict(facts: Facts) -> str:
+    """The prior, what the rest of the data give, and which entry to look at."""
+    name, unit, experiments = facts["name"], facts["unit"], facts["experiments"]
+    default = f'median = {facts["value"]:.3g}, factor = 10, unit = "{unit.strip() or 1}"'
+    source, remedy = {
+        "rig": (f"[rig] {name}", f"Check value, sd and unit of {name} in rig.toml, and the units in {experiments}."),
+        "prior": (
+            f"[prior] {name}",
+            f"Check value and unit of [prior] {name} in rig.toml and the units in {experiments}; remove a guessed prior.",
+        ),
+        "": (
+            f"the default prior of {name}",
+            f"Check the units in {experiments}; if they are right, state [prior] {name} = {{ {default} }}.",
+        ),
+    }[facts["stated"]]
+    if facts["informed"] > 0.5:
+        found = f"{experiments} and the other priors give {facts['value']:.5g} ± {facts['sd']:.2g}{unit}"
+    else:
+        found = f"{experiments} and the other priors pull it to {facts['fitted']:.5g}{unit}"
+    return (
+        f"{source} ({facts['prior']}, SI) contradicts the rest of the data: {found}, {abs(facts['z']):.1f} sd away "
+        f"({stated_p(facts['p'])}). {remedy}"
+    )
+
+
+def _modes(facts: Facts) -> str:
+    """The modes of a parameter with their weights, or how far its maximum lies from the sample."""
+    name, unit = facts["name"], facts["unit"]
+    if "modes" in facts:
+        seen = " and ".join(f"{value:.4g} {unit} with weight {weight:.2f}" for value, weight in facts["modes"])
+        return (
+            f"expected one mode of the posterior of {name}; found {seen}. Median and sd describe none of them. Add a test "
+            f"that tells them apart, or state [prior] {name} from what you know of the rig."
+        )
+    return (
+        f"expected the maximum of the posterior within 3 sd of its sample; {name} = {facts['maximum']:.4g} {unit} at the "
+        f"maximum, {facts['median']:.4g} ± {facts['sd']:.2g} {unit} in the sample ({facts['distance']:.1f} sd apart). The "
+        f"residuals and curves are those of the maximum, so no check covers the quoted number. Add readings that determine "
+        f"{name}, or state its [prior]."
+    )
+
+
+_CHAINS = (
+    "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, largest split R-hat {rhat:.4f} "
+    "({worst})"
+)
+
+
+POSTERIOR_MESSAGES: Mapping[str, Message] = {
+    "starts.agree": Message(
+        "starts agree",
+        ok="all {starts} starts of the point fit ended at the same maximum",
+        warn=_maxima_without_mass,
+        fail=_maxima_with_mass,
+    ),
+    "chains.converged": Message(
+        "chains converged",
+        ok=_CHAINS,
+        warn="no sample was drawn: there are no intervals",
+        fail=(
+            "expected more than {length_wanted:.0f} autocorrelation times and R-hat <= {rhat_wanted}; found "
+            + _CHAINS
+            + " when the steps were used up. Raise --max-steps, or look for a parameter that the data do not inform."
+        ),
+    ),
+    "sample.maximum": Message(
+        "maximum and sample", ok="the sample of every physical parameter has one mode, at the maximum", fail=_modes
+    ),
+    "sample.modes": Message("maximum and sample", fail=_modes),
+    "parameters.informed": Message(
+        "parameters informed",
+        ok="the data narrow the prior of every physical parameter",
+        warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
+    ),
+    "priors.conflict": Message(
+        "priors and data", ok="{number} priors and weighings agree with the rest of the data", fail=_conflict
+    ),
+    "priors.tails": Message(
+        "boundary effects",
+        ok="no parameter ends in the tail of its prior",
+        warn="{names} ended in the tail of the prior, which pulls the estimate. State a wider or better placed [prior].",
+    ),
+}

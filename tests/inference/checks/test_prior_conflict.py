@@ -1,0 +1,149 @@
+"""A prior or weighing that the data contradict fails; each remedy in its text is applied and helps."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import capsule_id as cid
+from capsule_id.api import Fit
+from capsule_id.experiments import make_experiments
+from capsule_id.inference.checks.priors import conflicts
+from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.rig.model import PriorOverride, Rig
+from capsule_id.synthetic import synthesize
+from tests.experiments.bench import column, rig, table
+from tests.measured.folders import Entry, make_rig
+
+FACTOR = 1.05
+WIDTH = np.log(FACTOR) / stats.norm.ppf(0.975)
+CURRENT = np.linspace(0.5, 2.0, 6)
+FORCE_SD = 0.05
+
+
+def calibration(rng: np.random.Generator, median: float, K: float) -> Setting:
+    """A motor with exact currents and stated errors, and a prior of K."""
+    force = K * CURRENT + FORCE_SD * rng.standard_normal(6)
+    columns = [column("force", force, FORCE_SD), column("current", CURRENT, 1e-9)]
+    known = rig(table("motor_current", columns), priors={"K": PriorOverride(median, FACTOR)})
+    target = LogPosterior(known, make_experiments(known))
+    fit = point_fit(target, 0, 1)
+    return Setting(target, fit, None, {**target.fixed, **fit.values})
+
+
+def test_the_distance_is_that_of_prior_and_least_squares() -> None:
+    setting = calibration(np.random.default_rng(0), 2.0, 2.2)
+    (experiment,) = setting.experiments
+    slope, covariance = np.polyfit(CURRENT, experiment.observed, 1, w=np.full(6, 1.0 / FORCE_SD), cov="unscaled")
+    value, sd = slope[0], np.sqrt(covariance[0, 0])
+    found = conflicts(setting)["K"]
+    assert (found.value, found.sd) == pytest.approx((value, sd), rel=0.08)  # curvature of the logarithm
+    assert found.z == pytest.approx(np.log(value / 2.0) / np.hypot(sd / value, WIDTH), rel=0.08)
+
+
+def test_the_distance_is_standard_normal_where_prior_and_data_agree() -> None:
+    rng = np.random.default_rng(1)
+    z = [conflicts(calibration(rng, 2.0, 2.0 * np.exp(WIDTH * rng.standard_normal())))["K"].z for _ in range(60)]
+    assert stats.kstest(z, "norm").pvalue > 1e-3
+    assert max(np.abs(z)) < 3.5
+
+
+def twin(prior: str = "") -> Callable[[Path], Rig]:
+    """The decays of the default bench with one line of [prior]."""
+
+    def make(folder: Path) -> Rig:
+        synthesize(folder, 3)
+        file = folder / "rig.toml"
+        head, *entries = file.read_text().split("\n[[experiment]]")
+        decays = [entry for entry in entries if "free_vibration" in entry]
+        file.write_text("\n[[experiment]]".join([f"{head}\n[prior]\n{prior}\n", *decays]))
+        return cid.read_rig(folder)
+
+    return make
+
+
+MOTOR = Entry(
+    "motor_current", "motor", {"current [A]": CURRENT, "force [N]": 2.0 * CURRENT + 0.03 * np.cos(5.0 * CURRENT)}
+)
+TILT = Entry("static_friction", "tilt", {"angle [deg]": np.array([33.1, 33.6, 33.4, 32.9])})
+
+
+def tilts(angle: float, prior: str = "") -> Callable[[Path], Rig]:
+    entry = Entry("static_friction", "tilt", {"angle [deg]": angle * np.array([1.0, 1.1, 0.9, 1.0])})
+    return _with_prior(entry, prior)
+
+
+def pushes(prior: str = "") -> Callable[[Path], Rig]:
+    """Distances in km under the label mm."""
+    distance = 1e-6 * np.array([14.0, 30.0, 55.0, 90.0, 140.0])
+    columns = {"speed [m/s]": np.array([0.3, 0.5, 0.7, 0.9, 1.1]), "distance [mm]": distance}
+    return _with_prior(Entry("dynamic_friction", "push", columns), prior)
+
+
+def _with_prior(entry: Entry, prior: str) -> Callable[[Path], Rig]:
+    def make(folder: Path) -> Rig:
+        made = make_rig(folder, entry)
+        if not prior:
+            return made
+        file = folder / "rig.toml"
+        file.write_text(file.read_text().replace("\n[[experiment]]", f"\n[prior]\n{prior}\n[[experiment]]", 1))
+        return cid.read_rig(folder)
+
+    return make
+
+
+def fit(make: Callable[[Path], Rig], folder: Path, budget: int | None = None) -> tuple[Fit, list[str]]:
+    """The fit, and the texts of its conflicts."""
+    result = cid.fit(make(folder), budget=budget)
+    return result, [result.text(f) for f in result.findings if f.code == "priors.conflict" and f.level == "fail"]
+
+
+K1_WRONG = 'k1 = { median = 1000, factor = 1.01, unit = "N/m" }'
+
+
+def test_a_wrong_prior_that_moves_a_weighing_fails_without_and_with_a_sample(tmp_path: Path) -> None:
+    for name, budget in (("point", None), ("sample", 2_000)):
+        result, texts = fit(twin(K1_WRONG), tmp_path / name, budget)
+        assert any("[prior] k1" in text and "free_vibration_1" in text for text in texts)
+        assert any("[rig] m1" in text for text in texts)
+        assert not result.clean
+        assert {name for name in ("k1", "c", "m1") if result.summary.at[name, "trust"] == "not trusted"} == {
+            "k1",
+            "c",
+            "m1",
+        }
+    assert fit(twin(), tmp_path / "removed")[1] == []
+
+
+@pytest.mark.parametrize(
+    ("entry", "prior", "right"),
+    [
+        (MOTOR, 'K = { median = 2, factor = 3, unit = "mN/A" }', 'K = { median = 2, factor = 3, unit = "N/A" }'),
+        (TILT, 'mu = { median = 66, factor = 1.5, unit = "1" }', 'mu = { median = 0.66, factor = 1.5, unit = "1" }'),
+    ],
+)
+def test_a_prior_in_a_wrong_unit_fails_and_in_the_right_one_passes(
+    tmp_path: Path, entry: Entry, prior: str, right: str
+) -> None:
+    result, (text,) = fit(_with_prior(entry, prior), tmp_path / "wrong")
+    assert result.trust == "not trusted"
+    assert "Check value and unit of [prior]" in text
+    assert fit(_with_prior(entry, right), tmp_path / "right")[1] == []
+
+
+@pytest.mark.parametrize("rows", [tilts, pushes], ids=["tilts of 1e-9 degrees", "pushes in km"])
+def test_readings_that_the_default_prior_excludes_fail(
+    tmp_path: Path, rows: Callable[..., Callable[[Path], Rig]]
+) -> None:
+    make = tilts(1e-9) if rows is tilts else pushes()
+    result, (text,) = fit(make, tmp_path / "default")
+    assert result.trust == "not trusted"
+    assert "the default prior of mu" in text
+    if rows is pushes:  # the prior that the text proposes is accepted and ends the conflict
+        proposed = re.findall(r"state \[prior\] (mu = \{.*?\})", text)[0]
+        assert fit(pushes(proposed), tmp_path / "stated")[1] == []
