@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.experiments.kind import Estimate, Kind
+from capsule_id.experiments.lint_magnitudes import lint_magnitudes, lint_rig_quantities
 from capsule_id.records.faults.duplicates import Readings, repeated_blocks
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Finding
@@ -23,7 +24,9 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     masses = (("m1", rig.m1), ("m2", rig.m2))
     exact = [name for name, mass in masses if mass is not None and mass.sd == 0.0]
     findings = [Finding("masses.exact", "warn", {"name": name}) for name in exact]
+    findings += lint_rig_quantities(rig)
     for table in tables:
+        findings += lint_magnitudes(table, kinds[table.kind])
         findings += [found for lint_table in kinds[table.kind].lint for found in lint_table(table, rig)]
     return (*findings, *_same_files(rig, tables), *_repeated_blocks(rig, tables))
 

@@ -2,7 +2,17 @@
 
 from collections.abc import Mapping
 
-from capsule_id.views import Message
+from capsule_id.views import Facts, Message
+
+
+def _unusual(facts: Facts) -> str:
+    """The number, the usual interval, and the unit that was probably meant."""
+    meant = f" If the number is in {facts['meant']}, write that unit." if facts["meant"] else ""
+    return (
+        f"{facts['name']} is {facts['value']:.4g} {facts['unit']}; {facts['low']:.3g} to {facts['high']:.3g} {facts['unit']} "
+        f"is usual. Check the unit.{meant}"
+    )
+
 
 DATA_MESSAGES: Mapping[str, Message] = {
     "masses.exact": Message(
@@ -29,6 +39,7 @@ DATA_MESSAGES: Mapping[str, Message] = {
             "{first}. Delete the repeated rows."
         ),
     ),
+    "readings.magnitude": Message("magnitudes", warn=_unusual),
     "readings.gaps": Message(
         "gaps in a record",
         warn=(

@@ -32,12 +32,16 @@ SHORTEST_RECORD = 8
 
 @dataclass(frozen=True)
 class ColumnRule:
-    """A column: SI unit, domain, and whether its values must increase from row to row or vary."""
+    """A column: SI unit, domain, and whether its values must increase from row to row or vary.
+
+    ``usual``: lowest and highest usual magnitude, SI, where it is not that of all quantities of this unit.
+    """
 
     si: str
     domain: Domain = ANY
     increasing: bool = False
     varies: bool = False
+    usual: tuple[float, float] | None = None
 
 
 @runtime_checkable
@@ -57,11 +61,15 @@ class SettingRule(Protocol):
 
 @dataclass(frozen=True)
 class QuantityRule:
-    """``{ value = ..., unit = ... }`` as an SI float; with ``has_sd`` also ``sd``, as a ``Quantity``."""
+    """``{ value = ..., unit = ... }`` as an SI float; with ``has_sd`` also ``sd``, as a ``Quantity``.
+
+    ``usual``: as in ``ColumnRule``.
+    """
 
     si: str
     domain: Domain = POSITIVE
     has_sd: bool = False
+    usual: tuple[float, float] | None = None
 
     def read(self, document: TomlDocument, path: KeyPath, value: object) -> float | Quantity:
         """See ``SettingRule``."""
@@ -196,5 +204,5 @@ def parameter_rows(kinds: Mapping[str, KindRule]) -> dict[str, Parameter]:
 RIG_QUANTITIES: Mapping[str, QuantityRule] = {
     "m1": QuantityRule("kg", has_sd=True),
     "m2": QuantityRule("kg", has_sd=True),
-    "g": QuantityRule("m/s^2", has_sd=True),
+    "g": QuantityRule("m/s^2", has_sd=True, usual=(9.5, 10.1)),
 }

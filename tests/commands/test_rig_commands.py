@@ -115,7 +115,11 @@ def test_lint(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     uneven = good.replace("\n0.003,", "\n0.0034,")
     for name, table, finding in (
         ("good.csv", good, ""),
-        ("coarse.csv", coarse, r"coarse: 8\.\d samples per period; 20 or more are wanted. Sample faster."),
+        (
+            "coarse.csv",
+            coarse,
+            r"coarse: 8\.\d samples per period; 20 or more are wanted. Sample faster.coarse.csv: the sampling cannot tell 16 Hz .*",
+        ),
         ("short.csv", short, r"short: 1\.\d periods; 2 or more are wanted. Record for longer."),
         (
             "uneven.csv",

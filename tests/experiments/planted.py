@@ -12,6 +12,7 @@ from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Finding
+from tests.cli_tools import DATA
 
 KINDS = default_registry()
 Fault = Callable[[Rig, np.random.Generator], Rig]
@@ -97,3 +98,58 @@ def lose(rig: Rig, rng: np.random.Generator) -> Rig:
     if rng.random() < 0.5:
         kept["time"] = table["time"][: len(kept["time"])]
     return with_table(rig, index, with_values(table, **kept))
+
+
+def wrong_unit(rig: Rig, rng: np.random.Generator) -> Rig:
+    """Multiply one mass or one column by 1000, or divide it by 1000."""
+    factor = float(rng.choice([1e3, 1e-3]))
+    place = int(rng.integers(len(rig.tables) + 1))
+    if place == len(rig.tables):
+        name = str(rng.choice(["m1", "m2"]))
+        mass = getattr(rig, name)
+        return replace(rig, **{name: replace(mass, value=factor * mass.value)})
+    table = rig.tables[place]
+    name = str(rng.choice([name for name in table.columns if name != "angle"] or ["angle"]))
+    if name == "angle":
+        factor = 1e-3
+    return with_table(rig, place, with_values(table, **{name: factor * table[name]}))
+
+
+def mislabelled(rig: Rig, rng: np.random.Generator) -> Rig:
+    """Swap two columns, or turn the sign of one, of a forced run or of the pushes; numbers and units stay as written."""
+    kind = str(rng.choice(["forced_run", "dynamic_friction"], p=[0.8, 0.2]))
+    index = pick(rig, rng, kind)
+    table = rig.tables[index]
+    if kind == "dynamic_friction":
+        return with_table(rig, index, swapped(table, "speed", "distance"))
+    which = int(rng.integers(4))
+    if which == 0:
+        return with_table(rig, index, swapped(table, "x_rel", "acceleration_rod"))
+    if which == 1:
+        numbers = table["x_rel"] * table.columns["x_rel"].to_display
+        return with_table(rig, index, with_values(table, acceleration_rod=numbers))
+    if which == 2:
+        return with_table(rig, index, with_values(table, x_rel=-table["x_rel"]))
+    return with_table(rig, index, swapped(table, "x_rel", "current"))
+
+
+def swapped(table: Table, one: str, other: str) -> Table:
+    """The table with the numbers of two columns exchanged under their headers."""
+    first, second = table.columns[one], table.columns[other]
+    values = {
+        one: second.values * second.to_display / first.to_display,
+        other: first.values * first.to_display / second.to_display,
+    }
+    return with_values(table, **values)
+
+
+def run_rig(folder: Path, seed: int) -> Rig:
+    """The rig of ``data/`` with further noise on every channel of the runs."""
+    del folder
+    rig, rng = read_rig(DATA, KINDS), np.random.default_rng(seed)
+    noise = {"x_rel": 1e-5, "x_capsule": 1e-5, "acceleration_rod": 0.5, "current": 5e-3}
+    for index, table in enumerate(rig.tables):
+        if not table.bench:
+            noisy = {n: table[n] + sd * rng.standard_normal(len(table.rows)) for n, sd in noise.items()}
+            rig = with_table(rig, index, with_values(table, **noisy))
+    return rig

@@ -5,7 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.experiments.planted import Fault, clip, duplicate, lose, named, rest, rig_of
+from tests.experiments.planted import (
+    Fault,
+    clip,
+    duplicate,
+    lose,
+    mislabelled,
+    named,
+    rest,
+    rig_of,
+    run_rig,
+    wrong_unit,
+)
 
 #: Fault -> codes that name it.
 FAULTS: dict[Fault, tuple[str, ...]] = {
@@ -13,6 +24,8 @@ FAULTS: dict[Fault, tuple[str, ...]] = {
     clip: ("readings.clipped",),
     rest: ("decays.release",),
     lose: ("readings.gaps", "readings.jump"),
+    wrong_unit: ("readings.magnitude", "decays.magnitude"),
+    mislabelled: ("runs.kinematics", "runs.power", "pushes.power"),
 }
 
 
@@ -20,7 +33,8 @@ def share_named(folder: Path, fault: Fault, rigs: int) -> float:
     """Share of ``rigs`` rigs with ``fault`` whose findings name it."""
     hits = 0
     for seed in range(rigs):
-        faulty = fault(rig_of(folder, seed), np.random.default_rng(1000 + seed))
+        rig = run_rig(folder, seed) if fault is mislabelled else rig_of(folder, seed)
+        faulty = fault(rig, np.random.default_rng(1000 + seed))
         hits += any(found.code in FAULTS[fault] for found in named(faulty))
     return hits / rigs
 
@@ -32,6 +46,7 @@ def test_planted_faults_are_named(tmp_path: Path, fault: Fault) -> None:
 
 def test_clean_rigs_raise_nothing(tmp_path: Path) -> None:
     assert [found for seed in range(6) for found in named(rig_of(tmp_path, seed))] == []
+    assert named(run_rig(tmp_path, 0)) == ()
 
 
 @pytest.mark.slow
@@ -43,3 +58,4 @@ def test_planted_faults_are_named_in_95_of_100_rigs(tmp_path: Path, fault: Fault
 @pytest.mark.slow
 def test_at_most_5_percent_of_clean_rigs_raise_a_finding(tmp_path: Path) -> None:
     assert np.mean([bool(named(rig_of(tmp_path, 500 + seed))) for seed in range(200)]) <= 0.05
+    assert np.mean([bool(named(run_rig(tmp_path, 500 + seed))) for seed in range(40)]) <= 0.05

@@ -6,6 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from capsule_id.experiments.dynamic_friction.lint import MESSAGES as LINT_MESSAGES
+from capsule_id.experiments.dynamic_friction.lint import lint_pushes
 from capsule_id.experiments.families.friction import (
     CAPTIONS,
     MESSAGES,
@@ -94,8 +96,8 @@ KIND = Kind(
     template=TEMPLATE,
     informs="mu, v_s",
     captions=CAPTIONS,
-    messages=MESSAGES,
-    lint=(partial(lint_rows, fewest=5), lint_reading_errors),
+    messages={**MESSAGES, **LINT_MESSAGES},
+    lint=(partial(lint_rows, fewest=5), lint_reading_errors, lint_pushes),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

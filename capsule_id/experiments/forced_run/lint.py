@@ -10,7 +10,6 @@ from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_
 from capsule_id.records.faults.channels import (
     FEWEST_PERIODS,
     SIGN_ERRORS,
-    Phasor,
     acceleration_ratio,
     drive_power,
     phasor,
@@ -19,6 +18,10 @@ from capsule_id.records.tone import recorded_drive
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Finding, Message
 
+#: Harmonics of the drive that are compared, and the smallest share of the acceleration's standard deviation there.
+HARMONICS, STRONG = (1, 2, 3), 0.3
+#: Fewest samples in a period of the drive.
+FEWEST_SAMPLES = 4.0
 #: Admissible ratio of the recorded acceleration to that of the recorded position X1 = x_rel + x_capsule; without
 #: x_capsule its motion is unknown, so the limits are wide.
 RATIO_OF_X1, RATIO_OF_X_REL = (0.5, 2.0), (0.1, 10.0)
@@ -30,11 +33,12 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     used = np.ones(len(table.rows), dtype=bool)
     yield from lint_times(table, used)
     period = 2.0 * np.pi / table.settings.angular_frequency
-    faults = []
+    faults = list(_time_scale(table, period))
     for name in table.columns:
         # A capsule may rest at an extreme position, which is no clipping.
         if name not in ("time", "x_capsule"):
             faults += lint_channel(table, name, used, period)
+    faults = faults or [*_columns(table)]
     if "current" in table.columns and not faults:
         faults += lint_smooth(table, "current", used, period)
     yield from faults
@@ -45,8 +49,15 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if drive is not None and drive.disagrees:
         facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd}
         yield Finding("runs.frequency", "warn", facts, table.label)
-    elif not faults:
-        yield from _columns(table)
+
+
+def _time_scale(table: Table[Any], period: float) -> Iterable[Finding]:
+    """Report a stated frequency of which the record holds no period, or which its sampling cannot follow."""
+    time = table["time"]
+    samples, periods = period / float(np.median(np.diff(time))), float(time[-1] - time[0]) / period
+    if samples < FEWEST_SAMPLES or periods < 1.0:
+        facts = {"file": table.file, "periods": periods, "samples": samples}
+        yield Finding("runs.time_scale", "fail", facts, table.label)
 
 
 def _columns(table: Table[Any]) -> Iterable[Finding]:
@@ -54,22 +65,26 @@ def _columns(table: Table[Any]) -> Iterable[Finding]:
     time, Omega = table["time"], table.settings.angular_frequency
     if "x_rel" not in table.columns or (time[-1] - time[0]) * Omega < FEWEST_PERIODS * 2.0 * np.pi:
         return
-    found = {name: phasor(time, table[name], Omega) for name in table.columns if name != "time"}
-    x_rel, x_capsule = found["x_rel"], found.get("x_capsule")
-    position = x_rel
-    if x_capsule is not None:
-        position = Phasor(x_rel.value + x_capsule.value, float(np.hypot(x_rel.sd, x_capsule.sd)))
-    moves = abs(position.value) > SIGN_ERRORS * position.sd
-    if "acceleration_rod" in found and moves:
-        ratio = acceleration_ratio(position, found["acceleration_rod"], Omega)
-        low, high = RATIO_OF_X_REL if x_capsule is None else RATIO_OF_X1
-        if not low <= ratio.real <= high:
-            other = "x_rel" if x_capsule is None else "x_rel + x_capsule"
-            facts = {"file": table.file, "position": other, "ratio": ratio.real, "low": low, "high": high}
-            yield Finding("runs.kinematics", "fail", facts, table.label)
-            return
-    if "current" in found and moves:
-        power, error = drive_power(found["current"], position, Omega)
+    whole = {name: table[name] for name in table.columns if name != "time"}
+    position = whole["x_rel"] + whole.get("x_capsule", 0.0)
+    first = phasor(time, position, Omega)
+    if abs(first.value) < SIGN_ERRORS * first.sd:
+        return
+    if "acceleration_rod" in whole:
+        low, high = RATIO_OF_X1 if "x_capsule" in whole else RATIO_OF_X_REL
+        for harmonic in HARMONICS if "x_capsule" in whole else HARMONICS[:1]:
+            frequency = harmonic * Omega
+            moves, accelerates = phasor(time, position, frequency), phasor(time, whole["acceleration_rod"], frequency)
+            expected = frequency**2 * abs(moves.value)
+            strong = max(expected, abs(accelerates.value)) > STRONG * float(np.std(whole["acceleration_rod"]))
+            ratio = acceleration_ratio(moves, accelerates, frequency)
+            if strong and abs(moves.value) > SIGN_ERRORS * moves.sd and not low <= ratio.real <= high:
+                other = "x_rel + x_capsule" if "x_capsule" in whole else "x_rel"
+                facts = {"file": table.file, "position": other, "ratio": ratio.real, "low": low, "high": high}
+                yield Finding("runs.kinematics", "fail", {**facts, "harmonic": harmonic}, table.label)
+                return
+    if "current" in whole:
+        power, error = drive_power(phasor(time, whole["current"], Omega), first, Omega)
         if power < -SIGN_ERRORS * error:
             yield Finding("runs.power", "fail", {"file": table.file}, table.label)
 
@@ -82,11 +97,18 @@ MESSAGES = {
             "rad/s. Correct Omega."
         ),
     ),
+    "runs.time_scale": Message(
+        "time scale of a run",
+        fail=(
+            "{file}: the record holds {periods:.3g} periods of the stated drive with {samples:.3g} samples each. Check the "
+            "unit of time (s or ms) and that of the frequency (rad/s or Hz)."
+        ),
+    ),
     "runs.kinematics": Message(
         "columns of a run",
         fail=(
-            "{file}: acceleration_rod must be the second derivative of {position}; at the drive's frequency it is {ratio:.3g} "
-            "times that (allowed: {low:g} to {high:g}). Check the names, units and signs of these columns."
+            "{file}: acceleration_rod must be the second derivative of {position}; at {harmonic} times the drive's frequency "
+            "it is {ratio:.3g} times that (allowed: {low:g} to {high:g}). Check the names, units and signs of these columns."
         ),
     ),
     "runs.power": Message(

@@ -8,6 +8,9 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.settings import rows_in_window
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
+from capsule_id.parameters import TABLE
+from capsule_id.records.faults.aliasing import aliases
+from capsule_id.records.faults.magnitudes import USUAL, unit_meant
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.filters import dominant_frequency, sampling_step
 from capsule_id.rig.model import Rig, Table
@@ -21,7 +24,6 @@ FEWEST_PERIODS = 2
 
 def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Report faults of the record, rest before the release, low sampling rate and short length."""
-    del rig
     used = rows_in_window(table)
     yield from lint_times(table, used)
     channels = [name for name in table.columns if name != "time"]
@@ -35,7 +37,46 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         used = used & (time >= decay.start) & (time <= (np.inf if decay.stop is None else decay.stop))
         faults = faults or [found for name in channels for found in lint_smooth(table, name, used, period)]
     yield from faults
-    yield from _sampling(table, time[used], table[channels[0]][used])
+    window = time[used], table[channels[0]][used]
+    yield from _sampling(table, *window)
+    if not faults:
+        yield from _frequency(table, rig, *window)
+
+
+def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
+    """Report an unusual frequency, and frequencies that the sampling cannot tell from that of the record."""
+    even = np.linspace(time[0], time[-1], len(time))
+    frequency = dominant_frequency(even, np.interp(even, time, values))
+    low, high = USUAL["Hz"]
+    if not low <= frequency <= high:
+        facts = {"name": f"the frequency of {table.file}", "value": frequency, "unit": "Hz", "low": low, "high": high}
+        meant = unit_meant(1.0 / frequency, table.columns["time"].to_display, "s", (1.0 / high, 1.0 / low))
+        remedy = f" If the times are in {meant}, write that unit." if meant else ""
+        yield Finding("decays.magnitude", "warn", {**facts, "remedy": remedy}, table.label)
+    if rig.m1 is None:
+        return
+    stated, default = rig.priors.get("k1"), TABLE["k1"].prior
+    assert default is not None, "k1 has a default prior"
+    median, factor = default.location, default.spread
+    if stated is not None and stated.median is not None and stated.factor is not None:
+        median, factor = stated.median, stated.factor
+    k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
+    coarse = float(np.median(np.diff(time))) * frequency * SAMPLES_PER_PERIOD > 1.0
+    inside = median / factor <= k1 <= median * factor
+    if not coarse and inside:
+        return
+    others = aliases(time, values, frequency)
+    stiffnesses = rig.m1.value * (2.0 * np.pi * others) ** 2
+    possible = (stiffnesses >= median / factor) & (stiffnesses <= median * factor)
+    if possible.any():
+        facts = {
+            "file": table.file,
+            "frequency": frequency,
+            "others": ", ".join(f"{f:.4g}" for f in others[possible][:3]),
+            "k1": k1,
+            "k1s": ", ".join(f"{k:.4g}" for k in stiffnesses[possible][:3]),
+        }
+        yield Finding("decays.alias", "fail", facts, table.label)
 
 
 def _release(table: Table[Any], decay: FreeDecay) -> Iterable[Finding]:
@@ -83,6 +124,18 @@ MESSAGES = {
         fail=(
             "the energy of a free decay must not grow; it grows after {found:.5g} s. Add this line to the experiment in "
             "rig.toml: " + _line("stop")
+        ),
+    ),
+    "decays.magnitude": Message(
+        "magnitudes",
+        warn="{name} is {value:.4g} {unit}; {low:g} to {high:g} {unit} is usual. Check the unit of the times.{remedy}",
+    ),
+    "decays.alias": Message(
+        "aliasing",
+        fail=(
+            "{file}: the sampling cannot tell {frequency:.4g} Hz (k1 = {k1:.4g} N/m) from {others} Hz (k1 = {k1s} N/m). Sample "
+            'faster; or state what is known: k1 = {{ median = ..., factor = ..., unit = "N/m" }} in [prior], narrow enough '
+            "to hold one of them only."
         ),
     ),
     "decays.uneven": Message(

@@ -84,8 +84,8 @@ KIND = Kind(
     name="static_friction",
     columns={
         "angle": ColumnRule("rad", SLOPE_ANGLE),
-        "height": ColumnRule("m", POSITIVE),
-        "length": ColumnRule("m", POSITIVE),
+        "height": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
+        "length": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
     },
     sets=(("angle",), ("height", "length")),
     settings=TiltSettings,

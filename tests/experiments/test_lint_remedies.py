@@ -1,0 +1,131 @@
+"""Findings on decays and rigs, and the remedies of their texts, applied to the case that raised them."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import bench
+import numpy as np
+import pytest
+
+import capsule_id as cid
+from capsule_id.experiments.lint import lint
+from capsule_id.experiments.registry import default_registry
+from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
+from capsule_id.rig.read import read_rig
+from capsule_id.views import Finding
+
+KINDS = default_registry()
+
+
+def found(rig: Rig, *codes: str) -> list[Finding]:
+    """The findings with one of these codes."""
+    return [finding for finding in lint(rig, KINDS, rig.tables) if finding.code in codes]
+
+
+def text(finding: Finding) -> str:
+    return finding_text(finding, messages_of(KINDS))
+
+
+def write(folder: Path, time: np.ndarray, values: np.ndarray, settings: str = "", prior: str = "") -> Path:
+    """A rig folder with one decay, m."""
+    folder.mkdir(exist_ok=True)
+    rows = "".join(f"{t:.7g},{1e3 * x:.7g}\n" for t, x in zip(time, values, strict=True))
+    (folder / "decay.csv").write_text("time [s],x_rel [mm]\n" + rows, encoding="utf-8")
+    entry = f'[[experiment]]\nkind = "free_vibration"\nfile = "decay.csv"\n{settings}\n'
+    head = '[rig]\nname = "a"\nm1 = { value = 110, sd = 0.2, unit = "g" }\n'
+    (folder / "rig.toml").write_text(head + prior + entry, encoding="utf-8")
+    return folder
+
+
+def decay(time: np.ndarray, seed: int) -> np.ndarray:
+    return bench.released(time, 2e-3) + 2e-5 * np.random.default_rng(seed).standard_normal(len(time))
+
+
+def test_the_line_that_names_the_release_makes_the_fit_clean(tmp_path: Path) -> None:
+    time = np.arange(3600) / 2000.0
+    rng = np.random.default_rng(0)
+    rest = 2e-5 * rng.standard_normal(2600)
+    values = np.concatenate([rest, decay(time[:1000], 1)])
+    rig = read_rig(write(tmp_path / "rig", time, values), KINDS)
+    (finding,) = found(rig, "decays.release")
+    assert finding.level == "fail"
+    line = re.search(r"start = \{.*?\}", text(finding))
+    assert line is not None
+    result = cid.fit(read_rig(write(tmp_path / "rig", time, values, line[0]), KINDS), budget=None)
+    assert result.clean
+    k1, c = (result.summary.loc[name] for name in ("k1", "c"))
+    assert abs(k1["map"] - bench.K1) < 4.0 * k1["standard_error"]
+    assert abs(c["map"] - bench.C) < 4.0 * c["standard_error"]
+
+
+def test_the_line_that_names_a_second_excitation_ends_the_decay_there(tmp_path: Path) -> None:
+    time = np.arange(2000) / 2000.0
+    values = np.concatenate([decay(time[:800], 1), decay(time[:1200], 2)])
+    (finding,) = found(read_rig(write(tmp_path / "rig", time, values), KINDS), "decays.second")
+    line = re.search(r"stop = \{.*?\}", text(finding))
+    assert line is not None
+    rig = read_rig(write(tmp_path / "rig", time, values, line[0]), KINDS)
+    assert found(rig, "decays.second", "decays.release", "readings.jump") == []
+    assert cid.fit(rig, budget=None).clean
+
+
+def coarse(rate: float) -> Table:
+    """A lightly damped decay of 18 Hz sampled at ``rate`` Hz for 2 s."""
+    time = np.arange(round(2.0 * rate)) / rate
+    values = bench.released(time, 2e-3, c=0.3) + 1e-5 * np.random.default_rng(3).standard_normal(len(time))
+    return bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", values)])
+
+
+@pytest.mark.parametrize("rate", [25.0, 20.0, 17.0, 40.0])
+def test_an_aliased_decay_fails_unless_a_prior_excludes_the_aliases(rate: float) -> None:
+    rig = bench.rig(coarse(rate))
+    (finding,) = found(rig, "decays.alias")
+    assert finding.level == "fail"
+    assert "Sample faster" in text(finding)
+    true = bench.K1 * (1.0 - 1e-3)
+    stiffnesses = [finding.facts["k1"], *map(float, finding.facts["k1s"].split(", "))]
+    assert min(abs(np.log(k1 / true)) for k1 in stiffnesses) < 0.1
+    # The remedy: a prior that holds the frequency found, and no other.
+    narrow = {"k1": PriorOverride(finding.facts["k1"], 1.2)}
+    assert found(bench.rig(coarse(rate), priors=narrow), "decays.alias") == []
+    # A prior that holds an alias instead does not make the frequency found right.
+    if abs(np.log(finding.facts["k1"] / bench.K1)) > 0.5:
+        (again,) = found(bench.rig(coarse(rate), priors={"k1": PriorOverride(bench.K1, 1.2)}), "decays.alias")
+        assert again.level == "fail"
+
+
+def test_uneven_sampling_and_fast_sampling_have_no_aliases() -> None:
+    assert found(bench.rig(coarse(1000.0)), "decays.alias") == []
+    table = coarse(60.0)
+    rng = np.random.default_rng(4)
+    time = np.sort(rng.uniform(0.0, 2.0, 120))
+    values = bench.released(time, 2e-3, c=0.3)
+    uneven = replace(table, columns={"time": bench.column("time", time), "x_rel": bench.column("x_rel", values)})
+    assert found(bench.rig(uneven), "decays.alias") == []
+
+
+def test_a_mass_in_the_wrong_unit_is_named_with_the_unit_meant() -> None:
+    (finding,) = found(bench.rig(m1=Quantity(110.0, 0.2)), "readings.magnitude")
+    assert finding.level == "warn"
+    assert "m1 of [rig] is 110 kg" in text(finding)
+    assert "If the number is in g, write that unit." in text(finding)
+    assert found(bench.rig(m1=Quantity(0.11, 0.2)), "readings.magnitude") == []
+
+
+def test_times_in_milliseconds_labelled_seconds_are_named() -> None:
+    time = np.arange(1000) / 2000.0
+    table = bench.table("free_vibration", [bench.column("time", 1e3 * time), bench.column("x_rel", decay(time, 5))])
+    (finding,) = found(bench.rig(table), "decays.magnitude")
+    assert "If the times are in ms, write that unit." in text(finding)
+
+
+def test_pushes_with_swapped_columns_are_named() -> None:
+    speed = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+    distance = speed**2 / (2.0 * 9.81 * 0.5)
+    right = bench.table("dynamic_friction", [bench.column("speed", speed), bench.column("distance", distance)])
+    wrong = bench.table("dynamic_friction", [bench.column("speed", distance), bench.column("distance", speed)])
+    assert found(bench.rig(right), "pushes.power") == []
+    (finding,) = found(bench.rig(wrong), "pushes.power")
+    assert "the power 0.5 ±" in text(finding)
