@@ -39,7 +39,7 @@ def _maxima_with_mass(facts: Facts) -> str:
 def _conflict(facts: Facts) -> str:
     """The prior, what the rest of the data give, and which entry to look at."""
     name, unit, experiments = facts["name"], facts["unit"], facts["experiments"]
-    default = f'median = {facts["value"]:.3g}, factor = 10, unit = "{unit.strip() or 1}"'
+    default = f'median = {facts["fitted"]:.3g}, factor = 10, unit = "{unit.strip() or 1}"'
     source, remedy = {
         "rig": (f"[rig] {name}", f"Check value, sd and unit of {name} in rig.toml, and the units in {experiments}."),
         "prior": (
@@ -49,6 +49,11 @@ def _conflict(facts: Facts) -> str:
         "": (
             f"the default prior of {name}",
             f"Check the units in {experiments}; if they are right, state [prior] {name} = {{ {default} }}.",
+        ),
+        "scatter": (
+            f"the default prior of {name}",
+            f"Either the model does not follow {experiments}, or the trials scatter this much: look at the curve, then state "
+            f'[prior] {name} = {{ scale = {facts["fitted"]:.2g}, unit = "{unit.strip() or 1}" }}.',
         ),
     }[facts["stated"]]
     if facts["informed"] > 0.5:

@@ -21,6 +21,16 @@ class Domain:
         return ((values >= self.low) if self.low_allowed else (values > self.low)) & (values < self.high)
 
 
+#: Magnitudes of quantities that a rig may have, SI: their squares and ratios stay far from the limits of float64.
+SMALLEST, LARGEST = 1e-30, 1e30
+
+
+def is_plausible(values: np.ndarray | float) -> np.ndarray:
+    """Whether each value is 0 or has a magnitude between ``SMALLEST`` and ``LARGEST``, elementwise."""
+    size = np.abs(values)
+    return (size == 0.0) | ((size >= SMALLEST) & (size <= LARGEST))
+
+
 ANY = Domain("be a finite number")
 POSITIVE = Domain("be greater than 0", low=0.0)
 NOT_NEGATIVE = Domain("be 0 or greater", low=0.0, low_allowed=True)

@@ -7,6 +7,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from capsule_id.errors import InputError
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
@@ -30,6 +32,8 @@ from capsule_id.rig.toml_values import (
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the paper's value, exact where the folder states none
 _READING_ERRORS = ("_sd", "_resolution")
+#: Smallest stated reading error relative to the largest reading; below it rounding exceeds the error.
+SMALLEST_RELATIVE_ERROR = 1e-12
 
 
 def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequence[Parameter] = ()) -> Rig:
@@ -211,6 +215,10 @@ def _with_reading_error(
     for suffix in _READING_ERRORS:
         key, si = column.name + suffix, kind.columns[column.name].si
         stated[suffix] = read_quantity(document, (*path, key), entry[key], si).value if key in entry else None
+        smallest = SMALLEST_RELATIVE_ERROR * float(np.max(np.abs(column.values), initial=0.0))
+        if (size := stated[suffix]) is not None and size < smallest:
+            rule = f"{key} must not be below {SMALLEST_RELATIVE_ERROR:g} of the largest reading ({smallest:.1g} in SI units)"
+            raise document.error((*path, key), rule, f"{size:g}", "correct the value or its unit, or remove it")
     return Column(column.name, column.unit, column.to_display, column.values, stated["_sd"], stated["_resolution"])
 
 

@@ -8,6 +8,7 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
 from capsule_id.rig.formats import READERS
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.model import Column
@@ -124,6 +125,8 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
         values = scale(written, factor)
     valid = np.isfinite(values) & rule.domain.holds(values)
     _raise_at_first_false(table, name, valid, f"{name} must {rule.domain.text}", "correct the value or delete the row")
+    magnitude = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
+    _raise_at_first_false(table, name, is_plausible(values), magnitude, "correct the value or the unit of the column")
     if rule.increasing:
         rises = np.concatenate([[True], np.diff(values) > 0.0])
         _raise_at_first_false(

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from math import isfinite
 from typing import Any
 
-from capsule_id.rig.domains import ABOVE_ONE, NOT_NEGATIVE, POSITIVE, Domain
+from capsule_id.rig.domains import ABOVE_ONE, LARGEST, NOT_NEGATIVE, POSITIVE, SMALLEST, Domain, is_plausible
 from capsule_id.rig.model import PriorOverride, Quantity
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.units import UnitError, factor_to_si, scale
@@ -140,6 +140,9 @@ def _read_scaled(
         scaled = float("inf")
     if not isfinite(scaled):
         raise document.error(place, f"{name} must be a finite number", shown(number), "correct the value")
+    if not is_plausible(scaled):
+        rule = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
+        raise document.error(place, rule, shown(number), "correct the value or its unit")
     if not domain.holds(scaled):
         raise document.error(place, f"{name} must {domain.text}", shown(number), "correct the value")
     return scaled

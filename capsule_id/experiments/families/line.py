@@ -27,6 +27,20 @@ MESSAGES = {
             "(p = {p:.1g}), so {name} depends on where it is read. Use the part of the range that the runs use."
         ),
     ),
+    "lines.two_rows": Message(
+        "scatter of calibration lines",
+        warn=(
+            "two readings show nothing of their own scatter, so the sd of {name} follows from an assumed one. State {y}_sd, "
+            "or measure more rows."
+        ),
+    ),
+    "lines.step": Message(
+        "scatter of calibration lines",
+        warn=(
+            "the readings lie closer to the line than their step, so the sd of {name} follows from the step of their digits, "
+            "{step:g} {unit}. State {y}_resolution or {y}_sd."
+        ),
+    ),
     "lines.slopes": Message(
         "Calibration lines",
         caption=(

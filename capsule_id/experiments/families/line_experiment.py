@@ -24,11 +24,14 @@ from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 
 #: Default prior of a scatter: log-normal, median 1 % of the range of y, factor 100.
 SCATTER_MEDIAN, SCATTER_FACTOR = 0.01, 100.0
+#: Its factor where the table has too few rows to show any scatter.
+SCATTER_FACTOR_OF_FEW = 3.0
 
 
 def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
@@ -47,6 +50,20 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
             facts = {"name": e.slope.name, "departure": bend, "p": p}
             findings.append(Finding("lines.straight", "fail", facts, e.label))
     return findings or [Finding("lines.straight", "ok", {"number": len(lines)})]
+
+
+def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Report lines whose scatter the readings do not show: two rows, or readings closer to the line than their step."""
+    del fit
+    findings = []
+    for e in lines:
+        column = e.y_column
+        if e.errors_known or (e.n > 2 and e.step == 0.0) or (column.sd is not None and e.n < 3):
+            continue
+        code = "lines.two_rows" if e.n < 3 else "lines.step"
+        facts = {"y": e.y_name, "unit": column.unit, "step": e.step * column.to_display, "name": e.slope.name}
+        findings.append(Finding(code, "warn", facts, e.label, (e.slope.name,)))
+    return findings
 
 
 def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int]) -> tuple[float, float]:
@@ -98,6 +115,7 @@ class Line(Experiment):
     x_sd, y_sd : stated reading errors, SI
     width : sd of the intercept's prior, SI
     sd_ratio : stated ratio of both errors; None: not stated
+    step : step of the digits of y, SI, where it exceeds the scatter about the line and no error of y is stated; else 0
     symbol : symbol of the slope
     errors_known : whether both reading errors are stated
     """
@@ -108,13 +126,14 @@ class Line(Experiment):
     y_sd: float
     width: float
     sd_ratio: float | None
+    step: float
     symbol: str = eqx.field(static=True)
     x_name: str = eqx.field(static=True)
     y_name: str = eqx.field(static=True)
     errors_known: bool = eqx.field(static=True)
 
     estimates_may_be_negative = True
-    checks = (check_linearity,)
+    checks = (check_linearity, check_scatter)
     tables = (line_table,)
 
     def __init__(self, table: Table, rig: Rig, x: str, y: str, slope: Parameter, sd_ratio: float | None) -> None:
@@ -126,7 +145,12 @@ class Line(Experiment):
         self.width = NUISANCE_WIDTH * size
         self.sd_ratio = sd_ratio
         self.errors_known = x_column.sd is not None and y_column.sd is not None
-        scatter = parameter("scatter", table.label, Prior("lognormal", SCATTER_MEDIAN * size, SCATTER_FACTOR))
+        stated = y_column.sd is not None or y_column.resolution is not None
+        step = 0.0 if stated else reading_step(self.y * y_column.to_display) / y_column.to_display
+        self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
+        self.y_sd = max(self.y_sd, self.step / np.sqrt(12.0))
+        factor = SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
+        scatter = parameter("scatter", table.label, Prior("lognormal", SCATTER_MEDIAN * size, factor))
         self.about = About(table, rig, (slope,) if self.errors_known else (slope, scatter))
 
     @property

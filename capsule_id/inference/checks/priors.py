@@ -17,7 +17,7 @@ from capsule_id.inference.target.priors import prior_of
 from capsule_id.views import Finding
 
 #: Smallest part of a prior's variance that the data count as removing: below, rounding of the sample decides.
-SMALLEST_REDUCTION = 0.05
+SMALLEST_REDUCTION = 0.2
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,14 @@ class Conflict:
 
 
 def conflicts(s: Setting) -> dict[str, Conflict]:
-    """Distance of every prior of a physical parameter and of every stated one, by name."""
+    """Distance of the priors of physical parameters and scatters, and of every stated one, by name.
+
+    A scatter far above its prior is one by which the fit explains what its law does not; one below is harmless.
+    """
     centre, sd = _location(s)
     found = {}
     for i, row in enumerate(s.target.parameters):
-        if not (row.physical or row.name in s.rig.priors):
+        if not (row.physical or row.scatter or row.name in s.rig.priors):
             continue
         prior = s.target.priors.at(i, np)
         middle, width = float(prior.centre), float(prior.width)
@@ -50,6 +53,8 @@ def conflicts(s: Setting) -> dict[str, Conflict]:
         alone, alone_sd = middle + (centre[i] - middle) / informed, sd[i] / np.sqrt(informed)
         value, scale = (np.exp(alone), np.exp(alone)) if prior.lognormal else (alone, 1.0)
         z = (centre[i] - middle) / (width * np.sqrt(informed))
+        if row.scatter and row.name not in s.rig.priors:
+            z = max(z, 0.0)
         found[row.name] = Conflict(float(z), float(value), float(scale * alone_sd), informed)
     return found
 
@@ -84,7 +89,7 @@ def _finding(s: Setting, name: str, conflict: Conflict, p: float) -> Finding:
         "name": name,
         "unit": "" if row.unit == "1" else f" {row.unit}",
         "prior": prior_of(row).describe(),
-        "stated": "rig" if name in MASSES else "prior" if name in s.rig.priors else "",
+        "stated": "rig" if name in MASSES else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",
         "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
         "fitted": s.values[name],
         "p": p,

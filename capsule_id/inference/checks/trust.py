@@ -1,7 +1,7 @@
 """Which numbers of a fit may be quoted, from its findings.
 
-A failed check makes the parameters that its experiment informs not trusted. Without a sample, and where the data do
-not inform a parameter, its number is not judged: no check can tell.
+A failed check makes the parameters that its experiment informs not trusted. Without a sample, where the data do not
+inform a parameter, and where a warning names it, its number is not judged: no check can tell.
 """
 
 from collections.abc import Sequence
@@ -32,12 +32,11 @@ def trust_words(setting: Setting, informed: np.ndarray) -> dict[str, Trust]:
     informed : (d,) whether the data narrow the prior of each parameter
     """
     failed = [concerned(f, setting.experiments) for f in setting.findings if f.level == "fail"]
+    doubtful = {name for f in setting.findings if f.level == "warn" for name in f.parameters}
     words: dict[str, Trust] = {}
     for row, known in zip(setting.target.parameters, informed, strict=True):
+        judged = setting.posterior is not None and (known or row.name in MASSES) and row.name not in doubtful
+        words[row.name] = "trusted" if judged else "not judged"
         if any(names is None or row.name in names for names in failed):
             words[row.name] = "not trusted"
-        else:
-            words[row.name] = (
-                "trusted" if setting.posterior is not None and (known or row.name in MASSES) else "not judged"
-            )
     return words

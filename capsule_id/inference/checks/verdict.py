@@ -52,7 +52,8 @@ def _declared_findings(setting: Setting, bench: bool) -> Iterator[Finding]:
     for check in declared(setting.experiments, "checks", bench):
         names = dict.fromkeys(row.name for e in check.args[0] for row in e.parameters)
         for finding in check(setting):
-            yield finding if finding.experiment or finding.parameters else replace(finding, parameters=tuple(names))
+            general = finding.level == "fail" and not (finding.experiment or finding.parameters)
+            yield replace(finding, parameters=tuple(names)) if general else finding
 
 
 def declared(

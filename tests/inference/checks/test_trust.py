@@ -63,5 +63,10 @@ def test_what_the_data_do_not_inform_is_not_judged_except_a_weighing(sampled: Se
     assert words(sampled, Finding("x", "fail"), uninformed="v_s")["v_s"] == "not trusted"
 
 
+def test_a_warning_that_names_parameters_leaves_them_not_judged(sampled: Setting) -> None:
+    found = words(sampled, Finding("x", "warn", {}, "motor_current", ("K",)))
+    assert [name for name, word in found.items() if word == "not judged"] == ["K"]
+
+
 def test_the_words_are_ordered_from_best_to_worst() -> None:
     assert get_args(Trust) == ("trusted", "not judged", "not trusted")
