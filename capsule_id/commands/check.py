@@ -1,6 +1,8 @@
 """``capsule-id check DATA``: read a rig folder, describe it, list findings before a fit; fits nothing."""
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 
 from capsule_id.console import say
 from capsule_id.errors import InputError
@@ -9,13 +11,15 @@ from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.rough_values import rough_values
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import sampling_step
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
+from capsule_id.views import Finding
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DATA."""
+    """Add DATA and the option of the figures."""
     parser.add_argument("data", metavar="DATA", help="rig folder, with its rig.toml")
+    parser.add_argument("--figures", type=Path, metavar="DIR", help="draw every experiment with its findings into DIR")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -24,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        If the folder is not a valid rig.
+        If the folder is not a valid rig, or DIR cannot be written.
     """
     kinds = default_registry()
     rig = read_rig(args.data, kinds)
@@ -34,8 +38,33 @@ def run(args: argparse.Namespace) -> int:
     findings = (*lint(rig, kinds, rig.tables), *lint_settings(rig, kinds, rough_values(rig, kinds)))
     messages = messages_of(kinds)
     lines += [f"{finding.level}: {finding_text(finding, messages)}" for finding in findings]
+    if args.figures is not None:
+        lines += _draw(rig, findings, args.figures)
     say("\n".join([*lines, _number(len(findings))]))
     return 0
+
+
+def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
+    """Write a PNG file per experiment into ``folder``; return a line that says so.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    from capsule_id.report.figures.readings import readings_figure
+    from capsule_id.report.figures.style import mark, png
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for table in rig.tables:
+            figure = readings_figure(table, [found for found in findings if found.experiment == table.label])
+            if rig.synthetic:
+                mark(figure, "SYNTHETIC")
+            (folder / f"{table.label}.png").write_bytes(png(figure))
+    except OSError as error:
+        raise InputError("--figures DIR must be writable", str(error.strerror), "name another one", folder) from None
+    return [f"figures: {len(rig.tables)} in {folder}"]
 
 
 def _number(findings: int) -> str:

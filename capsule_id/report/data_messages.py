@@ -43,8 +43,8 @@ DATA_MESSAGES: Mapping[str, Message] = {
     "readings.gaps": Message(
         "gaps in a record",
         warn=(
-            "{file}:{line}: the times must be evenly spaced; found {gaps} gaps, the first after {time:.6g} s, and {lost} lost "
-            "samples of {step:.4g} s. The fit uses the times as recorded. Record without gaps."
+            "{file}:{line}: the times must be evenly spaced; found {lost} missing samples of {step:.4g} s, the first after "
+            "{time:.6g} s. The fit uses the times as recorded. Record without gaps."
         ),
     ),
     "readings.rounded_times": Message(
