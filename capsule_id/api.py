@@ -6,7 +6,7 @@ from pathlib import Path
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
-from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.families.friction_model import friction_of
 from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.pipeline import (
@@ -105,7 +105,7 @@ def fit(
         raise InputError(
             "budget must be positive", str(budget), "give 1 or more steps, or None for the point fit alone"
         )
-    law = EQUATION_1 if friction is None else FrictionModel(friction)
+    law = friction_of(rig, friction)
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
     made_from = provenance(rig, seed, experiments, law.source)
     if progress:

@@ -29,6 +29,12 @@ name = "@NAME@"
 # m2 = { value = 0.530, sd = 0.001, unit = "kg" }
 # g = { value = 9.81, unit = "m/s^2" }
 
+#: Choices of the model. friction: "stribeck" (eq. (1)) or "constant" (the same at every speed, no v_s).
+#: free: optional parameters that the fit samples: @OPTIONAL@.
+# [model]
+# friction = "stribeck"
+# free = ["ratio"]
+
 #: Priors: knowledge from before the measurement. Default priors are broad.
 #: Log-normal, 95 % within median/factor to median*factor: @LOGNORMAL@.
 #: Half-normal, by scale: @HALFNORMAL@.
@@ -44,6 +50,7 @@ def template(kinds: Registry, name: str) -> str:
     lognormal = ['"k2[<spring>]"' if row.symbol == "k2" else row.symbol for row in stated if not row.scatter]
     head = HEAD.replace("@NAME@", name).replace("@LOGNORMAL@", " ".join(lognormal))
     head = head.replace("@HALFNORMAL@", " ".join(row.symbol for row in stated if row.scatter))
+    head = head.replace("@OPTIONAL@", " ".join(row.symbol for row in kinds.parameters.values() if row.optional))
     return "\n".join([head, *(kind.template for kind in kinds.values())])
 
 

@@ -62,11 +62,17 @@ def make_experiments(
     for name, kind in kinds.items():
         kind.check([table for table in tables if table.kind == name])
     # The law loads JAX, which takes seconds. A faulty folder must be reported before.
-    from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+    from capsule_id.experiments.families.friction_model import friction_of
 
-    model = EQUATION_1 if friction is None else FrictionModel(friction)
+    model = friction_of(rig, friction)
     model.check(kinds.parameters)
     made = tuple(e for table in tables for e in kinds[table.kind].make(table, rig, model))
+    measured = {row.symbol for e in made for row in e.parameters}
+    for symbol in rig.model.free if experiments == "all" else ():
+        if symbol not in measured:
+            rule = f"an experiment must measure {symbol}, which [model] sets free"
+            remedy = f'remove "{symbol}" from free, or add an experiment with a sliding capsule'
+            raise InputError(rule, "none", remedy, rig.folder / "rig.toml")
     for e in made:
         for mass in e.masses:
             if getattr(rig, mass) is None:

@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
+
+from capsule_id.parameters import Prior
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,29 @@ class PriorOverride:
     median: float | None = None
     factor: float | None = None
     scale: float | None = None
+
+    @property
+    def prior(self) -> Prior:
+        """The stated density."""
+        if self.scale is not None:
+            return Prior("halfnormal", 0.0, self.scale)
+        assert self.median is not None, "the schema requires median and factor"
+        assert self.factor is not None, "the schema requires median and factor"
+        return Prior("lognormal", self.median, self.factor)
+
+
+@dataclass(frozen=True)
+class ModelChoices:
+    """The choices of ``[model]``.
+
+    Attributes
+    ----------
+    friction : "stribeck": eq. (1); "constant": the same friction at every speed, ratio = 1 and no v_s
+    free : symbols of the optional parameters that a fit samples
+    """
+
+    friction: Literal["stribeck", "constant"] = "stribeck"
+    free: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -100,6 +125,7 @@ class Rig:
     priors : overrides by parameter name (``k1``, ``k2[L60]``, ``tilt_sd``, ...)
     tables : in the order of ``rig.toml``
     files : sha256 of every file read, by relative path
+    model : the choices of ``[model]``
     """
 
     name: str
@@ -111,6 +137,7 @@ class Rig:
     tables: tuple[Table[Any], ...]
     files: Mapping[str, str]
     folder: Path
+    model: ModelChoices = ModelChoices()
 
     @property
     def has_runs(self) -> bool:

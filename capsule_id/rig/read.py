@@ -12,6 +12,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
+from capsule_id.rig.choices import check_masses_of_free, read_model
 from capsule_id.rig.decode import decode
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
@@ -58,7 +59,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     folder = Path(folder)
     document, sha256 = _read_document(folder)
     data = document.data
-    refuse_unknown_keys(document, (), data, ("rig", "prior", "experiment"))
+    refuse_unknown_keys(document, (), data, ("rig", "model", "prior", "experiment"))
     if "rig" not in data:
         raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", document.path, 1, 1)
     head = read_table(document, ("rig",), data["rig"], "[rig]")
@@ -73,7 +74,9 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         if key in head
     }
     tables, files = _read_experiments(document, kinds)
+    model = read_model(document)
     _check_masses(document, tables, kinds, set(stated))
+    check_masses_of_free(document, model, tables, kinds, set(stated))
     return Rig(
         name=name,
         synthetic=synthetic,
@@ -84,6 +87,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         tables=tables,
         files=MappingProxyType({"rig.toml": sha256, **files}),
         folder=folder,
+        model=model,
     )
 
 

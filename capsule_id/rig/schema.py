@@ -131,6 +131,7 @@ class KindRule:
         ``Annotated[type, rule]`` any other. A field with a default may be absent
     rules : each raises an ``InputError`` where columns and settings are inconsistent
     masses : the masses of [rig] that an experiment with this table needs
+    masses_of_free : the masses that an experiment needs where ``[model] free`` names a parameter, by its symbol
     parameters : rows of the parameters that only experiments of this kind have
     bench : a bench test; else a forced run
     """
@@ -143,6 +144,7 @@ class KindRule:
     settings: type[Settings] = Settings
     rules: tuple[Callable[["Entry[Any]"], None], ...] = ()
     masses: Callable[[Table[Any]], tuple[str, ...]] = field(default=lambda table: ())
+    masses_of_free: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     parameters: tuple[Parameter, ...] = ()
     bench: bool = True
 

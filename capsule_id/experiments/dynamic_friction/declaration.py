@@ -10,6 +10,7 @@ from capsule_id.experiments.dynamic_friction.lint import MESSAGES as LINT_MESSAG
 from capsule_id.experiments.dynamic_friction.lint import lint_pushes
 from capsule_id.experiments.families.friction import (
     CAPTIONS,
+    MASSES_OF_FREE,
     MESSAGES,
     check_scatter,
     friction_estimates,
@@ -88,6 +89,7 @@ KIND = Kind(
     sets=(("speed", "distance"),),
     settings=PushSettings,
     masses=lambda table: ("m1", "m2") if table.settings.forward == "capsule" else (),
+    masses_of_free=MASSES_OF_FREE,
     parameters=(PUSH_SCATTER,),
     make=made_by(
         "capsule_id.experiments.dynamic_friction.experiment:DynamicFriction",

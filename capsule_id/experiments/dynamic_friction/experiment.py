@@ -59,5 +59,8 @@ class DynamicFriction(FrictionExperiment):
         """Points by the paper's formula: mu = v^2/(2gd) at the initial speed."""
         return self.speed, self.speed**2 / (2.0 * self.rig.g.value * self.distance)
 
+    def point_errors(self) -> tuple[np.ndarray, float]:
+        return np.hypot(self.distance_sd / self.distance, 2.0 * self.speed_sd / self.speed), 1.0
+
     def starts(self) -> dict[str, Start]:
         return {**self.rough_starts(), "push_scatter": Start(0.02, 0.3)}

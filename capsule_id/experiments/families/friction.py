@@ -18,7 +18,33 @@ CAPTIONS = {
     "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours."
 }
 
+#: A friction coefficient holds the viscous part as a force per weight.
+MASSES_OF_FREE = {"viscous": ("m1", "m2")}
+
 MESSAGES = {
+    "friction.variants": Message(
+        "friction law",
+        ok=(
+            "{name} is not told from the best of {count} friction laws (Bayes factor {factor:.2g}). The simplest law that "
+            "the readings do not tell from the best is {simplest}: {line} in [model]"
+        ),
+        fail=(
+            "{labels}: expected readings that {name} explains; found them {factor:.3g} times more probable under another "
+            "friction law. Write in [model] of rig.toml: {line}"
+        ),
+        caption=(
+            "Friction laws fitted to the friction experiments alone: posterior mean ± sd, largest log-likelihood, BIC and "
+            "log marginal likelihood (differences from the best), p-value of residuals ordered by speed."
+        ),
+    ),
+    "friction.order": Message(
+        "friction against speed",
+        ok="the residuals show no order in speed (p = {p:.2g})",
+        fail=(
+            "{labels}: expected residuals without order in speed; found neighbours of one sign under {name} (p = {p:.2g}). "
+            "Compare the friction laws in the report, or repeat the readings at more speeds."
+        ),
+    ),
     "friction.one_surface": Message(
         "experiments agree",
         ok="mu = {mu_tilts:.3f} by tilting, {mu_slides:.3f} by sliding (p = {p:.2g})",
@@ -26,7 +52,7 @@ MESSAGES = {
             "{tilts} and {slides}: expected one surface; found mu = {mu_tilts:.3f} by tilting and {mu_slides:.3f} by "
             "sliding (p = {p:.2g}). Measure both on the same surface, and read the tilt at break-away."
         ),
-    )
+    ),
 }
 
 

@@ -1,18 +1,23 @@
 """Friction experiments: coefficient against velocity (Fig. 2), the paper's protocol, consistency of the surface."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from scipy.optimize import curve_fit
+from scipy.optimize import OptimizeWarning, curve_fit
 
 from capsule_id.experiments.base import Start, ValuesBySymbol, band
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.families.friction_checks import check_variants, variant_table
 from capsule_id.experiments.families.friction_model import SurfaceExperiment
 from capsule_id.physics.friction import CoulombStribeck, slide_distance
 from capsule_id.views import Comparison, Curve, Finding, Points
+
+#: Lower bound of v_s in the paper's fit, m/s.
+LOWEST_V_S = 1e-6
 
 
 def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
@@ -23,7 +28,8 @@ def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
 def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, float]:
     """Fit eq. (1) by least squares to points (speed, coefficient), as in the paper; static points have speed 0.
 
-    Return mu and, with at least one sliding point, v_s; empty if the fit does not converge.
+    Return mu and, with at least one sliding point, v_s. v_s is left out where its standard error exceeds its value, and
+    everything where the fit does not converge or ends at its lower bound of v_s: mu is then not determined either.
     """
     sliding = speed > 0.0
     if not sliding.any():
@@ -32,16 +38,22 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
         return {}
     start = (float(np.max(coefficient)), float(np.median(speed[sliding])))
     try:
-        (mu, v_s), _ = curve_fit(
-            lambda v, mu, v_s: unit_law(mu, v_s).forward(v),
-            speed,
-            coefficient,
-            p0=start,
-            bounds=([0.0, 1e-6], [np.inf, np.inf]),
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", OptimizeWarning)
+            (mu, v_s), covariance = curve_fit(
+                lambda v, mu, v_s: unit_law(mu, v_s).forward(v),
+                speed,
+                coefficient,
+                p0=start,
+                bounds=([0.0, LOWEST_V_S], [np.inf, np.inf]),
+            )
     except RuntimeError:
         return {}
-    return {"mu": float(mu), "v_s": float(v_s)}
+    if v_s < 1.01 * LOWEST_V_S:
+        return {}
+    # Two points determine both values, without a standard error.
+    known = len(speed) == 2 or np.sqrt(covariance[1, 1]) <= v_s
+    return {"mu": float(mu), "v_s": float(v_s)} if known else {"mu": float(mu)}
 
 
 def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> list[Finding]:
@@ -68,11 +80,16 @@ class FrictionExperiment(SurfaceExperiment):
     """A friction experiment; all of them share the friction law, the paper's protocol and one panel."""
 
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
-    checks = (check_one_surface,)
+    checks = (check_one_surface, check_variants)
+    tables = (variant_table,)
 
     @property
     def masses(self) -> tuple[str, ...]:
         return self.friction.masses
+
+    @abstractmethod
+    def point_errors(self) -> tuple[Any, Any]:
+        """Relative sd of the paper's points from the reading errors, and per unit of the scatter; () or (n,) each."""
 
     @abstractmethod
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:

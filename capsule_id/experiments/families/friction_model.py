@@ -12,10 +12,12 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import ModelChoices, Rig, Table
 
 #: Symbol of the leaf that holds the normal force, N.
 NORMAL_FORCE = "N"
+#: Values of eq. (1) at which the friction is the same at every speed; v_s is then any positive number.
+CONSTANT = {"ratio": 1.0, "v_s": 1.0}
 #: Prior draws at which a parameter may change the break-away force.
 PRIOR_DRAWS = 64
 #: Relative changes of the break-away force below this are rounding.
@@ -57,6 +59,7 @@ class FrictionModel:
     ----------
     law : its class; eq. (1) by default
     free : symbols of the optional parameters that are sampled; the others keep their defaults
+    constant : eq. (1) with ratio 1: the same friction at every speed, without v_s
 
     Raises
     ------
@@ -67,6 +70,7 @@ class FrictionModel:
 
     law: type[FrictionLaw] = CoulombStribeck
     free: tuple[str, ...] = ()
+    constant: bool = False
 
     def __post_init__(self) -> None:
         law, wanted = self.law, ("parameters", "forward", "backward")
@@ -94,7 +98,8 @@ class FrictionModel:
         """Name for legends."""
         if self.law is not CoulombStribeck:
             return self.law.__name__
-        return ", ".join(["eq. (1)", *(f"free {symbol}" for symbol in self.free)])
+        words = ["constant friction" if self.constant else "eq. (1)", *(f"free {symbol}" for symbol in self.free)]
+        return ", ".join(words)
 
     @property
     def is_proportional(self) -> bool:
@@ -105,7 +110,8 @@ class FrictionModel:
     def parameters(self) -> tuple[Parameter, ...]:
         """The sampled parameters."""
         rows = (row for row in self.law.parameters if row.symbol != NORMAL_FORCE)
-        return tuple(row for row in rows if not row.optional or row.symbol in self.free)
+        sampled = (row for row in rows if not row.optional or row.symbol in self.free)
+        return tuple(row for row in sampled if not (self.constant and row.symbol in CONSTANT))
 
     @property
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
@@ -152,7 +158,8 @@ class FrictionModel:
 
     def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
         """Resistance per weight (m1 + m2) g at ``theta``, 1; theta has ``masses`` and g."""
-        if self.is_proportional:
+        # Without masses only the break-away coefficient is read, and nothing viscous acts at rest.
+        if self.is_proportional or (self.law is CoulombStribeck and not {"m1", "m2"} <= set(theta)):
             return self._at(theta, 1.0)
         return PerWeight(self.force(theta), _weight(theta))
 
@@ -160,7 +167,7 @@ class FrictionModel:
         # Parameters that tilts do not sample have no effect at rest, so any value is valid there.
         known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in self.parameters}
         constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
-        return cast(Any, self.law)(**known, **constant)
+        return cast(Any, self.law)(**known, **constant, **(CONSTANT if self.constant else {}))
 
 
 def _prior_of(row: Parameter) -> Prior:
@@ -174,6 +181,22 @@ def _weight(theta: ValuesBySymbol) -> Any:
 
 #: Default friction law: eq. (1) of the paper.
 EQUATION_1 = FrictionModel()
+
+
+def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel:
+    """Return the friction model of a fit: the class ``law``, by default eq. (1) with the choices of ``[model]``.
+
+    Raises
+    ------
+    InputError
+        If both ``law`` and ``[model]`` choose the friction, or ``law`` cannot be fitted.
+    """
+    if law is None:
+        return FrictionModel(free=rig.model.free, constant=rig.model.friction == "constant")
+    if rig.model != ModelChoices():
+        rule, remedy = "a friction law of its own replaces [model]", "remove friction and free from [model]"
+        raise InputError(rule, f"both {law.__name__} and [model]", remedy, rig.folder / "rig.toml")
+    return FrictionModel(law)
 
 
 class SurfaceExperiment(Experiment):

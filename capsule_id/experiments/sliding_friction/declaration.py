@@ -4,6 +4,7 @@ from functools import partial
 
 from capsule_id.experiments.families.friction import (
     CAPTIONS,
+    MASSES_OF_FREE,
     MESSAGES,
     check_scatter,
     friction_estimates,
@@ -36,6 +37,7 @@ KIND = Kind(
     },
     sets=(("speed", "force"), ("speed", "coefficient")),
     masses=lambda table: ("m1", "m2") if "force" in table.columns else (),
+    masses_of_free=MASSES_OF_FREE,
     parameters=(SLIDING_SCATTER,),
     make=made_by("capsule_id.experiments.sliding_friction.experiment:SlidingFriction"),
     template=TEMPLATE,

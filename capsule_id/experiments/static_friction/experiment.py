@@ -10,6 +10,7 @@ from capsule_id.experiments.families.friction_experiment import FrictionExperime
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.static_friction.declaration import TILT_SD
+from capsule_id.physics.friction import CoulombStribeck
 from capsule_id.rig.model import Rig, Table
 
 
@@ -33,6 +34,11 @@ class StaticFriction(FrictionExperiment):
         self.angle, self.reading_sd = _angles(table)
 
     @property
+    def masses(self) -> tuple[str, ...]:
+        """None for eq. (1): its break-away coefficient is mu."""
+        return () if self.friction.law is CoulombStribeck else self.friction.masses
+
+    @property
     def scatters(self) -> tuple[str]:
         return ("tilt_sd",)
 
@@ -47,6 +53,10 @@ class StaticFriction(FrictionExperiment):
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Points by the paper's formula: mu = tan(angle) at speed 0."""
         return np.zeros(self.n), np.tan(self.angle)
+
+    def point_errors(self) -> tuple[np.ndarray, np.ndarray]:
+        per_angle = 2.0 / np.sin(2.0 * self.angle)
+        return self.reading_sd * per_angle, per_angle
 
     def starts(self) -> dict[str, Start]:
         scatter = np.std(self.angle, ddof=1) if self.n > 1 else 0.0

@@ -90,12 +90,4 @@ def prior_sd(row: Parameter) -> float:
 
 def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
     """Return the row with the prior of ``rig.toml``, where one is stated."""
-    if stated is None:
-        return row
-    if stated.scale is not None:
-        prior = Prior("halfnormal", 0.0, stated.scale)
-    else:
-        assert stated.median is not None, "the schema requires median and factor"
-        assert stated.factor is not None, "the schema requires median and factor"
-        prior = Prior("lognormal", stated.median, stated.factor)
-    return row.named(row.of, prior)
+    return row if stated is None else row.named(row.of, stated.prior)

@@ -63,7 +63,7 @@ def test_the_quoted_number_and_the_curve_follow_the_readings_of_nearly_constant_
     (panel,) = result.comparisons
     ours = next(curve for curve in panel.curves if curve.role == "ours")
     assert 0.45 < ours.y[0] < 0.6
-    assert result.clean
+    assert [f.code for f in result.findings if f.level == "fail"] == ["friction.variants"]
 
 
 def test_a_maximum_away_from_the_sample_fails_and_names_both(tmp_path: Path) -> None:
@@ -115,4 +115,6 @@ def test_the_rack_gives_a_coefficient_within_its_readings(tmp_path: Path) -> Non
     mu = result.summary.loc["mu"]
     assert np.min(coefficient) < mu["value"] < np.max(coefficient)
     assert mu["map"] == pytest.approx(mu["value"], abs=mu["sd"])
-    assert mu["trust"] == "trusted"
+    # The friction is the same at every speed, which eq. (1) does not explain (tests/experiments/test_friction_variants.py).
+    assert [f.code for f in result.findings if f.level == "fail"] == ["friction.variants"]
+    assert mu["trust"] == "not trusted"

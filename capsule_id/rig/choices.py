@@ -1,0 +1,66 @@
+"""Reads ``[model]`` of ``rig.toml``: the friction law and the optional parameters that a fit samples."""
+
+from collections.abc import Mapping, Sequence
+from typing import get_args, get_type_hints
+
+from capsule_id.parameters import TABLE
+from capsule_id.rig.model import ModelChoices, Table
+from capsule_id.rig.schema import KindRule
+from capsule_id.rig.toml_document import TomlDocument
+from capsule_id.rig.toml_values import closest, read_choice, read_table, refuse_unknown_keys, shown
+
+#: Words that ``free`` may hold.
+OPTIONAL = tuple(symbol for symbol, row in TABLE.items() if row.optional)
+
+
+def read_model(document: TomlDocument) -> ModelChoices:
+    """Return the choices of ``[model]``; the defaults where it is absent.
+
+    Raises
+    ------
+    InputError
+        If a key or word is unknown or repeated, or a free parameter has no effect in the chosen law.
+    """
+    head = read_table(document, ("model",), document.data.get("model", {}), "[model]")
+    refuse_unknown_keys(document, ("model",), head, ("friction", "free"))
+    words = get_args(get_type_hints(ModelChoices)["friction"])
+    friction = read_choice(document, ("model", "friction"), head.get("friction", words[0]), words)
+    constant = friction == "constant"
+    free = head.get("free", [])
+    path = ("model", "free")
+    if not isinstance(free, list):
+        raise document.error(path, "free must be a list of words", shown(free), f'write free = ["{OPTIONAL[0]}"]')
+    for index, word in enumerate(free):
+        if word not in OPTIONAL:
+            near = closest(word, OPTIONAL) if isinstance(word, str) else None
+            remedy = f"write {near}" if near else f"write some of {' '.join(OPTIONAL)}"
+            raise document.error(path, "free must name optional parameters", shown(word), remedy)
+        if word in free[:index]:
+            raise document.error(path, "free must name each parameter once", shown(word), "remove the second one")
+    if constant and "ratio" in free:
+        remedy = 'remove "ratio" from free, or remove friction = "constant"'
+        raise document.error(path, "constant friction has no ratio", shown("ratio"), remedy)
+    return ModelChoices("constant" if constant else "stribeck", tuple(symbol for symbol in OPTIONAL if symbol in free))
+
+
+def check_masses_of_free(
+    document: TomlDocument,
+    model: ModelChoices,
+    tables: Sequence[Table],
+    kinds: Mapping[str, KindRule],
+    stated: set[str],
+) -> None:
+    """Refuse a free parameter whose unit an experiment converts by a mass that [rig] does not state.
+
+    Raises
+    ------
+    InputError
+        At the word in ``free``; it names the experiment and the missing mass.
+    """
+    for symbol in model.free:
+        for table in tables:
+            for mass in kinds[table.kind].masses_of_free.get(symbol, ()):
+                if mass not in stated:
+                    rule = f"free {symbol} needs {mass}, because {table.label} gives friction without the weight"
+                    remedy = f'add {mass} = {{ value = ..., sd = ..., unit = "kg" }} to [rig], or remove "{symbol}"'
+                    raise document.error(("model", "free"), rule, f"no {mass} in [rig]", remedy)
