@@ -141,6 +141,15 @@ FIT_MESSAGES: Mapping[str, Message] = {
         ok="residuals of {records} records are white (Ljung–Box, {lags} lags)",
         fail=_coloured_residuals,
     ),
+    "trials.order": Message(
+        "order of trials",
+        ok="residuals of neighbouring rows are uncorrelated in {number} tables",
+        fail=(
+            "expected residuals without order; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
+            "(p = {p:.1g}). The trials drift or come in sessions, and the sd is too small by a factor of about {factor:.1f}. "
+            "Repeat the trials in random order, with the test set up anew between them."
+        ),
+    ),
     "outliers": Message("outliers", ok="no reading stands apart from the others of its table", fail=_outliers),
     "errors.stated": Message(
         "stated errors",

@@ -27,6 +27,15 @@ MESSAGES = {
             "(p = {p:.1g}), so {name} depends on where it is read. Use the part of the range that the runs use."
         ),
     ),
+    "lines.replicates": Message(
+        "repeated readings",
+        ok="the means of repeated readings lie on {number} calibration lines",
+        fail=(
+            "expected the means of repeated readings on the line; they deviate by {deviation:.1f} sd of a reading "
+            "(p = {p:.1g}), so {name} has errors that repetition does not show. Set {x} anew before each reading, and check "
+            "for hysteresis."
+        ),
+    ),
     "lines.two_rows": Message(
         "scatter of calibration lines",
         warn=(

@@ -21,6 +21,7 @@ from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.families.line_replicates import check_replicates
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -133,7 +134,7 @@ class Line(Experiment):
     errors_known: bool = eqx.field(static=True)
 
     estimates_may_be_negative = True
-    checks = (check_linearity, check_scatter)
+    checks = (check_linearity, check_replicates, check_scatter)
     tables = (line_table,)
 
     def __init__(self, table: Table, rig: Rig, x: str, y: str, slope: Parameter, sd_ratio: float | None) -> None:
