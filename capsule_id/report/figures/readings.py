@@ -22,6 +22,8 @@ from capsule_id.report.figures.style import (
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
+#: A record with more samples than this is a line without markers.
+MOST_MARKERS = 200
 #: Marks of rows that findings name: code, words of the legend, marker, colour.
 _MARKS = (
     ("readings.clipped", "clipped", "v", VERMILION),
@@ -65,8 +67,8 @@ def channel_with_findings(
     y = _displayed(table, name)
     x = _displayed(table, across) if across else np.arange(1.0, len(y) + 1.0)
     record = "time" in table.columns
-    style = {"lw": 0.8} if record and len(y) > 200 else {"lw": 0.8 if record else 0.0, "marker": "o", "ms": 3.5}
-    ax.plot(x, y, color=BLUE, label="readings", **style)
+    marker = "" if record and len(y) > MOST_MARKERS else "o"
+    ax.plot(x, y, color=BLUE, lw=0.8 if record else 0.0, marker=marker, ms=3.5, label="readings")
     if record:
         _mark_times(table, findings, ax)
     for code, words, marker, color in _MARKS:
