@@ -56,6 +56,9 @@ if TYPE_CHECKING:
     from capsule_id.motions.sweep import continuation as continuation
     from capsule_id.motions.sweep import diagram as diagram
     from capsule_id.motions.sweep import motion_map as motion_map
+    from capsule_id.physics.drives.pulses import Pulses as Pulses
+    from capsule_id.physics.drives.recorded import RecordedDrive as RecordedDrive
+    from capsule_id.physics.drives.recorded import RodMotion as RodMotion
     from capsule_id.physics.model import CapsuleParameters as CapsuleParameters
     from capsule_id.physics.model import Excitation as Excitation
     from capsule_id.physics.model import Status as Status
@@ -74,9 +77,12 @@ _MODULE_OF = {
     "fit": "capsule_id.api",
     "InputError": "capsule_id.errors",
     "motion_map": "capsule_id.motions.sweep",
+    "Pulses": "capsule_id.physics.drives.pulses",
     "read_rig": "capsule_id.api",
+    "RecordedDrive": "capsule_id.physics.drives.recorded",
     "Response": "capsule_id.motions.response",
     "response": "capsule_id.motions.response",
+    "RodMotion": "capsule_id.physics.drives.recorded",
     "Settling": "capsule_id.motions.response",
     "simulate": "capsule_id.physics.model",
     "Smoothing": "capsule_id.physics.smooth.engine",

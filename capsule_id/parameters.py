@@ -70,6 +70,7 @@ class Parameter:
     sign : the sign that the model admits
     scatter : a standard deviation, absolute or relative; it scales residuals and changes no prediction
     sampled : False for constants, which a fit never samples
+    may_be_infinite : True where infinity is a value: a gap that is never closed
     default : value of the model where none is given, SI, or the symbol of the parameter that it equals then; None: a
         value must be given. A fit samples a row with a default and a prior where ``[model] free`` names it
     table_1 : the paper's value (Table 1), SI
@@ -88,6 +89,7 @@ class Parameter:
     sampled: bool = True
     table_1: float | None = None
     default: float | str | None = None
+    may_be_infinite: bool = False
 
     @property
     def name(self) -> str:
@@ -131,7 +133,7 @@ class Parameter:
     def admits(self, value: Any) -> Any:
         """Whether ``value`` is finite and has an admissible sign, elementwise; number, NumPy or JAX array."""
         bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": value == value}[self.sign]
-        return (abs(value) < np.inf) & bound
+        return bound if self.may_be_infinite else (abs(value) < np.inf) & bound
 
 
 def _lognormal(median: float, factor: float) -> Prior:
@@ -184,35 +186,77 @@ TABLE: Mapping[str, Parameter] = {
             "viscous", "N s/m", "viscous friction of the ground", r"b_\mathrm{g}", _lognormal(1.0, 100.0),
             leaf="capsule", sign="not negative", default=0.0,
         ),
-        Parameter("G", "m", "gap between rod and support spring", "G", leaf="capsule", sign="not negative"),
+        Parameter(
+            "G", "m", "gap between rod and support spring", "G",
+            leaf="capsule", sign="not negative", may_be_infinite=True,
+        ),
         Parameter(
             "g", "m/s^2", "acceleration of gravity", "g",
             leaf="capsule", sign="not negative", sampled=False, table_1=9.81,
+        ),
+        Parameter(
+            "k_cubic", "N/m^3", "cubic stiffness between rod and capsule", r"k_\mathrm{cubic}",
+            leaf="capsule", sign="any", default=0.0,
+        ),
+        Parameter(
+            "c2", "N s/m", "damping of the closed contact", "c_2", leaf="capsule", sign="not negative", default=0.0
+        ),
+        Parameter(
+            "k2_back", "N/m", "stiffness of the back spring", r"k_{2,-}",
+            leaf="capsule", sign="not negative", default=0.0,
+        ),
+        Parameter(
+            "G_back", "m", "gap between rod and back spring", "G_-",
+            leaf="capsule", sign="not negative", default=np.inf, may_be_infinite=True,
+        ),
+        Parameter(
+            "slope", "rad", "slope of the ground, +X uphill", r"\alpha",
+            leaf="capsule", sign="any", sampled=False, default=0.0,
+        ),
+        Parameter(
+            "N0", "N", "force that presses the capsule down besides the weight", "N_0",
+            leaf="capsule", sign="any", sampled=False, default=0.0,
         ),
         Parameter("P_d", "N", "amplitude of the drive", "P_d", leaf="drive", sign="any"),
         Parameter(
             "Omega", "rad/s", "angular frequency of the drive", r"\Omega", leaf="drive", sign="any", sampled=False
         ),
         Parameter("phase", "rad", "phase of the drive", r"\varphi", physical=False, leaf="drive", sign="any", default=0.0),
+        Parameter(
+            "reaction", "1", "share of the drive's force that pushes the capsule back", r"\rho_\mathrm{D}",
+            physical=False, leaf="drive", sign="any", sampled=False, default=0.0,
+        ),
+        Parameter("P_on", "N", "force of a pulse", r"P_\mathrm{on}", leaf="drive", sign="any"),
+        Parameter("P_off", "N", "force between pulses", r"P_\mathrm{off}", leaf="drive", sign="any", default=0.0),
+        Parameter("period", "s", "period of the pulses", "T", leaf="drive", sampled=False),
+        Parameter(
+            "duty", "1", "share of the period in which the pulse is on", r"\delta",
+            leaf="drive", sign="any", sampled=False,
+        ),
+        Parameter("lag", "s", "lag of the force of pulses", r"\tau", leaf="drive", sign="not negative", default=0.0),
         Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
-        Parameter(
-            "k_cubic", "N/m^3", "cubic stiffness between rod and capsule", r"k_\mathrm{cubic}", sign="any",
-        ),
         nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
         nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
         scatter("scatter", "N", "scatter about a calibration line", "s"),
     )
 }  # fmt: skip
 
-#: The leaves of the model: fields of ``CapsuleParameters``, fields of ``Excitation``, and both.
+#: The drives that a command can be given, and the leaves of each.
+DRIVES: Mapping[str, tuple[str, ...]] = {
+    "harmonic": ("P_d", "Omega", "phase", "reaction"),
+    "pulses": ("P_on", "period", "duty", "P_off", "phase", "lag", "reaction"),
+}
+
+#: The leaves of the model: fields of ``CapsuleParameters``, fields of the drives, and both.
 CAPSULE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "capsule"}
 DRIVE_LEAVES: Mapping[str, Parameter] = {s: row for s, row in TABLE.items() if row.leaf == "drive"}
 LEAVES: Mapping[str, Parameter] = {**CAPSULE_LEAVES, **DRIVE_LEAVES}
-#: Quantities of a sweep: every leaf, and the frequency of the drive in Hz.
+#: Quantities of a sweep: every leaf, and the frequency of the drive in Hz, also in the place of the period of pulses (a
+#: diagram's ``period`` is that of the motion).
 SWEPT: Mapping[str, Parameter] = {
-    **LEAVES,
+    **{symbol: row for symbol, row in LEAVES.items() if symbol != "period"},
     "f": Parameter("f", "Hz", "frequency of the drive", "f", leaf="drive", sign="any", sampled=False),
 }
 #: The values of the paper's Table 1, SI.

@@ -37,10 +37,14 @@ def read_cases() -> Cases:
     """The cases of exact_cases.json."""
     raw = json.loads((Path(__file__).parent / "physics" / "exact_cases.json").read_text())["cases"]
     column = {key: np.array([case[key] for case in raw]) for key in (*PARAMETERS, "P_d", "Omega")}
+    capsule = CapsuleParameters(**{key: column[key] for key in PARAMETERS})
+    p, e = jax.tree.map(
+        lambda leaf: np.broadcast_to(leaf, len(raw)), (capsule, Excitation(column["P_d"], column["Omega"]))
+    )
     return Cases(
         raw,
-        CapsuleParameters(**{key: column[key] for key in PARAMETERS}),
-        Excitation(column["P_d"], column["Omega"], np.zeros(len(raw))),
+        p,
+        e,
         2.0 * np.pi / column["Omega"],
         np.array([case["states_at_period_ends"] for case in raw]),
         np.array([case["contacts_in_10_periods"] for case in raw]),

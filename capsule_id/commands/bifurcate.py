@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from capsule_id.commands.capsule_options import (
     DEFAULTS,
     add_capsule_arguments,
+    capsule_and_drive,
     capsule_values,
     fitted_values,
     number,
@@ -21,7 +22,7 @@ from capsule_id.commands.sweep_output import prepare_store, publish_pair, remove
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import default_registry
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVE_LEAVES, LEAVES, SWEPT
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
@@ -108,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
         if not (args.result / "parameters.json").is_file():
             remedy = "run fit-params on it, or give --result"
             raise InputError("DATA must have been fitted", f"no {args.result}", remedy)
-    free = frozenset("Omega" if axis.name == "f" else axis.name for axis in axes)
+    free = frozenset(_frequency_leaf(args) if axis.name == "f" else axis.name for axis in axes)
     values = capsule_values(args, FIG_6_DEFAULTS, free | _names_from_posterior(args))
     out = args.out if args.out is not None else _default_out(rig.name if rig is not None else None, axes)
     store = prepare_store(out, args.resume)
@@ -151,7 +152,6 @@ def _dataset(
     """The Dataset for the options."""
     from capsule_id.motions import operating, sweep
     from capsule_id.motions.response import Settling
-    from capsule_id.physics.model import CapsuleParameters, Excitation
     from capsule_id.report.posterior_file import read_draws
 
     settling = Settling(
@@ -169,8 +169,7 @@ def _dataset(
             raise InputError("k2 must be given", "the posterior has several springs or none", "add --spring or --k2")
         given = {name for name in LEAVES if getattr(args, name) is not None}
         leaves |= {name: column for name, column in draws.items() if name not in given}
-    p = CapsuleParameters(**{name: leaves[name] for name in CAPSULE_LEAVES if name in leaves})
-    e = Excitation(**{name: leaves[name] for name in DRIVE_LEAVES})
+    p, e = capsule_and_drive(leaves, args.drive)
     x = {axis.name: axis.values() for axis in axes}
     (over, grid), *_ = x.items()
     if args.posterior is not None:
@@ -196,7 +195,7 @@ def _measured_points(
     """The forced runs with the settings of a diagram. Standard error lists the omitted runs."""
     from capsule_id.commands.measured_runs import Span, overlay
 
-    diagram = len(axes) == 1 and args.posterior is None
+    diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
     if not diagram or not rig.has_runs:
         return ()
     x = axes[0].values()
@@ -244,7 +243,9 @@ def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points
 def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
     """Refuse options that do not apply together."""
     names = {axis.name for axis in axes}
-    if len(names) < len(axes) or names == {"f", "Omega"}:
+    for name in sorted(names - {"f", *CAPSULE_LEAVES, *DRIVES[args.drive]}):
+        raise InputError(f"the {args.drive} drive has no {name}", f"--over or --with {name}", "change --drive")
+    if len(names) < len(axes) or names == {"f", _frequency_leaf(args)}:
         raise InputError("a map needs two different quantities", f"{args.over} and {args.second}", "name another one")
     blocks = len(axes) == 2 or args.posterior is not None
     if args.posterior is not None and len(axes) == 2:
@@ -257,9 +258,14 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
         raise InputError("--resume is for maps and bands", "one quantity", "remove --resume")
     if args.draws is not None and args.posterior is None:
         raise InputError("--draws needs --posterior", "there is none", "add --posterior FILE")
-    for name in sorted(names | ({"Omega"} if "f" in names else set())):
+    for name in sorted(names | ({_frequency_leaf(args)} if "f" in names else set())):
         if getattr(args, name, None) is not None:
             raise InputError(f"a varied {name} has no fixed value", f"--{name} is given", f"remove --{name}")
+
+
+def _frequency_leaf(args: argparse.Namespace) -> str:
+    """The leaf that the frequency f stands for."""
+    return "Omega" if args.drive == "harmonic" else "period"
 
 
 def _names_from_posterior(args: argparse.Namespace) -> frozenset[str]:

@@ -7,9 +7,14 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import LEAVES, TABLE_1, Parameter
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, Parameter
+
+if TYPE_CHECKING:
+    from capsule_id.physics.drives.pulses import Pulses
+    from capsule_id.physics.model import CapsuleParameters, Excitation
 
 #: Name of the default friction law in the provenance of a result.
 EQUATION_1 = "eq. (1)"
@@ -26,9 +31,12 @@ XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_thr
 def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str, float] = DEFAULTS) -> None:
     """Add an option per parameter, in SI, and the options for fitted values. ``capsule_values`` parses the numbers."""
     group = parser.add_argument_group("parameters", "plain numbers in SI units")
+    group.add_argument("--drive", choices=tuple(DRIVES), default="harmonic", help="force on the rod (default harmonic)")
     for name, leaf in LEAVES.items():
         text = f"default {defaults[name]:g}" if name in defaults else _without_default(leaf)
-        group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text})")
+        drives = [drive for drive, names in DRIVES.items() if name in names]
+        only = f"; {drives[0]} drive" if len(drives) == 1 else ""
+        group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text}{only})")
     group.add_argument(
         "--result", metavar="DIR", type=Path, help="result directory of fit-params, for its fitted parameters"
     )
@@ -38,20 +46,25 @@ def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str
 def capsule_values(
     args: argparse.Namespace, defaults: Mapping[str, float] = DEFAULTS, free: frozenset[str] = frozenset()
 ) -> dict[str, float]:
-    """Every parameter by symbol, SI. Those of ``free`` are optional: their value is the default or 1.
+    """Every parameter of capsule and drive by symbol, SI. Those of ``free`` are optional: their value is the default or 1.
 
     A parameter that equals another one by default is absent where nothing gives it.
 
     Raises
     ------
     InputError
-        If a value is missing, no number or not admissible, or the result cannot be read.
+        If a value is missing, no number or not admissible, belongs to another drive, or the result cannot be read.
     """
     fitted = _fitted(args.result, args.spring) if args.result is not None else {}
     values = {}
+    own = {*CAPSULE_LEAVES, *DRIVES[args.drive]}
     for name, leaf in LEAVES.items():
         text = getattr(args, name)
-        value = number(name, text) if text is not None else fitted.get(name, defaults.get(name))
+        if name not in own:
+            if text is not None:
+                raise InputError(f"the {args.drive} drive has no {name}", f"--{name}", "remove it, or change --drive")
+            continue
+        value = _number(name, text) if text is not None else fitted.get(name, defaults.get(name))
         if value is None and name in free:
             value = 1.0
         if value is None and isinstance(leaf.default, str):
@@ -83,6 +96,21 @@ def _check_sign(name: str, value: float, place: str) -> None:
         remedy = {"positive": "give a value above 0", "not negative": "give 0 or more", "any": "give a finite value"}
         rule = f"must be {row.sign}" if row.sign == "positive" else "must not be negative"
         raise InputError(f"{name} {rule}", f"{place} {value:g}", remedy[row.sign])
+
+
+def capsule_and_drive(values: Mapping[str, Any], drive: str) -> "tuple[CapsuleParameters, Excitation | Pulses]":
+    """The model's parameters and the drive of that name, from values by symbol, SI."""
+    from capsule_id.physics.drives.pulses import Pulses
+    from capsule_id.physics.model import CapsuleParameters, Excitation
+
+    p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
+    own = {name: values[name] for name in DRIVES[drive]}
+    return p, Excitation(**own) if drive == "harmonic" else Pulses(**own)
+
+
+def _number(name: str, text: str) -> float:
+    """A number from the option of a parameter; infinity where it is a value."""
+    return math.inf if LEAVES[name].may_be_infinite and text == "inf" else number(name, text)
 
 
 def number(name: str, text: str) -> float:

@@ -3,12 +3,18 @@
 import argparse
 import math
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_values, number, set_loop_option
+from capsule_id.commands.capsule_options import (
+    add_capsule_arguments,
+    capsule_and_drive,
+    capsule_values,
+    number,
+    set_loop_option,
+)
 from capsule_id.errors import InputError
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVE_LEAVES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     if args.figure is not None:
         _check_suffix(args.figure, (".png",))
     values = capsule_values(args)
-    end, samples = _length(args, values["Omega"])
+    period = _period(values)
+    end, samples = _length(args, period)
     X1, Y1, X2, Y2 = (number(name, text) for name, text in zip(STATE, args.initial or ["0"] * 4, strict=True))
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
@@ -59,14 +66,13 @@ def run(args: argparse.Namespace) -> int:
     set_loop_option()
     import numpy as np
 
-    from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, status_message
+    from capsule_id.physics.model import Status, simulate, status_message
     from capsule_id.physics.smooth.engine import Smoothing
     from capsule_id.report.motion_files import write_motion
 
-    p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
-    e = Excitation(**{name: values[name] for name in DRIVE_LEAVES})
+    p, e = capsule_and_drive(values, args.drive)
     grid = np.linspace(0.0, end, samples)
-    section = _section(values["Omega"], end)
+    section = _section(period, end)
     # Impacts are short: the figure needs more samples than the table.
     drawn = np.linspace(0.0, end, PICTURE_SAMPLES) if args.figure is not None else section
     times = np.union1d(np.union1d(grid, section), drawn)
@@ -89,7 +95,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _length(args: argparse.Namespace, Omega: float) -> tuple[float, int]:
+def _period(values: Mapping[str, float]) -> float | None:
+    """Period of the drive, s; None for a force that does not repeat."""
+    if "period" in values:
+        return values["period"]
+    return 2.0 * math.pi / values["Omega"] if values["Omega"] > 0.0 else None
+
+
+def _length(args: argparse.Namespace, period: float | None) -> tuple[float, int]:
     """End of the run in s and number of samples."""
     if args.periods is not None and args.duration is not None:
         raise InputError("a run has one length", "--periods and --duration", "remove one of them")
@@ -98,24 +111,23 @@ def _length(args: argparse.Namespace, Omega: float) -> tuple[float, int]:
         raise InputError("--samples must be a whole number of at least 2", args.samples, "give e.g. 2000")
     if args.duration is not None:
         end, text = number("duration", args.duration), f"--duration {args.duration}"
-    elif Omega > 0.0:
+    elif period is not None:
         periods = args.periods or "20"
-        end, text = 2.0 * math.pi / Omega * number("periods", periods), f"--periods {periods}"
+        end, text = period * number("periods", periods), f"--periods {periods}"
     else:
-        raise InputError("--periods needs Omega above 0", f"Omega = {Omega:g}", "give --duration")
+        raise InputError("--periods needs Omega above 0", f"Omega = {float(args.Omega):g}", "give --duration")
     if not end > 0.0:
         raise InputError("the length must be positive", text, "give a positive number")
     return end, int(samples)
 
 
-def _section(Omega: float, end: float) -> "np.ndarray":
+def _section(period: float | None, end: float) -> "np.ndarray":
     """Times within the run at which the drive has its initial phase."""
     import numpy as np
 
-    if Omega <= 0.0:
+    if period is None:
         return np.zeros(0)
-    T = 2.0 * np.pi / Omega
-    return T * np.arange(np.floor(end / T) + 1.0)
+    return period * np.arange(np.floor(end / period) + 1.0)
 
 
 def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:

@@ -115,7 +115,7 @@ def _report(progress: OnProgress | None, done: int, total: int) -> None:
 
 def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Sequence[str], block: int) -> None:
     """Create the folder, or check that its blocks belong to these points."""
-    leaves = hashlib.sha256()
+    leaves = hashlib.sha256(str(jax.tree.structure((points.p, points.e))).encode())
     for leaf in jax.tree.leaves((points.p, points.e, points.initial)):
         leaves.update(np.ascontiguousarray(leaf).tobytes())
     mine = {

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
 from capsule_id.motions.attractors import attractors_of
-from capsule_id.motions.points import MOTION_COLUMNS, SECTION, SUMMARY, MotionColumns
+from capsule_id.motions.points import MOTION_COLUMNS, SECTION, SUMMARY, MotionColumns, swept_leaf
 from capsule_id.motions.response import Settling
 from capsule_id.parameters import SWEPT
-from capsule_id.physics.model import CapsuleParameters, Excitation
+from capsule_id.physics.drive import PeriodicDrive
+from capsule_id.physics.model import CapsuleParameters
 
 ATTRACTOR = {"units": "1", "long_name": "number of the attractor among those found here, -1 if the run failed"}
 ATTRACTORS = {"units": "1", "long_name": "number of different attractors found here"}
@@ -34,7 +35,7 @@ def grid_of(over: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     return {name: values_of(name, values) for name, values in over.items()}
 
 
-def single(p: CapsuleParameters, e: Excitation) -> tuple[CapsuleParameters, Excitation]:
+def single(p: CapsuleParameters, e: PeriodicDrive) -> tuple[CapsuleParameters, PeriodicDrive]:
     """p and e themselves.
 
     Raises
@@ -62,12 +63,12 @@ def values_of(name: str, values: ArrayLike) -> np.ndarray:
 
 
 def provenance(
-    p: CapsuleParameters, e: Excitation, over: Sequence[str], settling: Settling, method: str
+    p: CapsuleParameters, e: PeriodicDrive, over: Sequence[str], settling: Settling, method: str
 ) -> dict[str, Any]:
     """Attributes: every parameter that is not swept, and how the motions were settled."""
-    swept = {"Omega" if name == "f" else name for name in over}
+    swept = {swept_leaf(name, e) for name in over}
     given = {**vars(p), **vars(e)}
-    held = {name: float(np.asarray(value)) for name, value in given.items() if name not in swept and value is not None}
+    held = {name: float(np.asarray(x)) for name, x in given.items() if name not in swept and x is not None}
     return {**held, **asdict(settling), "method": method, "model": "exact", "semantics": "stick-slip"}
 
 

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.physics.batches import lanes_of, run_lanes
+from capsule_id.physics.drive import PeriodicDrive
 from capsule_id.physics.exact.engine import run
 from capsule_id.physics.friction import FrictionLaw, friction_law
-from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Excitation, Initial, Status
+from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Status, without_absent
 
 # Excitation periods in which the tangent turns into the direction that grows most, before its growth counts.
 ALIGNMENT = 16
@@ -36,7 +37,7 @@ class Exponent(NamedTuple):
 
 def largest_exponent(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     initial: Initial | None = None,
     periods: int = 100,
     max_steps: int = MAX_STEPS,
@@ -46,7 +47,7 @@ def largest_exponent(
 
     Parameters
     ----------
-    p, e : parameters and drive; leaves () or (batch,), concrete; Omega positive
+    p, e : parameters and drive; leaves () or (batch,), concrete; the period positive
     initial : (X1, Y1, X2, Y2) at the drive's phase, each () or (batch,); default at rest at the origin
     periods : excitation periods over which growth is a mean (after 16 in which the tangent aligns)
     friction : a law in place of the capsule's own, see ``simulate``
@@ -58,10 +59,10 @@ def largest_exponent(
     InputError
         Shapes that do not agree.
     """
-    given = (p, e, friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
+    given = (*without_absent(p, e), friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
     (p, e, friction, (X1, Y1, X2, Y2)), _, _ = lanes_of(given, np.zeros(1))
     law = friction_law(p, friction)
-    T = 2.0 * np.pi / np.asarray(e.Omega)
+    T = np.asarray(e.period)
     begin = tuple(np.nan_to_num(x) for x in (X1 - X2, Y1 - Y2, Y2))
     span = np.stack([np.zeros_like(T), T], axis=1)
     kernel = partial(_growth, np.int32(periods), np.int32(max_steps))
@@ -74,7 +75,7 @@ def _growth(
     periods: jax.Array,
     max_steps: jax.Array,
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     law: FrictionLaw,
     begin: tuple[jax.Array, ...],
     span: jax.Array,
@@ -84,7 +85,8 @@ def _growth(
     Seven arguments, because the engine's inputs are unpacked.
     """
     # Lengths in m: a velocity counts as the displacement that it makes in 1/Omega.
-    unit = jnp.stack([jnp.ones_like(e.Omega), e.Omega, e.Omega])
+    Omega = 2.0 * jnp.pi / jnp.asarray(e.period)
+    unit = jnp.stack([jnp.ones_like(Omega), Omega, Omega])
 
     def period(y: jax.Array) -> tuple[jax.Array, jax.Array]:
         x_rel, rate, Y2 = y

@@ -21,7 +21,8 @@ from capsule_id.motions.points import MOTION_COLUMNS, SUMMARY, sweep_points
 from capsule_id.motions.response import SETTLING, Settling
 from capsule_id.parameters import SWEPT
 from capsule_id.physics.batches import lanes_of
-from capsule_id.physics.model import CapsuleParameters, Excitation
+from capsule_id.physics.drive import PeriodicDrive
+from capsule_id.physics.model import CapsuleParameters
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,7 +34,7 @@ QUANTILES = (0.025, 0.5, 0.975)
 
 def draws_diagram(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     over: str,
     values: ArrayLike,
     *,

@@ -29,7 +29,7 @@ class SpanRecord(NamedTuple):
     closings : closings of the gap, those after an opening shorter than ``merge`` left out
     lead : time of the first closing if no opening stands before it in the span, else inf
     opened : time of the last opening, -inf if there is none
-    work : of the drive on the rod, J
+    work : of the drive on rod and capsule, J
     status : a ``Status`` code
     """
 
@@ -130,7 +130,9 @@ def _work(drive: Drive, state: CapsuleState, step: StepSeries, t: jax.Array) -> 
     def power(node: jax.Array) -> jax.Array:
         since = node * dt
         s = since / step.h
-        Y1 = horner(step.w, s) + horner(step.v, s)
-        return drive.value(drive.state(state.t + since)) * Y1
+        Y2 = horner(step.v, s)
+        driven = horner(step.w, s) + Y2
+        driven = driven if drive.reaction is None else driven - drive.reaction * Y2
+        return drive.value(drive.advanced(state.drive, state.t + since, since)) * driven
 
     return dt * jnp.sum(_WEIGHT[:, None] * jax.vmap(power)(jnp.asarray(_NODE)), axis=0)

@@ -5,16 +5,18 @@ batch, so the result does not depend on the blocks or on the worker that compute
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.motions.response import Settled, Settling, settle
-from capsule_id.parameters import SWEPT
+from capsule_id.parameters import CAPSULE_LEAVES, LEAVES, SWEPT
 from capsule_id.physics.batches import lanes_of
-from capsule_id.physics.model import CapsuleParameters, Excitation, Initial
+from capsule_id.physics.drive import PeriodicDrive
+from capsule_id.physics.model import CapsuleParameters, Excitation, Initial, without_absent
 
 MotionColumns = dict[str, np.ndarray]  # name -> (points, ...)
 
@@ -42,7 +44,7 @@ class SweepPoints:
     """Lanes of points: every leaf and every component of the initial state is (points,)."""
 
     p: CapsuleParameters
-    e: Excitation
+    e: PeriodicDrive
     initial: Initial
 
     @property
@@ -56,27 +58,38 @@ class SweepPoints:
 
 
 def sweep_points(
-    p: CapsuleParameters, e: Excitation, over: Mapping[str, np.ndarray], initial: Initial | None = None
+    p: CapsuleParameters, e: PeriodicDrive, over: Mapping[str, np.ndarray], initial: Initial | None = None
 ) -> SweepPoints:
     """The lanes in which the quantities of ``over`` (symbol -> (points,), SI; ``f`` in Hz) replace those of p and e.
 
     Raises
     ------
     InputError
-        A quantity that does not exist, one given twice (f and Omega), shapes that do not agree.
+        A quantity that the model or the drive does not have, one given twice (f and Omega), shapes that do not agree.
     """
     leaves = {name: np.asarray(values, float) for name, values in over.items()}
+    of_model = {"f", *CAPSULE_LEAVES, *(row.symbol for row in e.parameters)}
+    own = [symbol for symbol in SWEPT if symbol in of_model]
     for name in leaves:
-        if name not in SWEPT:
-            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(SWEPT)}")
+        if name not in own:
+            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(own)}")
     if {"f", "Omega"} <= set(leaves):
         raise InputError("f and Omega are the same quantity", "both are swept", "leave one out")
     if "f" in leaves:
-        leaves["Omega"] = 2.0 * np.pi * leaves.pop("f")
-    p = CapsuleParameters(**{**vars(p), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "capsule"}})
-    e = Excitation(**{**vars(e), **{name: x for name, x in leaves.items() if SWEPT[name].leaf == "drive"}})
+        f, frequency = leaves.pop("f"), swept_leaf("f", e)
+        leaves[frequency] = 2.0 * np.pi * f if frequency == "Omega" else 1.0 / f
+    p = replace(p, **{name: x for name, x in leaves.items() if LEAVES[name].leaf == "capsule"})
+    drive: Any = e
+    e = replace(drive, **{name: x for name, x in leaves.items() if LEAVES[name].leaf == "drive"})
+    # What is absent is absent in all blocks of a sweep, so a point does not depend on its block.
+    p, e = without_absent(p, e)
     lanes, _, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
     return SweepPoints(*lanes)
+
+
+def swept_leaf(name: str, e: PeriodicDrive) -> str:
+    """The leaf that a swept quantity sets: ``f`` is Omega or the period of pulses."""
+    return name if name != "f" else "Omega" if isinstance(e, Excitation) else "period"
 
 
 def settled_columns(points: SweepPoints, settling: Settling) -> MotionColumns:
@@ -87,7 +100,7 @@ def settled_columns(points: SweepPoints, settling: Settling) -> MotionColumns:
 def motion_columns(seen: Settled, points: SweepPoints) -> MotionColumns:
     """The fields of ``seen`` and the efficiency of each motion, 0 for one that stands."""
     found: MotionColumns = {name: np.asarray(getattr(seen, name)) for name in MOTION_COLUMNS if name != "efficiency"}
-    advance = found["mean_velocity"] * 2.0 * np.pi / np.asarray(points.e.Omega)
+    advance = found["mean_velocity"] * np.asarray(points.e.period)
     # Without a drive there is neither work nor advance.
     work = np.where(found["work_per_period"] == 0.0, np.inf, found["work_per_period"])
     return found | {"efficiency": np.where(found["direction"] == "S", 0.0, advance / work)}

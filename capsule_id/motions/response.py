@@ -15,9 +15,10 @@ from capsule_id.errors import InputError
 from capsule_id.motions.lyapunov import largest_exponent
 from capsule_id.motions.periods import observe
 from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
+from capsule_id.physics.drive import PeriodicDrive
 from capsule_id.physics.exact.engine import kernel
 from capsule_id.physics.friction import FrictionLaw, friction_law
-from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Excitation, Initial, Status
+from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Excitation, Initial, Status, without_absent
 
 # Excitation periods left out, and observed.
 DROPPED, OBSERVED = 300, 48
@@ -110,7 +111,7 @@ class Settled(Response):
 
 def response(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     *,
     settling: Settling = SETTLING,
     max_steps: int | None = None,
@@ -120,7 +121,8 @@ def response(
 
     Parameters
     ----------
-    p, e : parameters and drive; any leaf may carry a batch axis (batch,). Omega must be positive.
+    p, e : parameters and drive (``Excitation`` or ``Pulses``); any leaf may carry a batch axis (batch,). The period of
+        the drive must be positive.
     settling : other numbers of periods, the rule for micro-contacts
     max_steps : bound on the steps of a lane, in the place of that of ``settling``
     friction : a law in place of eq. (1), see ``simulate``; leaves () or (batch,)
@@ -128,10 +130,11 @@ def response(
     Raises
     ------
     InputError
-        Traced values (a label is a string), Omega not positive, shapes that do not agree.
+        Traced values (a label is a string), a drive without a positive period, shapes that do not agree.
     """
     if is_traced((p, e, friction)):
         raise InputError("response needs concrete values", "a traced value", "call it outside of jit, vmap and jvp")
+    p, e = without_absent(p, e)
     _, _, batched = lanes_of((p, e, friction), np.zeros(1))
     if max_steps is not None:
         settling = Settling(**{**vars(settling), "max_steps": max_steps})
@@ -142,7 +145,7 @@ def response(
 
 def settle(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     initial: Initial | None = None,
     settling: Settling = SETTLING,
     width: int = CHUNK,
@@ -160,15 +163,12 @@ def settle(
     Raises
     ------
     InputError
-        Omega not positive, a merging time that would take in whole periods, shapes that do not agree.
+        A drive without a positive period, a merging time that would take in whole periods, shapes that do not agree.
     """
     given = (p, e, friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
     (p, e, friction, initial), _, _ = lanes_of(given, np.zeros(1))
     law = friction_law(p, friction)
-    if not np.all(np.asarray(e.Omega) > 0.0):
-        wrong = np.asarray(e.Omega)[~(np.asarray(e.Omega) > 0.0)][0]
-        raise InputError("Omega must be positive", str(wrong), "a response needs a period: use simulate")
-    T = 2.0 * np.pi / np.asarray(e.Omega)
+    T = periods_of(e)
     if not settling.merge_contacts < 0.5 * T.min():
         rule = "merge_contacts must be less than half a period of the drive"
         raise InputError(rule, f"{settling.merge_contacts} s", f"give less than {0.5 * T.min():.3g} s")
@@ -192,9 +192,27 @@ def settle(
     return Settled(*columns, x_rel=X1 - X2, rate=Y1 - Y2, Y2=Y2)
 
 
+def periods_of(e: PeriodicDrive) -> np.ndarray:
+    """(lanes,) s: the periods of the drive.
+
+    Raises
+    ------
+    InputError
+        A drive without a period, a frequency or a period that is not positive.
+    """
+    name = "Omega" if isinstance(e, Excitation) else "period"
+    value = np.asarray(getattr(e, name, np.nan))
+    if not np.all(value > 0.0):
+        remedy = "a response needs a period: use simulate"
+        raise InputError(
+            f"{name} must be positive", f"{type(e).__name__} with {value[~(value > 0.0)].ravel()[0]}", remedy
+        )
+    return np.asarray(e.period)
+
+
 def exponents(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     ends: tuple[np.ndarray, ...],
     chosen: np.ndarray,
     settling: Settling,

@@ -44,7 +44,8 @@ from capsule_id.motions.points import (
 )
 from capsule_id.motions.response import SETTLING, Settling, exponents, settle
 from capsule_id.physics.batches import CHUNK
-from capsule_id.physics.model import CapsuleParameters, Excitation, Initial
+from capsule_id.physics.drive import PeriodicDrive
+from capsule_id.physics.model import CapsuleParameters, Initial
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 
 def diagram(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     over: str,
     values: ArrayLike,
     *,
@@ -93,7 +94,7 @@ def diagram(
 
 def continuation(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     over: str,
     values: ArrayLike,
     *,
@@ -145,7 +146,7 @@ def continuation(
 
 def motion_map(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     over: Mapping[str, ArrayLike],
     *,
     settling: Settling = SETTLING,
@@ -177,7 +178,7 @@ def motion_map(
 
 def basins(
     p: CapsuleParameters,
-    e: Excitation,
+    e: PeriodicDrive,
     x_rel: ArrayLike,
     rate: ArrayLike,
     Y2: float = 0.0,
@@ -212,11 +213,11 @@ def basins(
     )
 
 
-def spread_starts(p: CapsuleParameters, e: Excitation, count: int, seed: int = 0) -> Initial:
+def spread_starts(p: CapsuleParameters, e: PeriodicDrive, count: int, seed: int = 0) -> Initial:
     """``count`` initial states (X1, Y1, X2, Y2), each (count,): rest, then a Latin hypercube around it.
 
-    The box: x_rel within twice the larger of the gap and the static deflection P_d/k1, velocities within what Omega
-    makes of that. Leaves ().
+    The box: x_rel within twice the larger of the gap and the static deflection of the drive's amplitude, velocities
+    within what the drive's frequency makes of that. An infinite gap does not count. Leaves ().
 
     Raises
     ------
@@ -225,10 +226,11 @@ def spread_starts(p: CapsuleParameters, e: Excitation, count: int, seed: int = 0
     """
     if count < 1:
         raise InputError("the number of initial states must be at least 1", str(count), "give 1 or more")
-    sizes = [float(np.asarray(x)) for x in (p.G, e.P_d, p.k1, e.Omega)]
-    reach = 2.0 * max(sizes[0], sizes[1] / sizes[2] if sizes[2] > 0.0 else 0.0)
+    G, amplitude, k1, period = (float(np.asarray(x)) for x in (p.G, e.amplitude, p.k1, e.period))
+    reach = 2.0 * max(G if np.isfinite(G) else 0.0, amplitude / k1 if k1 > 0.0 else 0.0)
     box = qmc.LatinHypercube(3, rng=np.random.default_rng(seed)).random(count)
-    x_rel, rate, Y2 = ((2.0 * box - 1.0) * reach * np.array([1.0, sizes[3], sizes[3]])).T
+    Omega = 2.0 * np.pi / period
+    x_rel, rate, Y2 = ((2.0 * box - 1.0) * reach * np.array([1.0, Omega, Omega])).T
     X1, Y1, X2, Y2 = x_rel, rate + Y2, np.zeros(count), Y2
     for component in (X1, Y1, Y2):
         component[0] = 0.0

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import jax.core
@@ -31,6 +31,26 @@ Times = jax.Array | np.ndarray
 CHUNK = 64
 
 
+class Record:
+    """Base of a pytree whose leaves ``samples`` are (n,) or (batch, n); all its other leaves are () or (batch,)."""
+
+    samples: ClassVar[tuple[str, ...]]
+
+
+def _sample_axes(tree: object) -> list[int]:
+    """For each leaf 1 if it has an axis of samples, else 0."""
+
+    def axes(node: Any) -> Any:
+        if not isinstance(node, Record):
+            return 0
+        given = {
+            name: jax.tree.map(lambda _, name=name: int(name in node.samples), x) for name, x in vars(node).items()
+        }
+        return type(node)(**given)
+
+    return jax.tree.leaves(jax.tree.map(axes, tree, is_leaf=lambda node: isinstance(node, Record)))
+
+
 def array_module(*values: object) -> ModuleType:
     """``jax.numpy`` if one of ``values`` is a JAX array, else ``numpy``: formulas that serve both use it."""
     return jnp if any(isinstance(value, jax.Array) for value in values) else np
@@ -43,6 +63,8 @@ def is_traced(tree: object) -> bool:
 
 def lanes_of(tree: Tree, times: ArrayLike) -> tuple[Tree, Times, bool]:
     """(tree, times, whether a batch axis was given): leaves () or (batch,) become (L,), times (n,) become (L, n).
+
+    Samples of a ``Record`` become (L, n) as well.
 
     Raises
     ------
@@ -66,17 +88,22 @@ def lanes_of(tree: Tree, times: ArrayLike) -> tuple[Tree, Times, bool]:
         raise InputError("times must be finite", "an infinite or undefined time", "leave it out")
     if xp is np and not bool(np.all(np.diff(grid, axis=-1) > 0.0)):
         raise InputError("times must increase", "found a step that is not positive", "sort them, drop repeated ones")
-    if any(leaf.ndim > 1 for leaf in leaves):
-        shape = next(leaf.shape for leaf in leaves if leaf.ndim > 1)
+    own = _sample_axes(tree)
+    ranks = [leaf.ndim - axes for leaf, axes in zip(leaves, own, strict=True)]
+    if any(rank not in (0, 1) for rank in ranks):
+        shape = next(leaf.shape for leaf, rank in zip(leaves, ranks, strict=True) if rank not in (0, 1))
         raise InputError("a leaf must have shape () or (batch,)", str(shape), "use one batch axis, or jax.vmap")
-    sizes = {leaf.shape[0] for leaf in leaves if leaf.ndim == 1} | ({grid.shape[0]} if grid.ndim == 2 else set())
+    sizes = {leaf.shape[0] for leaf, rank in zip(leaves, ranks, strict=True) if rank == 1}
+    sizes |= {grid.shape[0]} if grid.ndim == 2 else set()
     if len(sizes) > 1:
         raise InputError("all batch axes must have one length", f"lengths {sorted(sizes)}", "make them agree")
     lanes = sizes.pop() if sizes else 1
-    batched = grid.ndim == 2 or any(leaf.ndim == 1 for leaf in leaves)
+    batched = grid.ndim == 2 or any(rank == 1 for rank in ranks)
     if lanes == 0:
         raise InputError("a batch must hold at least one lane", "length 0", "leave the call out")
-    spread = [xp.broadcast_to(leaf, (lanes,)) for leaf in leaves]
+    spread = [
+        xp.broadcast_to(leaf, (lanes, *leaf.shape[leaf.ndim - axes :])) for leaf, axes in zip(leaves, own, strict=True)
+    ]
     return jax.tree.unflatten(structure, spread), xp.broadcast_to(grid, (lanes, grid.shape[-1])), batched
 
 

@@ -1,16 +1,17 @@
 """The drive on the rod: the force at any time, and what a Taylor step needs of it.
 
 A drive is a frozen pytree with the methods of ``Drive``; both engines, the energy balance and the sensors use nothing
-else. Its ``parameters`` are the rows of the parameter table that name its leaves and state what they admit.
+else. Its ``parameters`` are the rows of the parameter table that name its leaves and state what they admit. Other
+drives: ``capsule_id.physics.drives``.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 
-from capsule_id.parameters import DRIVE_LEAVES, Parameter
+from capsule_id.parameters import DRIVES, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, array_module
 from capsule_id.physics.series import Series
 from capsule_id.precision import require_float64
@@ -19,23 +20,44 @@ require_float64()
 
 
 class Drive(Protocol):
-    """A force on the rod as a function of time, analytic in time.
+    """A force on the rod as a function of time, analytic in time on each of its pieces.
 
-    A drive that switches also needs the next switching time after t: ``exact.engine.take_step`` then ends a step there.
+    prescribed : the drive states the motion of the rod, not the force on it: ``force_at``, ``value`` and ``series`` then
+        are the acceleration of the rod, m/s^2
+    reaction : share of the force that pushes the capsule back, 1; None: 0
     """
 
     parameters: ClassVar[tuple[Parameter, ...]]
+    prescribed: ClassVar[bool]
 
-    def force(self, t: Any) -> Any:
-        """Force in N at the times t, s; leaves and t broadcast; NumPy and JAX."""
+    @property
+    def reaction(self) -> Any: ...
+
+    def force_at(self, t: Any, piece: Any = None) -> Any:
+        """Force in N at the times t, s; leaves and t broadcast; NumPy and JAX.
+
+        piece : the force follows the analytic piece that holds at this time, s; default t itself
+        """
         ...
 
-    def rate(self) -> jax.Array:
-        """(L,) 1/s, how fast the force changes: it bounds the first guess of a step."""
+    def frequency(self) -> jax.Array:
+        """(L,) rad/s, how fast the force changes; 0 where only pieces are known."""
+        ...
+
+    def covers(self, begin: Any, end: Any) -> Any:
+        """(L,) bool: whether the drive is well-formed and defined from begin to end (L,), s; NumPy and JAX."""
+        ...
+
+    def rate(self, state: tuple[jax.Array, ...]) -> jax.Array:
+        """(L,) 1/s, how fast the force changes from this state on: it bounds the first guess of a step."""
         ...
 
     def state(self, t: jax.Array) -> tuple[jax.Array, ...]:
         """What the exact engine carries along at the time t (L,); every entry (L,)."""
+        ...
+
+    def advanced(self, state: tuple[jax.Array, ...], t: jax.Array, dt: jax.Array) -> tuple[jax.Array, ...]:
+        """The state at t (L,), after a step of dt (L,) s on one piece."""
         ...
 
     def value(self, state: tuple[jax.Array, ...]) -> jax.Array:
@@ -51,33 +73,91 @@ class Drive(Protocol):
         ...
 
 
+class PeriodicDrive(Drive, Protocol):
+    """What a drive with a period adds: motions can settle under it."""
+
+    @property
+    def period(self) -> Any:
+        """s; () or (batch,)."""
+        ...
+
+    @property
+    def amplitude(self) -> Any:
+        """The largest force, N; () or (batch,)."""
+        ...
+
+
+@runtime_checkable
+class SwitchingDrive(Drive, Protocol):
+    """What a drive of several pieces adds: steps end where pieces meet."""
+
+    def next_switch(self, state: tuple[jax.Array, ...]) -> jax.Array:
+        """(L,) s, the time at which the piece of this state ends, infinite for the last one; differentiable."""
+        ...
+
+    def switched(self, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        """The state at the start of the next piece, from that at the end of this one."""
+        ...
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Excitation:
-    """The drive P_d cos(Omega t + phase) on the rod: P_d in N, Omega in rad/s, phase in rad; leaves () or (batch,)."""
+    """The drive P_d cos(Omega t + phase) on the rod: P_d in N, Omega in rad/s, phase in rad; leaves () or (batch,).
+
+    reaction : share of the force that pushes the capsule back, 1: 0 for a force from outside, 1 for an actuator
+        between rod and capsule
+    """
 
     P_d: NumberOrBatch
     Omega: NumberOrBatch
     phase: NumberOrBatch = 0.0
+    reaction: NumberOrBatch | None = 0.0
 
-    parameters: ClassVar[tuple[Parameter, ...]] = tuple(DRIVE_LEAVES.values())
+    parameters: ClassVar[tuple[Parameter, ...]] = tuple(TABLE[name] for name in DRIVES["harmonic"])
+    prescribed: ClassVar[bool] = False
+
+    @property
+    def period(self) -> Any:
+        """2 pi / Omega, s; Omega must not be 0."""
+        return 2.0 * jnp.pi / self.Omega
+
+    @property
+    def amplitude(self) -> Any:
+        """|P_d|, N."""
+        return abs(self.P_d)
 
     def cosine(self, t: Any) -> Any:
         """cos(Omega t + phase) at the times t, s."""
         angle = self.Omega * t + self.phase
         return array_module(angle).cos(angle)
 
-    def force(self, t: Any) -> Any:
+    def force_at(self, t: Any, piece: Any = None) -> Any:
         """P_d cos(Omega t + phase), N."""
+        del piece
         return self.P_d * self.cosine(t)
 
-    def rate(self) -> jax.Array:
+    def frequency(self) -> jax.Array:
         """|Omega|."""
+        return jnp.abs(self.Omega)
+
+    def covers(self, begin: Any, end: Any) -> Any:
+        """True: a tone has no beginning."""
+        return begin <= end
+
+    def rate(self, state: tuple[jax.Array, ...]) -> jax.Array:
+        """|Omega|."""
+        del state
         return jnp.abs(self.Omega)
 
     def state(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Cosine and sine of the drive's angle."""
         return cos_sin(self.Omega * t + self.phase)
+
+    def advanced(self, state: tuple[jax.Array, ...], t: jax.Array, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Cosine and sine at t."""
+        del state, dt
+        return self.state(t)
 
     def value(self, state: tuple[jax.Array, ...]) -> jax.Array:
         """P_d cos(Omega t + phase), N."""

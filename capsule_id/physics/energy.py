@@ -18,8 +18,9 @@ from capsule_id.physics.drive import Drive
 from capsule_id.physics.exact.dense import values_of
 from capsule_id.physics.exact.engine import initial_lanes, march
 from capsule_id.physics.exact.taylor import constants_of
+from capsule_id.physics.forces import downhill
 from capsule_id.physics.friction import FrictionLaw, friction_law, sliding_friction
-from capsule_id.physics.model import CapsuleParameters, Initial, Status
+from capsule_id.physics.model import CapsuleParameters, Initial, Status, without_absent
 
 # Quadrature nodes per step: exact for the square of a velocity polynomial of degree 12.
 NODES = 16
@@ -29,7 +30,7 @@ NODES = 16
 class EnergyBalance:
     """Energies in J over a run, numbers or arrays (batch,).
 
-    drive : work of the drive on the rod            stored : change of kinetic and elastic energy
+    drive : work of the drive on rod and capsule    stored : change of kinetic, elastic and potential energy
     damper, friction : dissipated, never negative   status : a ``Status`` code
     """
 
@@ -66,9 +67,11 @@ def energy_balance(
     Raises
     ------
     InputError
-        A lane that does not run to the end (status in the message), shapes that do not agree.
+        A lane that does not run to the end (status in the message), a prescribed rod, shapes that do not agree.
     """
-    given = (p, e, friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
+    if e.prescribed:
+        raise InputError("an energy balance needs a force as drive", type(e).__name__, "give a drive that is a force")
+    given = (*without_absent(p, e), friction, initial if initial is not None else (0.0, 0.0, 0.0, 0.0))
     (p, e, friction, begun), times, batched = lanes_of(given, np.asarray(span))
     law = friction_law(p, friction)
     rows, starts, status = jax.device_get(_recorded(max_steps, p, e, law, begun, times))
@@ -81,15 +84,21 @@ def energy_balance(
     half = 0.5 * (np.concatenate([begins[1:], times[None, :, 1]]) - begins)
     node, weight = np.polynomial.legendre.leggauss(NODES)
     t = begins[..., None] + half[..., None] * (1.0 + node)
-    _, Y1, _, Y2 = (np.asarray(x) for x in values_of(jnp.asarray(rows[..., None]), jnp.asarray(t)))
+    X1, Y1, X2, Y2 = (np.asarray(x) for x in values_of(jnp.asarray(rows[..., None]), jnp.asarray(t)))
     # A law may compute with JAX: its leaves stand as (step, lane, node), like the speeds.
-    columns_e, columns_law = jax.tree.map(lambda leaf: np.asarray(leaf)[None, :, None], (e, law))
+    columns_p, columns_e, columns_law = jax.tree.map(lambda leaf: np.asarray(leaf)[None, :, None], (p, e, law))
 
     def total(power: np.ndarray) -> np.ndarray:
         return np.sum(power * weight * half[..., None], axis=(0, 2))
 
-    work = total(columns_e.force(t) * Y1)
-    damper = total(np.asarray(p.c)[:, None] * (Y1 - Y2) ** 2)
+    # The middle of a step names the piece of the drive: its ends belong to two.
+    driven = Y1 if e.reaction is None else Y1 - columns_e.reaction * Y2
+    work = total(columns_e.force_at(t, begins[..., None] + half[..., None]) * driven)
+    damping = columns_p.c
+    if p.c2 is not None:
+        closed = (X1 - X2 >= columns_p.G).mean(axis=-1, keepdims=True) > 0.5
+        damping = damping + columns_p.c2 * closed * (columns_p.k2 > 0.0)
+    damper = total(damping * (Y1 - Y2) ** 2)
     rubbed = total(np.asarray(sliding_friction(columns_law, np.sign(Y2), Y2)) * Y2)
     last = rows[:, np.maximum(taken.sum(axis=0) - 1, 0), np.arange(len(status))]
     end = values_of(jnp.asarray(last), jnp.asarray(times[:, 1]))
@@ -100,9 +109,15 @@ def energy_balance(
 
 def _stored(p: CapsuleParameters, X1: np.ndarray, Y1: np.ndarray, X2: np.ndarray, Y2: np.ndarray) -> np.ndarray:
     r = X1 - X2
-    # The support's energy k2 (r - G)^2 / 2 is its force times half the penetration.
-    support_energy = 0.5 * support(p.k2, p.G, r) * (r - p.G)
-    return 0.5 * (p.m1 * Y1**2 + p.m2 * Y2**2 + p.k1 * r**2) + support_energy
+    stored = 0.5 * (p.m1 * Y1**2 + p.m2 * Y2**2 + p.k1 * r**2)
+    # The energy of a support, k2 (r - G)^2 / 2, is its force times half the penetration.
+    if p.k2 is not None:
+        stored = stored + 0.5 * support(p.k2, p.G, r) * (r - p.G)
+    if p.k2_back is not None:
+        stored = stored + 0.5 * support(p.k2_back, p.G_back, -r) * (-r - p.G_back)
+    if p.k_cubic is not None:
+        stored = stored + 0.25 * p.k_cubic * r**4
+    return stored + downhill(p, p.m1) * X1 + downhill(p, p.m2) * X2
 
 
 @partial(jax.jit, static_argnums=0)

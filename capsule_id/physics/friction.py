@@ -115,9 +115,11 @@ class CoulombStribeck:
         return FrictionSeries(kinetic + fading * u[0] + viscous * v, rate, extend)
 
 
-def normal_force(m1: Any, m2: Any, g: Any) -> Any:
-    """N = (m1 + m2) g, N."""
-    return (m1 + m2) * g
+def normal_force(m1: Any, m2: Any, g: Any, slope: Any = None, N0: Any = None) -> Any:
+    """N = (m1 + m2) g cos(slope) + N0, N; None: level ground, and the weight alone. NumPy and JAX."""
+    N = (m1 + m2) * g
+    N = N if slope is None else N * array_module(slope).cos(slope)
+    return N if N0 is None else N + N0
 
 
 def friction_law(p: "CapsuleParameters", friction: FrictionLaw | None = None) -> FrictionLaw:
@@ -125,7 +127,7 @@ def friction_law(p: "CapsuleParameters", friction: FrictionLaw | None = None) ->
     if friction is not None:
         return friction
     own = {row.symbol: getattr(p, row.symbol) for row in CoulombStribeck.parameters if row.symbol != "N"}
-    return CoulombStribeck(N=normal_force(p.m1, p.m2, p.g), **own)
+    return CoulombStribeck(N=normal_force(p.m1, p.m2, p.g, p.slope, p.N0), **own)
 
 
 def sliding_friction(law: FrictionLaw, sigma: Any, v: Any) -> jax.Array:

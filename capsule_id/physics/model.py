@@ -9,14 +9,22 @@ State (X1, Y1, X2, Y2): absolute position and velocity of the rod (m1) and of th
     stuck while Y2 = 0 and |f| <= F_b = mu (m1 + m2) g
 
 (the paper's eqs. (1) and (2), read as the text below eq. (1) says: "stick-slip" semantics). ``CoulombStribeck``
-generalises F_s by mu_back, ratio and viscous.
+generalises F_s by mu_back, ratio and viscous. The general capsule has more, each term absent by default; w = Y1 - Y2,
+D the force of any drive:
+
+    f = k1 r + k_cubic r^3 + c w + [r >= G] (k2 (r - G) + c2 w) + [r <= -G_back] k2_back (r + G_back)
+    m1 X1'' = D - f - m1 g sin(slope)             N = (m1 + m2) g cos(slope) + N0
+    m2 X2'' = F - F_s(Y2),  F = f - reaction D - m2 g sin(slope);  stuck while Y2 = 0 and F is within the break-away forces
+
+Contacts are switched by r alone: the force may pull just before opening. Where Y2 reaches 0 the stuck rule decides with
+the contacts and D of that instant (after a jump).
 """
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import reduce
 from operator import and_
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +33,7 @@ from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, TABLE
-from capsule_id.physics.batches import NumberOrBatch, lanes_of, run_lanes
+from capsule_id.physics.batches import NumberOrBatch, is_traced, lanes_of, run_lanes
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drive import Excitation as Excitation
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
@@ -40,6 +48,8 @@ Initial = tuple[NumberOrBatch, NumberOrBatch, NumberOrBatch, NumberOrBatch]
 
 # Bound on the steps of one lane: 348 periods of the busiest reference motion need 45,000.
 MAX_STEPS = 100_000
+# A normal force below this part of the weight is rounding, as on a slope of 90 degrees.
+NORMAL_ROUNDING = 1e-12
 # Leaves of the capsule that a friction law of its own replaces.
 _OWN_FRICTION = frozenset(row.symbol for row in CoulombStribeck.parameters)
 
@@ -52,9 +62,13 @@ class CapsuleParameters:
     m1, m2 : mass of rod and capsule, kg          k1, k2 : stiffness of the rod's and of the support spring, N/m
     c : damping of the rod's spring, N s/m        mu : static friction coefficient, 1
     v_s : Stribeck velocity, m/s                  G : gap between rod and support spring, m
-    g : acceleration of gravity, m/s^2
+    g : acceleration of gravity, m/s^2            k_cubic : cubic stiffness of the rod's spring, N/m^3
+    c2 : damping of the closed contact, N s/m     k2_back, G_back : stiffness and gap of a back spring, N/m and m
+    slope : of the ground, rad, +X uphill         N0 : force that presses the capsule down, N, besides the weight
     mu_back : static friction coefficient of backward sliding, 1; None: as mu
     ratio : kinetic over static friction, 1       viscous : viscous friction of the ground, N s/m
+
+    k2 = 0 or G = inf: no support spring, and no c2; likewise the back spring.
     """
 
     m1: NumberOrBatch
@@ -66,15 +80,44 @@ class CapsuleParameters:
     v_s: NumberOrBatch
     G: NumberOrBatch
     g: NumberOrBatch = 9.81
+    k_cubic: NumberOrBatch = 0.0
+    c2: NumberOrBatch = 0.0
+    k2_back: NumberOrBatch = 0.0
+    G_back: NumberOrBatch = np.inf
+    slope: NumberOrBatch = 0.0
+    N0: NumberOrBatch = 0.0
     mu_back: NumberOrBatch | None = None
     ratio: NumberOrBatch = 0.5
     viscous: NumberOrBatch = 0.0
 
 
+AnyDrive = TypeVar("AnyDrive", bound=Drive)
+
+
+def without_absent(p: CapsuleParameters, e: AnyDrive) -> tuple[CapsuleParameters, AnyDrive]:
+    """p and e with None for each term that is known to be absent in all lanes: the engines leave it out.
+
+    A traced value may be anything, so its term stays.
+    """
+
+    def absent(value: Any, nothing: float) -> bool:
+        return value is None or (not is_traced(value) and bool(np.all(np.asarray(value) == nothing)))
+
+    gone = [name for name in ("k_cubic", "c2", "slope", "N0") if absent(getattr(p, name), 0.0)]
+    if absent(p.k2, 0.0) or absent(p.G, np.inf):
+        gone += ["k2", "G", "c2"]
+    if absent(p.k2_back, 0.0) or absent(p.G_back, np.inf):
+        gone += ["k2_back", "G_back"]
+    off: dict[str, Any] = {name: None for name in ("reaction", "lag") if absent(getattr(e, name, None), 0.0)}
+    kept: Any = e
+    return replace(p, **dict.fromkeys(gone)), replace(kept, **{name: x for name, x in off.items() if hasattr(e, name)})
+
+
 def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:
     """(L,) bool: every leaf (L,) is finite and of the sign that its row of the parameter table admits.
 
-    The break-away forces are N >= 0 too. The parameters of eq. (1) are judged where they are leaves of the law.
+    The break-away forces are N >= 0 too. The parameters of eq. (1) are judged where they are leaves of the law. A
+    prescribed rod needs no mass.
     """
     own = tuple(row for symbol, row in CAPSULE_LEAVES.items() if symbol not in _OWN_FRICTION)
     leaves = [
@@ -84,7 +127,21 @@ def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:
     ]
     still = jnp.zeros_like(jnp.asarray(p.m1))
     leaves += [(TABLE["mu"], threshold(still)) for threshold in (law.forward, law.backward)]
-    return reduce(and_, (row.admits(jnp.asarray(leaf)) for row, leaf in leaves if leaf is not None))
+    if e.prescribed:
+        leaves = [(TABLE["c"] if row.symbol == "m1" else row, leaf) for row, leaf in leaves]
+    judged = [row.admits(jnp.asarray(leaf)) for row, leaf in leaves if leaf is not None]
+    return reduce(and_, [*judged, pressed(p, law)])
+
+
+def pressed(p: CapsuleParameters, law: FrictionLaw) -> Any:
+    """(L,) bool: the ground carries the capsule, N > 0; NumPy and JAX.
+
+    Only a slope or N0 can lift it. A law of its own has no normal force.
+    """
+    if not isinstance(law, CoulombStribeck) or (p.slope is None and p.N0 is None):
+        return p.m1 == p.m1
+    size = (p.m1 + p.m2) * p.g + abs(0.0 if p.N0 is None else p.N0)
+    return NORMAL_ROUNDING * size < law.N
 
 
 def _signs() -> str:
@@ -150,6 +207,7 @@ class Trajectory:
 
     times : (n,), s                X1, Y1, X2, Y2 : (n,), m and m/s, absolute
     contacts : closings of the gap between times[0] and times[-1] (a start in contact is not a closing)
+    contacts_back : closings of the back gap
     status : a ``Status`` code     steps : integration steps taken
     events : changes of mode located (0 for the smoothed model, which has none)
     """
@@ -163,6 +221,7 @@ class Trajectory:
     status: jax.Array
     steps: jax.Array
     events: jax.Array
+    contacts_back: jax.Array
 
     @property
     def x_rel(self) -> jax.Array:
@@ -183,6 +242,20 @@ def _check_choices(model: str, semantics: str, smoothing: "Smoothing | None") ->
         raise InputError("the exact model has no smoothing", repr(smoothing), 'leave it out or use model="smooth"')
 
 
+def _check_values(p: CapsuleParameters, e: Drive, law: FrictionLaw, times: np.ndarray) -> None:
+    """Refuse lanes without a normal force, and times outside the drive."""
+    carried = np.asarray(pressed(p, law))
+    if isinstance(law, CoulombStribeck) and not (carried | np.isnan(law.N)).all():
+        N = float(np.asarray(law.N)[~carried & ~np.isnan(law.N)][0])
+        rule = "the normal force (m1 + m2) g cos(slope) + N0 must be positive"
+        raise InputError(rule, f"N = {N:.3g} N", "reduce the slope, or raise N0")
+    covered = np.asarray(e.covers(times[:, 0], times[:, -1]))
+    if not covered.all():
+        begin, end = times[~covered][0, [0, -1]]
+        rule = f"the drive {type(e).__name__} must cover the run, and its own times must increase"
+        raise InputError(rule, f"times from {begin:g} to {end:g} s", "shorten the run, or correct the drive")
+
+
 def simulate(
     p: CapsuleParameters,
     e: Drive,
@@ -199,9 +272,11 @@ def simulate(
 
     Parameters
     ----------
-    p, e : parameters and drive; any leaf may carry a leading batch axis of one common length
+    p, e : parameters and drive (``Excitation``, ``Pulses``, ``RecordedDrive``, ``RodMotion``); any leaf may carry a
+        leading batch axis of one common length
     times : (n,) or (batch, n), s, increasing; times[0] is the start
-    initial : (X1, Y1, X2, Y2) at times[0], each () or (batch,); default at rest at the origin
+    initial : (X1, Y1, X2, Y2) at times[0], each () or (batch,); default at rest at the origin. A prescribed rod
+        starts from its own X1 and Y1 instead
     model : "exact" (event-driven) or "smooth" (smoothed Heavisides)
     semantics : "stick-slip", or "eq2" (eq. (2) to the letter; smooth model only, for comparison)
     smoothing : widths of the smooth model; default the certified ones
@@ -221,12 +296,15 @@ def simulate(
     ------
     InputError
         Unknown model or semantics, "eq2" or smoothing with the exact model, leaves whose shapes do not agree, times
-        that do not increase.
+        that do not increase; concrete values with a normal force N <= 0, or times outside the drive.
     """
     _check_choices(model, semantics, smoothing)
-    (p, e, friction, initial), grid, batched = lanes_of((p, e, friction, initial or (0.0, 0.0, 0.0, 0.0)), times)
-    # JAX cannot batch and differentiate a function of a tree that holds None.
-    lanes = (p if p.mu_back is not None else replace(p, mu_back=p.mu), e, friction_law(p, friction), initial)
+    given = (*without_absent(p, e), friction, initial or (0.0, 0.0, 0.0, 0.0))
+    (p, e, friction, initial), grid, batched = lanes_of(given, times)
+    law = friction_law(p, friction)
+    if not is_traced((p, e, law, grid)):
+        _check_values(p, e, law, np.asarray(grid))
+    lanes = (p, e, law, initial)
     if model == "exact":
         from capsule_id.physics.exact import engine as exact
 

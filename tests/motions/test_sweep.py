@@ -1,5 +1,6 @@
 """Sweeps: every leaf, continuation and co-existing motions, maps, basins, what fails, and what is written."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,14 +8,22 @@ import pytest
 import xarray as xr
 
 from capsule_id.errors import InputError
-from capsule_id.motions.points import MOTION_COLUMNS, SUMMARY
+from capsule_id.motions.points import MOTION_COLUMNS, SUMMARY, swept_leaf
 from capsule_id.motions.response import Settling, response
 from capsule_id.motions.sweep import basins, continuation, diagram, motion_map, spread_starts
-from capsule_id.parameters import SWEPT
+from capsule_id.parameters import CAPSULE_LEAVES, SWEPT
+from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
 E = Excitation(4.0, 34.56)
+#: Every term acts.
+GENERAL = replace(
+    P, k_cubic=1e8, c2=5.0, k2_back=1e4, G_back=1e-3, slope=0.05, N0=1.0, mu_back=0.5, ratio=0.6, viscous=1.0
+)
+GENERAL_E = Excitation(8.0, 34.56, 0.3, 0.2)
+PULSES = Pulses(P_on=12.0, period=0.18, duty=0.4, P_off=-3.0, phase=0.5, lag=5e-3, reaction=0.2)
+SHORT = Settling(dropped=10, observed=6, exponent_periods=0)
 QUICK = Settling(dropped=60, observed=12, exponent_periods=0)
 # A lightly damped capsule with a period-1 motion beside chaos between 4.5 and 6 N.
 LIGHT = CapsuleParameters(m1=0.11, m2=0.3, k1=1420.0, k2=56410.0, c=0.5, mu=0.2, v_s=0.3, G=0.5e-3)
@@ -31,21 +40,32 @@ def test_a_diagram_is_the_responses_value_by_value() -> None:
     np.testing.assert_allclose(data["efficiency"][0] * r.work_per_period, r.mean_velocity * 2.0 * np.pi / 34.56)
 
 
-def test_every_quantity_can_be_swept() -> None:
+@pytest.mark.parametrize("e", [GENERAL_E, PULSES], ids=["harmonic", "pulses"])
+def test_every_quantity_can_be_swept(e: Excitation | Pulses) -> None:
     """Each one moves the motion, and leaves as attributes all the others."""
+    given = {**vars(GENERAL), **vars(e)}
     for name in SWEPT:
-        base = {"f": 34.56 / (2.0 * np.pi), "phase": 1.0}.get(name, {**vars(P), **vars(E)}.get(name))
-        data = diagram(P, E, name, base * np.array([0.9, 1.0]), settling=QUICK)
+        if name not in {"f", *CAPSULE_LEAVES, *(row.symbol for row in e.parameters)}:
+            continue
+        base = 1.0 / float(e.period) if name == "f" else given[name]
+        data = diagram(GENERAL, e, name, base * np.array([0.8, 1.0]), settling=SHORT)
         assert (data["status"] <= Status.GRAZING).all()
         assert data[name].attrs["units"] == SWEPT[name].unit
-        swept = "Omega" if name == "f" else name
-        assert set(data.attrs) & {*vars(P), *vars(E)} == {*vars(P), *vars(E)} - {swept}
+        assert set(data.attrs) & set(given) == set(given) - {swept_leaf(name, e)}
         # A drive with another phase ends in the same motion, met at another point of it.
-        assert data["x_rel"][0, 0, -1] != data["x_rel"][0, 1, -1]
-        assert name == "phase" or data["mean_velocity"][0, 0] != data["mean_velocity"][0, 1]
+        assert data["x_rel"][0, 0, -1] != data["x_rel"][0, 1, -1], name
+        assert name == "phase" or data["mean_velocity"][0, 0] != data["mean_velocity"][0, 1], name
+
+
+def test_a_frequency_is_that_of_the_drive() -> None:
     hertz = diagram(P, E, "f", [5.0], settling=QUICK)
     radians = diagram(P, E, "Omega", [10.0 * np.pi], settling=QUICK)
     np.testing.assert_allclose(hertz["mean_velocity"].to_numpy(), radians["mean_velocity"].to_numpy(), rtol=1e-12)
+    hertz = diagram(GENERAL, PULSES, "f", [5.0], settling=SHORT)
+    seconds = response(GENERAL, replace(PULSES, period=0.2), settling=SHORT)
+    np.testing.assert_allclose(hertz["mean_velocity"].to_numpy(), seconds.mean_velocity, rtol=1e-12)
+    with pytest.raises(InputError, match="P_d, choose from m1"):
+        diagram(P, PULSES, "P_d", [1.0])
 
 
 def test_continuation_follows_a_motion_to_where_rest_does_not_lead_and_shows_what_coexists() -> None:

@@ -274,7 +274,7 @@ class ForcedRun(CapsuleForward):
             view = view_record(self.table, K=theta["K"] if self.driven_by_current else None)
         except InputError:
             return None
-        return RunRecord(self.label, view, np.asarray(e.force(self.time)))
+        return RunRecord(self.label, view, np.asarray(e.force_at(self.time)))
 
     def records(self, theta: ValuesBySymbol) -> list[tuple[str, np.ndarray]]:
         scaled = self.scaled(theta, np)[: len(self.channels)]

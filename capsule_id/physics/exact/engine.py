@@ -4,11 +4,14 @@
 
 Each lane has its own time, mode and step; one loop runs them all. Derivatives: forward mode goes through the loop. Step
 lengths and located times are held constant. At an event the state and the time get one Newton correction, dt = -g/g',
-whose value is next to nothing and whose tangent is the event's own (the saltation matrix).
+whose value is next to nothing and whose tangent is the event's own (the saltation matrix). Switching times of the drive
+are events with g = t - t_switch.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +20,21 @@ from jax.custom_batching import custom_vmap
 from jax.lax import stop_gradient
 
 from capsule_id.physics.batches import is_traced
-from capsule_id.physics.drive import Drive
+from capsule_id.physics.drive import Drive, SwitchingDrive
+from capsule_id.physics.drives.recorded import RodMotion
 from capsule_id.physics.exact.dense import WIDTH, Samples, read_off, row_of, samples_at
-from capsule_id.physics.exact.events import GAP, NONE, UPPER, VELOCITY, first_event, mode_at, motion_at
+from capsule_id.physics.exact.events import (
+    BACK,
+    GAP,
+    NONE,
+    SWITCH,
+    UPPER,
+    VELOCITY,
+    first_event,
+    force_rate,
+    mode_at,
+    motion_at,
+)
 from capsule_id.physics.exact.taylor import (
     CapsuleState,
     Constants,
@@ -27,10 +42,11 @@ from capsule_id.physics.exact.taylor import (
     StepSeries,
     advance,
     constants_of,
+    force_on_capsule,
     rod_force,
+    rod_rate,
     series,
     size,
-    stiffness_of,
     trusted,
 )
 from capsule_id.physics.friction import FrictionLaw, sliding_friction
@@ -44,6 +60,9 @@ ROWS = 64
 # An event whose function falls slower than this, relative to the typical size of its rate, counts as grazing.
 GRAZING_RATE = 1e-5
 
+# A piece of a drive shorter than this part of the time counts as that long: time always goes on.
+SHORTEST_PIECE = 1e-15
+
 # Numbers of samples are padded to this times a power of four.
 SHORTEST = 64
 
@@ -51,7 +70,10 @@ Kernel = Callable[[CapsuleParameters, Drive, FrictionLaw, Initial, jax.Array], T
 
 
 class RunState(NamedTuple):
-    """Everything that a step changes, every leaf (L,): the state, its mode, and the progress of the run."""
+    """Everything that a step changes, every leaf (L,): the state, its mode, and the progress of the run.
+
+    contacts, contacts_back : closings of the gap and of the back gap; the latter None without a back spring
+    """
 
     state: CapsuleState
     mode: Mode
@@ -60,6 +82,7 @@ class RunState(NamedTuple):
     contacts: jax.Array
     events: jax.Array
     steps: jax.Array
+    contacts_back: jax.Array | None = None
 
 
 def correct(
@@ -69,21 +92,32 @@ def correct(
 
     s, at : the located time and the state there, in the mode before the event
     """
-    f = rod_force(constants, at, mode.contact)
+    spring_force = rod_force(constants, at, mode)
+    f = force_on_capsule(constants, spring_force, at.drive)
     acceleration = (f - sliding_friction(constants.law, mode.sigma, at.v)) / constants.m2
     a2 = jnp.where(mode.sigma != 0.0, acceleration, 0.0)
-    w_rate = (constants.drive.value(at.drive) - f) / constants.m1 - a2
-    f_rate = stiffness_of(constants, mode.contact) * at.w + constants.c * w_rate
+    w_rate = rod_rate(constants, spring_force, at.drive) - a2
     level = jnp.where(kind == UPPER, -constants.F_forward, constants.F_backward)
-    g = jnp.where(kind == GAP, at.d, jnp.where(kind == VELOCITY, at.v, f + level))
-    rate = jnp.where(kind == GAP, at.w, jnp.where(kind == VELOCITY, a2, f_rate))
     f_rates = [k * x for k, x in enumerate(step.f)][1:]
     braking = (jnp.abs(f) + jnp.maximum(constants.F_forward, constants.F_backward)) / constants.m2
+    meets = (kind == GAP) if at.b is None else (kind == GAP) | (kind == BACK)
+    g = jnp.where(kind == GAP, at.d, jnp.where(kind == VELOCITY, at.v, f + level))
+    rate = jnp.where(meets, at.w, jnp.where(kind == VELOCITY, a2, force_rate(constants, at, mode, w_rate)))
     onset_or_stop = jnp.where(kind == VELOCITY, braking, size(f_rates, s) / step.h)
-    typical = jnp.where(kind == GAP, size(step.w, s), onset_or_stop)
+    typical = jnp.where(meets, size(step.w, s), onset_or_stop)
+    if at.b is not None:
+        g = jnp.where(kind == BACK, at.b, g)
+    if isinstance(constants.drive, SwitchingDrive):
+        switch = kind == SWITCH
+        g = jnp.where(switch, at.t - constants.drive.next_switch(at.drive), g)
+        rate, typical = jnp.where(switch, 1.0, rate), jnp.where(switch, 1.0, typical)
     rate, a2, w_rate, before, typical = stop_gradient((rate, a2, w_rate, at, typical))
     grazing = (kind != NONE) & ~(jnp.abs(rate) > GRAZING_RATE * typical)
     dt = -g / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
+    drive = constants.drive.shifted(at.drive, dt)
+    if isinstance(constants.drive, SwitchingDrive):
+        following = constants.drive.switched(drive)
+        drive = tuple(jnp.where(kind == SWITCH, x, y) for x, y in zip(following, drive, strict=True))
     return CapsuleState(
         at.t + dt,
         at.r + before.w * dt,
@@ -91,8 +125,33 @@ def correct(
         at.w + w_rate * dt,
         at.X2 + before.v * dt,
         jnp.where(kind == VELOCITY, 0.0, at.v + a2 * dt),
-        constants.drive.shifted(at.drive, dt),
+        drive,
+        None if at.b is None else jnp.where(kind == BACK, 0.0, at.b + before.w * dt),
     ), grazing
+
+
+def _mode_after(constants: Constants, mode: Mode, new: CapsuleState, kind: jax.Array) -> Mode:
+    """The mode that follows an event; ``new`` is the state on its surface.
+
+    Contacts and the capsule's motion change one at a time; a second event at the same instant follows next. Where an
+    event makes the force on the capsule jump, a stuck capsule may set off at once.
+    """
+    contact, back = jnp.where(kind == GAP, new.w > 0.0, mode.contact), mode.back
+    if back is not None:
+        back = jnp.where(kind == BACK, new.w < 0.0, back)
+    after = Mode(contact, mode.sigma, back)
+    moved = (kind > GAP) & (kind < BACK)
+    if constants.c2 is not None:
+        moved = moved | ((kind == GAP) & (mode.sigma == 0.0))
+    if constants.reaction is not None and isinstance(constants.drive, SwitchingDrive):
+        moved = moved | ((kind == SWITCH) & (mode.sigma == 0.0))
+    sigma = motion_at(stop_gradient(constants), stop_gradient(new), after, kind)
+    return after._replace(sigma=jnp.where(moved, sigma, mode.sigma))
+
+
+def _closed(before: jax.Array, after: jax.Array, stiffness: jax.Array) -> jax.Array:
+    """Whether a contact has closed; without stiffness there is no spring to meet."""
+    return after & ~before & (stiffness > 0.0)
 
 
 def take_step(
@@ -101,33 +160,46 @@ def take_step(
     """One step of every active lane."""
     state, mode, active = run.state, run.mode, run.active
     left = t_end - stop_gradient(state.t)
+    switching = None
+    if isinstance(constants.drive, SwitchingDrive):
+        switch = stop_gradient(constants.drive.next_switch(state.drive))
+        switching = switch < t_end
+        piece = switch - stop_gradient(state.t)
+        left = jnp.where(switching, jnp.maximum(piece, SHORTEST_PIECE * jnp.abs(switch)), left)
+        left = jnp.where(left > 0.0, left, jnp.finfo(float).tiny)
     step = series(constants, state, mode, left)
     held = stop_gradient(step)
-    s, kind = first_event(stop_gradient(constants), mode, held, trusted(held), active)
+    s, kind = first_event(stop_gradient(constants), mode, held, stop_gradient(state.b), trusted(held), active)
+    whole = (kind == NONE) & (s >= 1.0) & held.last
+    if switching is not None:
+        kind = jnp.where(whole & switching, SWITCH, kind)
+        whole = whole & ~switching
     at = advance(constants, state, step, s)
     new, grazing = correct(constants, mode, step, s, at, kind)
-    finished = (kind == NONE) & (s >= 1.0) & held.last
-    new = new._replace(t=jnp.where(finished, t_end, new.t))
-    finished = finished | (at.t >= t_end)
-    # The gap and the capsule's motion change mode one at a time; a second event at the same instant follows next.
-    contact = jnp.where(kind == GAP, new.w > 0.0, mode.contact)
-    sigma = motion_at(stop_gradient(constants), stop_gradient(new), mode.contact, kind)
-    after = Mode(contact, jnp.where(kind > GAP, sigma, mode.sigma))
+    new = new._replace(t=jnp.where(whole, t_end, new.t))
+    finished = whole | ((at.t if switching is None else new.t) >= t_end)
+    after = _mode_after(constants, mode, new, kind)
     steps = run.steps + active
     finite = jnp.isfinite(at.d + at.w + at.X2 + at.v)
     status = jnp.where(active & grazing, jnp.maximum(run.status, Status.GRAZING), run.status)
     status = jnp.where(active & ~finished & (steps >= max_steps), jnp.int32(Status.TOO_MANY_STEPS), status)
     status = jnp.where(active & ~finite, jnp.int32(Status.NOT_FINITE), status)
     moved = active & finite
+    contacts, back = run.contacts, run.contacts_back
+    if constants.k2 is not None:
+        contacts = contacts + (moved & _closed(mode.contact, after.contact, constants.k2))
+    if back is not None and mode.back is not None and after.back is not None and constants.k2_back is not None:
+        back = back + (moved & _closed(mode.back, after.back, constants.k2_back))
     state, mode = jax.tree.map(lambda x, y: jnp.where(moved, x, y), (new, after), (state, mode))
     return RunState(
         state,
         mode,
         active & ~finished & (status <= Status.GRAZING),
         status,
-        run.contacts + (moved & contact & ~run.mode.contact),
+        contacts,
         run.events + (moved & (kind != NONE)),
         steps,
+        back,
     ), step
 
 
@@ -136,16 +208,22 @@ def initial_lanes(
 ) -> RunState:
     """Runs at t (L,), s. A gap that is zero within rounding is set to exactly zero."""
     X1, Y1, X2, Y2 = (jnp.asarray(x) for x in initial)
-    d = (X1 - X2) - constants.G
-    rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2) + constants.G)
-    d = jnp.where(jnp.abs(d) <= rounding, d - stop_gradient(d), d)
-    state = CapsuleState(t, X1 - X2, d, Y1 - Y2, X2, Y2, constants.drive.state(t))
+    rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2))
+
+    def without_rounding(d: jax.Array, gap: jax.Array) -> jax.Array:
+        allowed = rounding + 2.0 * jnp.finfo(float).eps * gap
+        return jnp.where(jnp.abs(d) <= allowed, d - stop_gradient(d), d)
+
+    d = without_rounding((X1 - X2) - constants.G, constants.G)
+    b = None if constants.G_back is None else without_rounding((X1 - X2) + constants.G_back, constants.G_back)
+    state = CapsuleState(t, X1 - X2, d, Y1 - Y2, X2, Y2, constants.drive.state(t), b)
     given = jnp.stack([*jax.tree.leaves(state), t_end])
     valid = jnp.all(jnp.isfinite(given), axis=0) & admissible(p, constants.drive, constants.law)
+    valid = valid & constants.drive.covers(t, t_end)
     zero = jnp.zeros(d.shape, jnp.int32)
     status = jnp.where(valid, jnp.int32(Status.OK), jnp.int32(Status.INVALID))
     mode = mode_at(stop_gradient(constants), stop_gradient(state))
-    return RunState(state, mode, valid & (t < t_end), status, zero, zero, zero)
+    return RunState(state, mode, valid & (t < t_end), status, zero, zero, zero, None if b is None else zero)
 
 
 def march(
@@ -184,6 +262,8 @@ def run(
     Seven arguments, because the engine's inputs are unpacked.
     """
     constants, t_end = constants_of(p, e, law), stop_gradient(t_end)
+    if isinstance(e, RodMotion):
+        initial = (*e.rod(times[:, 0]), *initial[2:])
     lanes = initial_lanes(p, constants, times[:, 0], t_end, initial)
     samples = samples_at(times, initial, lanes.status == Status.OK)
     n = times.shape[1]
@@ -194,28 +274,40 @@ def run(
 
     lanes, samples = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
     X1, Y1, X2, Y2 = (samples.values[:, i, :n] for i in range(4))
-    return Trajectory(times, X1, Y1, X2, Y2, lanes.contacts, lanes.status, lanes.steps, lanes.events)
+    back = jnp.zeros_like(lanes.contacts) if lanes.contacts_back is None else lanes.contacts_back
+    return Trajectory(times, X1, Y1, X2, Y2, lanes.contacts, lanes.status, lanes.steps, lanes.events, back)
 
 
-_folding = custom_vmap(run)
+def _run_folded(*lanes: Any) -> Trajectory:
+    """``run``, whose lanes take in the axis of a ``jax.vmap``; every argument as there."""
+    leaves, structure = jax.tree.flatten(lanes)
+    return _folding(structure)(*leaves)
 
 
-@_folding.def_vmap
-def _fold(size: int, batched: list[object], *args: object) -> tuple[Trajectory, Trajectory]:
-    """Fold a new axis into the lanes: a loop inside a loop over lanes would copy its buffers at every step."""
-    flat, structure = jax.tree.flatten(args)
-    flags = jax.tree.leaves(batched)
-    if not any(flags):
-        out = run(*args)  # pyright: ignore[reportArgumentType]
-        return out, jax.tree.map(lambda _: False, out)
-    full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(flat, flags, strict=True)]
-    L = full[0].shape[1]
-    lanes = jax.tree.unflatten(structure, [x.reshape(size * L, *x.shape[2:]) for x in full])
-    out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), _folding(*lanes))
-    return out, jax.tree.map(lambda _: True, out)
+@cache
+def _folding(structure: Any) -> Callable[..., Trajectory]:
+    """``run`` of leaves: a tree that holds None cannot be batched and differentiated at once."""
+
+    @custom_vmap
+    def run_leaves(*leaves: jax.Array) -> Trajectory:
+        return run(*jax.tree.unflatten(structure, leaves))
+
+    @run_leaves.def_vmap
+    def _fold(size: int, batched: list[bool], *leaves: jax.Array) -> tuple[Trajectory, Trajectory]:
+        """Fold a new axis into the lanes: a loop inside a loop over lanes would copy its buffers at every step."""
+        if not any(batched):
+            out = run_leaves(*leaves)
+            return out, jax.tree.map(lambda _: False, out)
+        full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)]
+        L = full[0].shape[1]
+        lanes = [x.reshape(size * L, *x.shape[2:]) for x in full]
+        out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), run_leaves(*lanes))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return run_leaves
 
 
-_run = jax.jit(_folding)
+_run = jax.jit(_run_folded)
 
 
 def kernel(max_steps: int) -> Kernel:
@@ -234,7 +326,6 @@ def kernel(max_steps: int) -> Kernel:
         length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
         padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
         t = _run(p, e, law, initial, padded, t_end, bound)
-        times, X1, Y1, X2, Y2 = (x[:, :n] for x in (t.times, t.X1, t.Y1, t.X2, t.Y2))
-        return Trajectory(times, X1, Y1, X2, Y2, t.contacts, t.status, t.steps, t.events)
+        return replace(t, **{name: getattr(t, name)[:, :n] for name in ("times", "X1", "Y1", "X2", "Y2")})
 
     return simulate_exact

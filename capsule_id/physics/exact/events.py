@@ -1,8 +1,9 @@
 """Changes of mode: where on a step the first one lies, and which mode follows.
 
-In a mode three functions must stay >= 0: the gap's (d in contact, -d out of it) and, while sliding, the velocity in the
-mode's direction, or, while stuck, F_forward - f and F_backward + f. Each is a linear combination
-of the series of the step, so it is a polynomial in s.
+In a mode these functions must stay >= 0: the gap's (d in contact, -d out of it), that of the back gap, and, while
+sliding, the velocity in the mode's direction, or, while stuck, F_forward - f and F_backward + f, f the force on the
+capsule. Each is a linear combination of the series of the step, so it is a polynomial in s. What is absent is not
+watched. Switching times of the drive are known: they end a step (``SWITCH``) and need no search.
 """
 
 from typing import NamedTuple
@@ -10,12 +11,23 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from capsule_id.physics.exact.taylor import CapsuleState, Constants, Mode, StepSeries, rod_force, size
+from capsule_id.physics.exact.taylor import (
+    CapsuleState,
+    Constants,
+    Mode,
+    StepSeries,
+    damping_of,
+    force_on_capsule,
+    rod_force,
+    rod_rate,
+    size,
+    tangent_stiffness,
+)
 from capsule_id.physics.friction import sliding_friction
 from capsule_id.physics.series import Series, horner
 
 # Kinds of events.
-NONE, GAP, VELOCITY, UPPER, LOWER = 0, 1, 2, 3, 4
+NONE, GAP, VELOCITY, UPPER, LOWER, BACK, SWITCH = 0, 1, 2, 3, 4, 5, 6
 # The march arrives when its next leap is this small a part of the step, or, at a root that is crossed at a definite
 # rate, when a leap below SURE_LEAP agrees with Newton's to SURE_AGREEMENT: the correction in ``correct`` does the rest.
 LEAP_TOLERANCE = 1e-9
@@ -85,17 +97,21 @@ def _sure(p0: jax.Array, p1: jax.Array, tau: jax.Array) -> jax.Array:
 
 
 def first_event(
-    constants: Constants, mode: Mode, step: StepSeries, s_end: jax.Array, active: jax.Array
+    constants: Constants, mode: Mode, step: StepSeries, b: jax.Array | None, s_end: jax.Array, active: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """(s, kind): where the step ends and why; s = s_end and NONE if nothing happens before.
 
     Marches from the left, each leap to the root of a quadratic minorant of each event function on what is left of the
-    step, so no root can be passed, double ones included.
+    step, so no root can be passed, double ones included. b (L,) m: the back gap at the start of the step.
     """
     sliding = mode.sigma != 0.0
     middle = 0.5 * (constants.F_forward - constants.F_backward)
     level = jnp.where(sliding, 0.0, 0.5 * (constants.F_forward + constants.F_backward))
-    gap = _watched(_divided([jnp.where(mode.contact, x, -x) for x in step.d], s_end), jnp.zeros_like(level), s_end)
+    gaps = []
+    if constants.k2 is not None:
+        gaps.append((GAP, _gap([jnp.where(mode.contact, x, -x) for x in step.d], s_end)))
+    if mode.back is not None and b is not None:
+        gaps.append((BACK, _gap([jnp.where(mode.back, -x, x) for x in (b, *step.d[1:])], s_end)))
     speed = _divided([mode.sigma * x for x in step.v], s_end)
     # While stuck level - (f - middle) and level + (f - middle), while sliding sigma Y2, written as level + sign * p.
     force = [step.f[0] - middle, *step.f[1:]]
@@ -104,17 +120,18 @@ def first_event(
 
     def leap(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         s, kind, going, leaps = carry
-        g0, g1 = gap.at(s)
         p0, p1 = other.at(s)
-        to_gap = _leap(g0, g1, gap.rest - gap.p2)
         to_upper = _leap(base + p0, p1, other.rest - other.p2)
         to_lower = jnp.where(sliding, jnp.inf, _leap(base - p0, -p1, other.rest + other.p2))
-        to_motion = jnp.minimum(to_upper, to_lower)
-        tau = jnp.minimum(to_gap, to_motion)
-        is_gap, sign = to_gap <= to_motion, jnp.where(to_upper <= to_lower, 1.0, -1.0)
-        sure = jnp.where(is_gap, _sure(g0, g1, tau), _sure(base + sign * p0, sign * p1, tau))
+        tau, sign = jnp.minimum(to_upper, to_lower), jnp.where(to_upper <= to_lower, 1.0, -1.0)
+        sure = _sure(base + sign * p0, sign * p1, tau)
+        which = jnp.where(sliding, VELOCITY, jnp.where(sign > 0.0, UPPER, LOWER))
+        for gap_kind, gap in reversed(gaps):
+            g0, g1 = gap.at(s)
+            to_gap = _leap(g0, g1, gap.rest - gap.p2)
+            is_gap, tau = to_gap <= tau, jnp.minimum(to_gap, tau)
+            sure, which = jnp.where(is_gap, _sure(g0, g1, tau), sure), jnp.where(is_gap, gap_kind, which)
         arrived = tau <= jnp.where(sure, SURE_LEAP, LEAP_TOLERANCE) * s_end
-        which = jnp.where(is_gap, GAP, jnp.where(sliding, VELOCITY, jnp.where(sign > 0.0, UPPER, LOWER)))
         kind = jnp.where(going & arrived, which, kind)
         onward = s + tau
         return (
@@ -129,37 +146,77 @@ def first_event(
     return jnp.clip(s, SMALLEST_FRACTION * s_end, s_end), kind
 
 
-def motion_at(constants: Constants, state: CapsuleState, contact: jax.Array, kind: jax.Array) -> jax.Array:
+def _gap(p: Series, s_end: jax.Array) -> _Watched:
+    """The event function of a gap: p, without its root at the start of the step."""
+    return _watched(_divided(p, s_end), jnp.zeros_like(s_end), s_end)
+
+
+def motion_at(constants: Constants, state: CapsuleState, mode: Mode, kind: jax.Array) -> jax.Array:
     """(L,) sigma of the mode that follows from a state: the sign of v or, where v = 0, that of f if it breaks away.
 
+    mode : the contacts; its sigma does not matter
     kind : (L,) the event; after UPPER or LOWER f is at the threshold of a capsule at rest, whatever rounding says
+
+    f is the force on the capsule but for friction.
     """
-    k2 = jnp.where(contact, constants.k2, 0.0)
-    spring, damper, support = constants.k1 * state.r, constants.c * state.w, k2 * state.d
-    f = spring + damper + support
-    drive = constants.drive.value(state.drive)
-    f_rate = (constants.k1 + k2) * state.w + constants.c * (drive - f) / constants.m1
+    spring_force = rod_force(constants, state, mode)
+    f = force_on_capsule(constants, spring_force, state.drive)
+    w_rate = rod_rate(constants, spring_force, state.drive)
+    f_rate = force_rate(constants, state, mode, w_rate)
     onset = (kind == UPPER) | (kind == LOWER)
     side = jnp.where(onset, jnp.where(kind == UPPER, 1.0, -1.0), jnp.sign(f))
     threshold = jnp.where(side < 0.0, constants.F_backward, constants.F_forward)
-    size_of_forces = jnp.abs(spring) + jnp.abs(damper) + jnp.abs(support) + threshold
-    tolerance = size_of_forces * THRESHOLD_ROUNDINGS * jnp.finfo(float).eps
+    tolerance = (_size_of_forces(constants, state, mode) + threshold) * THRESHOLD_ROUNDINGS * jnp.finfo(float).eps
     at_threshold = onset | (jnp.abs(jnp.abs(f) - threshold) <= tolerance)
     slips = jnp.where(at_threshold, side * f_rate > 0.0, jnp.abs(f) > threshold)
-    # Without friction nothing ever sticks, and a force of zero leaves the direction to its rate, then to the drive's.
+    # Without friction nothing ever sticks, and a force of zero leaves the direction to its rate, then to the rod's.
     free = (constants.F_forward == 0.0) & (constants.F_backward == 0.0)
-    later = jnp.where(f_rate != 0.0, jnp.sign(f_rate), jnp.where(drive < 0.0, -1.0, 1.0))
+    later = jnp.where(f_rate != 0.0, jnp.sign(f_rate), jnp.where(w_rate < 0.0, -1.0, 1.0))
     direction = jnp.where(free & (jnp.abs(f) <= tolerance), later, side)
     sigma = jnp.where(slips | free, direction, 0.0)
     return jnp.where(state.v != 0.0, jnp.sign(state.v), sigma)
 
 
+def force_rate(constants: Constants, state: CapsuleState, mode: Mode, w_rate: jax.Array) -> jax.Array:
+    """(L,) N/s: rate of the force on the capsule but for friction; w_rate (L,) m/s^2, the rate of w."""
+    rate = tangent_stiffness(constants, mode, state.r) * state.w + damping_of(constants, mode.contact) * w_rate
+    if constants.reaction is None:
+        return rate
+    return rate - constants.reaction * constants.drive.series(state.drive, jnp.ones_like(rate), 2)[1]
+
+
+def _size_of_forces(constants: Constants, state: CapsuleState, mode: Mode) -> jax.Array:
+    """(L,) N: sum of the magnitudes of the forces on the capsule, which its rounding scales with."""
+    terms = [constants.k1 * state.r, constants.c * state.w]
+    if constants.k_cubic is not None:
+        terms.append(constants.k_cubic * state.r**3)
+    if constants.k2 is not None:
+        terms.append(jnp.where(mode.contact, constants.k2, 0.0) * state.d)
+    if constants.c2 is not None:
+        terms.append(constants.c2 * state.w)
+    if constants.k2_back is not None and state.b is not None and mode.back is not None:
+        terms.append(jnp.where(mode.back, constants.k2_back, 0.0) * state.b)
+    if constants.reaction is not None:
+        terms.append(constants.reaction * constants.drive.value(state.drive))
+    if constants.downhill is not None:
+        terms.append(constants.downhill[1])
+    return sum((jnp.abs(x) for x in terms[1:]), jnp.abs(terms[0]))
+
+
 def mode_at(constants: Constants, state: CapsuleState) -> Mode:
-    """The mode that any state begins in: signs of d, v and, where they are 0, of their first rate that is not."""
+    """The mode that any state begins in: signs of d, b, v and, where they are 0, of their first rate that is not."""
     meeting = (state.d > 0.0) | ((state.d == 0.0) & (state.w > 0.0))
-    sigma = motion_at(constants, state, meeting, jnp.full(state.d.shape, NONE))
-    f = rod_force(constants, state, jnp.zeros_like(meeting))
-    drive = constants.drive.value(state.drive)
+    if constants.k2 is None:
+        meeting = jnp.zeros_like(meeting)
+    leaning = None if state.b is None else (state.b < 0.0) | ((state.b == 0.0) & (state.w < 0.0))
+    sigma = motion_at(constants, state, Mode(meeting, jnp.zeros_like(state.v), leaning), jnp.full(state.d.shape, NONE))
+    free = Mode(jnp.zeros_like(meeting), sigma, None if leaning is None else jnp.zeros_like(leaning))
+    spring_force = rod_force(constants, state, free)
+    f = force_on_capsule(constants, spring_force, state.drive)
     a2 = jnp.where(sigma != 0.0, (f - sliding_friction(constants.law, sigma, state.v)) / constants.m2, 0.0)
-    touching = (state.d == 0.0) & (state.w == 0.0) & ((drive - f) / constants.m1 - a2 > 0.0)
-    return Mode(meeting | touching, sigma)
+    w_rate = rod_rate(constants, spring_force, state.drive) - a2
+    touching = (state.d == 0.0) & (state.w == 0.0) & (w_rate > 0.0)
+    contact = meeting if constants.k2 is None else meeting | touching
+    if leaning is None or state.b is None:
+        return Mode(contact, sigma)
+    return Mode(contact, sigma, leaning | ((state.b == 0.0) & (state.w == 0.0) & (w_rate < 0.0)))

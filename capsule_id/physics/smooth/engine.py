@@ -4,6 +4,9 @@
     m2 Y2' = f - friction(Y2, f),           X1' = Y1,  X2' = Y2                       semantics "stick-slip"
     m2 Y2' = gate(f) (f - F_s(Y2)),         X1' = Y1,  X2' = gate(f) Y2               semantics "eq2"
 
+The general capsule has the further terms of ``physics.model``; c2 acts through H1. The pieces of a drive end steps;
+derivatives in its switching times are those of the exact model only.
+
 "stick-slip" switches in velocity and force (``friction_smooth``) and tends to the exact model as the widths go
 to zero. "eq2" switches in force alone, as eq. (2) is printed; it tends to a sliding mode on |f| = F_b, a different
 motion, and is offered so that the difference can be shown.
@@ -17,9 +20,11 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
+from capsule_id.physics.batches import NumberOrBatch
 from capsule_id.physics.contacts import support_smooth
-from capsule_id.physics.drive import Drive
-from capsule_id.physics.forces import spring_and_damper
+from capsule_id.physics.drive import Drive, SwitchingDrive
+from capsule_id.physics.drives.recorded import RodMotion
+from capsule_id.physics.forces import downhill, spring_and_damper
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Trajectory, admissible
 from capsule_id.physics.smooth.friction import breakaway, force_gate, friction_smooth
@@ -61,38 +66,75 @@ class Smoothing:
     tolerance: Array = 2e-5
 
 
-def stick_slip_field(system: System) -> Field:
-    """The field whose limit is the exact model."""
-    p, e, law, widths = system
+def stick_slip_field(system: System, piece: jax.Array | None = None) -> Field:
+    """The field whose limit is the exact model, on the piece of the drive that holds at the time ``piece`` (L,), s."""
+    _, _, law, widths = system
     F_b = breakaway(law)
+    forces = _forces(system, piece)
 
     def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        f = _rod_on_capsule(p, widths, r, Y1 - Y2)
+        Y1_rate, f = forces(t, r, Y1 - Y2)
         held = friction_smooth(law, F_b, Y2, f, (widths.velocity, widths.rounding))
-        return (e.force(t) - f) / p.m1, Y2, (f - held) / p.m2
+        return Y1_rate, Y2, (f - held) / system[0].m2
 
     return field
 
 
-def eq2_field(system: System) -> Field:
+def eq2_field(system: System, piece: jax.Array | None = None) -> Field:
     """The field of eq. (2) to the letter, with its force gate smoothed over ``rounding``: for comparison only."""
-    p, e, law, widths = system
+    _, _, law, widths = system
     F_b = breakaway(law)
+    forces = _forces(system, piece)
 
     def field(t: jax.Array, r: jax.Array, Y1: jax.Array, Y2: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        f = _rod_on_capsule(p, widths, r, Y1 - Y2)
+        Y1_rate, f = forces(t, r, Y1 - Y2)
         gate = force_gate(law, F_b, f, widths.rounding)
         forth = smooth_heaviside(Y2, widths.velocity)
         speed = smooth_abs(Y2, widths.velocity)
         sliding = forth * law.forward(speed) - (1.0 - forth) * law.backward(speed)
-        return (e.force(t) - f) / p.m1, gate * Y2, gate * (f - sliding) / p.m2
+        return Y1_rate, gate * Y2, gate * (f - sliding) / system[0].m2
 
     return field
 
 
+def _forces(
+    system: System, piece: jax.Array | None
+) -> Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    """(t, r, w) -> (Y1', m/s^2; force on the capsule but for friction, N)."""
+    p, e, _, widths = system
+
+    def forces(t: jax.Array, r: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:
+        f, D = _rod_on_capsule(p, widths, r, w), e.force_at(t, piece)
+        on_rod = D - f if p.slope is None else D - f - downhill(p, p.m1)
+        Y1_rate = D if e.prescribed else on_rod / p.m1
+        f = f if e.reaction is None else f - e.reaction * D
+        return Y1_rate, f if p.slope is None else f - downhill(p, p.m2)
+
+    return forces
+
+
 def _rod_on_capsule(p: CapsuleParameters, widths: Smoothing, r: jax.Array, w: jax.Array) -> jax.Array:
-    k2, G = jnp.asarray(p.k2), jnp.asarray(p.G)
-    return spring_and_damper(p, r, w) + support_smooth(k2, G, r, widths.penetration)
+    f = spring_and_damper(p, r, w)
+    if p.k2 is not None:
+        G, within_reach = _finite(p.G)
+        f = f + support_smooth(jnp.where(within_reach, p.k2, 0.0), G, r, widths.penetration)
+        if p.c2 is not None:
+            damping = jnp.where(within_reach & (jnp.asarray(p.k2) > 0.0), p.c2, 0.0)
+            f = f + damping * w * smooth_heaviside(r - G, widths.penetration)
+    if p.k2_back is not None:
+        G, within_reach = _finite(p.G_back)
+        f = f - support_smooth(jnp.where(within_reach, p.k2_back, 0.0), G, -r, widths.penetration)
+    return f
+
+
+def _gap(gap: NumberOrBatch | None) -> jax.Array:
+    return jnp.asarray(jnp.inf if gap is None else gap)
+
+
+def _finite(gap: NumberOrBatch) -> tuple[jax.Array, jax.Array]:
+    """(a gap with 0 in the place of infinity, whether it is finite)."""
+    within_reach = jnp.isfinite(jnp.asarray(gap))
+    return jnp.where(within_reach, gap, 0.0), within_reach
 
 
 def _valid(system: System) -> jax.Array:
@@ -109,16 +151,24 @@ def _problem(system: System, semantics: Semantics) -> Problem:
     # Rates of springs, damper, drive and friction, 1/s; the switch's own rate needs no small first step.
     resistance, slope = jax.jvp(law.forward, (jnp.zeros_like(p.m1),), (jnp.ones_like(p.m1),))
     friction_rate = 2.0 * p.g * jnp.abs(slope) / jnp.where(resistance > 0.0, resistance, jnp.inf)
-    fastest = jnp.sqrt((p.k1 + p.k2) * lightness) + p.c * lightness + e.rate() + friction_rate
+    stiffness = p.k1 + sum(jnp.asarray(k) for k in (p.k2, p.k2_back) if k is not None)
+    fastest = jnp.sqrt(stiffness * lightness) + p.c * lightness + e.frequency() + friction_rate
+    field = stick_slip_field if semantics == "stick-slip" else eq2_field
     return Problem(
-        field=(stick_slip_field if semantics == "stick-slip" else eq2_field)(system),
-        gap=jnp.asarray(p.G),
+        field=partial(field, system),
+        piece_end=partial(_piece_end, e) if isinstance(e, SwitchingDrive) else None,
+        gaps=(_gap(p.G), _gap(p.G_back)),
         first=FIRST_STEP / fastest,
-        longest=DRIVE_ANGLE / e.rate(),
+        longest=DRIVE_ANGLE / e.frequency(),
         floors=(jnp.asarray(widths.velocity), jnp.asarray(widths.penetration)),
         tolerance=jnp.asarray(widths.tolerance),
         valid=_valid(system),
     )
+
+
+def _piece_end(e: SwitchingDrive, t: jax.Array) -> jax.Array:
+    """(L,) s, the first switching time of the drive after t (L,)."""
+    return e.next_switch(e.state(t))
 
 
 @lru_cache(maxsize=32)
@@ -135,12 +185,16 @@ def _compiled(semantics: Semantics, max_steps: int) -> Callable[..., Trajectory]
         times: jax.Array,
     ) -> Trajectory:
         shape = times.shape[:1]
-        system = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), shape), (p, e, law, smoothing))
+        widths = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), shape), smoothing)
+        system = (*jax.tree.map(lambda leaf: jnp.asarray(leaf, float), (p, e, law)), widths)
         times = jnp.asarray(times, float)
+        if isinstance(e, RodMotion):
+            initial = (*e.rod(times[:, 0]), *initial[2:])
         record = march(system, times, jnp.stack(initial))
         X1, Y1, X2, Y2 = record.samples
         none = jnp.zeros_like(record.steps)
-        return Trajectory(times, X1, Y1, X2, Y2, record.closings, record.status, record.steps, none)
+        contacts, back = record.closings
+        return Trajectory(times, X1, Y1, X2, Y2, contacts, record.status, record.steps, none, back)
 
     return lanes
 

@@ -24,8 +24,9 @@ _LEAST_STEP = 1e-13
 class Problem(NamedTuple):
     """What a run is made of besides its inputs; every array is (L,) or ()."""
 
-    field: Field
-    gap: jax.Array  # m: a closing is r - gap turning from negative to not negative
+    field: Callable[..., Field]  # of a time (L,), s, or of nothing: the field on the drive's piece that holds there
+    piece_end: Callable[[jax.Array], jax.Array] | None  # (L,) s -> (L,) s: the next time at which a step must end
+    gaps: tuple[jax.Array, jax.Array]  # m: a closing is r - gap, or -r - back gap, turning from negative
     first: jax.Array  # s: length of the first step tried
     longest: jax.Array  # s: no step is longer (infinity: no bound)
     floors: tuple[jax.Array, jax.Array]  # m/s and m: scales below which velocity and r need no accuracy
@@ -45,15 +46,15 @@ class MarchState(NamedTuple):
     speed: jax.Array  # largest |velocity| so far: the scale of the error in velocity
     stretch: jax.Array  # largest |r| so far: the scale of the error in r
     steps: jax.Array
-    closings: jax.Array
+    closings: tuple[jax.Array, jax.Array]  # of the gap, of the back gap
     status: jax.Array
 
 
 class Record(NamedTuple):
-    """Samples (X1, Y1, X2, Y2) of shape (4, L, n); per lane the closings of the gap, the steps tried, the status."""
+    """Samples (X1, Y1, X2, Y2) of shape (4, L, n); per lane the closings of both gaps, the steps tried, the status."""
 
     samples: jax.Array
-    closings: jax.Array
+    closings: tuple[jax.Array, jax.Array]
     steps: jax.Array
     status: jax.Array
 
@@ -71,7 +72,7 @@ def initial_lanes(problem: Problem, times: jax.Array, y: StateArray) -> MarchSta
     finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(y), axis=0)
     status = jnp.where(finite & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
     zero = jnp.zeros(t.shape, jnp.int32)
-    return MarchState(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, zero, status)
+    return MarchState(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, (zero, zero), status)
 
 
 def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int) -> MarchState:
@@ -79,10 +80,11 @@ def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int
     t, y = lanes.t, lanes.y
     active = (t < end) & (lanes.status == Status.OK)
     h = jnp.minimum(lanes.h, problem.longest)
+    target = end if problem.piece_end is None else jnp.minimum(end, problem.piece_end(t))
     # A rest shorter than a hundredth of a step is taken along, so that no sliver of a step is left at the end.
-    last = h * 1.01 >= end - t
-    h = jnp.where(active, jnp.where(last, end - t, h), 1.0)
-    y_new, defect = step(problem.field, t, y, h)
+    last = h * 1.01 >= target - t
+    h = jnp.where(active, jnp.where(last, target - t, h), 1.0)
+    y_new, defect = step(problem.field(t + 0.5 * h), t, y, h)
     speed, stretch = _grown(lanes.speed, lanes.stretch, y_new)
     velocity_error = jnp.maximum(jnp.abs(defect[1]), jnp.abs(defect[3]))
     # max(velocity_error / speed, r_error / stretch) / tolerance, in one division.
@@ -90,9 +92,13 @@ def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int
     error = worse / (speed * stretch * problem.tolerance)
     h_next = h * step_factor(error)
     accepted = active & (error <= 1.0)
-    closing = accepted & (y[0] - y[2] < problem.gap) & (y_new[0] - y_new[2] >= problem.gap)
+    r, r_new = y[0] - y[2], y_new[0] - y_new[2]
+    closed = (
+        accepted & (before < gap) & (after >= gap)
+        for before, after, gap in zip((r, -r), (r_new, -r_new), problem.gaps, strict=True)
+    )
     steps = lanes.steps + active
-    t_new = jnp.where(accepted, jnp.where(last, end, t + h), t)
+    t_new = jnp.where(accepted, jnp.where(last, target, t + h), t)
     hopeless = active & ~jnp.isfinite(error) & (h < _LEAST_STEP * (jnp.abs(t) + jnp.abs(end)))
     status = jnp.where(hopeless, Status.NOT_FINITE, lanes.status)
     status = jnp.where(active & (steps >= max_steps) & (t_new < end), Status.TOO_MANY_STEPS, status)
@@ -103,7 +109,7 @@ def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int
         speed=jnp.where(accepted, speed, lanes.speed),
         stretch=jnp.where(accepted, stretch, lanes.stretch),
         steps=steps,
-        closings=lanes.closings + closing,
+        closings=(lanes.closings[0] + next(closed), lanes.closings[1] + next(closed)),
         status=status.astype(jnp.int32),
     )
 
@@ -123,29 +129,40 @@ def segment(
 ) -> tuple[jax.Array, MarchState]:
     """Try up to ``length`` steps; the rows (t, X1, Y1, X2, Y2) on the way, and where the lanes then stand.
 
-    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of system is (L,). Under ``jax.vmap`` the
+    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of system is (L, ...). Under ``jax.vmap`` the
     new axis joins the lanes: batching the loop itself would copy all rows in every step.
     """
 
+    # A tree that holds None cannot be batched and differentiated at once: the system goes in as its leaves.
+    leaves, structure = jax.tree.flatten(system)
+
     @jax.custom_batching.custom_vmap
-    def march(system: Any, end: jax.Array, lanes: MarchState) -> tuple[jax.Array, MarchState]:
-        return _segment(build(system), end, lanes, max_steps, length)
+    def march(leaves: list[jax.Array], end: jax.Array, lanes: MarchState) -> tuple[jax.Array, MarchState]:
+        return _segment(build(jax.tree.unflatten(structure, leaves)), end, lanes, max_steps, length)
 
     @march.def_vmap
     def _(size: int, batched: Any, *given: Any) -> tuple[Any, Any]:
+        def whole(leaf: jax.Array, has_axis: bool) -> jax.Array:
+            return leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
+
         def join(leaf: jax.Array, has_axis: bool) -> jax.Array:
-            leaf = leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
-            leaf = jnp.moveaxis(leaf, 0, -2)
+            leaf = jnp.moveaxis(whole(leaf, has_axis), 0, -2)
             return leaf.reshape(*leaf.shape[:-2], -1)
+
+        def join_first(leaf: jax.Array, has_axis: bool) -> jax.Array:
+            leaf = whole(leaf, has_axis)
+            return leaf.reshape(-1, *leaf.shape[2:])
 
         def split(leaf: jax.Array) -> jax.Array:
             return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], size, -1), -2, 0)
 
-        system, end, lanes = jax.tree.map(join, given, tuple(batched))
+        # Lanes stand first in the system, whose records have samples behind them, and last in states.
+        system = jax.tree.unflatten(structure, map(join_first, given[0], batched[0]))
+        end, lanes = jax.tree.map(join, given[1:], tuple(batched)[1:])
         result = jax.tree.map(split, segment(build, system, end, lanes, max_steps, length))
         return result, jax.tree.map(lambda _: True, result)
 
-    return march(system, end, lanes)
+    return march(leaves, end, lanes)
 
 
 def _segment(
@@ -213,7 +230,7 @@ def run(build: Build, system: Any, times: jax.Array, y: StateArray, max_steps: i
     def body(carry: tuple[MarchState, jax.Array]) -> tuple[MarchState, jax.Array]:
         rows, lanes = segment(build, system, end, carry[0], max_steps, STEPS_PER_SEGMENT)
         here = inside(rows, lanes, times)[None]
-        return lanes, jnp.where(here, interpolate(problem.field, rows[:, 0], rows[:, 1:], times), carry[1])
+        return lanes, jnp.where(here, interpolate(problem.field(), rows[:, 0], rows[:, 1:], times), carry[1])
 
     nothing = jnp.full((4, *times.shape), jnp.nan)
     samples = nothing.at[:, :, 0].set(jnp.where((lanes.status == Status.OK)[None], y, jnp.nan))
@@ -253,9 +270,10 @@ def replay(problem: Problem, y: StateArray, t: jax.Array, times: jax.Array) -> t
     def one(y: StateArray, span: tuple[jax.Array, jax.Array]) -> tuple[StateArray, StateArray]:
         t, h = span
         taken = jnp.isfinite(h) & (h > 0.0)
-        y = jnp.where(taken[None], step(problem.field, t, y, jnp.where(taken, h, 1.0))[0], y)
+        h = jnp.where(taken, h, 1.0)
+        y = jnp.where(taken[None], step(problem.field(t + 0.5 * h), t, y, h)[0], y)
         return y, y
 
     spans = (jnp.where(jnp.isfinite(t[:-1]), t[:-1], 0.0), jnp.diff(t, axis=0))
     y_end, ends = jax.lax.scan(one, y, spans)
-    return y_end, interpolate(problem.field, t, jnp.concatenate([y[None], ends]), times)
+    return y_end, interpolate(problem.field(), t, jnp.concatenate([y[None], ends]), times)

@@ -86,7 +86,8 @@ def _tangent_maps(
         _, c_system, c_y = jax.lax.while_loop(lambda c: c[0] > 0, body, (count, *none))
         # A lane that has failed has NaN cotangents at samples that no segment holds.
         poison = jnp.where(jnp.any(jnp.isnan(cotangent), axis=(0, 2)), jnp.nan, 0.0)
-        return jax.tree.map(lambda leaf: leaf + poison, c_system), c_y + cotangent[:, :, 0] + poison[None]
+        lanes_first = jax.tree.map(lambda leaf: leaf + poison.reshape(-1, *[1] * (leaf.ndim - 1)), c_system)
+        return lanes_first, c_y + cotangent[:, :, 0] + poison[None]
 
     return forward, backward
 
@@ -133,14 +134,14 @@ def differentiable_run(build: Build, max_steps: int) -> Callable[[Any, jax.Array
         system, times, y = _first_order_only(primals)
         d_system, d_times, d_y = tangents
         samples = _first_order_only(record.samples)
-        field = build(jax.tree.map(lambda leaf: leaf[..., None], system)).field
+        field = build(jax.tree.map(lambda leaf: leaf[:, None], system)).field()
         rate = derivative(field, times, samples)
         # A later start from the same state is the same start from a state moved back along the field.
         d_y = d_y - rate[:, :, 0] * d_times[None, :, 0]
         forward, backward = _tangent_maps(build, (system, times, y), max_steps)
         d_samples = _apply_linear(forward, backward, (d_system, d_y), samples) + rate * d_times[None]
         d_samples = d_samples * jnp.where(jnp.isfinite(samples), 1.0, jnp.nan)
-        counts = [jnp.zeros(leaf.shape, jax.dtypes.float0) for leaf in record[1:]]
+        counts = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jax.dtypes.float0), record[1:])
         return record, Record(d_samples, *counts)
 
     return function
