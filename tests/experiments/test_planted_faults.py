@@ -1,11 +1,14 @@
 """Planted faults are named in at least 95 of 100 rigs; at most 5 % of clean rigs raise any finding."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from capsule_id.report.messages import finding_text, messages_of
 from tests.experiments.planted import (
+    KINDS,
     Fault,
     clip,
     duplicate,
@@ -15,6 +18,8 @@ from tests.experiments.planted import (
     rest,
     rig_of,
     run_rig,
+    with_table,
+    with_values,
     wrong_unit,
 )
 
@@ -59,3 +64,20 @@ def test_planted_faults_are_named_in_95_of_100_rigs(tmp_path: Path, fault: Fault
 def test_at_most_5_percent_of_clean_rigs_raise_a_finding(tmp_path: Path) -> None:
     assert np.mean([bool(named(rig_of(tmp_path, 500 + seed))) for seed in range(200)]) <= 0.05
     assert np.mean([bool(named(run_rig(tmp_path, 500 + seed))) for seed in range(40)]) <= 0.05
+
+
+def test_a_turned_sign_of_x_rel_is_called_a_sign(tmp_path: Path) -> None:
+    rig = run_rig(tmp_path, 0)
+    for index, table in enumerate(rig.tables):
+        if table.kind == "forced_run":
+            (found,) = named(
+                with_table(rig, index, with_values(table, x_rel=-table["x_rel"], x_capsule=-table["x_capsule"]))
+            )
+            assert "wrong sign" in finding_text(found, messages_of(KINDS))
+            columns = {name: column for name, column in table.columns.items() if name != "acceleration_rod"}
+            without = replace(table, columns=columns)
+            assert named(with_table(rig, index, without)) == ()
+            (found,) = named(
+                with_table(rig, index, with_values(without, x_rel=-table["x_rel"], x_capsule=-table["x_capsule"]))
+            )
+            assert found.code == "runs.power"

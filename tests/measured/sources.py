@@ -21,9 +21,9 @@ def _file(name: str) -> Path:
     return path
 
 
-def ship_roll() -> tuple[np.ndarray, np.ndarray]:
-    """KVLCC2 model, run 21337, 0 kn: time, s, and roll angle, rad, (n,) each; lead-in before the release included."""
-    data = np.genfromtxt(_file("kvlcc2_roll/model_test_21337.csv"), delimiter=",", names=True)
+def ship_roll(run: int = 21337) -> tuple[np.ndarray, np.ndarray]:
+    """KVLCC2 model, run 21337 or 21338: time, s, and roll angle, rad, (n,) each; lead-in before the release included."""
+    data = np.genfromtxt(_file(f"kvlcc2_roll/model_test_{run}.csv"), delimiter=",", names=True)
     return data["time"], data["phi"]
 
 

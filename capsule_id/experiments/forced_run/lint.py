@@ -16,10 +16,10 @@ from capsule_id.records.faults.channels import (
 )
 from capsule_id.records.tone import recorded_drive
 from capsule_id.rig.model import Rig, Table
-from capsule_id.views import Finding, Message
+from capsule_id.views import Facts, Finding, Message
 
 #: Harmonics of the drive that are compared, and the smallest share of the acceleration's standard deviation there.
-HARMONICS, STRONG = (1, 2, 3), 0.3
+HARMONICS, STRONG = (1, 2, 3, 4, 5), 0.15
 #: Fewest samples in a period of the drive.
 FEWEST_SAMPLES = 4.0
 #: Admissible ratio of the recorded acceleration to that of the recorded position X1 = x_rel + x_capsule; without
@@ -89,6 +89,17 @@ def _columns(table: Table[Any]) -> Iterable[Finding]:
             yield Finding("runs.power", "fail", {"file": table.file}, table.label)
 
 
+def _contradiction(facts: Facts) -> str:
+    """The ratio of the two columns, and what to check."""
+    check = "Check the names and units of these columns."
+    if -facts["high"] <= facts["ratio"] <= -facts["low"]:
+        check = "One of them has the wrong sign: x_rel is positive towards the spring, and so is the acceleration."
+    return (
+        f"{facts['file']}: acceleration_rod must be the second derivative of {facts['position']}; at {facts['harmonic']} times "
+        f"the drive's frequency it is {facts['ratio']:.3g} times that ({facts['low']:g} to {facts['high']:g} allowed). {check}"
+    )
+
+
 MESSAGES = {
     "runs.frequency": Message(
         "frequency of the drive",
@@ -104,13 +115,7 @@ MESSAGES = {
             "unit of time (s or ms) and that of the frequency (rad/s or Hz)."
         ),
     ),
-    "runs.kinematics": Message(
-        "columns of a run",
-        fail=(
-            "{file}: acceleration_rod must be the second derivative of {position}; at {harmonic} times the drive's frequency "
-            "it is {ratio:.3g} times that (allowed: {low:g} to {high:g}). Check the names, units and signs of these columns."
-        ),
-    ),
+    "runs.kinematics": Message("columns of a run", fail=_contradiction),
     "runs.power": Message(
         "columns of a run",
         fail=(

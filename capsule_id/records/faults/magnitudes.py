@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from capsule_id.rig.units import factor_to_si
 
 #: Usual magnitudes by SI unit: lowest and highest largest value of a column, or value of a setting. Each interval spans
@@ -20,11 +18,11 @@ USUAL: Mapping[str, tuple[float, float]] = {
     "Hz": (0.05, 500.0),
     "1": (0.01, 10.0),
 }
-#: Units that are mistaken for each other.
+#: Units that are mistaken for each other, the likeliest first.
 _ALTERNATIVES: Mapping[str, tuple[str, ...]] = {
-    "kg": ("kg", "g", "mg"),
-    "m": ("m", "mm", "um", "cm"),
-    "s": ("s", "ms", "us", "min"),
+    "kg": ("g", "kg", "mg"),
+    "m": ("mm", "m", "um", "cm"),
+    "s": ("ms", "s", "us", "min"),
     "N": ("N", "mN", "kN", "gf", "kgf"),
     "A": ("A", "mA", "uA"),
     "m/s": ("m/s", "mm/s", "cm/s"),
@@ -36,7 +34,7 @@ _ALTERNATIVES: Mapping[str, tuple[str, ...]] = {
 
 
 def unit_meant(value: float, to_display: float, si: str, usual: tuple[float, float]) -> str:
-    """Return the unit in which the written number would be usual; "" where there is none.
+    """Return the likeliest unit in which the written number would be usual; "" where there is none.
 
     Parameters
     ----------
@@ -45,10 +43,7 @@ def unit_meant(value: float, to_display: float, si: str, usual: tuple[float, flo
     si : unit of the quantity
     usual : lowest and highest usual value, SI
     """
-    centre = np.log(usual[0] * usual[1]) / 2.0
-    distances = {
-        unit: abs(np.log(value * to_display * factor_to_si(unit, si)) - centre) for unit in _ALTERNATIVES.get(si, ())
-    }
-    half = np.log(usual[1] / usual[0]) / 2.0
-    near = {unit: distance for unit, distance in distances.items() if distance <= half}
-    return min(near, key=lambda unit: near[unit]) if near else ""
+    for unit in _ALTERNATIVES.get(si, ()):
+        if usual[0] <= value * to_display * factor_to_si(unit, si) <= usual[1]:
+            return unit
+    return ""

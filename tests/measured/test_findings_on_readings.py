@@ -1,0 +1,41 @@
+"""What the checks of the readings say about measured records; their twins are in tests/experiments/test_lint_remedies.py."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.experiments.lint import lint
+from capsule_id.experiments.registry import default_registry
+from capsule_id.rig.model import Rig
+from tests.measured.folders import Entry, make_rig, quantity
+from tests.measured.sources import pendulum, ship_roll
+
+KINDS = default_registry()
+
+
+def codes(rig: Rig) -> set[str]:
+    """Codes of all findings."""
+    return {found.code for found in lint(rig, KINDS, rig.tables)}
+
+
+def rig_of(folder: Path, record: tuple[np.ndarray, np.ndarray], settings: dict[str, str]) -> Rig:
+    entry = Entry("free_vibration", "record", {"time [s]": record[0], "x_rel [m]": record[1]}, settings)
+    return make_rig(folder, entry, head={"m1": quantity(1.0, "kg", 0.01)})
+
+
+@pytest.mark.parametrize("run", [21337, 21338])
+def test_the_rest_before_the_release_of_the_ship_model_is_found(tmp_path: Path, run: int) -> None:
+    rig = rig_of(tmp_path / "whole", ship_roll(run), {})
+    (found,) = [found for found in lint(rig, KINDS, rig.tables) if found.level == "fail"]
+    assert found.code == "decays.release"
+    # The release is at 24 s and at 7.5 s, by eye, and the first free swing after it.
+    assert found.facts["start"] == pytest.approx({21337: 24.9, 21338: 8.1}[run], abs=0.5)
+    rest = codes(rig_of(tmp_path / "cut", ship_roll(run), {"start": quantity(found.facts["start"], "s")}))
+    assert rest == set()
+
+
+@pytest.mark.parametrize("record", [1, 2, 3])
+def test_the_pendulum_has_no_fault_but_its_unit(tmp_path: Path, record: int) -> None:
+    """Radians, relabelled as metres: the magnitude is unusual, and nothing else is."""
+    assert codes(rig_of(tmp_path, pendulum(record), {})) == {"readings.magnitude"}
