@@ -15,6 +15,7 @@ from capsule_id.inference.pipeline import (
     make_result,
     provenance,
     sample_posterior,
+    second_models,
     stage_seeds,
 )
 from capsule_id.inference.result import Result
@@ -110,8 +111,9 @@ def fit(
     made_from = provenance(rig, seed, experiments, law.source)
     if progress:
         progress(0, 1, "point fit")
-    target = LogPosterior(rig, make_experiments(rig, experiments, kinds, friction))
-    before = check_readings(rig, experiments, kinds)
+    made, second = second_models(make_experiments(rig, experiments, kinds, friction))
+    target = LogPosterior(rig, made)
+    before = (*check_readings(rig, experiments, kinds), *second)
     point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
     checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress), before)
     return make_result(checked, kinds, seeds.report, made_from, Fit)

@@ -9,7 +9,7 @@ fields are strings and flags. ``About`` holds all other data.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -236,6 +236,11 @@ class Experiment(eqx.Module):
             return None
         squares = [np.sum(self.misfit(theta).at_nuisance_draw(rng) ** 2) for theta in draws]
         return float(np.mean(stats.chi2.sf(squares, self.n)))
+
+    @classmethod
+    def second_models(cls, records: "Sequence[Any]") -> "tuple[list[Any], list[Finding]]":
+        """Replace the models that ``records``, all of this class, contradict and that the settings leave open."""
+        return list(records), []
 
     # -- optional methods of a kind ---------------------------------------------------------------------------------
 

@@ -4,11 +4,12 @@
     rig = read_rig(folder, kinds)                                # folder -> Rig
     seeds = stage_seeds(0)
     before = check_readings(rig, "all", kinds)                   # Rig -> findings on the readings
-    experiments = make_experiments(rig, "all", kinds)            # Rig -> experiments
+    stated = make_experiments(rig, "all", kinds)                 # Rig -> experiments as stated
+    experiments, second = second_models(stated)                  # ... -> with the models that they demand
     target = LogPosterior(rig, experiments)                      # experiments -> log-posterior
     point = fit_points(target, kinds, seeds.starts, True)        # log-posterior -> point fit
     sampled = sample_posterior(point, seeds.walkers)             # point fit -> posterior
-    checked = check_fit(sampled, before)                         # posterior -> checks
+    checked = check_fit(sampled, (*before, *second))              # posterior -> checks
     result = make_result(checked, kinds, seeds.report, provenance(rig, 0, "all", "eq. (1)"))
 
 ``capsule_id.fit`` runs all stages.
@@ -25,6 +26,7 @@ import numpy as np
 
 from capsule_id.console import OnProgress
 from capsule_id.experiments import Choice, compare, select_tables
+from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
@@ -68,6 +70,18 @@ def stage_seeds(seed: int) -> StageSeeds:
 def check_readings(rig: Rig, experiments: Choice, registry: Registry) -> tuple[Finding, ...]:
     """Return findings on the readings that ``experiments`` selects, before anything is fitted."""
     return lint(rig, registry, select_tables(rig, experiments))
+
+
+def second_models(stated: Sequence[Experiment]) -> tuple[tuple[Experiment, ...], tuple[Finding, ...]]:
+    """Replace models that the readings contradict and the settings leave open; findings name the new models."""
+    chosen, findings = list(stated), list[Finding]()
+    for kind in dict.fromkeys(type(e) for e in stated):
+        own = [i for i, e in enumerate(stated) if type(e) is kind]
+        replaced, found = kind.second_models([stated[i] for i in own])
+        findings += found
+        for i, experiment in zip(own, replaced, strict=True):
+            chosen[i] = experiment
+    return tuple(chosen), tuple(findings)
 
 
 def sample_posterior(

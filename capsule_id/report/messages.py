@@ -78,9 +78,22 @@ def _coloured_residuals(facts: Facts) -> str:
             "Look at the residuals and the phase portrait, check spring, gap and friction law, or state "
             'noise = "ar1" where the sensor filters.'
         ),
-        "decay": "Compare the damping models below, or cut the record to free decay with start/stop.",
+        "decay": _decay_remedy(facts),
     }.get(facts.get("model", ""), "Look at the residuals.")
     return " ".join(filter(None, [seen, _drift(facts), remedy]))
+
+
+def _decay_remedy(facts: Facts) -> str:
+    """What the fitted model of a free decay contains, and what is left to do."""
+    if facts.get("model") != "decay":
+        return ""
+    present = f"Present in the fitted model: {', '.join(facts['present'])}. " if facts["present"] else ""
+    cut = "Cut the record to free decay with start and stop"
+    if facts["second"]:
+        return f"{present}No model that a second fit offers passes. {cut}, or record again with less disturbance."
+    return (
+        f"{present}{cut}, or remove damping, stiffness, drift and noise from its entry: a second fit then chooses them."
+    )
 
 
 def _drift(facts: Facts) -> str:

@@ -21,7 +21,7 @@ from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.domains import ANY, POSITIVE, Domain
 from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
-from capsule_id.rig.toml_values import read_choice, read_name, read_quantity
+from capsule_id.rig.toml_values import read_choice, read_name, read_quantity, shown
 
 if TYPE_CHECKING:
     from capsule_id.rig.entry import Entry
@@ -86,6 +86,17 @@ class ChoiceRule:
     def read(self, document: TomlDocument, path: KeyPath, value: object) -> str:
         """See ``SettingRule``."""
         return read_choice(document, path, value, self.choices)
+
+
+@dataclass(frozen=True)
+class CountRule:
+    """A whole number, 1 or more."""
+
+    def read(self, document: TomlDocument, path: KeyPath, value: object) -> int:
+        """See ``SettingRule``."""
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise document.error(path, f"{path[-1]} must be a whole number, 1 or more", shown(value), "write e.g. 10")
+        return value
 
 
 @dataclass(frozen=True)

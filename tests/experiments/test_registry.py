@@ -19,7 +19,7 @@ from capsule_id.report.data_messages import DATA_MESSAGES
 from capsule_id.report.messages import FIT_MESSAGES, messages_of
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
 from capsule_id.rig.model import Settings
-from capsule_id.rig.schema import ChoiceRule, ColumnRule, NameRule, QuantityRule, SettingRule, WordsRule
+from capsule_id.rig.schema import ChoiceRule, ColumnRule, CountRule, NameRule, QuantityRule, SettingRule, WordsRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Message
@@ -37,10 +37,11 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "start": (QuantityRule("s", ANY), None),
         "stop": (QuantityRule("s", ANY), None),
         "capsule": (ChoiceRule(("held", "free")), "held"),
-        "damping": (WordsRule(("viscous", "dry", "quadratic")), ("viscous",)),
-        "stiffness": (ChoiceRule(("linear", "cubic")), "linear"),
-        "drift": (ChoiceRule(("none", "linear", "gp")), "none"),
-        "noise": (ChoiceRule(("white", "ar1", "arma")), "white"),
+        "damping": (WordsRule(("viscous", "dry", "quadratic")), None),
+        "stiffness": (ChoiceRule(("linear", "cubic")), None),
+        "drift": (ChoiceRule(("none", "linear", "gp")), None),
+        "noise": (ChoiceRule(("white", "ar1", "arma")), None),
+        "every": (CountRule(), None),
         "smoothing_window": (QuantityRule("s"), None),
         "spring": (NameRule(), None),
         "gap": (_GAP, None),

@@ -5,7 +5,6 @@ rad²/s², c twice the rate of decay, 1/s, and F_dry the dry moment over the ine
 0.09 deg is stated as x_rel_resolution.
 """
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,7 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
-from capsule_id.experiments.free_vibration.tables import DAMPING_MODELS
-from capsule_id.inference.fit.point_fit import bic, point_fit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.experiments.free_vibration.screening import second_models
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import pendulum
@@ -52,27 +48,25 @@ def test_the_part_that_is_fitted_has_small_angles(swing: Fit) -> None:
     assert np.max(np.abs(panel.points[0].y)) < np.deg2rad(25.0)
 
 
-def test_the_decrement_is_said_to_grow_as_the_swing_falls(swing: Fit) -> None:
-    (finding,) = [f for f in swing.findings if f.code == "residuals.white"]
-    assert finding.level == "fail"
-    assert "the damping grows as the amplitude falls" in swing.text(finding)
+def test_dry_friction_is_named_and_quoted(swing: Fit) -> None:
+    (finding,) = [f for f in swing.findings if f.code == "decays.second_fit"]
+    assert 'damping = ["viscous", "dry"], stiffness = "cubic"' in swing.text(finding)
+    frame = note(swing, "decays.second_fit").frame
+    assert frame["residuals white"].tolist() == ["no", "yes"]
+    assert frame.loc["stated", "BIC"] > 100.0
+    assert swing.clean
+    F_dry = swing.summary.loc["F_dry"]
+    assert F_dry["map"] > 10.0 * F_dry["standard_error"]
 
 
-def test_mixed_dry_and_viscous_damping_is_preferred(swing: Fit) -> None:
-    models = note(swing, "decays.damping")
-    frame = models.frame
-    assert frame["BIC"].idxmin() == "dry"
-    assert (frame["BIC"].drop("dry") > 100.0).all()
-    assert (frame["starts agree"] == "yes").all()
-    assert "takes off the same amount every cycle" in swing.text(models)
-    F_dry, error = _dry_friction(str(frame.loc["dry", "further"]))
-    assert F_dry > 20.0 * error
-    assert frame.loc["dry", "c, N s/m"] > 0.1
+def test_the_cubic_spring_is_that_of_a_pendulum(swing: Fit) -> None:
+    """The moment of gravity is k1 (x - x^3/6 + ...)."""
+    k_cubic = swing.summary.loc["k_cubic"]
+    expected = -swing.summary.loc["k1", "map"] / 6.0
+    assert abs(k_cubic["map"] - expected) < 4.0 * k_cubic["standard_error"]
 
 
 def test_the_dry_friction_is_what_the_peaks_lose(swing: Fit) -> None:
-    frame = note(swing, "decays.damping").frame
-    F_dry, _ = _dry_friction(str(frame.loc["dry", "further"]))
     time, angle = pendulum(3)
     angle = angle[time >= START]
     index = np.sort(np.concatenate([find_peaks(side * angle, distance=250, height=0.1)[0] for side in (1.0, -1.0)]))
@@ -80,7 +74,8 @@ def test_the_dry_friction_is_what_the_peaks_lose(swing: Fit) -> None:
     # Of neighbours, so that the zero of the encoder drops out: next = ratio · this - shift (1 + ratio).
     size = 0.5 * (height[1:] + height[:-1])
     ratio, intercept = np.polyfit(size[:-1], size[1:], 1)
-    assert F_dry / frame.loc["dry", "k1, N/m"] == pytest.approx(-intercept / (1.0 + ratio), rel=0.15)
+    shift = swing.summary.loc["F_dry", "map"] / swing.summary.loc["k1", "map"]
+    assert shift == pytest.approx(-intercept / (1.0 + ratio), rel=0.2)
 
 
 def test_a_viscous_swing_is_not_taken_for_a_dry_one(tmp_path: Path) -> None:
@@ -91,19 +86,6 @@ def test_a_viscous_swing_is_not_taken_for_a_dry_one(tmp_path: Path) -> None:
     (record,) = make_experiments(rig)
     assert isinstance(record, FreeVibration)
     assert record.damping_trend() == {}
-    scores = {}
-    for damping in DAMPING_MODELS:
-        target = LogPosterior(rig, [record.with_model(DecayModel((damping,) if damping in DAMPING else ()))])
-        fit = point_fit(target, seed=1)
-        scores[damping] = bic(target, fit)
-        assert fit.agree
-    assert min(scores, key=lambda name: scores[name]) == "viscous"
-    # What is not there costs its unknown and gains next to nothing.
-    assert all(0.0 < scores[name] - scores["viscous"] < 2.0 * np.log(record.n) for name in ("dry", "quadratic"))
-
-
-def _dry_friction(text: str) -> tuple[float, float]:
-    """Value and standard error out of ``F_dry = 1.959 ± 0.023``."""
-    found = re.fullmatch(r"F_dry = ([\d.e-]+) ± ([\d.e-]+)", text)
-    assert found is not None
-    return float(found[1]), float(found[2])
+    ((same,), findings) = second_models([record])
+    assert same.model.symbols == ()
+    assert all("dry" not in str(finding.facts["second"]) for finding in findings)

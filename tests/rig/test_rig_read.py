@@ -54,9 +54,6 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "stop": 0.009,
         "capsule": "held",
         "damping": ("dry",),
-        "stiffness": "linear",
-        "drift": "none",
-        "noise": "white",
         "smoothing_window": 0.005,
         "forward": "closed",
     }

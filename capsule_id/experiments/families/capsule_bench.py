@@ -5,6 +5,7 @@ away than F_b/k1 moves its capsule. An unlocked rod oscillates on k1 and c while
 closed form is biased. The capsule model of the forced runs, with the drive off, is not.
 """
 
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -18,11 +19,12 @@ from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
-from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.experiment import DecayAbout, FreeVibration
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Prior, parameter
 from capsule_id.physics.model import Excitation
 from capsule_id.rig.model import Rig, Table
+from capsule_id.views import Finding
 
 #: Zero drive; its frequency has no effect.
 OFF = Excitation(0.0, 1.0)
@@ -60,7 +62,11 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
                 rows.append(parameter("G", table.label, Prior("positive_normal", gap.value, gap.sd)))
         rows += self.motion_parameters(self.rough_decrement())
         rows.append(NOISE_SD.named(table.label, self.noise_prior()))
-        self.about = About(table, rig, tuple(rows))
+        self.about = DecayAbout(table, rig, tuple(rows))
+
+    @classmethod
+    def second_models(cls, records: Sequence[Any]) -> tuple[list[Any], list[Finding]]:
+        return Experiment.second_models(records)
 
     @property
     def model_name(self) -> str:

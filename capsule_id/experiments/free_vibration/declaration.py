@@ -124,6 +124,8 @@ TEMPLATE = """\
 #: "white" (default), "ar1" (correlated, one correlation time) or "arma" (correlated and white). The last two include
 #: stated reading errors
 # noise = "white"
+#: use one sample in so many; a record that is sampled far faster than its noise changes needs no more
+# every = 10
 #: "closed" form (default), or the "capsule" model: a free capsule may slip, and the rod may hit the support spring
 # forward = "closed"
 #: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record
@@ -132,20 +134,12 @@ TEMPLATE = """\
 #: a support spring within reach: both of spring = "L60" and gap = { value = 1.0, sd = 0.02, unit = "mm" }
 """
 
-_DAMPING = {
-    "viscous": "Viscous damping alone fits as well as dry or quadratic damping beside it.",
-    "dry": "Dry friction beside the viscous damping fits best: it takes off the same amount every cycle.",
-    "quadratic": "Quadratic beside viscous damping fits best: the damping grows with amplitude.",
-}
 
-
-def _damping_caption(facts: Facts) -> str:
-    """Caption with the best of the three models, and whether it fits."""
-    rest = "" if facts["any_white"] else " None of the three leaves white residuals: another effect is present."
+def _second_fit(facts: Facts) -> str:
+    """The records that contradict the stated model, the quoted model and the lines that state it."""
     return (
-        "The damping model of the fit leaves structure in the residuals. Here all three models are fitted to the decays "
-        f'alone; BIC is relative to the best. {_DAMPING[facts["best"]]}{rest} State damping = "viscous", "dry" or '
-        '"quadratic" to choose one.'
+        f"{', '.join(facts['labels'])}: the record contradicts the first model ({facts['first']}). The quoted values are those "
+        f"of a second fit: {facts['second']}. To state it, write {facts['lines']}. To keep the first model, state its words."
     )
 
 
@@ -182,7 +176,14 @@ MESSAGES = {
             "noise."
         ),
     ),
-    "decays.damping": Message("Damping models compared", caption=_damping_caption),
+    "decays.second_fit": Message(
+        "second fit of free decays",
+        warn=_second_fit,
+        caption=(
+            "Free decays alone, under the stated model and under the model of the quoted values. BIC is relative to the lower "
+            "one. Lines of rig.toml that state the quoted model: {lines}."
+        ),
+    ),
 }
 
 KIND = Kind(

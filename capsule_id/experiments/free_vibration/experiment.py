@@ -1,5 +1,7 @@
 """Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
 
@@ -14,19 +16,18 @@ from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionM
 from capsule_id.experiments.free_vibration.checks import check_free_decay, check_stiffness
 from capsule_id.experiments.free_vibration.decay_models import decay, rates, viscous_basis
 from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
-from capsule_id.experiments.free_vibration.decay_trend import trend
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
-from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement
+from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement, trend
 from capsule_id.experiments.free_vibration.noise import noise_parameters, whiten
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
-from capsule_id.experiments.free_vibration.tables import damping_table, decay_table
+from capsule_id.experiments.free_vibration.tables import decay_table, second_fit_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Curve, Facts, Points
+from capsule_id.views import Comparison, Curve, Facts, Finding, Points
 
 #: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
@@ -34,6 +35,13 @@ NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 LATEST_TURNING_POINT = 0.1
 #: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
 SMOOTHING_ORDER = 3
+
+
+@dataclass(frozen=True)
+class DecayAbout(About):
+    """``known``: estimates by symbol, SI, from a screening of models; they give the starting point of a fit."""
+
+    known: Mapping[str, float] = field(default_factory=dict, compare=False)
 
 
 class FreeVibration(SurfaceExperiment):
@@ -50,30 +58,36 @@ class FreeVibration(SurfaceExperiment):
     side: float
     folded: np.ndarray
     step: float
+    about: DecayAbout = eqx.field(static=True)
     model: DecayModel = eqx.field(static=True)
     half_cycles: int = eqx.field(static=True)
     uniform: bool = eqx.field(static=True)
 
     time_series = True
     checks = (check_stiffness, check_free_decay)
-    tables = (decay_table, damping_table)
+    tables = (decay_table, second_fit_table)
 
     def __init__(
-        self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1, model: DecayModel | None = None
+        self,
+        table: Table,
+        rig: Rig,
+        friction: FrictionModel = EQUATION_1,
+        model: DecayModel | None = None,
+        known: Mapping[str, float] | None = None,
     ) -> None:
-        """Make one record; ``model`` None: as stated in the settings."""
+        """Make one record; ``model`` None: as stated in the settings; ``known`` estimates by symbol for starts."""
         self.friction = friction
-        time, self.values = decay_window(table)
-        self.time = time - float(time[0])
         self.model = model or DecayModel.stated(table.settings)
+        time, self.values = (values[:: self.model.every] for values in decay_window(table))
+        self.time = time - float(time[0])
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.reading_sd = table.columns["x_rel"].reading_sd
         step = uniform_step(self.time)
-        self.uniform = step is not None and self.model == DecayModel()
+        self.uniform = step is not None and self.model == DecayModel(every=self.model.every)
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side, self.half_cycles = 1.0, 0
-        self.about = About(table, rig, ())
+        self.about = DecayAbout(table, rig, (), known or {})
         rows = [parameter("k1"), parameter("c"), NOISE_SD.named(table.label, self.noise_prior())]
         if self.model.whitened:
             period = 2.0 * np.pi / self.rough_decrement().Omega_o
@@ -89,11 +103,17 @@ class FreeVibration(SurfaceExperiment):
                 AMPLITUDE.named(table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH)),
                 TURNING_TIME.named(table.label, Prior("normal", 0.0, float(self.time[-1]))),
             ]
-        self.about = About(table, rig, tuple(rows))
+        self.about = DecayAbout(table, rig, tuple(rows), known or {})
 
-    def with_model(self, model: DecayModel) -> "FreeVibration":
-        """Return the same record with another model."""
-        return FreeVibration(self.table, self.rig, self.friction, model)
+    def with_model(self, model: DecayModel, known: Mapping[str, float] | None = None) -> "FreeVibration":
+        """Return the same record with another model; ``known`` estimates by symbol, SI, give its starting point."""
+        return FreeVibration(self.table, self.rig, self.friction, model, known)
+
+    @classmethod
+    def second_models(cls, records: "Sequence[Any]") -> tuple[list[Any], list[Finding]]:
+        from capsule_id.experiments.free_vibration.screening import second_models
+
+        return second_models(records)
 
     @property
     def closed(self) -> bool:
@@ -159,21 +179,39 @@ class FreeVibration(SurfaceExperiment):
 
     # -- the paper's estimator and starts ---------------------------------------------------------------------------
 
-    def smoothed(self) -> np.ndarray:
-        """(n,) the record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
+    @property
+    def whole(self) -> tuple[np.ndarray, np.ndarray]:
+        """Time, s from the first sample, and x_rel, m, of every sample, thinned or not."""
+        time, values = decay_window(self.table)
+        return time - time[0], values
+
+    @property
+    def even(self) -> bool:
+        """Whether the record is evenly sampled, as the paper's filter requires."""
         try:
-            sampling_step(self.time)
+            sampling_step(self.whole[0])
         except InputError:
-            return self.values
+            return False
+        return True
+
+    def smoothed(self) -> np.ndarray:
+        """The whole record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
+        time, values = self.whole
+        if not self.even:
+            return values
         window = self.table.settings.smoothing_window
         if window is None:
-            window = choose_window(self.time, self.values, SMOOTHING_ORDER)
-        return savitzky_golay(self.time, self.values, window, SMOOTHING_ORDER)
+            window = choose_window(time, values, SMOOTHING_ORDER)
+        return savitzky_golay(time, values, window, SMOOTHING_ORDER)
+
+    def decrement(self, smooth: bool = True) -> Decrement | None:
+        """Return peaks and logarithmic decrement, from the smoothed or the raw record; None with too few peaks."""
+        (time, values), smoothed = self.whole, self.smoothed()
+        return logarithmic_decrement(time, smoothed if smooth else values, self.mass, smoothed)
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
-        """Estimate k1 and c of this record as in the paper, from the smoothed or the raw peaks."""
-        smoothed = self.smoothed()
-        return logarithmic_decrement(self.time, smoothed if smooth else self.values, self.mass, smoothed)
+        """Estimate k1 and c of this record as in the paper; None also for a record sampled unevenly."""
+        return self.decrement(smooth) if self.even else None
 
     @property
     def mass(self) -> float:
@@ -183,7 +221,7 @@ class FreeVibration(SurfaceExperiment):
 
     def rough_decrement(self) -> Decrement:
         """The paper's estimate, or one from the first zero crossings where there are too few peaks."""
-        decrement = self.paper_decrement()
+        decrement = self.decrement()
         if decrement is not None and decrement.delta > 0.0:
             return decrement
         x = self.values - equilibrium(self.values)
@@ -215,6 +253,13 @@ class FreeVibration(SurfaceExperiment):
             starts |= {symbol: forces[symbol] for symbol in self.model.symbols}
             starts[f"amplitude[{self.label}]"] = Start(size, 0.05)
             starts[f"turning_time[{self.label}]"] = Start(time, 0.05 / rough.Omega_o)
+        for row in self.parameters:
+            if row.symbol in self.about.known:
+                value = self.about.known[row.symbol]
+                near = starts.get(row.name, Start(value, 0.1))
+                # An absent term is no starting point of a logarithm.
+                floor = 1e-3 * near.centre if row.positive else -np.inf
+                starts[row.name] = Start(max(value, floor), 0.3 * near.spread)
         return starts
 
     def first_turning_point(self) -> tuple[float, float]:
@@ -243,16 +288,18 @@ class FreeVibration(SurfaceExperiment):
 
     def damping_trend(self) -> Facts:
         """Drift of damping and frequency of the peaks with amplitude, see ``trend``; empty without drift."""
-        decrement = self.paper_decrement()
+        decrement = self.decrement()
         return {} if decrement is None else trend(decrement, noise_level(self.values))
 
     def largest_force(self, theta: ValuesBySymbol) -> float:
         """Largest |f| over the record, N; f = k1 x_rel + c d(x_rel)/dt."""
         x = self.smoothed() - equilibrium(self.values)
-        return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.time))))
+        return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.whole[0]))))
 
     def noise_facts(self) -> Facts:
-        return {"model": "decay", **self.damping_trend()}
+        stated = DecayModel.stated(self.table.settings)
+        facts = {"present": self.model.additions, "second": self.model != stated, "lines": self.model.lines}
+        return {"model": "decay", **facts, **self.damping_trend()}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         def curve(values: ValuesBySymbol) -> np.ndarray:

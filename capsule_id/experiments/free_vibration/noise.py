@@ -19,6 +19,9 @@ from capsule_id.experiments.free_vibration.declaration import DRIFT_RATIO, DRIFT
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.parameters import Parameter, Prior
 
+#: Symbols of the shape parameters of noise and drift.
+SHAPES = tuple(row.symbol for row in (NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME))
+
 
 def noise_parameters(model: DecayModel, time: np.ndarray, period: float, of: str) -> list[Parameter]:
     """Return the shape parameters of noise and drift of the record ``of``, sampled at ``time`` (n,), s.
@@ -39,7 +42,7 @@ def whiten(time: np.ndarray, columns: Any, model: DecayModel, theta: ValuesBySym
 
     The map has determinant 1: the density of the readings is that of the whitened readings.
     """
-    shape = {row.symbol: theta[row.symbol] for row in noise_parameters(model, time, 1.0, "")}
+    shape = {symbol: theta[symbol] for symbol in SHAPES if symbol in theta}
     return whiten_by_shape(jnp.asarray(time), jnp.asarray(columns), model.noise, shape)
 
 

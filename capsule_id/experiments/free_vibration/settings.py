@@ -7,26 +7,32 @@ import numpy as np
 
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.model import Quantity, Settings, Table
-from capsule_id.rig.schema import NameRule, QuantityRule, WordsRule
+from capsule_id.rig.schema import CountRule, NameRule, QuantityRule, WordsRule
 
 #: Parameter of every damping term besides the viscous one, and of the cubic spring.
 DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 
+_EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
 _DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
 _NOISES = {"ar1": "AR(1) noise", "arma": "ARMA noise"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class DecaySettings(Settings):
-    """Settings of a free vibration, SI."""
+    """Settings of a free vibration, SI.
+
+    Absent words of the model stand for viscous damping, a linear spring, no drift and white noise. Where the record
+    contradicts that, a second fit may choose others (``capsule_id.experiments.free_vibration.screening``).
+    """
 
     start: Annotated[float | None, QuantityRule("s", ANY)] = None
     stop: Annotated[float | None, QuantityRule("s", ANY)] = None
     capsule: Literal["held", "free"] = "held"
-    damping: Annotated[tuple[str, ...], WordsRule(("viscous", *DAMPING))] = ("viscous",)
-    stiffness: Literal["linear", "cubic"] = "linear"
-    drift: Literal["none", "linear", "gp"] = "none"
-    noise: Literal["white", "ar1", "arma"] = "white"
+    damping: Annotated[tuple[str, ...] | None, WordsRule(("viscous", *DAMPING))] = None
+    stiffness: Literal["linear", "cubic"] | None = None
+    drift: Literal["none", "linear", "gp"] | None = None
+    noise: Literal["white", "ar1", "arma"] | None = None
+    every: Annotated[int | None, CountRule()] = None
     smoothing_window: Annotated[float | None, QuantityRule("s")] = None
     spring: Annotated[str | None, NameRule()] = None
     gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
@@ -42,18 +48,34 @@ class DecayModel:
     damping : words of ``DAMPING``, in that order
     cubic : whether the spring has a cubic term
     drift, noise : as in ``DecaySettings``
+    every : the likelihood uses every n-th sample
     """
 
     damping: tuple[str, ...] = ()
     cubic: bool = False
     drift: str = "none"
     noise: str = "white"
+    every: int = 1
 
     @classmethod
     def stated(cls, settings: DecaySettings) -> "DecayModel":
         """Return the model that ``settings`` state."""
-        damping = tuple(word for word in DAMPING if word in settings.damping)
-        return cls(damping, settings.stiffness == "cubic", settings.drift, settings.noise)
+        damping = tuple(word for word in DAMPING if word in (settings.damping or ()))
+        return cls(
+            damping,
+            settings.stiffness == "cubic",
+            settings.drift or "none",
+            settings.noise or "white",
+            settings.every or 1,
+        )
+
+    @property
+    def lines(self) -> str:
+        """Lines of ``rig.toml`` that state the model."""
+        damping = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
+        stiffness = "cubic" if self.cubic else "linear"
+        words = f'damping = [{damping}], stiffness = "{stiffness}", drift = "{self.drift}", noise = "{self.noise}"'
+        return f"{words}, every = {self.every}"
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -66,12 +88,19 @@ class DecayModel:
         return self.noise != "white" or self.drift == "gp"
 
     @property
+    def additions(self) -> list[str]:
+        """Effects of the model that the default lacks, in words."""
+        words = [_EFFECTS[symbol] for symbol in self.symbols]
+        return words + (["drift of the zero"] if self.drift != "none" else [])
+
+    @property
     def name(self) -> str:
         """Words for tables and legends."""
         words = [" + ".join(("viscous", *self.damping)) + " damping"]
         words += ["cubic spring"] if self.cubic else []
         words += [_DRIFTS[self.drift]] if self.drift != "none" else []
         words += [_NOISES[self.noise]] if self.noise != "white" else []
+        words += [f"one sample in {self.every}"] if self.every > 1 else []
         return ", ".join(words)
 
 

@@ -1,4 +1,4 @@
-"""Tables of free decays: estimates by record, and comparison of damping models."""
+"""Tables of free decays: estimates by record, and comparison of the stated with the quoted model."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -10,14 +10,11 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
 from capsule_id.experiments.free_vibration.checks import stiffness_by_record
-from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
+from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.views import ResultTable
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
-
-#: Damping models for comparison when the residuals of a decay are not white.
-DAMPING_MODELS = ("viscous", "dry", "quadratic")
 
 
 def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
@@ -43,33 +40,33 @@ def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultT
     return [ResultTable("decays.records", pd.DataFrame(rows).set_index("record"))]
 
 
-def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
-    """Fit the decays alone with each damping model and rank by BIC; [] where their residuals are white."""
-    labels = {record.label for record in records}
-    if not any(f.code == "residuals.white" and f.level == "fail" and f.experiment in labels for f in fit.findings):
+def second_fit_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
+    """Compare the decays alone under the stated model and under the quoted one; [] where both are the same."""
+    replaced = [record for record in records if record.model != DecayModel.stated(record.table.settings)]
+    if not replaced:
         return []
     rows = []
-    for damping in DAMPING_MODELS:
-        others = [record.with_model(DecayModel((damping,) if damping in DAMPING else ())) for record in records]
-        found = fit.refit(others)
-        residuals = [series for e in others for _, series in e.records(e.local(found.values))]
+    for role, members in (
+        ("stated", [r.with_model(DecayModel.stated(r.table.settings)) for r in replaced]),
+        ("quoted", replaced),
+    ):
+        found = fit.refit(members)
+        residuals = [series for e in members for _, series in e.records(e.local(found.values))]
         white = all(ljung_box(series)[1] * len(records) >= LEVEL for series in residuals)
-        extra = [name for name in ("F_dry", "c_q") if name in found.values]
+        symbols = ("k1", "c", *members[0].model.symbols)
         rows.append(
             {
-                "damping": damping,
-                "k1, N/m": found.values["k1"],
-                "c, N s/m": found.values["c"],
-                "further": ", ".join(
-                    f"{name} = {found.values[name]:.4g} ± {found.standard_errors[name]:.2g}" for name in extra
+                "fit": role,
+                "model": members[0].model.name,
+                "parameters": ", ".join(
+                    f"{name} = {found.values[name]:.5g} ± {found.standard_errors[name]:.2g}" for name in symbols
                 ),
-                "noise, m": float(np.mean([found.values[f"noise_sd[{record.label}]"] for record in records])),
+                "noise, m": float(np.mean([found.values[f"noise_sd[{e.label}]"] for e in members])),
                 "BIC": found.bic,
                 "residuals white": "yes" if white else "no",
                 "starts agree": "yes" if found.agree else "no",
             }
         )
-    frame = pd.DataFrame(rows).set_index("damping")
+    frame = pd.DataFrame(rows).set_index("fit")
     frame["BIC"] -= frame["BIC"].min()
-    facts = {"best": str(frame["BIC"].idxmin()), "any_white": "yes" in frame["residuals white"].tolist()}
-    return [ResultTable("decays.damping", frame, facts)]
+    return [ResultTable("decays.second_fit", frame, {"lines": replaced[0].model.lines})]

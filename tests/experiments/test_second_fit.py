@@ -1,0 +1,98 @@
+"""The second fit of a free decay: it finds what the record demands, keeps what is stated, and its lines state it."""
+
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from capsule_id.experiments.free_vibration.decay_models import decay
+from capsule_id.experiments.free_vibration.declaration import MESSAGES
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.screening import demands_another, second_models
+from capsule_id.experiments.free_vibration.settings import DecayModel
+from tests.experiments import bench
+
+TIME = np.arange(250) / 500.0
+#: m; viscous damping c = 1, so that the record holds about eight periods.
+RELEASE, NOISE, C = 2e-3, 1e-5, 1.0
+SPRING_FORCE = bench.K1 * RELEASE
+
+
+def record(disturbance: np.ndarray | float, extra: dict[str, float] | None = None, **settings: Any) -> FreeVibration:
+    """A decay with further forces, white noise and a disturbance in units of its sd."""
+    forces = {"k1": bench.K1, "c": C, "m1": bench.M1, **(extra or {})}
+    x = np.asarray(decay(TIME, forces, RELEASE, 0.0, 30).x_rel)
+    noise = np.random.default_rng(3).standard_normal(len(TIME))
+    columns = [bench.column("time", TIME), bench.column("x_rel", x + NOISE * (noise + disturbance))]
+    table = bench.table("free_vibration", columns, "decay", **settings)
+    return FreeVibration(table, bench.rig(table))
+
+
+def ar1(rho: float) -> np.ndarray:
+    """AR(1) noise of unit sd."""
+    e = np.random.default_rng(4).standard_normal(len(TIME)) * np.sqrt(1.0 - rho**2)
+    for i in range(1, len(e)):
+        e[i] += rho * e[i - 1]
+    return e
+
+
+DRY = {"F_dry": 0.03 * SPRING_FORCE}
+
+
+def test_a_viscous_decay_keeps_its_model() -> None:
+    own = record(0.0)
+    assert second_models([own]) == ([own], [])
+
+
+def test_false_alarms_are_rare() -> None:
+    """Of 30 clean records none demands another model at a rate of 0.001."""
+    rng = np.random.default_rng(8)
+    assert not any(demands_another(record(rng.standard_normal(len(TIME))), 0.001) for _ in range(30))
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "extra", "expected"),
+    [
+        (0.0, DRY, DecayModel(("dry",))),
+        (0.0, {"c_q": 10.0}, DecayModel(("quadratic",))),
+        (0.0, {"k_cubic": 0.03 * bench.K1 / RELEASE**2}, DecayModel(cubic=True)),
+        (0.0, {**DRY, "k_cubic": -0.03 * bench.K1 / RELEASE**2}, DecayModel(("dry",), cubic=True)),
+        (20.0 * TIME, {}, DecayModel(drift="linear")),
+        (10.0 * np.sin(6.0 * TIME), {}, DecayModel(drift="gp")),
+    ],
+    ids=["dry", "quadratic", "cubic", "dry and cubic", "linear drift", "drift"],
+)
+def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str, float], expected: DecayModel) -> None:
+    (second,), (finding,) = second_models([record(disturbance, extra)])
+    assert second.model == expected
+    assert (finding.code, finding.level, finding.experiment) == ("decays.second_fit", "warn", "decay")
+
+
+def test_coloured_noise_is_found() -> None:
+    (second,), _ = second_models([record(10.0 * ar1(0.9))])
+    assert second.model.noise in ("ar1", "arma")
+    assert second.model.symbols == ()
+
+
+def test_the_lines_of_the_finding_state_the_quoted_model() -> None:
+    (second,), (finding,) = second_models([record(0.0, DRY)])
+    text = MESSAGES["decays.second_fit"].text("warn", finding.facts)
+    lines = text.split("write ")[1].split(". To keep")[0]
+    stated = tomllib.loads(
+        lines.replace(", stiffness", "\nstiffness")
+        .replace(", drift", "\ndrift")
+        .replace(", noise", "\nnoise")
+        .replace(", every", "\nevery")
+    )
+    own = record(0.0, DRY, **{**stated, "damping": tuple(stated["damping"])})
+    assert own.model == second.model
+    assert second_models([own]) == ([own], [])
+
+
+def test_stated_words_are_kept() -> None:
+    words = {"damping": ("viscous",), "stiffness": "linear"}
+    (second,), _ = second_models([record(0.0, DRY, **words)])
+    assert second.model.symbols == ()
+    own = record(0.0, DRY, **words, drift="none", noise="white")
+    assert second_models([own]) == ([own], [])
