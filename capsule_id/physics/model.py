@@ -20,7 +20,7 @@ Contacts are switched by r alone: the force may pull just before opening. Where 
 the contacts and D of that instant (after a jump).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import reduce
 from operator import and_
@@ -108,9 +108,10 @@ def without_absent(p: CapsuleParameters, e: AnyDrive) -> tuple[CapsuleParameters
         gone += ["k2", "G", "c2"]
     if absent(p.k2_back, 0.0) or absent(p.G_back, np.inf):
         gone += ["k2_back", "G_back"]
-    off: dict[str, Any] = {name: None for name in ("reaction", "lag") if absent(getattr(e, name, None), 0.0)}
-    kept: Any = e
-    return replace(p, **dict.fromkeys(gone)), replace(kept, **{name: x for name, x in off.items() if hasattr(e, name)})
+    drive: Any = e
+    own = {field.name for field in fields(drive)}
+    off = [name for name in ("reaction", "lag") if name in own and absent(getattr(e, name), 0.0)]
+    return replace(p, **dict.fromkeys(gone)), replace(drive, **dict.fromkeys(off))
 
 
 def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:

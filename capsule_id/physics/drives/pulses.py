@@ -29,6 +29,9 @@ class Pulses:
     frac(x) = x - floor(x); u is continuous from the right. duty <= 0 is always off, duty >= 1 always on. The drive
     begins at t = 0: D(0) = P_off; without lag D = u from t = 0 on.
 
+    At lag = 0 the derivative in lag is one-sided: that of a delay of the switching times by lag. It leaves out the
+    transient of the start, and how a capsule breaks away during a transient.
+
     The engine carries the number of the half-period, even while on, and the transient D - u.
     """
 

@@ -296,7 +296,7 @@ def _folding(structure: Any) -> Callable[..., Trajectory]:
     def _fold(size: int, batched: list[bool], *leaves: jax.Array) -> tuple[Trajectory, Trajectory]:
         """Fold a new axis into the lanes: a loop inside a loop over lanes would copy its buffers at every step."""
         if not any(batched):
-            out = run_leaves(*leaves)
+            out = run(*jax.tree.unflatten(structure, leaves))
             return out, jax.tree.map(lambda _: False, out)
         full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)]
         L = full[0].shape[1]
