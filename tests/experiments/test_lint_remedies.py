@@ -129,3 +129,16 @@ def test_pushes_with_swapped_columns_are_named() -> None:
     assert found(bench.rig(right), "pushes.power") == []
     (finding,) = found(bench.rig(wrong), "pushes.power")
     assert "the power 0.5 ±" in text(finding)
+
+
+def test_decays_of_one_rig_have_one_frequency() -> None:
+    time = np.arange(1000) / 2000.0
+
+    def recorded(label: str, scale: float) -> Table:
+        columns = [bench.column("time", scale * time), bench.column("x_rel", decay(time, 5))]
+        return bench.table("free_vibration", columns, label)
+
+    assert found(bench.rig(recorded("a", 1.0), recorded("b", 1.1)), "decays.frequency") == []
+    (finding,) = found(bench.rig(recorded("a", 1.0), recorded("b", 60.0)), "decays.frequency")
+    assert (finding.level, finding.experiment) == ("fail", "b")
+    assert "The ratio is near 60 (min and s)." in text(finding)

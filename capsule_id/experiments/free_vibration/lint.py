@@ -20,6 +20,10 @@ from capsule_id.views import Finding, Message
 SAMPLES_PER_PERIOD = 20
 #: Smallest number of periods; with fewer, one peak determines the damping.
 FEWEST_PERIODS = 2
+#: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
+LARGEST_RATIO = 1.3
+#: Ratios of units that are mistaken for each other.
+RATIOS = (("1000 (s and ms)", 1000.0), ("60 (min and s)", 60.0), ("2 pi (rad and cycles)", 2.0 * np.pi))
 
 
 def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
@@ -43,16 +47,38 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         yield from _frequency(table, rig, *window)
 
 
+def _dominant(time: np.ndarray, values: np.ndarray) -> float:
+    """Dominant frequency of a record that may be sampled unevenly, Hz."""
+    even = np.linspace(time[0], time[-1], len(time))
+    return dominant_frequency(even, np.interp(even, time, values))
+
+
+def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[Finding]:
+    """Report a frequency that differs from that of the first decay of the rig, whose k1 and m1 are the same."""
+    first = next((other for other in rig.tables if other.kind == table.kind), table)
+    channel = next(name for name in first.columns if name != "time")
+    if first.label == table.label or channel not in table.columns:
+        return
+    used = rows_in_window(first)
+    ratio = frequency / _dominant(first["time"][used], first[channel][used])
+    if not 1.0 / LARGEST_RATIO < ratio < LARGEST_RATIO:
+        near = next(
+            (f" The ratio is near {words}." for words, r in RATIOS if abs(abs(np.log(ratio)) - np.log(r)) < 0.1), ""
+        )
+        facts = {"file": table.file, "first": first.file, "ratio": ratio, "near": near}
+        yield Finding("decays.frequency", "fail", facts, table.label)
+
+
 def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
     """Report an unusual frequency, and frequencies that the sampling cannot tell from that of the record."""
-    even = np.linspace(time[0], time[-1], len(time))
-    frequency = dominant_frequency(even, np.interp(even, time, values))
+    frequency = _dominant(time, values)
     low, high = USUAL["Hz"]
     if not low <= frequency <= high:
         facts = {"name": f"the frequency of {table.file}", "value": frequency, "unit": "Hz", "low": low, "high": high}
         meant = unit_meant(1.0 / frequency, table.columns["time"].to_display, "s", (1.0 / high, 1.0 / low))
         remedy = f" If the times are in {meant}, write that unit." if meant else ""
         yield Finding("decays.magnitude", "warn", {**facts, "remedy": remedy}, table.label)
+    yield from _other_frequency(table, rig, frequency)
     if rig.m1 is None:
         return
     stated, default = rig.priors.get("k1"), TABLE["k1"].prior
@@ -129,6 +155,13 @@ MESSAGES = {
     "decays.magnitude": Message(
         "magnitudes",
         warn="{name} is {value:.4g} {unit}; {low:g} to {high:g} {unit} is usual. Check the unit of the times.{remedy}",
+    ),
+    "decays.frequency": Message(
+        "magnitudes",
+        fail=(
+            "{file}: all decays have the same k1 and m1, so nearly the same frequency; it is {ratio:.4g} times that of {first}."
+            "{near} Check the unit of the times, the sampling rate, and that both records show the same rig."
+        ),
     ),
     "decays.alias": Message(
         "aliasing",
