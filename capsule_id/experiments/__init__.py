@@ -71,7 +71,8 @@ def make_experiments(
     for symbol in rig.model.free if experiments == "all" else ():
         if symbol not in measured:
             rule = f"an experiment must measure {symbol}, which [model] sets free"
-            remedy = f'remove "{symbol}" from free, or add an experiment with a sliding capsule'
+            wanted = 'with direction = "backward"' if symbol == "mu_back" else "with a sliding capsule"
+            remedy = f'remove "{symbol}" from free, or add an experiment {wanted}'
             raise InputError(rule, "none", remedy, rig.folder / "rig.toml")
     for e in made:
         for mass in e.masses:

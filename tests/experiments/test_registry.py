@@ -30,6 +30,7 @@ KINDS = default_registry()
 
 #: Every setting of every kind by the interface: its rule, and its default (...: it must be stated).
 _CHANNELS = ("x_rel", "x_capsule", "acceleration_rod", "current")
+_DIRECTION = (ChoiceRule(("forward", "backward")), "forward")
 _FORWARD = (ChoiceRule(("closed", "capsule")), "closed")
 _GAP = QuantityRule("m", NOT_NEGATIVE, has_sd=True)
 SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
@@ -47,9 +48,13 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "gap": (_GAP, None),
         "forward": _FORWARD,
     },
-    "static_friction": {"length_is": (ChoiceRule(("board", "base")), None)},
-    "dynamic_friction": {"forward": _FORWARD},
-    "sliding_friction": {},
+    "static_friction": {
+        "length_is": (ChoiceRule(("board", "base")), None),
+        "normal_force": (QuantityRule("N"), None),
+        "direction": _DIRECTION,
+    },
+    "dynamic_friction": {"forward": _FORWARD, "direction": _DIRECTION},
+    "sliding_friction": {"direction": _DIRECTION},
     "motor_current": {"sd_ratio": (QuantityRule("N/A"), None)},
     "support_spring": {
         "spring": (NameRule(), ...),

@@ -12,6 +12,7 @@ from capsule_id.experiments.families.friction import (
     CAPTIONS,
     MASSES_OF_FREE,
     MESSAGES,
+    SurfaceSettings,
     check_scatter,
     friction_estimates,
     friction_panels,
@@ -20,7 +21,6 @@ from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
-from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule
 
 PUSH_SCATTER = scatter(
@@ -32,7 +32,7 @@ SPEED_SD, DISTANCE_SD, SURFACE_SCATTER = 5e-3, 0.3e-3, 0.015
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushSettings(Settings):
+class PushSettings(SurfaceSettings):
     """Settings of pushes; ``forward`` selects the closed form of a locked rod or the capsule model of a free rod."""
 
     forward: Literal["closed", "capsule"] = "closed"
@@ -81,6 +81,7 @@ TEMPLATE = """\
 # speed_sd = { value = 5, unit = "mm/s" }
 # distance_sd = { value = 0.3, unit = "mm" }
 # forward = "closed"                                  # "capsule": the rod was free and vibrates
+# direction = "forward"                               # "backward": pushed away from the support spring
 """
 
 KIND = Kind(

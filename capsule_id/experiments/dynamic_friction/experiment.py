@@ -1,5 +1,6 @@
 """Pushes: an initial speed and the distance slid, rod locked to the capsule (paper, section 2.2)."""
 
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -31,7 +32,7 @@ class DynamicFriction(FrictionExperiment):
     role = "dynamic"
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction = friction
+        self.friction = friction = replace(friction, direction=table.settings.direction)
         self.about = About(table, rig, (*friction.parameters, PUSH_SCATTER))
         self.speed, self.distance = table["speed"], table["distance"]
         self.speed_sd = table.columns["speed"].reading_sd

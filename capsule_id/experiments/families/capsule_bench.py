@@ -109,7 +109,7 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         DynamicFriction.__init__(self, table, rig, friction)
         self.smoothing = None
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
-        self.about = About(table, rig, (parameter("k1"), parameter("c"), *friction.parameters, PUSH_SCATTER))
+        self.about = About(table, rig, (parameter("k1"), parameter("c"), *self.friction.parameters, PUSH_SCATTER))
 
     def slide(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
         """(n,) slide distance of the capsule, m."""

@@ -1,18 +1,27 @@
 """Shared declarations of friction experiments: eq. (1), the paper's fit, one panel, one rule on readings."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Values
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Settings, Table
 from capsule_id.views import Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.friction_experiment import FrictionExperiment
     from capsule_id.views import Comparison
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceSettings(Settings):
+    """``direction``: towards the support spring ("forward") or away from it; it matters where mu_back is free."""
+
+    direction: Literal["forward", "backward"] = "forward"
+
 
 CAPTIONS = {
     "friction": "Counterpart of the paper's Fig. 2: coefficients as the paper reads them off, its curve, and ours."

@@ -1,6 +1,7 @@
 """Checks of the friction law: comparison with other laws, order of the residuals in speed."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,7 @@ def check_variants(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> 
     ordered by speed.
     """
     del fit
-    in_use = experiments[0].friction
+    in_use = replace(experiments[0].friction, direction="both")
     if in_use.law is not CoulombStribeck or sum(e.n for e in experiments if e.role != "static") < FEWEST_SLIDES:
         return []
     points = Points(experiments)

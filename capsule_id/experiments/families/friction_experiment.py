@@ -12,7 +12,7 @@ from capsule_id.experiments.base import Start, ValuesBySymbol, band
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.families.friction_checks import check_variants, variant_table
-from capsule_id.experiments.families.friction_model import SurfaceExperiment
+from capsule_id.experiments.families.friction_model import FrictionModel, SurfaceExperiment
 from capsule_id.physics.friction import CoulombStribeck, slide_distance
 from capsule_id.views import Comparison, Curve, Finding, Points
 
@@ -59,7 +59,7 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
 def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> list[Finding]:
     """Check that tilts and slides agree on the coefficient at break-away."""
     tilts = [e for e in experiments if e.role == "static"]
-    slides = [e for e in experiments if e.role != "static"]
+    slides = [e for e in experiments if e.role != "static" and tilts and e.friction == tilts[0].friction]
     if not tilts or not slides:
         return []
     found, friction = fit.tension(tilts, slides), tilts[0].friction
@@ -98,7 +98,8 @@ class FrictionExperiment(SurfaceExperiment):
     def rough_starts(self) -> dict[str, Start]:
         """Starts of mu and v_s from the paper's estimates; another law starts at its prior medians."""
         speed, coefficient = self.paper_points()
-        return {"mu": Start(float(np.max(coefficient)), 0.3), "v_s": Start(float(np.median(speed)), 0.5)}
+        mu = Start(float(np.max(coefficient)), 0.3)
+        return {"mu": mu, "mu_back": mu, "v_s": Start(float(np.median(speed)), 0.5)}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return friction_comparison([self], theta, draws)
@@ -108,18 +109,22 @@ def friction_comparison(
     experiments: list[FrictionExperiment], theta: ValuesBySymbol, draws: list[ValuesBySymbol]
 ) -> Comparison:
     """Plot data of friction coefficient against velocity: readings, the paper's curve, this fit (paper, Fig. 2)."""
-    friction = experiments[0].friction
+    laws = list(dict.fromkeys(e.friction for e in experiments))
+    friction = laws[0]
     points = [Points(e.label, *e.paper_points(), role=e.role) for e in experiments]
     top = max(float(np.max(p.x)) for p in points)
     speed = np.linspace(0.0, 1.15 * top if top > 0 else 1.0, 161)
 
-    def curve(values: ValuesBySymbol) -> np.ndarray:
+    def curve(friction: FrictionModel, values: ValuesBySymbol) -> np.ndarray:
         # Tilts alone do not determine the sliding friction, so their line is horizontal.
         known = all(row.symbol in values for row in friction.parameters)
         return np.asarray(friction.coefficient(values).forward(speed if known else 0.0 * speed))
 
-    lower, upper = band(np.array([curve(draw) for draw in draws]))
-    curves = [Curve(f"this fit, {friction.name}", speed, curve(theta), lower, upper)]
+    curves = []
+    for law in laws:
+        lower, upper = band(np.array([curve(law, draw) for draw in draws]))
+        name = f"this fit, {law.name}" + (f", {law.direction}" if len(laws) > 1 else "")
+        curves.append(Curve(name, speed, curve(law, theta), lower, upper))
     paper = paper_friction_fit(np.concatenate([p.x for p in points]), np.concatenate([p.y for p in points]))
     if "v_s" in paper:
         curves.append(Curve("the paper's fit", speed, unit_law(**paper).forward(speed), role="paper"))

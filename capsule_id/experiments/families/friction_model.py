@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Literal, cast
 
 import equinox as eqx
 import jax
@@ -49,6 +49,24 @@ class PerWeight:
         return self.law.backward(speed) / self.weight
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Reversed:
+    """A law with its directions exchanged: readings of backward sliding, taken as forward ones."""
+
+    law: FrictionLaw
+
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+
+    def forward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards negative X2, N."""
+        return self.law.backward(speed)
+
+    def backward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards positive X2, N."""
+        return self.law.forward(speed)
+
+
 @dataclass(frozen=True)
 class FrictionModel:
     """One friction law for all experiments of a fit, as a function of the parameter values.
@@ -60,6 +78,7 @@ class FrictionModel:
     law : its class; eq. (1) by default
     free : symbols of the optional parameters that are sampled; the others keep their defaults
     constant : eq. (1) with ratio 1: the same friction at every speed, without v_s
+    direction : of the sliding that an experiment records. "backward" exchanges the directions of the law
 
     Raises
     ------
@@ -71,6 +90,7 @@ class FrictionModel:
     law: type[FrictionLaw] = CoulombStribeck
     free: tuple[str, ...] = ()
     constant: bool = False
+    direction: Literal["both", "forward", "backward"] = "both"
 
     def __post_init__(self) -> None:
         law, wanted = self.law, ("parameters", "forward", "backward")
@@ -110,8 +130,11 @@ class FrictionModel:
     def parameters(self) -> tuple[Parameter, ...]:
         """The sampled parameters."""
         rows = (row for row in self.law.parameters if row.symbol != NORMAL_FORCE)
+        absent = set(CONSTANT) if self.constant else set()
+        if "mu_back" in self.free:
+            absent |= {"forward": {"mu_back"}, "backward": {"mu"}}.get(self.direction, set())
         sampled = (row for row in rows if not row.optional or row.symbol in self.free)
-        return tuple(row for row in sampled if not (self.constant and row.symbol in CONSTANT))
+        return tuple(row for row in sampled if row.symbol not in absent)
 
     @property
     def parameters_at_rest(self) -> tuple[Parameter, ...]:
@@ -165,9 +188,13 @@ class FrictionModel:
 
     def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
         # Parameters that tilts do not sample have no effect at rest, so any value is valid there.
-        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in self.parameters}
+        held = set(CONSTANT) if self.constant else set()
+        rows = (row for row in self.law.parameters if row.symbol not in {NORMAL_FORCE, *held})
+        used = (row for row in rows if not row.optional or row.symbol in self.free)
+        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in used}
         constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
-        return cast(Any, self.law)(**known, **constant, **(CONSTANT if self.constant else {}))
+        law = cast(Any, self.law)(**known, **constant, **(CONSTANT if self.constant else {}))
+        return Reversed(law) if self.direction == "backward" else law
 
 
 def _prior_of(row: Parameter) -> Prior:

@@ -8,13 +8,13 @@ most 1/FACTOR (Markov's inequality, for parameters drawn from the prior).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special
 
-from capsule_id.experiments.families.friction_model import CONSTANT, FrictionModel
+from capsule_id.experiments.families.friction_model import CONSTANT, FrictionModel, Reversed
 from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
 from capsule_id.physics.friction import CoulombStribeck, normal_force, slide_distance
@@ -69,10 +69,12 @@ def model_lines(model: FrictionModel) -> str:
 
 def candidates(experiments: "Sequence[FrictionExperiment]") -> list[FrictionModel]:
     """Return the laws that the experiments can tell apart, the law in use included, the simplest first."""
-    in_use = experiments[0].friction
+    in_use = replace(experiments[0].friction, direction="both")
     models = [FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",))]
     if experiments[0].rig.m1 is not None and experiments[0].rig.m2 is not None:
         models += [FrictionModel(free=("viscous",), constant=True), FrictionModel(free=("ratio", "viscous"))]
+    if len({e.friction.direction for e in experiments}) > 1:
+        models += [replace(model, free=("mu_back", *model.free)) for model in models]
     return sorted({in_use, *models}, key=lambda m: (len(m.parameters), not m.constant, m.free))
 
 
@@ -104,6 +106,7 @@ class Points:
         for e, logs, (reading, per_scatter) in zip(self.experiments, self.logs, self.errors, strict=True):
             axes = (1, 2) if e.role == "dynamic" else (1,)
             law = CoulombStribeck(N=1.0, **{name: _expanded(value, axes) for name, value in known.items()})
+            law = Reversed(law) if e.friction.direction == "backward" else law
             speed = e.paper_points()[0]
             if e.role == "dynamic":
                 expected = speed**2 / (2.0 * self.g * slide_distance(law, 1.0 / self.g, speed))

@@ -6,6 +6,7 @@ from capsule_id.experiments.families.friction import (
     CAPTIONS,
     MASSES_OF_FREE,
     MESSAGES,
+    SurfaceSettings,
     check_scatter,
     friction_estimates,
     friction_panels,
@@ -26,6 +27,7 @@ TEMPLATE = """\
 # [[experiment]]
 # kind = "sliding_friction"
 # file = "sliding_friction.csv"
+# direction = "forward"                               # "backward": it slid away from the support spring
 """
 
 KIND = Kind(
@@ -36,6 +38,7 @@ KIND = Kind(
         "coefficient": ColumnRule("1", POSITIVE),
     },
     sets=(("speed", "force"), ("speed", "coefficient")),
+    settings=SurfaceSettings,
     masses=lambda table: ("m1", "m2") if "force" in table.columns else (),
     masses_of_free=MASSES_OF_FREE,
     parameters=(SLIDING_SCATTER,),

@@ -1,5 +1,6 @@
 """Steady sliding: friction force, or coefficient, at a held speed."""
 
+from dataclasses import replace
 from types import ModuleType
 
 import equinox as eqx
@@ -31,7 +32,7 @@ class SlidingFriction(FrictionExperiment):
     role = "sliding"
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction = friction
+        self.friction = friction = replace(friction, direction=table.settings.direction)
         self.about = About(table, rig, (*friction.parameters, SLIDING_SCATTER))
         self.quantity = "force" if "force" in table.columns else "coefficient"
         self.speed, self.values = table["speed"], table[self.quantity]

@@ -1,14 +1,15 @@
-"""Tilts until the capsule slips: columns, settings, rules, template and twin."""
+"""Tilts or pulls until the capsule slips: columns, settings, rules, template and twin."""
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from capsule_id.experiments.families.friction import (
     CAPTIONS,
     MESSAGES,
+    SurfaceSettings,
     check_scatter,
     friction_estimates,
     friction_panels,
@@ -18,30 +19,37 @@ from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE, SLOPE_ANGLE
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Settings
-from capsule_id.rig.schema import ColumnRule
+from capsule_id.rig.schema import ColumnRule, QuantityRule
 
 TILT_SD = scatter(
     "tilt_sd", "rad", "scatter of the tilt angle", r"\sigma_\mathrm{tilt}", Prior("halfnormal", 0.0, np.deg2rad(1.0))
+)
+PULL_SCATTER = scatter(
+    "pull_scatter", "1", "relative scatter of mu, pulls until slip", r"s_\mathrm{pull}", Prior("halfnormal", 0.0, 0.05)
 )
 #: Number of trials of the twin, and their scatter, rad.
 TRIALS, TRIAL_SD = 4, np.deg2rad(0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TiltSettings(Settings):
-    """Settings of tilts; ``length_is``: side of the triangle in the column length; None with a column angle."""
+class TiltSettings(SurfaceSettings):
+    """Settings of tilts; ``length_is``: side of the triangle, None without one; ``normal_force`` of a pull, N."""
 
     length_is: Literal["board", "base"] | None = None
+    normal_force: Annotated[float | None, QuantityRule("N")] = None
 
 
 def _check_tilt(entry: Entry[TiltSettings]) -> None:
     """Require ``length_is`` where height and length are recorded, because the angle depends on it."""
     table, meaning = entry.table, entry.table.settings.length_is
-    if "angle" in table.columns:
+    if table.settings.normal_force is not None and "force" not in table.columns:
+        remedy = "remove it, or give force"
+        raise entry.error("normal_force", "normal_force needs the column force", next(iter(table.columns)), remedy)
+    if "height" not in table.columns:
         if meaning is not None:
             remedy = "remove it, or give height and length"
-            raise entry.error("length_is", "length_is needs the columns height and length", "angle", remedy)
+            rule = "length_is needs the columns height and length"
+            raise entry.error("length_is", rule, next(iter(table.columns)), remedy)
         return
     if meaning is None:
         rule = "length_is must say which side of the triangle length is"
@@ -74,10 +82,13 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
 TEMPLATE = """\
 #: Tilts of the board until the capsule slips: mu. Column: angle [deg]; or height [mm] and length [mm] with
 #: length_is = "board" (the sloping side) or "base" (the side on the floor).
+#: Or force [N]: the level pull at which the capsule slips. The normal force is (m1 + m2) g, or stated by
+#: normal_force = { value = 6.3, unit = "N" }.
 # [[experiment]]
 # kind = "static_friction"
 # file = "static_friction.csv"
 # angle_resolution = { value = 0.1, unit = "deg" }
+# direction = "forward"                               # "backward": it slips away from the support spring
 """
 
 KIND = Kind(
@@ -86,11 +97,13 @@ KIND = Kind(
         "angle": ColumnRule("rad", SLOPE_ANGLE),
         "height": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
         "length": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
+        "force": ColumnRule("N", POSITIVE),
     },
-    sets=(("angle",), ("height", "length")),
+    sets=(("angle",), ("height", "length"), ("force",)),
+    masses=lambda table: ("m1", "m2") if "force" in table.columns and table.settings.normal_force is None else (),
     settings=TiltSettings,
     rules=(_check_tilt,),
-    parameters=(TILT_SD,),
+    parameters=(TILT_SD, PULL_SCATTER),
     make=made_by("capsule_id.experiments.static_friction.experiment:StaticFriction"),
     template=TEMPLATE,
     informs="mu",

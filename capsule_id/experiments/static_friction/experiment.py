@@ -1,6 +1,8 @@
 """Tilt to slide: mu is the tangent of the angle at which the capsule breaks away (paper, section 2.2)."""
 
+from dataclasses import replace
 from types import ModuleType
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +10,9 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.families.friction_experiment import FrictionExperiment
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
-from capsule_id.experiments.misfit import Misfit
-from capsule_id.experiments.static_friction.declaration import TILT_SD
-from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.experiments.static_friction.declaration import PULL_SCATTER, TILT_SD
+from capsule_id.physics.friction import CoulombStribeck, normal_force
 from capsule_id.rig.model import Rig, Table
 
 
@@ -24,14 +26,22 @@ class StaticFriction(FrictionExperiment):
     """
 
     angle: np.ndarray
+    #: () where it is the same for all trials, else (n,)
     reading_sd: np.ndarray
+    mean: float
+    squares: float
 
     role = "static"
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction = friction
+        self.friction = friction = replace(friction, direction=table.settings.direction)
         self.about = About(table, rig, (*friction.parameters_at_rest, TILT_SD))
         self.angle, self.reading_sd = _angles(table)
+        self.mean, self.squares = float(np.mean(self.angle)), float(np.sum((self.angle - np.mean(self.angle)) ** 2))
+
+    @classmethod
+    def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> tuple[FrictionExperiment, ...]:
+        return (StaticPulls(table, rig, friction) if "force" in table.columns else cls(table, rig, friction),)
 
     @property
     def masses(self) -> tuple[str, ...]:
@@ -50,6 +60,14 @@ class StaticFriction(FrictionExperiment):
         angle = xp.arctan(self.friction.coefficient(theta).forward(0.0))
         return (Misfit(self.angle - angle, self.reading_sd**2, 1.0, no_design(self.n, xp)),)
 
+    def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
+        """Mean and sum of squares are sufficient where all trials have one reading error."""
+        if np.ndim(self.reading_sd):
+            return super().summaries(theta, xp)
+        angle = xp.arctan(self.friction.coefficient(theta).forward(0.0))
+        yy = self.squares + self.n * (self.mean - angle) ** 2
+        return (Moments(yy, xp.zeros(0), xp.zeros((0, 0)), self.n, self.reading_sd**2),)
+
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Points by the paper's formula: mu = tan(angle) at speed 0."""
         return np.zeros(self.n), np.tan(self.angle)
@@ -60,17 +78,68 @@ class StaticFriction(FrictionExperiment):
 
     def starts(self) -> dict[str, Start]:
         scatter = np.std(self.angle, ddof=1) if self.n > 1 else 0.0
+        mu = Start(float(np.mean(np.tan(self.angle))), 0.3)
         return {
-            "mu": Start(float(np.mean(np.tan(self.angle))), 0.3),
+            "mu": mu,
+            "mu_back": mu,
             "tilt_sd": Start(max(scatter, np.deg2rad(0.1)), 0.3),
         }
 
 
+class StaticPulls(FrictionExperiment):
+    """Pulls on level ground: force_i = mu_0 N (1 + N(0, pull_scatter^2)) + reading error; N is stated or the weight."""
+
+    force: np.ndarray
+    reading_sd: float
+    normal_force: float | None
+
+    role = "static"
+
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        self.friction = friction = replace(friction, direction=table.settings.direction)
+        self.about = About(table, rig, (*friction.parameters_at_rest, PULL_SCATTER))
+        self.force, self.reading_sd = table["force"], table.columns["force"].reading_sd
+        self.normal_force = table.settings.normal_force
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        return ("m1", "m2") if self.normal_force is None or self.friction.law is not CoulombStribeck else ()
+
+    @property
+    def scatters(self) -> tuple[str]:
+        return ("pull_scatter",)
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.force
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        normal = normal_force(theta["m1"], theta["m2"], theta["g"]) if self.normal_force is None else self.normal_force
+        expected: Any = normal * self.friction.coefficient(theta).forward(0.0)
+        return (Misfit(self.force - expected, self.reading_sd**2, expected, no_design(self.n, xp)),)
+
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points by the paper's formula: mu = force/N at speed 0."""
+        normal = self.normal_force
+        if normal is None:
+            m1, m2 = self.rig.m1, self.rig.m2
+            assert m1 is not None, "the schema requires both masses for a pull without normal_force"
+            assert m2 is not None, "the schema requires both masses for a pull without normal_force"
+            normal = normal_force(m1.value, m2.value, self.rig.g.value)
+        return np.zeros(self.n), self.force / normal
+
+    def point_errors(self) -> tuple[np.ndarray, float]:
+        return self.reading_sd / self.force, 1.0
+
+    def starts(self) -> dict[str, Start]:
+        return {**self.rough_starts(), "pull_scatter": Start(0.02, 0.3)}
+
+
 def _angles(table: Table) -> tuple[np.ndarray, np.ndarray]:
-    """Angle and its reading error, (n,) rad each."""
+    """Angle, (n,) rad, and its reading error, () or (n,) rad."""
     if "angle" in table.columns:
         angle = table.columns["angle"]
-        return angle.values, np.full(len(angle.values), angle.reading_sd)
+        return angle.values, np.asarray(angle.reading_sd)
     height, length = table.columns["height"], table.columns["length"]
     ratio = height.values / length.values
     ratio_sd = ratio * np.hypot(height.reading_sd / height.values, length.reading_sd / length.values)
