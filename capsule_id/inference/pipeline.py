@@ -32,6 +32,7 @@ from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
+from capsule_id.inference.checks.widening import widenings
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import PointStage
 from capsule_id.inference.result import PointFit, PointwiseLogLikelihood, Posterior, Provenance, Result
@@ -127,7 +128,12 @@ def check_fit(sampled: Setting, before: Sequence[Finding] = ()) -> Setting:
     stop_if_interrupted()
     checked = run_checks(sampled)
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
-    return replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
+    checked = replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
+    widened = widenings(checked)
+    if not widened:
+        return checked
+    facts = {"factors": [(name, one.factor, one.parts) for name, one in widened.items()]}
+    return replace(checked, widened=widened, findings=(*checked.findings, Finding("model.error", "warn", facts)))
 
 
 def make_result(

@@ -64,8 +64,8 @@ def _interval(row: Row) -> str:
     return MISSING if MISSING in ends else " to ".join(ends)
 
 
-def _ends(values: Mapping[Hashable, Any]) -> list[float] | None:
-    ends = [float(values["lower"]), float(values["upper"])]
+def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | None:
+    ends = [float(values[f"lower{suffix}"]), float(values[f"upper{suffix}"])]
     return ends if np.all(np.isfinite(ends)) else None
 
 
@@ -110,6 +110,10 @@ COLUMNS = (
     OutputColumn("unit", "unit", lambda row: row.unit, numeric=False),
     OutputColumn("value", "value ± sd", lambda row: row.plus_minus("value", "sd", row.decimals)),
     OutputColumn("sd", outputs=FILES),
+    OutputColumn(
+        "sd_unwidened", "sd without model error", lambda row: row.number("sd_unwidened"), outputs=EVERYWHERE - {"console"}
+    ),
+    OutputColumn("widening", outputs=FILES),
     OutputColumn("basis", outputs=FILES),
     OutputColumn("trust", "trust", lambda row: str(row.values["trust"]), numeric=False),
     OutputColumn("paper", "paper", lambda row: row.number("paper")),
@@ -120,6 +124,7 @@ COLUMNS = (
     OutputColumn("lower", outputs=frozenset({"csv"})),
     OutputColumn("upper", outputs=frozenset({"csv"})),
     OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),
+    OutputColumn("ci95_unwidened", value=lambda values: _ends(values, "_unwidened"), outputs=frozenset({"json"})),
     OutputColumn("ess", "ESS", lambda row: fixed(float(row.values["ess"]), 0), outputs=EVERYWHERE - {"console"}, sampled=True),
     OutputColumn("rhat", "R-hat", lambda row: fixed(float(row.values["rhat"]), 3), sampled=True),
     OutputColumn("informed", "informed", _informed, sampled=True, numeric=False),

@@ -163,6 +163,14 @@ FIT_MESSAGES: Mapping[str, Message] = {
             "Repeat the trials in random order, with the test set up anew between them."
         ),
     ),
+    "model.error": Message(
+        "model error",
+        warn=lambda facts: (
+            "estimates from parts of the data scatter more than their sds say, so the quoted sd is multiplied by "
+            + ", ".join(f"{factor:.1f} for {name} ({parts} parts)" for name, factor, parts in facts["factors"])
+            + ". It is an estimate of the model's error; find its cause before you use the number."
+        ),
+    ),
     "outliers": Message("outliers", ok="no reading stands apart from the others of its table", fail=_outliers),
     "errors.stated": Message(
         "stated errors",

@@ -38,6 +38,8 @@ NUISANCES = {
     "scatter[support_spring_medium]": ("N", "scatter about a calibration line", 0.038, 0.0093, np.nan),
     "scatter[support_spring_stiff]": ("N", "scatter about a calibration line", 0.113, 0.029, np.nan),
 }
+#: Columns of a parameter without model error.
+NOT_WIDENED = dict.fromkeys(("widening", "sd_unwidened", "lower_unwidened", "upper_unwidened"), np.nan)
 SAMPLED = {**PHYSICAL, **NUISANCES}
 
 
@@ -49,7 +51,7 @@ def _frame(rows: dict[str, tuple[str, str, float, float, float]], rng: np.random
             "unit": unit, "meaning": meaning, "value": mean, "basis": "sample", "trust": "trusted", "paper": paper,
             "map": value, "standard_error": 0.97 * sd, "mean": mean,
             "sd": sd, "median": mean, "lower": mean - 1.96 * sd, "upper": mean + 1.96 * sd,
-            "ess": 4100.0 + 100 * rng.normal(), "rhat": 1.002, "informed": name not in ("m1", "m2"),
+            "ess": 4100.0 + 100 * rng.normal(), "rhat": 1.002, **NOT_WIDENED, "informed": name not in ("m1", "m2"),
         }  # fmt: skip
     frame = pd.DataFrame.from_dict(table, orient="index")
     frame.index.name = "name"

@@ -84,7 +84,8 @@ def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> N
     assert list(content["parameters"]) == list(result.summary.index)
     assert content["trust"] == "trusted"
     keys = [
-        "unit", "value", "sd", "basis", "trust", "paper", "map", "mean", "median", "ci95", "ess", "rhat", "informed",
+        "unit", "value", "sd", "sd_unwidened", "widening", "basis", "trust", "paper", "map", "mean", "median", "ci95",
+        "ci95_unwidened", "ess", "rhat", "informed",
     ]  # fmt: skip
     for name, entry in content["parameters"].items():
         row = result.summary.loc[name]

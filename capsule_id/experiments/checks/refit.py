@@ -40,7 +40,11 @@ def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]
     nuisances = experiment.misfit(theta).design.shape[1]
     freedom = len(keep) - len(symbols) - nuisances
     scale = 1.0 if experiment.scale_known else float(2.0 * solution.cost / max(freedom, 1))
-    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * scale
+    # A model that is not finite (an overdamped decay) determines nothing.
+    finite = bool(np.isfinite(solution.jac).all())
+    covariance = (
+        np.linalg.pinv(solution.jac.T @ solution.jac) * scale if finite else np.full((len(at), len(at)), np.inf)
+    )
     values = values_of(solution.x)
     errors = (at if signed else values) * np.sqrt(np.diag(covariance))
     return {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)}

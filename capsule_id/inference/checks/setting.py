@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks.context import Refit, Tension
@@ -13,6 +14,9 @@ from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 
+if TYPE_CHECKING:
+    from capsule_id.inference.checks.widening import Widening
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -22,6 +26,7 @@ class Setting:
     ----------
     bench : fit of the bench tests alone, where runs were fitted too
     seed : seed of the starting points of further point fits
+    widened : error of the model by name of the parameter, where a check failed
     """
 
     target: LogPosterior
@@ -33,6 +38,7 @@ class Setting:
     flagged: Mapping[str, Sequence[int]] = field(default_factory=dict)
     findings: Sequence[Finding] = ()
     bench: BenchFit = field(default_factory=BenchFit)
+    widened: Mapping[str, "Widening"] = field(default_factory=dict)
 
     @property
     def rig(self) -> Rig:

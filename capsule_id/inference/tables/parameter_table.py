@@ -1,5 +1,8 @@
 """The parameter table and the nuisance table of a result."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
@@ -8,12 +11,13 @@ from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.trust import trust_words
 from capsule_id.inference.checks.verdict import informed
+from capsule_id.inference.checks.widening import Widening
 from capsule_id.inference.result import Posterior
 from capsule_id.parameters import Parameter, parameter
 
 SUMMARY_COLUMNS = (
     "unit", "meaning", "value", "sd", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
-    "upper", "ess", "rhat", "informed",
+    "upper", "ess", "rhat", "informed", "widening", "sd_unwidened", "lower_unwidened", "upper_unwidened",
 )  # fmt: skip
 
 
@@ -39,7 +43,8 @@ def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame
             "standard_error": point.standard_errors[row.name],
             "informed": bool(known[i]),
         }
-        rows.append((row, entry | ({} if posterior is None else _sample_columns(posterior, i))))
+        entry |= {} if posterior is None else _sample_columns(posterior, i)
+        rows.append((row, entry | _widened(entry, setting.widened.get(row.name), row.positive)))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
         exact = dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value)
@@ -57,6 +62,23 @@ def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame
         for chosen in (True, False)
     )
     return physical, nuisances
+
+
+def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool) -> dict[str, object]:
+    """Columns with the error of the model; the ends of an interval move in u, so that they keep their sign."""
+    if widening is None:
+        return {}
+    found: dict[str, object] = {
+        "widening": widening.factor,
+        "sd": widening.factor * entry["sd"],
+        "sd_unwidened": entry["sd"],
+    }
+    for end in ("lower", "upper"):
+        if end in entry:
+            value, limit, stretch = entry["value"], entry[end], widening.factor * widening.quantile
+            moved = value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
+            found |= {end: moved, f"{end}_unwidened": limit}
+    return found
 
 
 def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
