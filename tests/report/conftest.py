@@ -147,7 +147,16 @@ OUTLIER = {
     "file": "stiff.csv", "lines": [5], "score": 4.1, "p": 1e-4, "most": 3,
     "estimates": [("k2[stiff]", "N/m", 56410.0, 56350.0)],
 }  # fmt: skip
-COLOURED = {"record": "free_vibration_2", "Q": 250.0, "lags": 20, "p": 1e-30, "model": "decay"}
+COLOURED = {
+    "record": "free_vibration_2",
+    "Q": 250.0,
+    "lags": 20,
+    "p": 1e-30,
+    "model": "decay",
+    "present": (),
+    "second": False,
+    "lines": "",
+}
 CHAINS = {
     "draws": 1000, "length": 12.0, "slowest": "v_s", "rhat": 1.2, "worst": "mu", "length_wanted": 50.0,
     "rhat_wanted": 1.01,
