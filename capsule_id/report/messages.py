@@ -143,7 +143,8 @@ def _inconsistent(facts: Facts) -> str:
     further = "".join(f", then {other} ({sd:+.1f} sd, {stated_p(p)})" for other, sd, p in others)
     return (
         f"bench tests and forced runs are inconsistent: {_largest_disagreement(facts)}{further}. The bench's {name} does "
-        "not fit the recorded motion. Repeat its bench test, or find what differs in the runs."
+        f"not fit the recorded motion. Check units, clock and calibration of {facts['tests'] or 'its bench test'} and repeat "
+        "it, or find what differs in the runs."
     )
 
 

@@ -112,10 +112,16 @@ def check_agreement(
     known = {row.name for e in target.experiments if not e.bench for row in e.parameters}
     shared = [] if bench is None else [name for name in bench.names if name in known]
     found = disagreement(shared, runs_alone(target, joint), bench, sample) if bench is not None and shared else {}
-    return [agreement(found, sample is not None)] if found else []
+    tests = {
+        name: [e.label for e in target.experiments if e.bench and name in {row.name for row in e.parameters}]
+        for name in found
+    }
+    return [agreement(found, sample is not None, tests)] if found else []
 
 
-def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
+def agreement(
+    found: Mapping[str, Distance], sampled: bool, tests: Mapping[str, Sequence[str]] | None = None
+) -> Finding:
     """Convert the distances of ``disagreement`` to a finding.
 
     Without a bench sample a disagreement is a failure only where Student's t with ``FREEDOM_WITHOUT_SAMPLE`` excludes
@@ -124,6 +130,7 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
     Among the parameters that disagree significantly, the largest disagreement, in sd, is reported.
     The distance in sd measures how much the error of one parameter explains. An error in one parameter also shifts
     the parameters correlated with it (v_s with mu). Heavy tails make z a poor measure of its origin.
+    ``tests`` are the labels of the bench tests that inform each parameter; those of the largest disagreement are named.
     """
     p = {name: _family_wise(one.z, len(found)) for name, one in found.items()}
     lost = [name for name, one in found.items() if not (np.isfinite(one.sd) and np.isfinite(one.z))]
@@ -138,6 +145,7 @@ def agreement(found: Mapping[str, Distance], sampled: bool) -> Finding:
         "distances": [(name, found[name].sd, p[name]) for name in named],
         "shared": len(found),
         "sampled": sampled,
+        "tests": ", ".join((tests or {}).get(named[0], ())),
     }
     return Finding("bench_and_runs.agree", level, facts)
 

@@ -57,6 +57,17 @@ def test_without_a_sample_a_gross_disagreement_fails_and_a_moderate_one_warns() 
     assert levels == {1.0: "ok", 5.0: "warn", 70.0: "fail"}
 
 
+def test_the_bench_test_of_the_largest_disagreement_is_named() -> None:
+    """A motor gain 10 % off, which moves mu a little too."""
+    found = {"K": Distance(15.0, 15.0), "mu": Distance(-5.0, -5.0)}
+    tests = {"K": ["motor_current"], "mu": ["static_friction", "dynamic_friction"]}
+    finding = agreement(found, True, tests)
+    assert finding.level == "fail"
+    assert "calibration of motor_current and repeat" in words(finding)
+    assert "static_friction" not in words(finding)
+    assert agreement({"K": Distance(0.5, 0.5)}, True, tests).level == "ok"
+
+
 def test_named_is_where_the_error_came_from() -> None:
     """Heavy tails make nothing of what lies between 19 and 7 sd; a parameter that is no surprise is not named at all."""
     found = {"k1": Distance(30.0, 1.0), "v_s": Distance(-6.6, -4.1), "mu": Distance(18.6, 4.0), "c": Distance(2.0, 2.0)}
