@@ -38,8 +38,9 @@ def scipy_decay(time: np.ndarray, forces: Mapping[str, float], amplitude: float,
         )
         inside = (time >= start) & (time <= part.t[-1])
         assert part.sol is not None
-        state = part.sol(time[inside])
-        motion[:, inside] = [*state, acceleration(state)]
+        if inside.any():
+            state = part.sol(time[inside])
+            motion[:, inside] = [*state, acceleration(state)]
         start, x, direction = part.t[-1], float(part.y[0, -1]), -direction
     stuck = np.isnan(motion[0])
     motion[:, stuck] = np.array([[x], [0.0], [0.0]])

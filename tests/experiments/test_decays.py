@@ -10,8 +10,14 @@ import pytest
 from bench import K1, M1, C, released
 from scipy.integrate import solve_ivp
 
-from capsule_id.experiments.free_vibration.decay_models import decay, rates, viscous_basis
-from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
+from capsule_id.experiments.free_vibration.decay_models import (
+    decay,
+    decay_moments,
+    fold,
+    rates,
+    uniform_step,
+    viscous_basis,
+)
 from tests.scipy_decay import scipy_decay
 
 TIME = np.arange(900) / 2000.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments.checks.series import autocorrelation, ljung_box
-from capsule_id.experiments.free_vibration.decay_moments import fold
+from capsule_id.experiments.free_vibration.decay_models import fold
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.compiling import COMPILE_QUICKLY

@@ -43,6 +43,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "drift": (ChoiceRule(("none", "linear", "gp")), None),
         "noise": (ChoiceRule(("white", "ar1", "arma")), None),
         "every": (CountRule(), None),
+        "samples": (ChoiceRule(("record", "turning_points")), "record"),
         "smoothing_window": (QuantityRule("s"), None),
         "spring": (NameRule(), None),
         "gap": (_GAP, None),

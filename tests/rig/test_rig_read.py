@@ -54,6 +54,7 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "stop": 0.009,
         "capsule": "held",
         "damping": ("dry",),
+        "samples": "record",
         "smoothing_window": 0.005,
         "forward": "closed",
     }

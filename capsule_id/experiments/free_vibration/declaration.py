@@ -1,10 +1,13 @@
 """Free vibration: columns, settings, rules, template, lint and the paper's estimates."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings, decay_window
@@ -17,9 +20,15 @@ from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
 from capsule_id.views import Facts, Message
 
 if TYPE_CHECKING:
+    from capsule_id.experiments.base import Experiment
+    from capsule_id.experiments.families.friction_model import FrictionModel
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
 
+#: Fewest passages of the rest position, and smallest distance from it that counts, relative to the record's range.
+FEWEST_SWINGS, SMALLEST_SWING = 2, 0.05
+
 NOISE_SD = scatter("noise_sd", "m", "noise of a record", r"\sigma")
+TIME_SD = scatter("time_sd", "s", "noise of the times of turning points", r"\sigma_t")
 AMPLITUDE = nuisance("amplitude", "m", "first turning point of a decay", "a_0")
 NOISE_TIME = Parameter("noise_time", "s", "correlation time of a record's noise", r"\tau", physical=False)
 WHITE_RATIO = Parameter(
@@ -74,10 +83,54 @@ def _check_forward(entry: Entry[DecaySettings]) -> None:
         remedy = 'add capsule = "free", or write forward = "closed" where the capsule was held'
         raise entry.error("forward", "forward capsule needs a capsule that is free to move", "held", remedy)
     model = DecayModel.stated(settings)
-    if model != DecayModel():
+    if model != DecayModel() or settings.samples != "record":
         rule = "forward capsule has viscous damping, a linear spring and white noise only"
         remedy = 'write forward = "closed", or remove damping, stiffness, drift and noise'
         raise entry.error("forward", rule, model.name, remedy)
+
+
+def _check_turning_points(entry: Entry[DecaySettings]) -> None:
+    """Refuse drift, coloured noise and thinning of turning points."""
+    settings = entry.table.settings
+    if settings.samples == "record":
+        return
+    for key, default in (("drift", "none"), ("noise", "white"), ("every", 1)):
+        value = getattr(settings, key)
+        if value not in (None, default):
+            rule = "turning points have white noise and no drift, and each of them counts"
+            raise entry.error(key, rule, str(value), f"remove {key}, or samples", of_key=True)
+
+
+def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
+    """Refuse a record that does not swing: neither frequency nor damping follows from it.
+
+    Raises
+    ------
+    InputError
+        At the first such table.
+    """
+    for table in tables:
+        values = decay_window(table)[1]
+        size = (values - equilibrium(values)) / np.ptp(values)
+        sides = np.sign(size[np.abs(size) > SMALLEST_SWING])
+        swings = int(np.count_nonzero(np.diff(sides)))
+        if table.settings.samples == "record" and swings < FEWEST_SWINGS:
+            rule = f"x_rel must pass its rest position at least {FEWEST_SWINGS} times"
+            remedy = (
+                "record a period or more, with at least 10 samples per period; where each row is a turning point, state "
+                'samples = "turning_points"'
+            )
+            raise InputError(rule, f"{swings} in {len(values)} samples", remedy, Path(table.file), int(table.rows[0]))
+
+
+def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":
+    """Make the experiment of the class that the settings demand."""
+    points = made_by("capsule_id.experiments.free_vibration.turning_points:TurningPoints")
+    record = made_by(
+        "capsule_id.experiments.free_vibration.experiment:FreeVibration",
+        capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
+    )
+    return (record if table.settings.samples == "record" else points)(table, rig, friction)
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
@@ -126,6 +179,9 @@ TEMPLATE = """\
 # noise = "white"
 #: use one sample in so many; a record that is sampled far faster than its noise changes needs no more
 # every = 10
+#: "record" (default), or "turning_points": a row per turning point. Those of one side are amplitudes about the rest
+#: position
+# samples = "record"
 #: "closed" form (default), or the "capsule" model: a free capsule may slip, and the rod may hit the support spring
 # forward = "closed"
 #: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record
@@ -191,13 +247,11 @@ KIND = Kind(
     columns={"time": ColumnRule("s", increasing=True), "x_rel": ColumnRule("m", varies=True)},
     sets=(("time", "x_rel"),),
     settings=DecaySettings,
-    rules=(_check_spring_with_gap, _check_window, _check_forward),
+    rules=(_check_spring_with_gap, _check_window, _check_forward, _check_turning_points),
     masses=_masses,
-    parameters=(NOISE_SD, AMPLITUDE, TURNING_TIME, NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME),
-    make=made_by(
-        "capsule_id.experiments.free_vibration.experiment:FreeVibration",
-        capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
-    ),
+    parameters=(NOISE_SD, TIME_SD, AMPLITUDE, TURNING_TIME, NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME),
+    make=_make,
+    check=_check_swings,
     template=TEMPLATE,
     informs="k1, c",
     captions={"free_vibration": "Free decay: the record, its residuals at the point fit, and their autocorrelation."},

@@ -14,8 +14,14 @@ from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.free_vibration.checks import check_free_decay, check_stiffness
-from capsule_id.experiments.free_vibration.decay_models import decay, rates, viscous_basis
-from capsule_id.experiments.free_vibration.decay_moments import decay_moments, fold, uniform_step
+from capsule_id.experiments.free_vibration.decay_models import (
+    decay,
+    decay_moments,
+    fold,
+    rates,
+    uniform_step,
+    viscous_basis,
+)
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement, trend
 from capsule_id.experiments.free_vibration.noise import noise_parameters, whiten

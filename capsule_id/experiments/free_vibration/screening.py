@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 SAMPLES_PER_PERIOD, RESPONSE_POINTS = 16, 60
 #: Fewest samples per period of a thinned record, and largest number of samples of a second fit.
 FEWEST_SAMPLES_PER_PERIOD, LONGEST = 8, 6000
+#: Shorter records, in samples, keep their model.
+SHORTEST = 40
 #: Residuals with a larger p-value of the Ljung–Box test count as white here; the check after the fit is more lenient.
 WHITENESS = 0.01
 #: Largest number of evaluations in a fit, and relative step of its difference quotients.
@@ -234,6 +236,8 @@ def response_p(record: "FreeVibration", theta: Mapping[str, float]) -> float:
         for a in (known / np.linalg.norm(known, axis=0), both / np.linalg.norm(both, axis=0))
     )
     freedom = record.n - both.shape[1]
+    if freedom < 1:
+        return 1.0
     return float(stats.f.sf((own - further) / extra.shape[1] * freedom / further, extra.shape[1], freedom))
 
 
@@ -309,7 +313,7 @@ def second_models(
         own = [records[i] for i in members]
         if None not in stated:
             continue
-        contradicting = [record.label for record in own if demands_another(record, level)]
+        contradicting = [e.label for e in own if e.n >= SHORTEST and demands_another(e, level)]
         if not contradicting:
             continue
         ranking = demanded_model(own)

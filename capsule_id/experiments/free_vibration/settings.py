@@ -33,6 +33,7 @@ class DecaySettings(Settings):
     drift: Literal["none", "linear", "gp"] | None = None
     noise: Literal["white", "ar1", "arma"] | None = None
     every: Annotated[int | None, CountRule()] = None
+    samples: Literal["record", "turning_points"] = "record"
     smoothing_window: Annotated[float | None, QuantityRule("s")] = None
     spring: Annotated[str | None, NameRule()] = None
     gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
