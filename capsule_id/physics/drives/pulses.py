@@ -103,7 +103,9 @@ class Pulses:
             return jnp.zeros_like(state[0])
         share = jnp.abs(state[1]) / self._size()
         lasts = self._lagging() & (share > 0.0)
-        return jnp.where(lasts, jnp.where(lasts, share, 1.0) ** (1.0 / DEGREE) / self._safe_lag(jnp), 0.0)
+        # XLA vectorises exponential and logarithm, but no power.
+        root = jnp.exp(jnp.log(jnp.where(lasts, share, 1.0)) * (1.0 / DEGREE))
+        return jnp.where(lasts, root / self._safe_lag(jnp), 0.0)
 
     def _size(self) -> jax.Array:
         size = jnp.abs(self.P_on) + jnp.abs(self.P_off)
