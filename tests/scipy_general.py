@@ -28,6 +28,63 @@ def pulses(q: Values, end: float) -> Drive:
     return force, switches
 
 
+Mode = tuple[bool, bool, int, int]  # contact, back contact, direction of sliding (0: stuck), switches so far
+
+
+class Capsule:
+    """The equations in one mode; q: every parameter of the capsule, and reaction."""
+
+    def __init__(self, q: Values, force: Callable[[float, int], float], rod: Any) -> None:
+        self.q, self.force, self.rod = q, force, rod
+        self.N = (q["m1"] + q["m2"]) * q["g"] * np.cos(q["slope"]) + q["N0"]
+        self.pull = q["g"] * np.sin(q["slope"])
+
+    def resistance(self, speed: float, sigma: int) -> float:
+        """Friction of a sliding capsule, N."""
+        q, mu = self.q, self.q["mu"] if sigma > 0 else self.q["mu_back"]
+        return self.N * mu * (q["ratio"] + (1.0 - q["ratio"]) * np.exp(-speed / q["v_s"])) + q["viscous"] * speed
+
+    def forces(self, t: float, y: np.ndarray, mode: Mode) -> tuple[float, float]:
+        """(force on the rod, force on the capsule without friction), N."""
+        q, (contact, back, _, on) = self.q, mode
+        r, w = y[0] - y[2], y[1] - y[3]
+        f = q["k1"] * r + q["k_cubic"] * r**3 + q["c"] * w
+        f += (q["k2"] * (r - q["G"]) + q["c2"] * w) if contact else 0.0
+        f += q["k2_back"] * (r + q["G_back"]) if back else 0.0
+        D = self.force(t, on) if self.rod is None else 0.0
+        return D - f - q["m1"] * self.pull, f - q["reaction"] * D - q["m2"] * self.pull
+
+    def sets_off(self, A: float) -> int:
+        """Direction in which a stuck capsule sets off under the force A, N; 0: it stays."""
+        upper, lower = self.N * self.q["mu"], -self.N * self.q["mu_back"]
+        return int(upper < A) - int(lower > A)
+
+    def field(self, t: float, y: np.ndarray, mode: Mode) -> tuple[float, ...]:
+        """dy/dt."""
+        (F1, A), sigma = self.forces(t, y, mode), mode[2]
+        a2 = (A - sigma * self.resistance(sigma * y[3], sigma)) / self.q["m2"] if sigma else 0.0
+        return y[1], F1 / self.q["m1"] if self.rod is None else float(self.rod(t, 2)), y[3] if sigma else 0.0, a2
+
+    def events(self, mode: Mode) -> list[Callable[[float, np.ndarray], float]]:
+        """Terminal events of the gap, of the back gap, and of stick or slip."""
+        q, N, sigma = self.q, self.N, mode[2]
+
+        def gap(t: float, y: np.ndarray) -> float:
+            return y[0] - y[2] - q["G"]
+
+        def back_gap(t: float, y: np.ndarray) -> float:
+            return y[0] - y[2] + q["G_back"]
+
+        def motion(t: float, y: np.ndarray) -> float:
+            A = self.forces(t, y, mode)[1]
+            return sigma * y[3] if sigma else min(N * q["mu"] - A, N * q["mu_back"] + A)
+
+        ways = (-1.0 if mode[0] else 1.0, 1.0 if mode[1] else -1.0, -1.0)
+        for event, way in zip((gap, back_gap, motion), ways, strict=True):
+            event.direction, event.terminal = way, True  # type: ignore[attr-defined]
+        return [gap, back_gap, motion]
+
+
 def simulate_general(
     q: Values, drive: Drive, times: np.ndarray, rtol: float = 1e-8, atol: float = 1e-11, rod: Any = None
 ) -> tuple[np.ndarray, int]:
@@ -36,57 +93,19 @@ def simulate_general(
     rod : X1 as a ``CubicSpline`` where the motion of the rod is given; its times must be in the switches
     """
     force, switches = drive
-    N = (q["m1"] + q["m2"]) * q["g"] * np.cos(q["slope"]) + q["N0"]
-    pull = q["g"] * np.sin(q["slope"])
-
-    def resistance(speed: float, sigma: int) -> float:
-        mu = q["mu"] if sigma > 0 else q["mu_back"]
-        return N * mu * (q["ratio"] + (1.0 - q["ratio"]) * np.exp(-speed / q["v_s"])) + q["viscous"] * speed
-
-    def forces(t: float, y: np.ndarray, mode: tuple[bool, bool, int, int]) -> tuple[float, float]:
-        """(force on the rod, force on the capsule without friction), N."""
-        contact, back, _, on = mode
-        r, w = y[0] - y[2], y[1] - y[3]
-        f = q["k1"] * r + q["k_cubic"] * r**3 + q["c"] * w
-        f += (q["k2"] * (r - q["G"]) + q["c2"] * w) if contact else 0.0
-        f += q["k2_back"] * (r + q["G_back"]) if back else 0.0
-        D = force(t, on) if rod is None else 0.0
-        return D - f - q["m1"] * pull, f - q["reaction"] * D - q["m2"] * pull
-
-    def sets_off(A: float) -> int:
-        return int(N * q["mu"] < A) - int(-N * q["mu_back"] > A)
-
+    capsule = Capsule(q, force, rod)
     y, t, on, contacts = np.zeros(4), float(times[0]), 0, 0
     if rod is not None:
         y[0], y[1] = rod(t), rod(t, 1)
     contact, back = y[0] - y[2] >= q["G"], y[0] - y[2] <= -q["G_back"]
-    sigma = sets_off(forces(t, y, (contact, back, 0, on))[1])
+    sigma = capsule.sets_off(capsule.forces(t, y, (contact, back, 0, on))[1])
     out = np.full((len(times), 4), np.nan)
     out[0] = y
     while t < times[-1]:
         mode = (contact, back, sigma, on)
         end = min([s for s in switches if s > t + 1e-13] + [times[-1]])
-
-        def field(t: float, y: np.ndarray, mode: tuple[bool, bool, int, int] = mode) -> tuple[float, ...]:
-            F1, A = forces(t, y, mode)
-            sigma = mode[2]
-            a2 = (A - sigma * resistance(sigma * y[3], sigma)) / q["m2"] if sigma else 0.0
-            return y[1], F1 / q["m1"] if rod is None else float(rod(t, 2)), y[3] if sigma else 0.0, a2
-
-        def gap(t: float, y: np.ndarray) -> float:
-            return y[0] - y[2] - q["G"]
-
-        def back_gap(t: float, y: np.ndarray) -> float:
-            return y[0] - y[2] + q["G_back"]
-
-        def motion(t: float, y: np.ndarray, mode: tuple[bool, bool, int, int] = mode) -> float:
-            A = forces(t, y, mode)[1]
-            return mode[2] * y[3] if mode[2] else min(N * q["mu"] - A, N * q["mu_back"] + A)
-
-        events = (gap, back_gap, motion)
-        for event, way in zip(events, (-1.0 if contact else 1.0, 1.0 if back else -1.0, -1.0), strict=True):
-            event.direction, event.terminal = way, True  # type: ignore[attr-defined]
-        run = solve_ivp(field, (t, end), y, "DOP853", events=events, dense_output=True, rtol=rtol, atol=atol)
+        options = {"events": capsule.events(mode), "dense_output": True, "rtol": rtol, "atol": atol}
+        run = solve_ivp(lambda t, y, mode=mode: capsule.field(t, y, mode), (t, end), y, "DOP853", **options)
         inside = (times > t) & (times <= run.t[-1])
         if inside.any():
             out[inside] = run.sol(times[inside]).T
@@ -96,9 +115,9 @@ def simulate_general(
             contact, contacts = not contact, contacts + (not contact)
         if run.t_events[1].size:
             back = not back
-        A = forces(t, y, (contact, back, sigma, on))[1]
+        A = capsule.forces(t, y, (contact, back, sigma, on))[1]
         if run.t_events[2].size:
-            sigma, y[3] = (sets_off(A) if sigma else int(np.sign(A))), 0.0
+            sigma, y[3] = (capsule.sets_off(A) if sigma else int(np.sign(A))), 0.0
         elif not sigma:
-            sigma = sets_off(A)
+            sigma = capsule.sets_off(A)
     return out, contacts
