@@ -31,6 +31,7 @@ _FEWEST_CONTACT_SAMPLES = 2  # of the folded record in contact, needed for the i
 _SAMPLES_PER_UNKNOWN = 10  # samples per unknown of the linear law
 _AVERAGED_SAMPLES = 3  # samples of the moving mean in single periods; a contact lasts longer
 _LINEAR_LAW_UNKNOWNS = 5  # unknowns of the linear law
+_ODDS_OF_A_CYCLE = 3.0  # that a single period shows the true number of contacts
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,11 @@ class Contacts:
     agreeing: int
     cycles: int
     reason: str = ""
+
+    @property
+    def probability(self) -> float:
+        """Of the count: a single period shows the true count with the probability 3/4, and any other with 1/4."""
+        return 1.0 / (1.0 + _ODDS_OF_A_CYCLE ** (self.cycles - 2 * self.agreeing))
 
 
 @dataclass(frozen=True)

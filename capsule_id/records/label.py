@@ -1,4 +1,4 @@
-"""Labels the motion of a record, P-<n>-<F|B|S>-<m> as in the paper, with evidence, or "undecided" with the reason.
+"""Labels the motion of a record, P-<n>-<F|B|S>-<m> as in the paper, with its probability and the evidence.
 
 drive -> period by repeat -> mean velocity -> contacts on the folded record -> label
 """
@@ -12,7 +12,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.records.contacts import Contacts, Cycle, find_contacts
 from capsule_id.records.mean_velocity import MeanVelocity, fit_mean_velocity
-from capsule_id.records.repeat import Repeat, find_period
+from capsule_id.records.repeat import DECIDED, Repeat, find_period, period_word
 from capsule_id.records.stated_settings import stated_gap, stated_Omega
 from capsule_id.records.tone import Harmonic, fit_harmonic, recorded_drive
 from capsule_id.rig.filters import sampling_step
@@ -28,7 +28,7 @@ class Evidence:
     drive : the tone of the current
     Omega : rad/s, of the current, else of x_rel, else as stated
     repeat, mean_velocity, contacts : results of the single steps
-    reasons : why the label is undecided, () for a decided label
+    reasons : what is missing for the whole label, () for a whole one
     """
 
     drive: Harmonic | None
@@ -42,13 +42,15 @@ class Evidence:
 class MeasuredMotion(NamedTuple):
     """Label, mean velocity and evidence.
 
-    label : in the format of ``response``, or "undecided"
+    label : in the format of ``response``, its period alone ("P-1"), or "undecided" where no probability reaches 0.9
     mean_velocity : of the capsule, m/s; NaN if x_capsule was not recorded
+    probability : of the label; of the most probable period where it is undecided; NaN without any
     """
 
     label: str
     mean_velocity: float
     evidence: Evidence
+    probability: float
 
 
 def measured_motion(table: Table) -> MeasuredMotion:
@@ -58,7 +60,8 @@ def measured_motion(table: Table) -> MeasuredMotion:
     ----------
     table : a ``forced_run`` of a rig; period and contacts need x_rel, direction needs x_capsule
 
-    The label describes the record, not a settled motion of the model: "P-1" means that it repeats within the noise.
+    The label describes the record, not a settled motion of the model: "P-1" means that it repeats within the scatter
+    from cycle to cycle. The probability of a whole label is the product of those of period, direction and contacts.
     """
     time, columns = table["time"], table.columns
     drive = recorded_drive(table)
@@ -67,17 +70,21 @@ def measured_motion(table: Table) -> MeasuredMotion:
         sampling_step(time)
     except InputError as error:
         reason = f"{error.rule} ({error.value})"
-        return MeasuredMotion(UNDECIDED, float("nan"), Evidence(drive, Omega, None, None, None, (reason,)))
+        return MeasuredMotion(
+            UNDECIDED, float("nan"), Evidence(drive, Omega, None, None, None, (reason,)), float("nan")
+        )
     if drive is None and "x_rel" in columns:
         Omega = fit_harmonic(time, table["x_rel"], Omega).Omega
     T = 2.0 * np.pi / Omega
     repeat = find_period(time, table["x_rel"], T, columns["x_rel"].reading_sd) if "x_rel" in columns else None
     period = repeat.period if repeat else None
     velocity = fit_mean_velocity(time, table["x_capsule"], T, period) if "x_capsule" in columns else None
-    contacts = find_contacts(_cycle(table, Omega, period * T, repeat.noise_sd)) if repeat and period else None
+    scatter = float(np.hypot(repeat.noise_sd, repeat.scatter)) if repeat else 0.0
+    contacts = find_contacts(_cycle(table, Omega, period * T, scatter)) if period else None
     mean_velocity = velocity.velocity if velocity else float("nan")
-    label, reasons = _label(repeat, velocity, contacts)
-    return MeasuredMotion(label, mean_velocity, Evidence(drive, Omega, repeat, velocity, contacts, reasons))
+    label, probability, reasons = _label(repeat, velocity, contacts)
+    evidence = Evidence(drive, Omega, repeat, velocity, contacts, reasons)
+    return MeasuredMotion(label, mean_velocity, evidence, probability)
 
 
 def _cycle(table: Table, Omega: float, period: float, noise_sd: float) -> Cycle:
@@ -88,17 +95,22 @@ def _cycle(table: Table, Omega: float, period: float, noise_sd: float) -> Cycle:
 
 def _label(
     repeat: Repeat | None, velocity: MeanVelocity | None, contacts: Contacts | None
-) -> tuple[str, tuple[str, ...]]:
-    """The label and, where it is "undecided", the reasons."""
+) -> tuple[str, float, tuple[str, ...]]:
+    """The label, its probability, and what is missing for the whole label."""
     if repeat is None:
-        return UNDECIDED, ("x_rel was not recorded",)
+        return UNDECIDED, float("nan"), ("x_rel was not recorded",)
     if repeat.period is None:
-        return UNDECIDED, (repeat.reason,)
+        return UNDECIDED, repeat.probability, (repeat.reason,)
+    period = period_word(repeat.period)
     if repeat.period == 0:
-        return "aperiodic", ()
+        return period, repeat.probability, ()
     reasons = [part.reason for part in (velocity, contacts) if part is not None and part.reason]
     if velocity is None:
         reasons.append("x_capsule was not recorded")
     if reasons or velocity is None or contacts is None or contacts.count is None:
-        return UNDECIDED, tuple(reasons)
-    return f"P-{repeat.period}-{velocity.direction}-{Fraction(contacts.count, repeat.period)}", ()
+        return period, repeat.probability, tuple(reasons)
+    whole = f"{period}-{velocity.direction}-{Fraction(contacts.count, repeat.period)}"
+    probability = repeat.probability * velocity.probability * contacts.probability
+    if probability < DECIDED:
+        return period, repeat.probability, (f"{whole} has the probability {probability:.2f}",)
+    return whole, probability, ()

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from capsule_id.errors import InputError
-from capsule_id.records.label import Evidence, MeasuredMotion, measured_motion
+from capsule_id.records.label import UNDECIDED, Evidence, MeasuredMotion, measured_motion
 from capsule_id.records.tone import Harmonic
 from capsule_id.records.view import FILTER_ORDER, view_record
 from capsule_id.rig.model import Table
@@ -13,9 +13,10 @@ def describe_run(table: Table) -> list[str]:
     """Lines about a ``forced_run``, without its label."""
     motion = measured_motion(table)
     evidence = "; ".join(_evidence(motion))
-    lines = [f"motion {motion.label} ({evidence})" if evidence else f"motion {motion.label}"]
+    lines = [f"motion {label_text(motion)} ({evidence})" if evidence else f"motion {motion.label}"]
     if motion.evidence.reasons:
-        lines.append(f"undecided because of {'; '.join(motion.evidence.reasons)}")
+        word = "undecided because of" if motion.label == UNDECIDED else "the rest of the label is undecided because of"
+        lines.append(f"{word} {'; '.join(motion.evidence.reasons)}")
     if motion.evidence.drive:
         lines.append(_drive(motion.evidence.drive))
     try:
@@ -27,14 +28,18 @@ def describe_run(table: Table) -> list[str]:
     return [*lines, f"Savitzky-Golay over {view.samples} samples, order {FILTER_ORDER}: gain {passed}"]
 
 
+def label_text(motion: MeasuredMotion) -> str:
+    """The label and, where it is decided, its probability."""
+    return motion.label if motion.label == UNDECIDED else f"{motion.label}, probability {motion.probability:.2g}"
+
+
 def _evidence(motion: MeasuredMotion) -> Iterator[str]:
     evidence: Evidence = motion.evidence
     if evidence.repeat:
         repeat = evidence.repeat
         yield f"{repeat.periods:.1f} periods of the drive, noise of x_rel {1e6 * repeat.noise_sd:.3g} um"
         if repeat.period:
-            excess = repeat.ratios[repeat.period - 1]
-            yield f"repeats after {repeat.period}, mean square {excess:.2f} times that of the noise"
+            yield f"scatter from cycle to cycle {repeat.scatter / repeat.motion:.2%} of the motion"
     if evidence.mean_velocity:
         yield f"{1e3 * motion.mean_velocity:.4g} ± {1e3 * evidence.mean_velocity.velocity_sd:.2g} mm/s"
     if evidence.contacts:

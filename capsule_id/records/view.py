@@ -36,6 +36,7 @@ class Gains:
 class RecordView:
     """A prepared record, SI.
 
+    label, probability : of the record's motion, see ``measured_motion``
     time : (n,)
     channels : raw, (n,) by column name
     x_rel, rate : (n,) filtered, and its derivative
@@ -48,6 +49,7 @@ class RecordView:
     """
 
     label: str
+    probability: float
     time: np.ndarray
     channels: Mapping[str, np.ndarray]
     x_rel: np.ndarray
@@ -92,6 +94,7 @@ def view_record(table: Table, motion: MeasuredMotion | None = None, K: float | N
     section = _section_times(time[half : len(time) - half], evidence.Omega, phase)
     return RecordView(
         label=motion.label,
+        probability=motion.probability,
         time=time,
         channels={name: column.values for name, column in table.columns.items() if name != "time"},
         x_rel=x_rel,

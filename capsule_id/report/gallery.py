@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from capsule_id.inference.result import Result, RunRecord
 from capsule_id.interruption import stop_if_interrupted
+from capsule_id.records.label import UNDECIDED
 from capsule_id.report.figures import comparisons as figures
 from capsule_id.report.figures.corner import corner
 from capsule_id.report.figures.runs import force_on_rod, run_overview
@@ -88,7 +89,8 @@ def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Pict
         "The record itself: raw channels, and the phase plane through Savitzky–Golay with the impact line and a point a "
         f"period. The filter ({view.samples} samples) leaves {left}."
     )
-    title = f"{record.name}: the record, {view.label}"
+    word = view.label if view.label == UNDECIDED else f"{view.label} (probability {view.probability:.2g})"
+    title = f"{record.name}: the record, {word}"
     drawn = [_picture(result, f"record_{label}", "measured", title, caption, run_overview(view))]
     if view.force is not None:
         figure = figure_of(force_on_rod(view, model=(view.time, record.force)))

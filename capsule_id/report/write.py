@@ -64,6 +64,10 @@ def parameters_json(result: Result) -> dict[str, object]:
                 for finding in result.findings
             ],
         },
+        "records": {
+            record.name: {"label": record.view.label, "probability": _plain(record.view.probability)}
+            for record in result.records
+        },
         "provenance": _plain(asdict(result.provenance)),
     }
 

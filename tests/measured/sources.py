@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 
 _FOLDER = Path(__file__).parents[2].parent / "shared" / "measured"
 
@@ -46,6 +47,12 @@ def pendulum(record: int) -> tuple[np.ndarray, np.ndarray]:
 def coil_spring() -> tuple[np.ndarray, np.ndarray]:
     """Deflection, cm, and added mass, g, (10,) each, in the order of the file."""
     return tuple(np.loadtxt(_file("hooke_spring_skcpr/spring_defl_vs_added_mass.csv"), delimiter=",", skiprows=1).T)
+
+
+def frame(load: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, s, and displacements of the storey and of the base of the shaken frame, m, (n,) each; load "350g" or "450g"."""
+    storey, base = (loadmat(_file(f"frame_marino/s_b_{load}_{name}.mat")) for name in "xy")
+    return storey["t"].ravel(), 1e-3 * storey["x"].ravel(), 1e-3 * base["y"].ravel()
 
 
 def load_cells() -> tuple[np.ndarray, np.ndarray]:

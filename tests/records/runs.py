@@ -59,6 +59,20 @@ def noisier(run: SyntheticRun, factor: float, seed: int) -> dict[str, np.ndarray
     return {"time": run.time, **channels, "settings": settings}  # type: ignore[dict-item]
 
 
+def scattered(run: SyntheticRun, seed: int, scatter: float = 0.01, drift: float = 0.02) -> dict[str, np.ndarray]:
+    """The channels with a motion whose size changes from cycle to cycle by ``scatter``, and slowly by ``drift`` in all."""
+    cycle = run.time * run.truth.Omega / (2.0 * np.pi)
+    z = np.random.default_rng(seed).standard_normal(int(cycle[-1]) + 2)
+    size = 1.0 + scatter * np.interp(cycle, np.arange(len(z)) - 0.5, z) + drift * (run.time / run.time[-1] - 0.5)
+    record = noisier(run, 1.0, seed)
+    for name in ("x_rel", "acceleration_rod"):
+        mean = np.mean(record[name])
+        record[name] = mean + size * (record[name] - mean)
+    place = record["x_capsule"]
+    record["x_capsule"] = place[0] + np.concatenate([[0.0], np.cumsum(0.5 * (size[1:] + size[:-1]) * np.diff(place))])
+    return record
+
+
 def table_of(
     record: Mapping[str, np.ndarray], samples: int | None = None, only: tuple[str, ...] = (), **settings: object
 ) -> Table:

@@ -1,4 +1,4 @@
-"""The label of a record is that of the model, or "undecided"; it is never wrong."""
+"""The label of a record is that of the model, its period alone, or "undecided"; with a probability of 0.9 it is right."""
 
 from collections.abc import Callable
 
@@ -9,20 +9,23 @@ from capsule_id.experiments.forced_run.twin import GAP_SD, SAMPLES
 from capsule_id.motions.response import response
 from capsule_id.physics.model import CapsuleParameters, Excitation
 from capsule_id.records.label import UNDECIDED, measured_motion
-from tests.records.runs import LONGER, Known, longer, noisier, reference, table_of
+from tests.records.runs import LONGER, Known, longer, noisier, reference, scattered, table_of
 
 
 def outcomes(cases: tuple[Known, ...], factor: float = 1.0, **changes: object) -> dict[str, str]:
-    """ "right", "undecided", or both labels, by case."""
-    found = {}
-    for case in cases:
-        label = (case.motion(factor, **changes) if changes or factor > 1.0 else case.nominal).label
-        found[case.name] = "right" if label == case.label else label if label == UNDECIDED else f"{label}/{case.label}"
-    return found
+    """ "right", "period" (right as far as it goes), "undecided", or both labels, by case."""
+    motions = [case.motion(factor, **changes) if changes or factor > 1.0 else case.nominal for case in cases]
+    return {case.name: outcome(motion.label, case.label) for case, motion in zip(cases, motions, strict=True)}
+
+
+def outcome(label: str, truth: str) -> str:
+    if label in (truth, UNDECIDED):
+        return "right" if label == truth else label
+    return "period" if truth.startswith(f"{label}-") else f"{label}/{truth}"
 
 
 def wrong(found: dict[str, str]) -> dict[str, str]:
-    return {name: outcome for name, outcome in found.items() if outcome not in ("right", UNDECIDED)}
+    return {name: outcome for name, outcome in found.items() if outcome not in ("right", "period", UNDECIDED)}
 
 
 def test_reference_cases_have_the_label_of_the_model() -> None:
@@ -35,7 +38,8 @@ def test_reference_cases_have_the_label_of_the_model() -> None:
 def test_longer_periods_and_aperiodic_motions() -> None:
     found = outcomes(longer())
     assert wrong(found) == {}
-    assert list(found.values()).count("right") >= 9
+    # chaos in two narrow bands is not told apart from a noisy period two
+    assert list(found.values()).count("right") >= 8
 
 
 def test_mean_velocities_are_those_of_the_model() -> None:
@@ -62,8 +66,43 @@ def test_the_record_places_the_impact_line() -> None:
     assert np.sqrt(np.mean(np.square(pulls))) < 2.0
 
 
-def test_ten_times_the_noise_leaves_everything_undecided() -> None:
-    assert set(outcomes(reference(), 10.0).values()) == {UNDECIDED}
+def test_ten_times_the_noise_leaves_no_whole_label() -> None:
+    found = outcomes(reference(), 10.0)
+    assert wrong(found) == {}
+    assert "right" not in found.values()
+
+
+def test_the_probability_is_that_of_the_label() -> None:
+    case = next(case for case in reference() if case.name == "fig11_Pd_1.2")
+    evidence = case.nominal.evidence
+    assert evidence.repeat is not None
+    assert evidence.mean_velocity is not None
+    assert evidence.contacts is not None
+    parts = [evidence.repeat.probability, evidence.mean_velocity.probability, evidence.contacts.probability]
+    assert case.nominal.probability == pytest.approx(np.prod(parts))
+    assert case.nominal.probability > 0.99
+    partial = case.motion(only=("x_rel", "current"))
+    assert (partial.label, partial.probability) == ("P-1", partial.evidence.repeat.probability)  # type: ignore[union-attr]
+
+
+def scattered_outcomes(cases: tuple[Known, ...], seed: int) -> list[str]:
+    """Outcomes of twins whose cycles scatter by 1 % and drift by 2 %."""
+    motions = [measured_motion(table_of(scattered(case.run, seed + i))) for i, case in enumerate(cases)]
+    return [outcome(motion.label, case.label) for case, motion in zip(cases, motions, strict=True)]
+
+
+def test_cycles_that_scatter_by_one_percent_have_their_label() -> None:
+    found = scattered_outcomes((*reference()[::3], *longer()[:3]), 0)
+    assert [one for one in found if one not in ("right", "period", UNDECIDED)] == []
+    assert found.count(UNDECIDED) <= 1
+
+
+@pytest.mark.slow
+def test_labels_of_216_scattered_twins() -> None:
+    found = [one for seed in range(6) for one in scattered_outcomes((*reference(), *longer()), 1000 * seed)]
+    decided = [one for one in found if one != UNDECIDED]
+    assert np.mean([one in ("right", "period") for one in decided]) >= 0.9
+    assert len(decided) >= 0.9 * len(found)
 
 
 def test_three_periods_are_too_few() -> None:
@@ -88,7 +127,7 @@ def test_less_recorded_means_less_decided(change: dict, reason: str | None) -> N
     if reason is None:  # half the record still tells
         assert motion.label == case.label
     else:
-        assert motion.label == UNDECIDED
+        assert motion.label == ("P-1" if reason.startswith("x_capsule") else UNDECIDED)
         assert motion.evidence.reasons == (reason,)
 
 
@@ -132,13 +171,13 @@ def test_uneven_sampling_is_a_reason() -> None:
 @pytest.mark.parametrize(("cases", "share"), [(reference, 0.99), (longer, 0.97)])
 def test_labels_under_growing_noise(cases: Callable[[], tuple[Known, ...]], share: float) -> None:
     """Four noise realisations of each case and level. Three times the noise hides chaos in narrow bands about period two."""
-    outcome = []
+    found = []
     for case in cases():
         for factor in (1.2, 1.5, 2.0, 3.0, 5.0):
             for seed in range(4):
                 label = measured_motion(table_of(noisier(case.run, factor, 7 + seed))).label
-                outcome.append(label in (case.label, UNDECIDED))
-    assert np.mean(outcome) > share
+                found.append(outcome(label, case.label) in ("right", "period", UNDECIDED))
+    assert np.mean(found) > share
 
 
 @pytest.mark.slow

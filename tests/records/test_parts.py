@@ -24,16 +24,13 @@ def noise(seed: int, sd: float = NOISE_SD) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 8, 11])
 def test_the_period_is_the_smallest_that_repeats(n: int) -> None:
-    for seed in range(20):
+    for seed in range(4):
         assert find_period(TIME, motion(n) + noise(seed), T).period == n
 
 
-def test_what_does_not_repeat_is_aperiodic_if_the_record_is_long_enough() -> None:
+def test_what_does_not_repeat_is_aperiodic() -> None:
     golden = motion(1) + 2e-4 * np.cos(2.0 * np.pi * TIME / T * 0.5 * (np.sqrt(5.0) - 1.0) + 0.3) + noise(0)
     assert find_period(TIME, golden, T).period == 0
-    shorter = find_period(TIME[:1200], golden[:1200], T)
-    assert shorter.period is None
-    assert "too short" in shorter.reason
 
 
 def test_a_long_period_needs_two_of_them() -> None:
@@ -42,21 +39,36 @@ def test_a_long_period_needs_two_of_them() -> None:
     assert "repeats after 13" in found.reason
 
 
-def test_noise_limits_the_visible_part() -> None:
-    """``visible`` states the smallest visible part of another period; a part of this size is detected."""
-    quiet = find_period(TIME, motion(1) + noise(2), T)
-    assert quiet.visible is not None
-    assert quiet.visible < 0.02 * quiet.motion
-    # the difference of a part of rms a after one period is 2 a for a period of two: half of ``visible`` is enough
-    shown = find_period(TIME, motion(2, 1.2 * np.sqrt(2.0) * quiet.visible / 1e-3) + noise(3), T)
-    assert shown.period == 2
-    loud = find_period(TIME, motion(2) + noise(4, 2e-4), T)
-    assert loud.period is None
-    assert "noise" in loud.reason
+def test_noise_hides_a_second_period() -> None:
+    assert find_period(TIME, motion(2, 0.03) + noise(3), T).period == 2
+    hidden = find_period(TIME, motion(2, 0.03) + noise(4, 2e-4), T)
+    assert hidden.period is None
+    assert "a part of another period is visible from" in hidden.reason
+    assert find_period(TIME, motion(2) + noise(4, 2e-3), T).reason.startswith("noise: its standard deviation is")
 
 
 def test_no_false_second_period_in_noise() -> None:
-    assert {find_period(TIME, motion(1) + noise(seed), T).period for seed in range(300)} == {1}
+    assert {find_period(TIME, motion(1) + noise(seed), T).period for seed in range(40)} == {1}
+
+
+def uneven(seed: int, part: float, scatter: float = 0.01) -> np.ndarray:
+    """Period two by ``part`` of the motion; its size scatters from cycle to cycle."""
+    z = np.random.default_rng(seed).standard_normal(60)
+    size = 1.0 + scatter * np.interp(TIME / T, np.arange(60) - 0.5, z)
+    return size * motion(2, part) + noise(seed)
+
+
+def test_a_small_second_period_is_not_called_the_first() -> None:
+    """Negative control of the labels of records that scatter."""
+    for part in (0.01, 0.02, 0.04):
+        found = [find_period(TIME, uneven(seed, part), T) for seed in range(8)]
+        assert all(one.period in (None, 2) for one in found)
+    assert all(one.period == 2 for one in found)  # 4 % of the motion
+    plain = [find_period(TIME, uneven(seed, 0.0), T) for seed in range(8)]
+    assert [one.period for one in plain].count(1) >= 7
+    assert np.median([one.scatter / one.motion for one in plain]) == pytest.approx(
+        0.007, rel=0.3
+    )  # interpolated: below 1 %
 
 
 def test_noise_estimate_and_its_stated_scatter() -> None:
@@ -151,7 +163,6 @@ def test_stretches_between_two_levels(z: list[float], stretches: list[tuple[int,
 
 
 def test_a_record_coarser_than_the_drive_is_undecided() -> None:
-    """With fewer than two samples per period only the edges of the spline are left."""
     time = np.arange(14) * 0.15
     found = find_period(time, np.cos(34.56 * time), 2.0 * np.pi / 34.56)
     assert found.period is None

@@ -101,7 +101,7 @@ def test_pictures_draw_what_they_are_given(view: RecordView) -> None:
 def test_check_says_it_in_a_few_lines(case: Known) -> None:
     table = table_of(noisier(case.run, 1.0, 0))
     motion, drive, filtered = describe_run(table)
-    assert motion.startswith("motion P-1-F-1 (23.4 periods of the drive, noise of x_rel 9.")
+    assert motion.startswith("motion P-1-F-1, probability 1 (23.4 periods of the drive, noise of x_rel 9.")
     assert "contacts by spikes 1/1/1, by crossings 1/1/1/1/1/1, same count in 22 of 22 single periods" in motion
     assert drive.startswith("drive Omega 73.5")
     assert "(stated 73.58), current 0.6" in drive

@@ -61,7 +61,11 @@ def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTab
         stacked = {name: np.array([theta[name] for theta in local]) for name in (local[0] if local else {})}
         sample = run.motion(stacked, np) if local else None
         seen = measured_motion(run.table)
-        row: dict[str, object] = {"motion of the record": seen.label, "contacts, model": int(best.contacts)}
+        row: dict[str, object] = {
+            "motion of the record": seen.label,
+            "probability": seen.probability,
+            "contacts, model": int(best.contacts),
+        }
         if sample is not None:
             low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
             row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"
