@@ -68,6 +68,8 @@ def read_rig(folder: str | Path, registry: Registry | None = None, friction: typ
     InputError
         At the first fault: file, line and column, the rule, the value found, the remedy.
     """
+    if not isinstance(folder, str | Path):
+        raise InputError("the rig must be a path (str or Path)", type(folder).__name__, "name a folder with a rig.toml")
     return read.read_rig(folder, registry or default_registry(), () if friction is None else friction.parameters)
 
 
@@ -100,8 +102,8 @@ def fit(
         If the rig holds nothing to fit, ``experiments`` is another word, ``seed`` or ``budget`` is out of range, or
         ``friction`` cannot be fitted.
     """
-    if seed < 0:
-        raise InputError("seed must not be negative", str(seed), "give 0 or more")
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
     if budget is not None and budget < 1:
         raise InputError(
             "budget must be positive", str(budget), "give 1 or more steps, or None for the point fit alone"

@@ -7,6 +7,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import NoReturn, TextIO
 
@@ -37,10 +38,17 @@ def capsule_id(arguments: Sequence[str] | None = None) -> int:
     return _run("capsule-id", _capsule_parser, arguments)
 
 
+def _parser(program: str, text: str) -> _Parser:
+    """A parser with ``--version``. It takes no abbreviated options: a new option must not change an old command."""
+    parser = _Parser(prog=program, description=text, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"{program} {version('capsule-id')}")
+    return parser
+
+
 def _fit_parser(program: str) -> argparse.ArgumentParser:
     from capsule_id.commands import fit
 
-    parser = _Parser(prog=program, description="Fit the vibro-impact capsule to a folder of rig measurements.")
+    parser = _parser(program, "Fit the vibro-impact capsule to a folder of rig measurements.")
     fit.add_arguments(parser)
     parser.set_defaults(run=fit.run)
     return parser
@@ -49,8 +57,9 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
     from capsule_id.commands import bifurcate, check, init, report, simulate, synthesize
 
-    parser = _Parser(prog=program, description="Make, check, simulate and report; fit-params fits.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+    parser = _parser(program, "Make, check, simulate and report; fit-params fits.")
+    parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
+    commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
     for name, module, text in (
         ("init", init, "an empty rig folder with a commented rig.toml"),
         ("check", check, "check a rig folder and list problems before a fit"),
@@ -59,7 +68,7 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
         ("bifurcate", bifurcate, "the settled motions over one quantity or two: bifurcation diagrams and maps"),
         ("report", report, "the parameter table and findings of a result"),
     ):
-        sub = commands.add_parser(name, help=text, description=text)
+        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
         module.add_arguments(sub)
         sub.set_defaults(run=module.run)
     return parser

@@ -52,6 +52,9 @@ def run(args: argparse.Namespace) -> int:
     rig = read_rig(args.data, kinds)
     directory = args.out if args.out is not None else Path("results") / rig.name
     check_directory(directory)
+    if args.no_sample and (directory / "posterior.nc").exists():
+        rule, remedy = "--no-sample must not replace a result with a sample", "choose another --out, or move it away"
+        raise InputError(rule, "it holds posterior.nc", remedy, directory)
     if args.experiments != "bench" and rig.has_runs:
         set_loop_option()
     # JAX loads only now, so that a faulty folder is reported at once.
@@ -63,13 +66,14 @@ def run(args: argparse.Namespace) -> int:
 
     make_experiments(rig, args.experiments, kinds)
     messages = messages_of(kinds)  # refuses conflicting messages before the fit
+    budget = None if args.no_sample else args.max_steps
     fingerprint = {
         "data": dict(rig.files),
         "seed": args.seed,
         "experiments": args.experiments,
+        "max-steps": budget,
         "versions": {**package_versions(PACKAGES), **kinds.packages},
     }
-    budget = None if args.no_sample else args.max_steps
     with work_in_progress(directory, fingerprint, args.resume) as partial, Progress(not args.quiet) as progress:
         result = fit(rig, args.seed, args.experiments, budget, partial / CHAINS, progress, kinds)
         progress(0, 1, "report")

@@ -20,8 +20,8 @@ def prepare_store(out: Path, resume: bool) -> Path:
     Raises
     ------
     InputError
-        If the name does not end in .nc, the folder cannot be written or belongs to something else, or ``resume`` finds
-        no blocks.
+        If the name does not end in .nc, the folder cannot be written, is a result or belongs to something else, or
+        ``resume`` finds no blocks.
     """
     if out.suffix != ".nc":
         raise InputError("the output must end in .nc", str(out), "change the suffix")
@@ -30,6 +30,9 @@ def prepare_store(out: Path, resume: bool) -> Path:
     parent = next(path for path in out.absolute().parents if path.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise InputError("the folder of the output must be writable", f"{parent} is not", "choose another --out")
+    if (out.parent / "parameters.json").exists():
+        rule, remedy = "the output must not lie in a result of fit-params", "choose another --out"
+        raise InputError(rule, f"{out.parent} is one", remedy, out)
     store = out.with_name(out.name + ".partial")
     if resume and not (store / STORE_FILE).is_file():
         raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)

@@ -9,7 +9,10 @@ from typing import Any
 from capsule_id.errors import InputError
 
 KeyPath = tuple[str | int, ...]
+#: Largest rig.toml, characters, and deepest key. A rig needs a few thousand characters and six levels.
+LARGEST_TEXT, DEEPEST_KEY = 1_000_000, 32
 
+_SHALLOW = "write the plain tables"
 _MULTILINE_BASIC = re.compile(r'"""(?:[^\\]|\\.)*?"""(?:"{0,2})', re.DOTALL)
 _MULTILINE_LITERAL = re.compile(r"'''.*?'''(?:'{0,2})", re.DOTALL)
 _BASIC = re.compile(r'"(?:[^"\\\n]|\\.)*"')
@@ -62,18 +65,28 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
     InputError
         If it is not TOML 1.0, at the place that tomllib names.
     """
+    if len(text) > LARGEST_TEXT:
+        rule, remedy = (
+            f"the file must hold at most {LARGEST_TEXT} characters",
+            "write readings into tables of their own",
+        )
+        raise InputError(rule, str(len(text)), remedy, path, 1, 1)
     try:
         data = tomllib.loads(text)
         scanner = _Scanner(text)
         scanner.scan()
     except RecursionError:
-        raise InputError("nesting must be shallow", "too many brackets", "write the plain tables", path, 1, 1) from None
+        raise InputError("nesting must be shallow", "too many brackets", _SHALLOW, path, 1, 1) from None
     except ValueError as error:
         message = str(error)
         found = re.search(r"\(at line (\d+), column (\d+)\)", message)
         line, column = (int(found[1]), int(found[2])) if found else _line_and_column(text, len(text))
         what = message.split(" (at ")[0]
         raise InputError("the file must be valid TOML", what, "correct this line", path, line, column) from None
+    deepest = max(scanner.keys, key=len, default=())
+    if len(deepest) > DEEPEST_KEY:
+        place = _line_and_column(text, scanner.keys[deepest])
+        raise InputError("nesting must be shallow", f"a key of {len(deepest)} levels", _SHALLOW, path, *place)
     return TomlDocument(path, data, scanner.keys, scanner.values, text)
 
 

@@ -188,6 +188,7 @@ def test_resume_refuses_what_has_changed(
         ((*WORDS, "--seed", "1"), "seed"),
         (("changed", *WORDS[1:]), "data"),
         ((*WORDS, "--experiments", "bench"), "experiments"),
+        ((*WORDS[:-1], "61"), "max-steps"),
     ):
         before = listing(here)
         assert fit_params([*words, "--out", "out", "--resume"]) == 2

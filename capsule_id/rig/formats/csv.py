@@ -18,6 +18,7 @@ from capsule_id.rig.formats.raw import RawTable
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE \t\n")  # plus the decimal mark
+_BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
 _LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
@@ -72,18 +73,18 @@ def _lines(content: bytes, path: Path) -> list[str]:
 
 
 def _cells(line: str, delimiter: str) -> list[tuple[str, int]]:
-    """The stripped cells of a line with the 1-based character at which each begins."""
+    """The cells of a line without spaces and tabs around them, and the 1-based character at which each begins."""
     cells, start = [], 0
     for cell in line.split(delimiter):
-        cells.append((cell.strip(), start + len(cell) - len(cell.lstrip()) + 1 if cell.strip() else start + 1))
+        bare = cell.strip(_BLANKS)
+        cells.append((bare, start + (len(cell) - len(cell.lstrip(_BLANKS)) if bare else 0) + 1))
         start += len(cell) + 1
     return cells
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names and units of the columns."""
-    names: list[str] = []
-    units: list[str] = []
+    units: dict[str, str] = {}
     remedy = "head each column `name [unit]`, e.g. `time [s]` ([1]: no unit)"
     for cell, column in _cells(line, delimiter):
         bare = cell[1:-1].strip() if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell
@@ -92,13 +93,12 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
         found = _HEADER_CELL.fullmatch(bare)
         if found is None or not found[2].strip():
             raise InputError("the first line must be headers `name [unit]`", _shown(bare), remedy, path, 1, column)
-        if found[1] in names:
+        if found[1] in units:
             raise InputError(
                 "column names must be unique", f"a second {found[1]}", "remove or rename it", path, 1, column
             )
-        names.append(found[1])
-        units.append(found[2].strip())
-    return tuple(names), tuple(units)
+        units[found[1]] = found[2].strip()
+    return tuple(units), tuple(units.values())
 
 
 def _read_fast(body: str, delimiter: str, decimal: str, columns: int, rows: int) -> np.ndarray | None:
