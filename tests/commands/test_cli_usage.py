@@ -60,7 +60,7 @@ def test_wrong_usage_is_one_line(capsys: pytest.CaptureFixture[str], words: tupl
     assert named in refused(capsys, *words)
 
 
-@pytest.mark.parametrize("words", [(), ("fit",), ("init",), ("check", "a", "b"), ("synthesize", "a", "--seed", "x")])
+@pytest.mark.parametrize("words", [("fit",), ("init",), ("check", "a", "b"), ("synthesize", "a", "--seed", "x")])
 def test_wrong_usage_of_the_second_command(capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
     assert "--help" in refused(capsys, *words, program="capsule_id")
 

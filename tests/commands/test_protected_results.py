@@ -39,7 +39,7 @@ def test_a_sweep_is_not_written_into_a_result(here: Path, capsys: pytest.Capture
 
 
 def test_options_are_not_abbreviated(capsys: pytest.CaptureFixture[str]) -> None:
-    assert capsule_id(["simulate", "--fig", "a.png"]) == 2
+    assert capsule_id(["simulate", "--out", "a.csv", "--fig", "a.png"]) == 2
     assert "unrecognized arguments: --fig" in capsys.readouterr().err
     assert fit_params(["rig", "--no-s"]) == 2
     assert "unrecognized arguments: --no-s" in capsys.readouterr().err
