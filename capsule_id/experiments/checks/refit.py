@@ -7,6 +7,9 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 
+#: Residuals, in units of the noise, where the model has no solution.
+UNFIT = 1e9
+
 
 def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]) -> dict[str, tuple[float, float]]:
     """Estimate and standard error of the experiment's physical parameters without some readings, SI.
@@ -33,6 +36,9 @@ def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]
         sd = misfit.sd[keep]
         y = misfit.raw[keep] / sd
         a = misfit.design[keep] / sd[:, None]
+        if not np.all(np.isfinite(a)):
+            # An overdamped decay has no solution; the solver then shortens its step.
+            return np.full(len(y), UNFIT)
         return y - a @ np.linalg.lstsq(a, y, rcond=None)[0] if a.shape[1] else y
 
     start = np.ones(len(at)) if signed else np.zeros(len(at))

@@ -19,9 +19,6 @@ from capsule_id.experiments.free_vibration.declaration import DRIFT_RATIO, DRIFT
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.parameters import Parameter, Prior
 
-#: Symbols of the shape parameters of noise and drift.
-SHAPES = tuple(row.symbol for row in (NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME))
-
 
 def noise_parameters(model: DecayModel, time: np.ndarray, period: float, of: str) -> list[Parameter]:
     """Return the shape parameters of noise and drift of the record ``of``, sampled at ``time`` (n,), s.
@@ -42,7 +39,7 @@ def whiten(time: np.ndarray, columns: Any, model: DecayModel, theta: ValuesBySym
 
     The map has determinant 1: the density of the readings is that of the whitened readings.
     """
-    shape = {symbol: theta[symbol] for symbol in SHAPES if symbol in theta}
+    shape = {symbol: theta[symbol] for symbol in model.shapes}
     return whiten_by_shape(jnp.asarray(time), jnp.asarray(columns), model.noise, shape)
 
 

@@ -207,7 +207,9 @@ def demands_another(record: "FreeVibration", level: float) -> bool:
         return ljung_box(Screening(record).fit(record.model)[0].residuals)[1] < level
     rough = record.rough_decrement()
     noise = max(noise_level(record.values), 1e-6 * float(np.ptp(record.values)))
-    theta = {"m1": record.mass, "k1": rough.k1, "c": rough.c, "noise_sd": noise}
+    # Steps of the fit must not start from an overdamped decay.
+    c = min(rough.c, float(np.sqrt(rough.k1 * record.mass)))
+    theta = {"m1": record.mass, "k1": rough.k1, "c": c, "noise_sd": noise}
     theta |= {symbol: value for symbol, (value, _) in refit(record, theta, []).items()}
     residuals = np.asarray(record.residuals(theta, np))[: record.n]
     return ljung_box(residuals)[1] < level or response_p(record, theta) < level

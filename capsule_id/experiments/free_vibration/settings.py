@@ -89,6 +89,12 @@ class DecayModel:
         return self.noise != "white" or self.drift == "gp"
 
     @property
+    def shapes(self) -> tuple[str, ...]:
+        """Symbols of the shape parameters of noise and drift."""
+        noise = {"white": (), "ar1": ("noise_time",), "arma": ("noise_time", "white_ratio")}[self.noise]
+        return (*noise, *(("drift_ratio", "drift_time") if self.drift == "gp" else ()))
+
+    @property
     def additions(self) -> list[str]:
         """Effects of the model that the default lacks, in words."""
         words = [_EFFECTS[symbol] for symbol in self.symbols]
