@@ -32,7 +32,8 @@ def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]
 
     def residuals(w: np.ndarray) -> np.ndarray:
         moved = {**theta, **dict(zip(symbols, values_of(w), strict=True))}
-        misfit = experiment.misfit(moved)
+        with np.errstate(invalid="ignore"):
+            misfit = experiment.misfit(moved)
         sd = misfit.sd[keep]
         y = misfit.raw[keep] / sd
         a = misfit.design[keep] / sd[:, None]
