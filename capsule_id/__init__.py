@@ -38,6 +38,7 @@ Glossary:
     bench, run            tests of single parts; a record of the capsule under a drive
     truth                 the parameters that computed a synthetic rig folder
 
+The guide, guide/*.md beside this file, describes experiments, results, the capsule model, maps and extensions.
 A public name is imported at its first use, so ``import capsule_id`` does not import JAX.
 """
 

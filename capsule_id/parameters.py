@@ -1,6 +1,6 @@
 """The parameter table: symbol, unit, meaning, LaTeX label, default prior, sign, and leaf of the model.
 
-Priors, engines, command options, sweeps, axes, report and README read it. A kind of experiment declares parameters of
+Priors, engines, command options, sweeps, axes, report and guide read it. A kind of experiment declares parameters of
 its own (``capsule_id.experiments``). The *name* of a parameter is its symbol; a bracket names the spring or record, as
 in ``k2[soft]`` or ``noise_sd[free_vibration_1]``. Positive parameters are sampled through their logarithm.
 """

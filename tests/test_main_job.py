@@ -1,6 +1,7 @@
 """``fit-params data/`` as in README; its files are read back and checked."""
 
 import json
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import xarray as xr
 from scipy import stats
 
 from capsule_id.synthetic import Truth
-from tests.cli_tools import DATA, argv, environment
+from tests.cli_tools import DATA, ROOT, argv, environment
 
 MAX_RHAT, MIN_ESS, MAX_Z = 1.01, 400.0, 3.5
 WALKER = ("chain", "draw")
@@ -158,3 +159,17 @@ def test_the_truth_is_found(job: Job) -> None:
     for name in ("k1", "v_s"):
         row = job.parameters["parameters"][name]
         assert abs(row["paper"] - truth[name]) > MAX_Z * row["sd"]
+
+
+def test_readme_shows_these_numbers(job: Job) -> None:
+    """Rounded as printed; another processor may change the last digit."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    printed = re.findall(r"^(\w+) +(\S+(?: s/m)?) +(\S+) ± (\S+) +(trusted)$", text, re.MULTILINE)
+    assert len(printed) >= 3
+    for name, unit, value, sd, trust in printed:
+        row = job.parameters["parameters"][name]
+        assert (unit, trust) == (row["unit"], row["trust"])
+        assert float(value) == pytest.approx(row["value"], abs=0.1 * row["sd"])
+        assert float(sd) == pytest.approx(row["sd"], rel=0.1)
+    (header,) = re.findall(r"^ +unit +value ± sd +trust$", text, re.MULTILINE)
+    assert job.done.stdout.splitlines()[1].startswith(header)

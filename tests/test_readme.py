@@ -1,32 +1,60 @@
-"""README is correct: its commands run, its tables are those of the package."""
+"""README and the guide are correct: their commands run, their tables are those of the package."""
 
+import argparse
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from pathlib import Path
+from typing import get_args, get_type_hints
 
+import numpy as np
 import pytest
 
+import capsule_id as cid
+from capsule_id import cli
 from capsule_id.experiments.registry import default_registry
-from tests.cli_tools import DATA, ROOT, environment
+from capsule_id.report.columns import COLUMNS
+from capsule_id.rig.choices import OPTIONAL
+from capsule_id.rig.model import ModelChoices
+from capsule_id.views import Trust
+from tests.cli_tools import DATA, ROOT, environment, run
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+GUIDE_FOLDER = ROOT / "capsule_id" / "guide"
+GUIDE = {path.stem: path.read_text(encoding="utf-8") for path in sorted(GUIDE_FOLDER.glob("*.md"))}
+TEXTS = {ROOT / "README.md": README} | {GUIDE_FOLDER / f"{name}.md": text for name, text in GUIDE.items()}
+EVERYTHING = "\n".join(TEXTS.values())
 KINDS = default_registry()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+LONGEST_README, WIDEST_README, LONGEST_PAGE = 130, 110, 150  # lines, columns, lines
+LARGEST_FIGURE = 150_000  # bytes
+
+
+def blocks(language: str, text: str = README) -> list[str]:
+    """The fenced blocks of a language, without the indentation of a list."""
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```$", text, re.MULTILINE | re.DOTALL)
+    return [re.sub(rf"^{indent}", "", body, flags=re.MULTILINE) for indent, body in found]
 
 
 def set_up_commands() -> list[list[str]]:
     """The two fenced commands at the start of README, each split at &&."""
-    return [[part.strip() for part in block.split("&&")] for block in re.findall(r"```sh\n(.*?)\n```", README)[:2]]
+    return [[part.strip() for part in block.split("&&")] for block in blocks("sh")[:2]]
 
 
-def rows(header: str) -> dict[str, list[str]]:
-    """The table of README whose header line is ``header``: cells by the first one."""
-    lines = README.split(header + "\n", 1)[1].splitlines()[1:]
+def rows(header: str, text: str) -> dict[str, list[str]]:
+    """The table of ``text`` whose header line is ``header``: cells by the first one."""
+    lines = text.split(header + "\n", 1)[1].splitlines()[1:]
     table = lines[: lines.index("") if "" in lines else None]
     cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table]
     return {first.strip("`| "): [cell.strip("| ") for cell in rest] for first, *rest in cells}
+
+
+def keys(header: str, text: str) -> list[str]:
+    """The words in code style in the first column of a table."""
+    return [key for cell in rows(header, text) for key in re.split(r"`, `", cell)]
 
 
 def test_the_two_commands_set_up_and_run() -> None:
@@ -55,37 +83,157 @@ def test_the_installed_command_reads_the_folder_that_readme_names(tmp_path: Path
     assert (tmp_path / report).is_file()
 
 
+def test_a_record_of_ones_own_gives_k1(tmp_path: Path) -> None:
+    """The steps of README, from a file with headers of a laboratory program to k1."""
+    rig, m1, k1, c = tmp_path / "my-rig", 0.11, 1420.0, 1.9
+    rig.mkdir()
+    (description,) = blocks("toml")
+    (rig / "rig.toml").write_text(description, encoding="utf-8")
+    header, *readings = blocks("csv")[0].splitlines()
+    (wrong,) = re.findall(r"begins with `(.*?)`", README)
+    assert re.findall(r"replace that line by `(.*?)`", README) == [header]
+
+    begin, second = (float(line.split(",")[0]) for line in readings)
+    time = begin + (second - begin) * np.arange(1000)
+    gamma = c / (2.0 * m1)
+    omega = np.sqrt(k1 / m1 - gamma**2)
+    swing = np.cos(omega * time) + gamma / omega * np.sin(omega * time)
+    noise = 0.02 * np.random.default_rng(0).standard_normal(time.size)
+    x_rel = float(readings[0].split(",")[1]) * np.exp(-gamma * time) * swing + noise
+    body = "".join(f"{t:.4f},{x:.4f}\n" for t, x in zip(time, x_rel, strict=True))
+    table = rig / tomllib.loads(description)["experiment"][0]["file"]
+
+    check, fit = (line.removeprefix(".venv/bin/").split() for line in blocks("sh")[2].splitlines())
+    names = {"capsule-id": "capsule_id", "fit-params": "fit_params"}
+    table.write_text(f"{wrong}\n{body}", encoding="utf-8")
+    refused = run(*check[1:], cwd=tmp_path, name=names[check[0]])
+    assert refused.returncode == cli.BAD_INPUT
+    assert header.split(",")[0] in refused.stderr
+
+    table.write_text(f"{header}\n{body}", encoding="utf-8")
+    checked = run(*check[1:], cwd=tmp_path, name=names[check[0]])
+    assert (checked.returncode, checked.stdout.splitlines()[-1]) == (0, "no findings")
+    done = run(*fit[1:], "--no-sample", "--quiet", cwd=tmp_path, name=names[fit[0]])
+    assert (done.returncode, done.stderr) == (0, "")
+    value, sd = (float(x) for x in re.findall(r"^k1 +N/m +(\S+) ± (\S+)", done.stdout, re.MULTILINE)[0])
+    assert abs(value - k1) < 3.0 * sd < 0.02 * k1
+    (report,) = re.findall(r"`(results/my-rig/\S+)`", README)
+    assert (tmp_path / report).is_file()
+
+
+def test_readme_and_the_pages_are_short() -> None:
+    lines = README.splitlines()
+    assert len(lines) <= LONGEST_README
+    assert max(map(len, lines)) <= WIDEST_README
+    assert {name: text.count("\n") for name, text in GUIDE.items() if text.count("\n") > LONGEST_PAGE} == {}
+
+
+def test_every_link_leads_to_a_file_and_readme_links_every_page() -> None:
+    for path, text in TEXTS.items():
+        links = re.findall(r"\]\(([^)#:]+)\)", text)
+        assert links, path
+        assert [link for link in links if not (path.parent / link).is_file()] == [], path
+    linked = {ROOT / link for link in re.findall(r"\]\(([^)#:]+)\)", README)}
+    assert linked == {path for path in GUIDE_FOLDER.iterdir() if path.is_file()}
+
+
+def test_the_figure_is_small_and_described() -> None:
+    ((description, figure),) = re.findall(r"!\[(.*?)\]\((.*?)\)", README, re.DOTALL)
+    assert len(description.split()) > 20
+    content = (ROOT / figure).read_bytes()
+    assert content.startswith(b"\x89PNG")
+    assert len(content) <= LARGEST_FIGURE
+
+
+def test_the_three_words_of_trust_are_the_packages() -> None:
+    assert set(rows("| trust | meaning | what to do |", README)) == set(get_args(Trust))
+
+
 def test_the_parameter_table_is_the_packages() -> None:
     expected = {symbol: [row.unit, row.meaning, row.describe_prior()] for symbol, row in KINDS.parameters.items()}
-    assert rows("| symbol | unit | meaning | default prior |") == expected
+    assert rows("| symbol | unit | meaning | default prior |", GUIDE["parameters"]) == expected
 
 
 def test_the_kinds_of_experiments_are_the_packages() -> None:
-    table = rows("| kind | columns | informs |")
+    table = rows("| kind | columns | informs |", GUIDE["experiments"])
     assert list(table) == list(KINDS)
     for kind, (columns, informs) in table.items():
         assert set(re.findall(r"`(\w+) \[", columns)) == set(KINDS[kind].columns)
         assert informs == KINDS[kind].informs
 
 
-def test_every_path_that_readme_names_exists() -> None:
-    named = set(re.findall(r"`((?:capsule_id|data)/[\w/.]*)`", README))
-    assert len(named) >= 8
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_the_settings_of_every_kind_are_the_packages(kind: str) -> None:
+    (page,) = (text for text in GUIDE.values() if f"| setting of `{kind}` |" in text)
+    assert sorted(keys(f"| setting of `{kind}` | meaning |", page)) == sorted(KINDS[kind].setting_rules)
+
+
+def test_the_choices_of_model_are_the_packages() -> None:
+    table = rows("| key of `[model]` | meaning |", GUIDE["friction"])
+    words = get_args(get_type_hints(ModelChoices)["friction"])
+    assert list(table) == ["friction", "free"]
+    assert tuple(re.findall(r'`"(\w+)"`', table["friction"][0])) == words
+    assert tuple(re.findall(r"`(\w+)`", table["free"][0])) == OPTIONAL
+
+
+def test_the_columns_of_a_result_are_the_packages() -> None:
+    found = keys("| column | content |", GUIDE["results"])
+    assert sorted(found) == sorted(column.key for column in COLUMNS)
+
+
+def test_the_drives_have_the_arguments_of_the_guide() -> None:
+    for call in rows("| drive | force on the rod |", GUIDE["capsule_model"]):
+        name, arguments = re.findall(r"cid\.([\w.]+)\((.*)\)", call)[0]
+        if "." not in name:
+            assert arguments.split(", ") == [field.name for field in fields(getattr(cid, name))]
+        else:
+            assert callable(getattr(getattr(cid, name.split(".")[0]), name.split(".")[1]))
+
+
+def test_every_path_that_the_texts_name_exists() -> None:
+    named = set(re.findall(r"`((?:capsule_id|data|notebooks|tests)/[\w/.]*)`", EVERYTHING))
+    assert len(named) >= 25
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 
 def test_the_exit_codes_are_those_of_the_command() -> None:
-    from capsule_id import cli
+    table = rows("| exit code | meaning |", GUIDE["results"])
+    assert set(table) == {"0", "3", *map(str, (cli.BAD_INPUT, cli.INTERNAL, cli.INTERRUPTED))}
 
-    assert set(rows("| exit code | meaning |")) == {"0", "3", *map(str, (cli.BAD_INPUT, cli.INTERNAL, cli.INTERRUPTED))}
+
+def parsers() -> list[argparse.ArgumentParser]:
+    """The parsers of both commands, and those of the subcommands."""
+    capsule = cli._capsule_parser("capsule-id")
+    (commands,) = (action for action in capsule._actions if isinstance(action, argparse._SubParsersAction))
+    return [cli._fit_parser("fit-params"), capsule, *commands.choices.values()]
+
+
+def test_every_command_and_option_is_understood() -> None:
+    lines = [line.split(" && ")[-1].removeprefix(".venv/bin/") for text in TEXTS.values() for line in _commands(text)]
+    assert len(lines) >= 8
+    for line in lines:
+        program, *words = shlex.split(line)
+        parser = {"fit-params": cli._fit_parser, "capsule-id": cli._capsule_parser}[program](program)
+        parser.parse_args(words)
+    known = {option for parser in parsers() for option in parser._option_string_actions}
+    spans = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", EVERYTHING, flags=re.DOTALL))
+    named = {option for span in spans for option in re.findall(r"(?:^| )(--[a-z][\w-]*)", span)}
+    assert len(named) >= 15
+    assert named - known == set()
+
+
+def _commands(text: str) -> list[str]:
+    """The lines of fenced shell blocks that end in a command of this package."""
+    lines = [line for block in blocks("sh", text) for line in block.splitlines()]
+    return [line for line in lines if re.search(r"(^|/)(fit-params|capsule-id) ", line)]
 
 
 def test_the_examples_in_python_give_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
     """The motion, then a friction law that goes on from it."""
-    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names: dict[str, object] = {"__name__": "readme"}
-    for block in blocks:
+    examples = blocks("python", GUIDE["capsule_model"])
+    for block in examples:
         exec(block, names)
         (promised,) = re.findall(r"print\(.*\)  # (\S+)", block)
         assert capsys.readouterr().out.split() == [promised]
-    assert len(blocks) == 2
+    assert len(examples) == EVERYTHING.count("```python") == 2

@@ -55,5 +55,5 @@ def test_batch_of_pulses_beside_scipy() -> None:
             assert int(t.contacts[lane]) == contacts
     ratio = np.median(scipy) / np.median(mine)
     print(f"\n{1e3 * np.median(mine):.3f} ms a run, SciPy {1e3 * np.median(scipy):.0f} ms: {ratio:.0f} x")
-    # The goal is 500 with the command's flags; it is not reached (README).
+    # The goal is 500 with the command's flags; it is not reached (capsule_id/guide/benchmarks.md).
     assert ratio > (200.0 if COMMAND_FLAGS else 40.0)

@@ -204,9 +204,10 @@ def test_progress_has_a_rate_and_the_time_left(capsys: pytest.CaptureFixture[str
         assert "<00:10" in progress._line(50, 100, 10.0)
 
 
-def test_the_commands_of_readme_are_understood() -> None:
+def test_the_commands_of_the_guide_are_understood() -> None:
     """The commands parse and pass the checks that need no fitted rig."""
-    lines = re.findall(r"^capsule-id bifurcate (.*)$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    text = (ROOT / "capsule_id" / "guide" / "maps.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^capsule-id bifurcate (.*)$", text, re.MULTILINE)
     assert len(lines) >= 4
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
