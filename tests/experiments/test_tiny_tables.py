@@ -73,6 +73,18 @@ def test_the_step_is_not_used_where_readings_scatter_or_their_error_is_stated(tm
     assert [f.code for f in result.findings if f.code == "lines.step"] == []
 
 
+def test_chosen_levels_are_no_reading_step(tmp_path: Path) -> None:
+    """Known weights of 10 lb each are far apart, but each is known to its last digit."""
+    force = 44.482216 * np.array([0.0, 1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0, 0.0])
+    current = force / 4.46 + 1e-3 * np.random.default_rng(1).standard_normal(9)
+    result = fit(tmp_path, Entry("motor_current", "cell", {"current [A]": current, "force [N]": force}, {}))
+    assert [f.code for f in result.findings if f.code == "lines.step"] == []
+    K = result.summary.loc["K"]
+    assert K["trust"] != "not trusted"
+    assert K["sd"] < 0.01
+    assert K["value"] == pytest.approx(4.46, abs=4.0 * K["sd"])
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

@@ -25,7 +25,6 @@ from capsule_id.experiments.families.line_replicates import check_replicates
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 
@@ -107,6 +106,15 @@ def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
     return [ResultTable("lines.slopes", pd.DataFrame(rows).set_index("table"))]
 
 
+def last_digit(values: np.ndarray) -> float:
+    """Step of the last decimal digit of ``values`` (n,), at most 1; 0 beyond ten decimals.
+
+    It is not the spacing of the levels: the levels of a calibration are chosen, such as known weights.
+    """
+    error = 1e-12 * float(np.max(np.abs(values), initial=0.0))
+    return next((10.0**-k for k in range(11) if np.max(np.abs(values - np.round(values, k))) <= error), 0.0)
+
+
 class Line(Experiment):
     """A line y against x; subclasses name the columns and the slope.
 
@@ -116,7 +124,7 @@ class Line(Experiment):
     x_sd, y_sd : stated reading errors, SI
     width : sd of the intercept's prior, SI
     sd_ratio : stated ratio of both errors; None: not stated
-    step : step of the digits of y, SI, where it exceeds the scatter about the line and no error of y is stated; else 0
+    step : step of the last digit of y, SI, where it exceeds the scatter about the line and no error of y is stated; else 0
     symbol : symbol of the slope
     errors_known : whether both reading errors are stated
     """
@@ -147,7 +155,7 @@ class Line(Experiment):
         self.sd_ratio = sd_ratio
         self.errors_known = x_column.sd is not None and y_column.sd is not None
         stated = y_column.sd is not None or y_column.resolution is not None
-        step = 0.0 if stated else reading_step(self.y * y_column.to_display) / y_column.to_display
+        step = 0.0 if stated else last_digit(self.y * y_column.to_display) / y_column.to_display
         self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
         self.y_sd = max(self.y_sd, self.step / np.sqrt(12.0))
         factor = SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
@@ -204,9 +212,11 @@ class Line(Experiment):
         return float(self.nuisance_mean(theta)[0] * self.width)
 
     def ordinary_line(self) -> tuple[float, float, float]:
-        """Slope, intercept and residual sd of ordinary least squares: the paper's linear fit."""
-        slope, intercept = np.polyfit(self.x, self.y, 1)
-        rest = self.y - slope * self.x - intercept
+        """Slope, intercept and residual sd of ordinary least squares, the paper's fit; slope 0 at one level of x."""
+        x, y = self.x - np.mean(self.x), self.y - np.mean(self.y)
+        slope = x @ y / (x @ x) if x @ x > 0.0 else 0.0
+        intercept = np.mean(self.y) - slope * np.mean(self.x)
+        rest = y - slope * x
         return float(slope), float(intercept), float(np.sqrt(rest @ rest / max(self.n - 2, 1)))
 
     def starts(self) -> dict[str, Start]:

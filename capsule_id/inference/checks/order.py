@@ -14,6 +14,8 @@ ORDER_LEVEL, SMALLEST_CORRELATION = 0.005, 0.2
 PERMUTATIONS, MANY_ROWS = 10_000, 200
 #: Fewest rows that can be judged: 6 rows have 720 orders.
 FEWEST_ROWS = 6
+#: Residuals below this share of the noise, rms, are rounding, and their order means nothing.
+SMALLEST_SCATTER = 0.02
 
 
 def check_order(s: Setting) -> list[Finding]:
@@ -27,7 +29,7 @@ def check_order(s: Setting) -> list[Finding]:
         if flagged := s.flagged.get(e.label, []):
             residuals, columns = np.delete(residuals, flagged), np.delete(columns, flagged, axis=0)
             residuals = residuals - columns @ np.linalg.lstsq(columns, residuals, rcond=None)[0]
-        if len(residuals) >= FEWEST_ROWS and np.ptp(residuals) > 0.0:
+        if len(residuals) >= FEWEST_ROWS and np.std(residuals) > SMALLEST_SCATTER:
             tables.append((e, residuals))
     for e, residuals in tables:
         correlation, p = lag_1(residuals)
