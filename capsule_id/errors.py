@@ -1,5 +1,7 @@
-"""The exception for bad input; it names place, rule, value and remedy."""
+"""The exceptions for bad input; they name place, rule, value and remedy."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -28,3 +30,42 @@ class InputError(ValueError):
         place = ":".join(str(part) for part in (self.file, line, column) if part not in ("", None))
         message = f"{rule}, {value}, {remedy}"
         super().__init__(" ".join((f"{place}: {message}" if place else message).split()))
+
+
+#: Most errors that are printed at once.
+MOST_SHOWN = 20
+
+
+class FolderError(InputError):
+    """Several errors of a rig folder: the text has a line for each of the first 20, then their number if there are more.
+
+    Attributes
+    ----------
+    errors : all of them; rule, value, remedy and place are those of the first one
+    """
+
+    def __init__(self, errors: Sequence[InputError]) -> None:
+        first = errors[0]
+        super().__init__(first.rule, first.value, first.remedy, first.file, first.line, first.column)
+        self.errors = tuple(errors)
+
+    def __str__(self) -> str:
+        lines = [str(error) for error in self.errors[:MOST_SHOWN]]
+        return "\n".join([*lines, f"{len(self.errors)} errors"] if len(self.errors) > MOST_SHOWN else lines)
+
+
+@contextmanager
+def collecting(errors: list[InputError]) -> Iterator[None]:
+    """Append an ``InputError`` of the body to ``errors`` instead of raising it."""
+    try:
+        yield
+    except InputError as error:
+        errors.append(error)
+
+
+def raise_all(errors: Sequence[InputError]) -> None:
+    """Raise the only error as it is, several as ``FolderError``; return if there is none."""
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        raise FolderError(errors)

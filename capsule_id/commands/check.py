@@ -76,6 +76,12 @@ def _summary(table: Table) -> str:
     """Kind, label, rows, columns and sampling of one experiment."""
     columns = ", ".join(f"{column.name} [{column.unit}]" for column in table.columns.values())
     text = f"{table.kind} {table.label}: {len(table.rows)} rows of {columns}"
+    dropped = [
+        f"{number} rows {why}"
+        for number, why in ((table.other, "outside where"), (table.missing, "with a missing reading"))
+        if number
+    ]
+    text += f" ({' and '.join(dropped)} not used)" if dropped else ""
     if "time" not in table.columns:
         return text
     try:

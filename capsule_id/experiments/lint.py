@@ -27,6 +27,9 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     findings += lint_rig_quantities(rig)
     for table in tables:
         findings += lint_magnitudes(table, kinds[table.kind])
+        if table.missing:
+            facts = {"file": table.file, "rows": table.missing, "used": len(table.rows)}
+            findings.append(Finding("readings.missing", "warn", facts, table.label))
         findings += [found for lint_table in kinds[table.kind].lint for found in lint_table(table, rig)]
     return (*findings, *_same_files(rig, tables), *_repeated_blocks(rig, tables))
 
@@ -38,20 +41,26 @@ def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tu
 
 def _same_files(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
     """Report tables whose files have the same bytes."""
-    by_content: dict[str, list[Table[Any]]] = {}
+    by_content: dict[tuple[object, ...], list[Table[Any]]] = {}
     for table in tables:
         if table.file in rig.files:
-            by_content.setdefault(rig.files[table.file], []).append(table)
+            by_content.setdefault(_content(rig, table), []).append(table)
     for first, *others in by_content.values():
         for other in others:
             facts = {"file": other.file, "first": first.label, "rows": list(range(len(other.rows)))}
             yield Finding("readings.repeated_file", "fail", facts, other.label)
 
 
+def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
+    """Equal for two tables with the same readings of the same file; column maps may read different ones."""
+    readings = ((name, column.values.tobytes()) for name, column in table.columns.items())
+    return rig.files.get(table.file, table.label), *readings
+
+
 def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
     """Report rows that occur twice, within a table or across tables with the same columns; equal files are left out."""
     groups: dict[tuple[str, ...], list[Table[Any]]] = {}
-    for table in {rig.files.get(table.file, table.label): table for table in reversed(tables)}.values():
+    for table in {_content(rig, table): table for table in reversed(tables)}.values():
         groups.setdefault(tuple(sorted(set(table.columns) - {"time"})), []).insert(0, table)
     for names, members in groups.items():
         by_label = {table.label: table for table in members}

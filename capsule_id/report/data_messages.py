@@ -22,6 +22,13 @@ DATA_MESSAGES: Mapping[str, Message] = {
         "number of readings",
         warn="{rows} rows are too few to estimate the scatter; {wanted} are wanted. Measure more rows.",
     ),
+    "readings.missing": Message(
+        "missing readings",
+        warn=(
+            "{file}: {rows} rows with a missing reading are dropped, {used} are used. Check that the losses do not depend on "
+            "the reading."
+        ),
+    ),
     "readings.errors": Message(
         "reading errors", warn="no reading error is stated for {names}. Add {first}_sd to the experiment."
     ),

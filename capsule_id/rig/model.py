@@ -94,11 +94,13 @@ class Table(Generic[S]):
     ----------
     kind : name of its kind, as in ``rig.toml``
     label : unique within the rig, the file's name without suffix
-    file : path relative to the folder
+    file : path relative to the folder, of the first file
     columns : by name
     settings : of its kind, checked, defaults filled in
-    rows : (n,) 1-based line number of every row in the file, read-only; findings name rows by it
+    rows : (n,) 1-based line number of every row in the file, read-only; findings name rows by it. Of a table from
+        files put one below the other: 1-based number of the row
     bench : its kind is a bench test; else a forced run
+    missing, other : rows of the files that a column map drops: for a missing cell, and outside ``where``
     """
 
     kind: str
@@ -108,6 +110,8 @@ class Table(Generic[S]):
     settings: S
     rows: np.ndarray
     bench: bool = True
+    missing: int = 0
+    other: int = 0
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""

@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
 from capsule_id.rig.choices import check_masses_of_free, read_model
 from capsule_id.rig.decode import decode
 from capsule_id.rig.entry import Entry
+from capsule_id.rig.maps.declared import MAP_KEYS
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, KindRule, parameter_rows
-from capsule_id.rig.tables import TableFile, read_table_file
+from capsule_id.rig.tables import TableFile, read_experiment_files
 from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
 from capsule_id.rig.toml_values import (
     NAME_PATTERN,
@@ -54,7 +55,8 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     Raises
     ------
     InputError
-        At the first fault: file, line and column, the rule, the value found, the remedy.
+        At the first fault: file, line and column, the rule, the value found, the remedy. Where several quantities of
+        [rig] or experiments have faults, at the first one of each (``FolderError``).
     """
     folder = Path(folder)
     document, sha256 = _read_document(folder)
@@ -68,12 +70,14 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         raise document.error(("rig",), "[rig] must have a name", "none", 'add name = "..."')
     name = read_name(document, ("rig", "name"), head["name"])
     synthetic = read_bool(document, ("rig", "synthetic"), head.get("synthetic", False))
-    stated = {
-        key: read_quantity(document, ("rig", key), head[key], rule.si, rule.domain, rule.has_sd)
-        for key, rule in RIG_QUANTITIES.items()
-        if key in head
-    }
-    tables, files = _read_experiments(document, kinds)
+    faults: list[InputError] = []
+    stated = {}
+    for key, rule in RIG_QUANTITIES.items():
+        if key in head:
+            with collecting(faults):
+                stated[key] = read_quantity(document, ("rig", key), head[key], rule.si, rule.domain, rule.has_sd)
+    tables, files = _read_experiments(document, kinds, faults)
+    raise_all(faults)
     model = read_model(document)
     _check_masses(document, tables, kinds, set(stated))
     check_masses_of_free(document, model, tables, kinds, set(stated))
@@ -152,9 +156,9 @@ def _check_prior_of_spring(document: TomlDocument, path: KeyPath, spring: str, t
 
 
 def _read_experiments(
-    document: TomlDocument, kinds: Mapping[str, KindRule]
+    document: TomlDocument, kinds: Mapping[str, KindRule], faults: list[InputError]
 ) -> tuple[tuple[Table, ...], dict[str, str]]:
-    """Every ``[[experiment]]``, and the sha256 of every table read."""
+    """Every ``[[experiment]]``, and the sha256 of every file read; the first error of each is appended to ``faults``."""
     entries = document.data.get("experiment", [])
     if not isinstance(entries, list) or not entries:
         remedy = 'add [[experiment]] with kind = "..." and file = "..."'
@@ -164,38 +168,40 @@ def _read_experiments(
     for index, entry in enumerate(entries):
         stop_if_interrupted()
         path: KeyPath = ("experiment", index)
-        read_table(document, path, entry, "[[experiment]]")
-        table, sha256 = _read_experiment(document, path, entry, kinds)
-        for other in tables:
-            if other.label == table.label:
-                place = "label" if "label" in entry else "file"
-                remedy = 'give one of them a label of its own: label = "..."'
-                raise document.error((*path, place), "labels must be unique", shown(table.label), remedy)
-        tables.append(table)
-        files[table.file] = sha256
+        with collecting(faults):
+            read_table(document, path, entry, "[[experiment]]")
+            table, sha256 = _read_experiment(document, path, entry, kinds)
+            for other in tables:
+                if other.label == table.label:
+                    place = next(key for key in ("label", "file", "files") if key in entry)
+                    remedy = 'give one of them a label of its own: label = "..."'
+                    raise document.error((*path, place), "labels must be unique", shown(table.label), remedy)
+            tables.append(table)
+            files |= sha256
     return tuple(tables), files
 
 
 def _read_experiment(
     document: TomlDocument, path: KeyPath, entry: dict[str, Any], kinds: Mapping[str, KindRule]
-) -> tuple[Table, str]:
-    """One entry with its table."""
-    for key in ("kind", "file"):
-        if key not in entry:
-            raise document.error(path, f"an experiment must have a {key}", "none", f'add {key} = "..."')
+) -> tuple[Table, Mapping[str, str]]:
+    """One entry with its table, and the sha256 of its files."""
+    if "kind" not in entry:
+        raise document.error(path, "an experiment must have a kind", "none", 'add kind = "..."')
     word = read_string(document, (*path, "kind"), entry["kind"])
     if word not in kinds:
         raise document.error((*path, "kind"), "unknown kind", shown(word), f"write one of {' '.join(kinds)}")
     kind = kinds[word]
     errors = [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
-    refuse_unknown_keys(document, path, entry, ("kind", "file", "label", *kind.setting_rules, *errors))
+    refuse_unknown_keys(document, path, entry, ("kind", "file", "label", *MAP_KEYS, *kind.setting_rules, *errors))
     settings = _read_settings(document, path, entry, kind)
-    name = read_string(document, (*path, "file"), entry["file"])
-    file = read_table_file(document, (*path, "file"), name, kind)
+    file = read_experiment_files(document, path, entry, kind)
+    name = next(iter(file.sha256))
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
     columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
     _refuse_reading_errors_without_column(document, path, entry, errors, file)
-    table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows, kind.bench)
+    table = Table(
+        word, label, name, MappingProxyType(columns), settings, file.raw.rows, kind.bench, file.missing, file.other
+    )
     for rule in kind.rules:
         rule(Entry(table, document, path, file))
     return table, file.sha256

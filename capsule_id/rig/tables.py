@@ -1,20 +1,27 @@
-"""Reads one table file of a rig folder: path check, bytes, hash, columns in SI."""
+"""Reads the files of one experiment: path check, bytes, hash, column map, columns in SI."""
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
-from capsule_id.rig.formats import READERS
+from capsule_id.rig.formats import EXPORTS, READERS
+from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.maps.declared import ColumnMap, read_map
+from capsule_id.rig.maps.mapped import apply_map
+from capsule_id.rig.maps.proposal import proposal
 from capsule_id.rig.model import Column
 from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
-from capsule_id.rig.toml_values import closest, shown
+from capsule_id.rig.toml_values import closest, read_string, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 
@@ -24,21 +31,24 @@ class TableFile:
 
     Attributes
     ----------
-    path : the file, for error lines
-    sha256 : of the bytes read
+    sha256 : of the bytes read, by name in ``rig.toml``, the first file first
     raw : the numbers as written
     columns : by name, still without reading errors
+    file_of : (row index or None for the header, column index) -> the file, for error lines
+    missing, other : rows that a column map drops: for a missing cell, and outside ``where``
     """
 
-    path: Path
-    sha256: str
+    sha256: Mapping[str, str]
     raw: RawTable
     columns: Mapping[str, Column]
+    file_of: Callable[[int | None, int], Path]
+    missing: int = 0
+    other: int = 0
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""
-        line, column = self.raw.place(row, self.raw.names.index(name))
-        return InputError(rule, value, remedy, self.path, line, column)
+        index = self.raw.names.index(name)
+        return InputError(rule, value, remedy, self.file_of(row, index), *self.raw.place(row, index))
 
 
 def table_path(document: TomlDocument, path: KeyPath, name: str) -> Path:
@@ -65,52 +75,120 @@ def table_path(document: TomlDocument, path: KeyPath, name: str) -> Path:
         raise document.error(path, "file must exist", shown(name), "correct the name or add the file")
     if not regular:
         raise document.error(path, "file must be a regular file", shown(name), "name a table, not a folder or device")
-    if file.suffix.lower() not in READERS:
-        known = " ".join(READERS)
+    if file.suffix.lower() not in EXPORTS:
+        known = " ".join(EXPORTS)
         raise document.error(path, f"file must be a table of a known kind ({known})", shown(name), "export it as CSV")
     return file
 
 
-def read_table_file(document: TomlDocument, path: KeyPath, name: str, kind: KindRule) -> TableFile:
-    """Read the table ``name`` and check its columns against ``kind``.
+def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any], kind: KindRule) -> TableFile:
+    """Read the table of the experiment at ``path``, by its column map if it has one, and check its columns.
 
     Raises
     ------
     InputError
-        At the ``file`` key of ``rig.toml`` (at ``path``) or at a place in the table.
+        At a key of ``rig.toml`` or at a place in a file.
     """
-    file = table_path(document, path, name)
+    places = _file_places(document, path, entry)
+    files, contents = {}, {}
+    for place, name in places:
+        file = table_path(document, place, name)
+        if file in files.values():
+            raise document.error(place, "files must be named once", shown(name), "remove the second one")
+        try:
+            files[name], contents[name] = file, file.read_bytes()
+        except OSError as error:
+            value = f"{shown(name)} ({error.strerror})"
+            raise document.error(place, "file must be readable", value, "check its permissions") from None
+    first = places[0][1]
+    column_map = read_map(document, path, entry, kind, partial(_proposal, contents[first], files[first], kind))
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    if column_map is None:
+        table = _read_plain(document, places[0][0], files[first], contents[first], hashes, kind)
+    else:
+        _check_map_names(document, path, column_map, kind)
+        read = [EXPORTS[file.suffix.lower()](contents[name], file, column_map.layout) for name, file in files.items()]
+        mapped = apply_map(document, path, read, column_map)
+        table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other)
+    table.raw.rows.flags.writeable = False
+    columns = {column: _to_si(table, index, kind.columns[column]) for index, column in enumerate(table.raw.names)}
+    return replace(table, columns=columns)
+
+
+def _file_places(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> list[tuple[KeyPath, str]]:
+    """The files of an experiment, each with its place in ``rig.toml``."""
+    if "files" not in entry:
+        if "file" not in entry:
+            raise document.error(path, "an experiment must have a file", "none", 'add file = "..."')
+        return [((*path, "file"), read_string(document, (*path, "file"), entry["file"]))]
+    place = (*path, "files")
+    if "file" in entry:
+        raise document.error(place, "an experiment has file or files", "both", "remove file", of_key=True)
+    names = entry["files"]
+    if not isinstance(names, list) or not names:
+        raise document.error(place, "files must be a list of files", shown(names), 'write files = ["...", "..."]')
+    return [((*place, index), read_string(document, (*place, index), name)) for index, name in enumerate(names)]
+
+
+def _read_plain(
+    document: TomlDocument, place: KeyPath, file: Path, content: bytes, hashes: Mapping[str, str], kind: KindRule
+) -> TableFile:
+    """A file with the column names of the kind; an error about its header proposes a column map."""
+    suffix = file.suffix.lower()
+    if suffix not in READERS:
+        remedy = f"add {_proposal(content, file, kind, Layout())}"
+        raise document.error(place, f"a {suffix} file needs a column map", "no columns", remedy)
     try:
-        content = file.read_bytes()
-    except OSError as error:
-        remedy = "check its permissions"
-        raise document.error(path, "file must be readable", f"{shown(name)} ({error.strerror})", remedy) from None
-    raw = READERS[file.suffix.lower()](content, file)
-    raw.rows.flags.writeable = False
-    table = TableFile(file, hashlib.sha256(content).hexdigest(), raw, {})
-    _check_names(table, kind)
-    columns = {column: _to_si(table, index, kind.columns[column]) for index, column in enumerate(raw.names)}
-    return TableFile(file, table.sha256, raw, columns)
+        raw = READERS[suffix](content, file)
+        table = TableFile(hashes, raw, {}, lambda row, column: file)
+        _check_names(raw.names, kind, lambda name, *text: table.error(None, name, *text))
+    except InputError as error:
+        if error.line != 1:
+            raise
+        remedy = f"{error.remedy}; or add {_proposal(content, file, kind, Layout())} to the experiment"
+        raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
+    return table
 
 
-def _check_names(table: TableFile, kind: KindRule) -> None:
-    """Refuse unknown columns, a wrong set of columns, and a table without a channel where the kind has channels."""
-    names = table.raw.names
+def _proposal(content: bytes, file: Path, kind: KindRule, layout: Layout) -> str:
+    """The column map that reads a file as ``kind``."""
+    export: Export | None = None
+    with suppress(InputError):
+        export = EXPORTS[file.suffix.lower()](content, file, layout)
+    return proposal(kind, export)
+
+
+def _check_map_names(document: TomlDocument, path: KeyPath, column_map: ColumnMap, kind: KindRule) -> None:
+    """Refuse a map without the columns that the kind needs."""
+    place = (*path, "columns")
+
+    def error(name: str, rule: str, value: str, remedy: str) -> InputError:
+        del name
+        return document.error(place, rule, value, remedy)
+
+    _check_names(tuple(column_map.sources), kind, error)
+
+
+def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str, str, str], InputError]) -> None:
+    """Refuse unknown columns, a wrong set of columns, and a table without a channel where the kind has channels.
+
+    ``error`` makes the error about a column from rule, value and remedy.
+    """
     for name in names:
         if name not in kind.columns:
             close = closest(name, kind.columns)
             remedy = f"rename it to {close}" if close else "remove it"
             known = " ".join(kind.columns)
-            raise table.error(None, name, f"unknown column in {kind.name}", shown(name), f"{remedy}; known: {known}")
+            raise error(name, f"unknown column in {kind.name}", shown(name), f"{remedy}; known: {known}")
     stated = {name for name in names if name not in (*kind.channels, *kind.optional)}
     if stated not in [set(columns) for columns in kind.sets]:
         wanted = ", or ".join(" and ".join(columns) for columns in kind.sets)
         value = " and ".join(names)
-        raise table.error(None, names[0], f"{kind.name} must have the columns {wanted}", value, "add or remove columns")
+        raise error(names[0], f"{kind.name} must have the columns {wanted}", value, "add or remove columns")
     if kind.channels and not set(kind.channels).intersection(names):
         wanted = " ".join(kind.channels)
         rule = f"{kind.name} must have a channel beside {' and '.join(sorted(stated))}"
-        raise table.error(None, names[0], rule, " ".join(names), f"add one of {wanted}")
+        raise error(names[0], rule, " ".join(names), f"add one of {wanted}")
 
 
 def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:

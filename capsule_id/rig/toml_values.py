@@ -80,7 +80,7 @@ def read_quantity(
     example = f'{{ value = ..., {"sd = ..., " if has_sd else ""}unit = "{si}" }}'
     entry = read_table(document, path, value, example)
     refuse_unknown_keys(document, path, entry, ("value", "sd", "unit") if has_sd else ("value", "unit"))
-    factor = _read_unit(document, path, entry, si)
+    factor = read_unit(document, path, entry, si)
     number = _read_scaled(document, path, entry, "value", factor, domain)
     sd = _read_scaled(document, path, entry, "sd", factor, NOT_NEGATIVE) if "sd" in entry else 0.0
     return Quantity(number, sd)
@@ -101,7 +101,7 @@ def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, is
     example = "{ " + ", ".join(f"{key} = ..." for key in keys[:-1]) + f', unit = "{si}" }}'
     entry = read_table(document, path, value, example)
     refuse_unknown_keys(document, path, entry, keys)
-    factor = 1.0 if si == "1" and "unit" not in entry else _read_unit(document, path, entry, si)
+    factor = 1.0 if si == "1" and "unit" not in entry else read_unit(document, path, entry, si)
     if is_scatter:
         return PriorOverride(scale=_read_scaled(document, path, entry, "scale", factor, POSITIVE))
     return PriorOverride(
@@ -110,7 +110,7 @@ def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, is
     )
 
 
-def _read_unit(document: TomlDocument, path: KeyPath, entry: dict[str, Any], si: str) -> float:
+def read_unit(document: TomlDocument, path: KeyPath, entry: dict[str, Any], si: str) -> float:
     """The factor of the entry's unit to SI."""
     if "unit" not in entry:
         raise document.error(

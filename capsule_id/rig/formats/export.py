@@ -1,0 +1,44 @@
+"""A table of any layout, as a logger or a program exports it; a column map of ``rig.toml`` selects its columns."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What ``rig.toml`` states about the layout of the files of an experiment.
+
+    Attributes
+    ----------
+    data_from_line : 1-based line of the first row of numbers (None: the first line that holds a number)
+    missing : texts of cells without a reading, such as ``--`` or ``NaN``
+    """
+
+    data_from_line: int | None = None
+    missing: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Export:
+    """One file with all its columns, read or not.
+
+    Attributes
+    ----------
+    path : of the file
+    headers : rows of headers, the last one first; each row has one header a column
+    width : number of columns
+    lines : (rows,) 1-based line of every row
+    values : column index -> (rows,) numbers in the file's units, NaN at a stated missing marker; it raises
+        ``InputError`` at the first other cell
+    place : (row index or None for the header, column index) -> 1-based (line, column) in the file
+    """
+
+    path: Path
+    headers: tuple[tuple[str, ...], ...]
+    width: int
+    lines: np.ndarray
+    values: Callable[[int], np.ndarray]
+    place: Callable[[int | None, int], tuple[int, int]]

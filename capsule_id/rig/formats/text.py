@@ -1,0 +1,155 @@
+"""Reads text exports of any layout: titles, headers, rows of units, comments, and any separator.
+
+Headers are found in the lines above the numbers that have as many cells as the rows. Lines that begin with # or % are
+comments; above the numbers they may hold the headers.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.rig.decode import decode
+from capsule_id.rig.formats.cells import BLANKS, cells_of, number_in, read_number, shown_cell
+from capsule_id.rig.formats.export import Export, Layout
+
+_COMMENTS = ("#", "%")
+
+
+def read_text(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read a text export.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : what ``rig.toml`` states about it
+
+    Raises
+    ------
+    InputError
+        If the rows of numbers are not found, or a row has another number of cells than the first one.
+    """
+    lines = decode(content, path).split("\n")
+    first = _first_row(lines, layout, path)
+    numbers = [i for i in range(first, len(lines)) if lines[i].strip() and not _is_comment(lines[i])]
+    if not numbers:
+        raise InputError("a table must have rows of numbers", "none", "export the readings", path, len(lines), 1)
+    delimiter = _delimiter(lines[numbers[0]], layout)
+    rows = [_split(lines[i], delimiter) for i in numbers]
+    if len(rows[0]) > 1 and not any(row[-1] for row in rows):  # a separator at the end of every line
+        rows = [row[:-1] for row in rows]
+    width = len(rows[0])
+    for i, row in zip(numbers, rows, strict=True):
+        if len(row) != width:
+            rule = f"a row must have {width} cells, as line {numbers[0] + 1} has"
+            remedy = f"correct the row, or state data_from_line = {i + 1} if the readings begin here"
+            raise InputError(rule, f"{len(row)} cells", remedy, path, i + 1, 1)
+    found = [(i, names) for i in range(first - 1, -1, -1) if (names := _headers(lines[i], delimiter, width, layout))]
+
+    def values(column: int) -> np.ndarray:
+        return _column([row[column] for row in rows], delimiter, layout, lambda k: (path, *place(k, column)))
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        line = numbers[row] if row is not None else found[0][0] if found else numbers[0]
+        cells = cells_of(lines[line], delimiter)
+        return line + 1, cells[column][1] if column < len(cells) else 1
+
+    return Export(path, tuple(names for _, names in found), width, np.asarray(numbers) + 1, values, place)
+
+
+def _first_row(lines: list[str], layout: Layout, path: Path) -> int:
+    """Index of the line with the first row of numbers."""
+    if layout.data_from_line is not None:
+        if layout.data_from_line > len(lines):
+            remedy = "state the line of the first reading"
+            rule = f"data_from_line must be a line of the file, which has {len(lines)}"
+            raise InputError(rule, str(layout.data_from_line), remedy, path, len(lines), 1)
+        return layout.data_from_line - 1
+    begun = None
+    for i, line in enumerate(lines):
+        if _is_comment(line):
+            continue
+        cells = _split(line, _delimiter(line, layout))
+        if begun is None and any(_is_number(cell) for cell in cells):
+            begun = i
+        if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
+            if i == begun:
+                return i
+            remedy = f"state data_from_line = {i + 1}, or the line of the first reading"
+            rule = "the first line with a number must be a row of readings"
+            raise InputError(rule, shown_cell(lines[begun].strip()), remedy, path, begun + 1, 1)
+    if begun is None:
+        remedy = "export the readings as text"
+        raise InputError("a table must have rows of numbers", "none", remedy, path, 1, 1)
+    remedy = f"state data_from_line = {begun + 1}, or the line of the first reading"
+    rule = "data_from_line must be stated where no row has numbers only"
+    raise InputError(rule, shown_cell(lines[begun].strip()), remedy, path, begun + 1, 1)
+
+
+def _column(
+    texts: list[str], delimiter: str | None, layout: Layout, place: Callable[[int], tuple[Path, int, int]]
+) -> np.ndarray:
+    """The numbers of one column; NaN at a missing marker. ``place`` gives the place of a row for error lines."""
+    present = [text for text in texts if text not in layout.missing]
+    marks = re.search("[.,]", "\n".join(present)) if delimiter != "," else None
+    decimal = marks[0] if marks else "."
+    values = np.full(len(texts), np.nan)
+    for k, text in enumerate(texts):
+        if text in layout.missing:
+            continue
+        value = number_in(text, decimal)
+        if value is None:
+            remedy = (
+                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row"
+            )
+            raise InputError("a cell must be a number", shown_cell(text), remedy, *place(k))
+        values[k] = value if np.isfinite(value) else read_number(text, decimal, *place(k))
+    return values
+
+
+def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:
+    """The headers in a line above the numbers; () if it holds none."""
+    cells = _split(line.lstrip(BLANKS).lstrip("".join(_COMMENTS)), delimiter)
+    if len(cells) == width + 1 and not cells[-1]:
+        cells.pop()
+    if len(cells) != width or not any(cells) or any(_is_number(cell) for cell in cells):
+        return ()
+    return tuple(" ".join(cell.split()) for cell in cells)
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    """The cells of a line without blanks and quotation marks around them."""
+    cells = line.split() if delimiter is None else line.split(delimiter)
+    return [cell.strip(BLANKS).strip('"') for cell in cells]
+
+
+def _delimiter(line: str, layout: Layout) -> str | None:
+    """The separator of a row: tab, semicolon, comma, or None for spaces; a comma may be the decimal mark."""
+    for mark in "\t;":
+        if mark in line:
+            return mark
+    words = line.split()
+    if "," not in line:
+        return None if len(words) > 1 else ","
+    if all(_is_reading(cell, layout) for cell in _split(line, ",")):
+        return ","
+    return None if len(words) > 1 and all(_is_reading(word, layout) for word in words) else ","
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line is a comment."""
+    return line.lstrip().startswith(_COMMENTS)
+
+
+def _is_number(cell: str) -> bool:
+    """Whether a cell is a number with either decimal mark."""
+    return number_in(cell, ".") is not None or number_in(cell, ",") is not None
+
+
+def _is_reading(cell: str, layout: Layout) -> bool:
+    """Whether a cell is a number or a stated missing marker."""
+    return _is_number(cell) or cell in layout.missing

@@ -1,0 +1,157 @@
+"""Reads the column map of an experiment: ``columns``, ``data_from_line``, ``missing`` and ``where`` of ``rig.toml``."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import isfinite
+from types import MappingProxyType
+from typing import Any
+
+from capsule_id.rig.formats.export import Layout
+from capsule_id.rig.schema import ColumnRule, KindRule
+from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.rig.toml_values import (
+    read_quantity,
+    read_string,
+    read_table,
+    read_unit,
+    refuse_unknown_keys,
+    shown,
+)
+
+#: Keys of an experiment that go with ``columns``.
+MAP_KEYS = ("columns", "files", "data_from_line", "missing", "where")
+_EXAMPLE = '{ from = "...", unit = "..." }'
+Header = str | int  #: a header, or a column's number counted from 1
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a column comes from: (``header`` - ``minus``) * ``scale`` + ``offset``, in ``unit``.
+
+    Attributes
+    ----------
+    header, minus : columns of the file (``minus`` None: nothing is subtracted)
+    unit : of the result, as written
+    scale, offset : factor, and a constant in ``unit`` that is added after it
+    rate : sampling rate, Hz, of a time that no column holds; else None
+    """
+
+    header: Header = 1
+    minus: Header | None = None
+    unit: str = "s"
+    scale: float = 1.0
+    offset: float = 0.0
+    rate: float | None = None
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """The column map of an experiment.
+
+    Attributes
+    ----------
+    sources : by column of the experiment
+    layout : what is stated about the layout of the files
+    where : value of a column, in the file's unit, by header or number: other rows are not read
+    """
+
+    sources: Mapping[str, Source]
+    layout: Layout
+    where: Mapping[str, float]
+
+
+def read_map(
+    document: TomlDocument, path: KeyPath, entry: Mapping[str, Any], kind: KindRule, propose: Callable[[Layout], str]
+) -> ColumnMap | None:
+    """The column map of the experiment at ``path``, None where it states none.
+
+    ``propose`` gives the map that reads its first file, for remedies.
+
+    Raises
+    ------
+    InputError
+        At the key or value of ``rig.toml`` that is wrong.
+    """
+    layout = Layout(_line(document, path, entry), _markers(document, path, entry))
+    if "columns" not in entry:
+        for key in MAP_KEYS[1:]:
+            if key in entry:
+                remedy = f"add {propose(layout)}"
+                raise document.error((*path, key), f"{key} needs a column map", "no columns", remedy, of_key=True)
+        return None
+    place = (*path, "columns")
+    stated = read_table(document, place, entry["columns"], propose(layout))
+    if not stated:
+        raise document.error(place, "a column map must have columns", "none", f"write {propose(layout)}")
+    refuse_unknown_keys(document, place, stated, tuple(kind.columns))
+    sources = {name: _source(document, (*place, name), stated[name], kind.columns[name]) for name in stated}
+    return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(_where(document, path, entry)))
+
+
+def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRule) -> Source:
+    """One entry of ``columns``."""
+    entry = read_table(document, path, value, _EXAMPLE)
+    if "rate" in entry:
+        refuse_unknown_keys(document, path, entry, ("rate",))
+        if rule.si != "s":
+            remedy = f"write {_EXAMPLE}"
+            raise document.error((*path, "rate"), "rate is for times", str(path[-1]), remedy, of_key=True)
+        return Source(rate=read_quantity(document, (*path, "rate"), entry["rate"], "Hz").value)
+    refuse_unknown_keys(document, path, entry, ("from", "minus", "unit", "scale", "offset"))
+    if "from" not in entry:
+        raise document.error(path, f"{path[-1]} must have a from", shown(entry), f"write {_EXAMPLE}")
+    read_unit(document, path, entry, rule.si)
+    scale = _number(document, (*path, "scale"), entry.get("scale", 1.0))
+    if scale == 0.0:
+        raise document.error((*path, "scale"), "scale must not be 0", "0", "write 1, or -1 for the other sign")
+    return Source(
+        _header(document, (*path, "from"), entry["from"]),
+        _header(document, (*path, "minus"), entry["minus"]) if "minus" in entry else None,
+        entry["unit"],
+        scale,
+        _number(document, (*path, "offset"), entry.get("offset", 0.0)),
+    )
+
+
+def _header(document: TomlDocument, path: KeyPath, value: object) -> Header:
+    """A header, or a number counted from 1."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        if value < 1:
+            raise document.error(path, "columns are counted from 1", str(value), "write 1 for the first column")
+        return value
+    if not isinstance(value, str):
+        rule = f"{path[-1]} must be a header or the number of a column"
+        raise document.error(path, rule, shown(value), f'write {path[-1]} = 1 or {path[-1]} = "<header>"')
+    return " ".join(read_string(document, path, value).split())
+
+
+def _number(document: TomlDocument, path: KeyPath, value: object) -> float:
+    """A finite number without unit."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise document.error(path, f"{path[-1]} must be a finite number", shown(value), "write a number without quotes")
+    return float(value)
+
+
+def _line(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> int | None:
+    """``data_from_line``, None where it is not stated."""
+    place, value = (*path, "data_from_line"), entry.get("data_from_line")
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        rule = "data_from_line must be a line, counted from 1"
+        raise document.error(place, rule, shown(value), "write the line of the first reading, such as 2")
+    return value
+
+
+def _markers(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """The texts of ``missing``; "" stands for an empty cell."""
+    place, value = (*path, "missing"), entry.get("missing", [])
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        remedy = 'write missing = ["--", "NaN"]'
+        raise document.error(place, "missing must be a list of texts", shown(value), remedy)
+    return tuple(value)
+
+
+def _where(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers of ``where``, by header or number."""
+    place = (*path, "where")
+    stated = read_table(document, place, entry.get("where", {}), "where = { <header> = <value> }")
+    return {key: _number(document, (*place, key), value) for key, value in stated.items()}

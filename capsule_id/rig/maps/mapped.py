@@ -1,0 +1,203 @@
+"""Applies a column map: selects, combines and scales the columns of one file or several."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.rig.formats.export import Export
+from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.maps.declared import ColumnMap, Header, Source
+from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.rig.toml_values import closest, shown
+
+#: Relative difference below which a column that several files hold is the same.
+ROUNDING = 1e-9
+_MOST_VALUES = 6  # shown of a column where no row has the value wanted
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A table made by a column map.
+
+    Attributes
+    ----------
+    raw : columns with the names of the kind, in the stated units; ``rows`` are lines of the file, or rows of the
+        table where several files are put one below the other
+    file_of : (row index or None for the header, column index) -> the file of a cell
+    missing : rows dropped because a used cell holds a missing marker
+    other : rows outside ``where``
+    """
+
+    raw: RawTable
+    file_of: Callable[[int | None, int], Path]
+    missing: int
+    other: int
+
+
+@dataclass(frozen=True)
+class _Found:
+    """One column of a part: its numbers, and where it stands."""
+
+    values: np.ndarray
+    export: Export
+    column: int
+
+
+def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], column_map: ColumnMap) -> Mapped:
+    """The table of the experiment at ``path``.
+
+    Files with the same headers are put one below the other; else side by side, and a column that several of them hold
+    must be the same within rounding.
+
+    Raises
+    ------
+    InputError
+        If a column is not found, cells are no numbers, columns have different lengths, or no row is left.
+    """
+    first = exports[0]
+    alike = all((each.headers, each.width) == (first.headers, first.width) for each in exports)
+    parts = [_Part(document, path, [each]) for each in exports] if alike else [_Part(document, path, exports)]
+    place = (*path, "columns")
+    sources = {name: source for name, source in column_map.sources.items() if source.rate is None}
+    found = [
+        {name: part.find((*place, name, "from"), source.header) for name, source in sources.items()} for part in parts
+    ]
+    values = {
+        name: np.concatenate(
+            [_scaled(part, here, (*place, name), source) for part, here in zip(parts, found, strict=True)]
+        )
+        for name, source in sources.items()
+    }
+    where = {
+        key: np.concatenate([part.find((*path, "where", key), _where_header(part, key)).values for part in parts])
+        for key in column_map.where
+    }
+    lengths = [part.rows for part in parts]
+    for name, source in column_map.sources.items():
+        if source.rate is not None:
+            values[name] = np.arange(sum(lengths)) / source.rate
+    keep, missing, other = _kept(document, path, {name: values[name] for name in sources}, where, column_map.where)
+    names = tuple(column_map.sources)
+    table = np.column_stack([values[name] for name in names])[keep]
+    origin = [(part, int(row)) for part, length in enumerate(lengths) for row in range(length)]
+    origin = [origin[index] for index in np.flatnonzero(keep)]
+    lines = np.array([parts[part].exports[0].lines[row] for part, row in origin])
+
+    def cell(row: int | None, column: int) -> tuple[Export, int | None, int]:
+        part, index = (0, None) if row is None else origin[row]
+        here = found[part].get(names[column], next(iter(found[part].values())))
+        return here.export, index, here.column
+
+    def place_of(row: int | None, column: int) -> tuple[int, int]:
+        export, index, position = cell(row, column)
+        return export.place(index, position)
+
+    units = tuple(column_map.sources[name].unit for name in names)
+    rows = lines if len(parts) == 1 else np.arange(1, len(lines) + 1)
+    raw = RawTable(names, units, table, rows, place_of)
+    return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)
+
+
+class _Part:
+    """Files side by side: the columns of one are found in any of them."""
+
+    def __init__(self, document: TomlDocument, path: KeyPath, exports: Sequence[Export]) -> None:
+        self.document, self.path, self.exports = document, path, exports
+        self.rows = 0  # of the columns found, 0 before the first one
+
+    def find(self, place: KeyPath, header: Header) -> _Found:
+        """The column ``header``, stated at ``place`` of ``rig.toml``."""
+        found = [
+            _Found(export.values(column), export, column)
+            for export in self.exports
+            if (column := self._column(place, export, header)) is not None
+        ]
+        if not found:
+            known = [name for export in self.exports for row in export.headers for name in row if name]
+            close = closest(str(header), known)
+            remedy = f'write "{close}"' if close else "write the number of the column, counted from 1"
+            value = f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}"
+            raise self.document.error(place, f"{place[-1]} must be a header of the file", value, remedy)
+        first = found[0]
+        self.rows = self.rows or first.values.size
+        for each in found:
+            if each.values.size != self.rows:
+                rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {each.values.size}"
+                remedy = "export the columns with one sampling rate, or map columns of equal length"
+                raise self.document.error(place, rule, value, remedy)
+            scale = float(np.nanmax(np.abs(first.values), initial=0.0))
+            if not np.allclose(each.values, first.values, rtol=0.0, atol=ROUNDING * scale, equal_nan=True):
+                rule = f"{shown(header)} must be the same in {first.export.path.name} and {each.export.path.name}"
+                value = f"a difference of {np.nanmax(np.abs(each.values - first.values)):.3g}"
+                raise self.document.error(place, rule, value, "name files that were recorded together")
+        return first
+
+    def _column(self, place: KeyPath, export: Export, header: Header) -> int | None:
+        """Index of a column in one file; None if the file does not have the header."""
+        if isinstance(header, int):
+            if len(self.exports) > 1:
+                rule = "columns of files with different headers are named by their headers"
+                raise self.document.error(place, rule, str(header), f'write {place[-1]} = "<header>"')
+            if header > export.width:
+                rule = f"{place[-1]} must be one of the {export.width} columns of the file"
+                remedy = f"write a number from 1 to {export.width}"
+                raise self.document.error(place, rule, str(header), remedy)
+            return header - 1
+        for row in export.headers:
+            numbers = [index for index, name in enumerate(row) if name == header]
+            if len(numbers) > 1:
+                value = f"{shown(header)} in columns {' '.join(str(index + 1) for index in numbers)}"
+                where = place[-2] == "where"
+                remedy = (
+                    f"write its number, {f'{numbers[0] + 1} = ...' if where else f'{place[-1]} = {numbers[0] + 1}'}"
+                )
+                raise self.document.error(place, "a header must be unique", value, remedy, of_key=where)
+            if numbers:
+                return numbers[0]
+        return None
+
+
+def _where_header(part: _Part, key: str) -> Header:
+    """A key of ``where`` as a header, or as a number where no file has the header."""
+    stated = any(key in row for export in part.exports for row in export.headers)
+    return int(key) if key.isascii() and key.isdigit() and int(key) > 0 and not stated else " ".join(key.split())
+
+
+def _scaled(part: _Part, found: Mapping[str, _Found], place: KeyPath, source: Source) -> np.ndarray:
+    """The values of a column in its stated unit."""
+    values = found[str(place[-1])].values
+    if source.minus is not None:
+        values = values - part.find((*place, "minus"), source.minus).values
+    with np.errstate(over="ignore"):
+        return values * source.scale + source.offset
+
+
+def _kept(
+    document: TomlDocument,
+    path: KeyPath,
+    values: Mapping[str, np.ndarray],
+    where: Mapping[str, np.ndarray],
+    wanted: Mapping[str, float],
+) -> tuple[np.ndarray, int, int]:
+    """Which rows are used, and how many are dropped: for a missing cell, and outside ``where``."""
+    unknown = np.any([np.isnan(column) for column in where.values()], axis=0) if where else np.array(False)
+    inside = np.ones(next(iter(values.values())).size, bool)
+    for key, column in where.items():
+        same = np.isclose(column, wanted[key], rtol=ROUNDING, atol=0.0)
+        if not same.any():
+            seen = np.unique(column[np.isfinite(column)])
+            text = " ".join(f"{value:g}" for value in seen[:_MOST_VALUES]) + (" …" if seen.size > _MOST_VALUES else "")
+            rule = f"where must keep a row; column {shown(key)} holds {text or 'no number'}"
+            raise document.error(
+                (*path, "where", key), rule, f"{wanted[key]:g}", "write one of the values of the column"
+            )
+        inside &= same
+    empty = np.any([np.isnan(column) for column in values.values()], axis=0)
+    keep = inside & ~empty
+    if not keep.any():
+        remedy = "correct where, or map another column"
+        raise document.error((*path, "columns"), "a table must have rows", "none is left", remedy)
+    missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
+    return keep, missing, inside.size - int(np.sum(keep)) - missing
