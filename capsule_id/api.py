@@ -113,9 +113,9 @@ def fit(
     made_from = provenance(rig, seed, experiments, law.source)
     if progress:
         progress(0, 1, "point fit")
-    made, second = second_models(make_experiments(rig, experiments, kinds, friction))
+    readings = check_readings(rig, experiments, kinds)
+    made, second = second_models(make_experiments(rig, experiments, kinds, friction), readings)
     target = LogPosterior(rig, made)
-    before = (*check_readings(rig, experiments, kinds), *second)
     point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
-    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress), before)
+    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress), (*readings, *second))
     return make_result(checked, kinds, seeds.report, made_from, Fit)

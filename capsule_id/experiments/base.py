@@ -238,8 +238,14 @@ class Experiment(eqx.Module):
         return float(np.mean(stats.chi2.sf(squares, self.n)))
 
     @classmethod
-    def second_models(cls, records: "Sequence[Any]") -> "tuple[list[Any], list[Finding]]":
-        """Replace the models that ``records``, all of this class, contradict and that the settings leave open."""
+    def second_models(
+        cls, records: "Sequence[Any]", readings: "Sequence[Finding]" = ()
+    ) -> "tuple[list[Any], list[Finding]]":
+        """Replace the models that ``records``, all of this class, contradict and that the settings leave open.
+
+        ``readings`` are the findings on the readings.
+        """
+        del readings
         return list(records), []
 
     # -- optional methods of a kind ---------------------------------------------------------------------------------

@@ -5,7 +5,7 @@
     seeds = stage_seeds(0)
     before = check_readings(rig, "all", kinds)                   # Rig -> findings on the readings
     stated = make_experiments(rig, "all", kinds)                 # Rig -> experiments as stated
-    experiments, second = second_models(stated)                  # ... -> with the models that they demand
+    experiments, second = second_models(stated, before)          # ... -> with the models that they demand
     target = LogPosterior(rig, experiments)                      # experiments -> log-posterior
     point = fit_points(target, kinds, seeds.starts, True)        # log-posterior -> point fit
     sampled = sample_posterior(point, seeds.walkers)             # point fit -> posterior
@@ -73,12 +73,17 @@ def check_readings(rig: Rig, experiments: Choice, registry: Registry) -> tuple[F
     return lint(rig, registry, select_tables(rig, experiments))
 
 
-def second_models(stated: Sequence[Experiment]) -> tuple[tuple[Experiment, ...], tuple[Finding, ...]]:
-    """Replace models that the readings contradict and the settings leave open; findings name the new models."""
+def second_models(
+    stated: Sequence[Experiment], readings: Sequence[Finding] = ()
+) -> tuple[tuple[Experiment, ...], tuple[Finding, ...]]:
+    """Replace models that the readings contradict and the settings leave open; findings name the new models.
+
+    A kind may keep the model of a record for which ``readings``, the findings on the readings, hold a failure.
+    """
     chosen, findings = list(stated), list[Finding]()
     for kind in dict.fromkeys(type(e) for e in stated):
         own = [i for i, e in enumerate(stated) if type(e) is kind]
-        replaced, found = kind.second_models([stated[i] for i in own])
+        replaced, found = kind.second_models([stated[i] for i in own], readings)
         findings += found
         for i, experiment in zip(own, replaced, strict=True):
             chosen[i] = experiment

@@ -9,8 +9,9 @@ import pytest
 from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.declaration import MESSAGES
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.screening import demands_another, second_models
+from capsule_id.experiments.free_vibration.second_fit.screening import demands_another, second_models
 from capsule_id.experiments.free_vibration.settings import DecayModel
+from capsule_id.views import Finding
 from tests.experiments import bench
 
 TIME = np.arange(250) / 500.0
@@ -67,6 +68,16 @@ def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str
     (second,), (finding,) = second_models([record(disturbance, extra)])
     assert second.model == expected
     assert (finding.code, finding.level, finding.experiment) == ("decays.second_fit", "warn", "decay")
+
+
+def test_a_record_that_is_no_free_decay_keeps_its_model() -> None:
+    """A record with rest before its release gets no second fit; without that finding it does."""
+    own = record(0.0, DRY)
+    (same,), (finding,) = second_models([own], [Finding("decays.release", "fail", {}, "decay")])
+    assert same is own
+    assert (finding.code, finding.level) == ("decays.first_fit", "warn")
+    ((other,), _) = second_models([own], [Finding("decays.release", "fail", {}, "another record")])
+    assert other.model == DecayModel(("dry",))
 
 
 def test_coloured_noise_is_found() -> None:

@@ -15,7 +15,7 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.screening import second_models
+from capsule_id.experiments.free_vibration.second_fit.screening import second_models
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import pendulum

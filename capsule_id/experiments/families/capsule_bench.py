@@ -65,8 +65,8 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         self.about = DecayAbout(table, rig, tuple(rows))
 
     @classmethod
-    def second_models(cls, records: Sequence[Any]) -> tuple[list[Any], list[Finding]]:
-        return Experiment.second_models(records)
+    def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
+        return Experiment.second_models(records, readings)
 
     @property
     def model_name(self) -> str:

@@ -146,8 +146,6 @@ def half_cycles(theta: Mapping[str, Any], amplitude: Any, turning_time: Any, num
 def decay(time: Any, theta: Mapping[str, Any], amplitude: Any, turning_time: Any, number: int) -> Motion:
     """Decay from a turning point, at the sample times.
 
-    Between nodes x_rel is the polynomial of degree 5 with position, velocity and acceleration of both nodes.
-
     Parameters
     ----------
     time : (n,) s; samples before ``turning_time`` continue the first polynomial
@@ -155,7 +153,16 @@ def decay(time: Any, theta: Mapping[str, Any], amplitude: Any, turning_time: Any
     amplitude : x_rel at the turning point at ``turning_time``, m, positive
     number : bound on the half cycles covered by ``time``
     """
-    path = half_cycles(theta, amplitude, turning_time, number)
+    return interpolate(half_cycles(theta, amplitude, turning_time, number), time)
+
+
+def interpolate(path: HalfCycles, time: Any) -> Motion:
+    """Motion at the sample times (n,), s.
+
+    Between nodes x_rel is the polynomial of degree 5 with position, velocity and acceleration of both nodes. Samples
+    before the first turning point continue the first polynomial.
+    """
+    number = path.times.shape[0]
     node = jnp.clip(jnp.searchsorted(path.node_times[:, :-1].ravel(), time, side="right") - 1, 0, number * STEPS - 1)
     half, left = node // STEPS, node % STEPS
     t, t_next, x, x_next, y, y_next, a, a_next = (values[half, at] for values in path[3:] for at in (left, left + 1))

@@ -232,6 +232,13 @@ MESSAGES = {
             "noise."
         ),
     ),
+    "decays.first_fit": Message(
+        "second fit of free decays",
+        warn=(
+            "{record}: no second fit, because the record contains more than a free decay. Add the line that the finding on its "
+            "readings states."
+        ),
+    ),
     "decays.second_fit": Message(
         "second fit of free decays",
         warn=_second_fit,

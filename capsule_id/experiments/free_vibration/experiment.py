@@ -116,10 +116,12 @@ class FreeVibration(SurfaceExperiment):
         return FreeVibration(self.table, self.rig, self.friction, model, known)
 
     @classmethod
-    def second_models(cls, records: "Sequence[Any]") -> tuple[list[Any], list[Finding]]:
-        from capsule_id.experiments.free_vibration.screening import second_models
+    def second_models(
+        cls, records: "Sequence[Any]", readings: Sequence[Finding] = ()
+    ) -> tuple[list[Any], list[Finding]]:
+        from capsule_id.experiments.free_vibration.second_fit.screening import second_models
 
-        return second_models(records)
+        return second_models(records, readings)
 
     @property
     def closed(self) -> bool:

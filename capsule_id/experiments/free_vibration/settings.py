@@ -22,7 +22,7 @@ class DecaySettings(Settings):
     """Settings of a free vibration, SI.
 
     Absent words of the model stand for viscous damping, a linear spring, no drift and white noise. Where the record
-    contradicts that, a second fit may choose others (``capsule_id.experiments.free_vibration.screening``).
+    contradicts that, a second fit may choose others (``capsule_id.experiments.free_vibration.second_fit.screening``).
     """
 
     start: Annotated[float | None, QuantityRule("s", ANY)] = None

@@ -2,28 +2,23 @@
 
 A record demands another model where its residuals are not white, or where they correlate with the response to dry
 friction, quadratic damping, a cubic spring or a drift. Every sum of the terms that the settings leave open is then fitted
-to the record by maximum likelihood, with the noise level in closed form, and ranked by BIC.
+to the record by maximum likelihood and ranked by BIC.
 """
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
-from scipy.optimize import least_squares
 from scipy.signal import lsim
 
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
-from capsule_id.experiments.free_vibration.decay_models import decay, viscous_basis
-from capsule_id.experiments.free_vibration.noise import whiten_by_shape
+from capsule_id.experiments.free_vibration.decay_models import viscous_basis
+from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
 from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
-from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.records.noise import noise_level
 from capsule_id.views import Finding
 
@@ -34,151 +29,12 @@ if TYPE_CHECKING:
 SAMPLES_PER_PERIOD, RESPONSE_POINTS = 16, 60
 #: Fewest samples per period of a thinned record, and largest number of samples of a second fit.
 FEWEST_SAMPLES_PER_PERIOD, LONGEST = 8, 6000
+#: Findings on a record that contains more than a free decay.
+NO_DECAY = ("decays.release", "decays.second")
 #: Shorter records, in samples, keep their model.
 SHORTEST = 40
 #: Residuals with a larger p-value of the Ljung–Box test count as white here; the check after the fit is more lenient.
 WHITENESS = 0.01
-#: Largest number of evaluations in a fit, and relative step of its difference quotients.
-EVALUATIONS, STEP = 40, 1e-5
-#: White over correlated noise that stands for white noise.
-WHITE = 1e3
-#: Unknowns of a fit, and bounds of their scaled values. Masses, forces and times are logarithms, or fractions of the
-#: linear spring's force at the first turning point.
-BOUNDS: Mapping[str, tuple[float, float]] = {
-    "k1": (-0.3, 0.3),
-    "c": (-8.0, 3.0),
-    "F_dry": (0.0, 1.0),
-    "c_q": (0.0, 20.0),
-    "k_cubic": (-1.0, 3.0),
-    "amplitude": (-1.0, 1.0),
-    "turning_time": (-1.5, 1.5),
-    "noise_time": (-7.0, 7.0),
-    "white_ratio": (-5.0, 5.0),
-    "drift_ratio": (-5.0, 9.0),
-    "drift_time": (0.0, 5.0),
-}
-NAMES = tuple(BOUNDS)
-
-
-@dataclass(frozen=True)
-class Screened:
-    """A fit of one thinned record: its BIC, values by symbol, SI, and whitened residuals (n,)."""
-
-    bic: float
-    values: Mapping[str, float]
-    residuals: np.ndarray
-
-
-def free_symbols(model: DecayModel) -> list[str]:
-    """Unknowns of ``model`` among ``NAMES``."""
-    absent = {"F_dry", "c_q", "k_cubic"} - set(model.symbols)
-    absent |= {"white_ratio"} if model.noise != "arma" else set()
-    absent |= {"noise_time"} if model.noise == "white" else set()
-    absent |= {"drift_ratio", "drift_time"} if model.drift != "gp" else set()
-    return [name for name in NAMES if name not in absent]
-
-
-@partial(jax.jit, static_argnames="number")
-def _residuals(time: Any, values: Any, theta: Mapping[str, Any], sloped: Any, side: Any, number: int) -> Any:
-    """(n,) whitened residuals at the best offset and, where ``sloped`` is 1, the best slope."""
-    forces = {name: theta[name] for name in ("k1", "c", "m1", "F_dry", "c_q", "k_cubic")}
-    raw = values - side * decay(time, forces, theta["amplitude"], theta["turning_time"], number).x_rel
-    slope = sloped * (time - jnp.mean(time)) / (time[-1] - time[0])
-    shape = {name: theta[name] for name in ("noise_time", "white_ratio", "drift_ratio", "drift_time")}
-    white = whiten_by_shape(time, jnp.stack([raw, jnp.ones_like(raw), slope], axis=1), "arma", shape)
-    design = white[:, 1:]
-    normal = design.T @ design + 1e-9 * jnp.eye(2)
-    return white[:, 0] - design @ jnp.linalg.solve(normal, design.T @ white[:, 0])
-
-
-@partial(jax.jit, static_argnames="number")
-def _batch(time: Any, values: Any, thetas: Mapping[str, Any], sloped: Any, side: Any, number: int) -> Any:
-    return jax.vmap(lambda theta: _residuals(time, values, theta, sloped, side, number))(thetas)
-
-
-class Screening:
-    """Maximum-likelihood fits of one record, of which every n-th sample is used."""
-
-    def __init__(self, record: "FreeVibration", every: int = 1) -> None:
-        rough = record.rough_decrement()
-        self.turning_time, peak = record.first_turning_point()
-        self.side, self.size = float(np.sign(peak)), abs(peak)
-        self.m1, self.k1, self.c, self.omega = record.mass, rough.k1, rough.c, rough.Omega_o
-        period, length = 2.0 * np.pi / self.omega, float(record.time[-1])
-        self.time, self.values = record.time[::every], record.values[::every]
-        self.number = int(3.0 * length / period) + 5
-        self.noise_time, self.drift_time = 0.1 * period, period
-
-    def theta(self, z: np.ndarray) -> dict[str, Any]:
-        """Values by symbol, SI, of scaled unknowns (..., names)."""
-        own = dict(zip(NAMES, np.moveaxis(z, -1, 0), strict=True))
-        k1 = self.k1 * np.exp(own["k1"])
-        return {
-            "m1": np.broadcast_to(self.m1, k1.shape),
-            "k1": k1,
-            "c": self.c * np.exp(own["c"]),
-            "F_dry": self.k1 * self.size * own["F_dry"],
-            "c_q": self.m1 / self.size * own["c_q"],
-            "k_cubic": self.k1 / self.size**2 * own["k_cubic"],
-            "amplitude": self.size * np.exp(own["amplitude"]),
-            "turning_time": self.turning_time + own["turning_time"] / self.omega,
-            "noise_time": self.noise_time * np.exp(own["noise_time"]),
-            "white_ratio": np.where(own["white_ratio"] < BOUNDS["white_ratio"][0], 0.0, np.exp(own["white_ratio"])),
-            "drift_ratio": np.where(own["drift_ratio"] < BOUNDS["drift_ratio"][0], 0.0, np.exp(own["drift_ratio"])),
-            "drift_time": self.drift_time * np.exp(own["drift_time"]),
-        }
-
-    def start(self, model: DecayModel, near: np.ndarray | None) -> np.ndarray:
-        """(names,) scaled starting values; absent terms are switched off."""
-        z = np.zeros(len(NAMES)) if near is None else near.copy()
-        free = free_symbols(model)
-        for name, value in (("F_dry", 0.02), ("c_q", 0.05), ("k_cubic", 0.0), ("drift_time", 1.0)):
-            i = NAMES.index(name)
-            z[i] = (z[i] or value) if name in free else 0.0
-        off = -1e3
-        for name, value, absent in (
-            ("white_ratio", 0.0, off if model.noise == "ar1" else np.log(WHITE)),
-            ("drift_ratio", np.log(3.0), off),
-        ):
-            i = NAMES.index(name)
-            inside = BOUNDS[name][0] < z[i] < BOUNDS[name][1]
-            z[i] = (z[i] if inside and near is not None else value) if name in free else absent
-        return z
-
-    def fit(self, model: DecayModel, near: np.ndarray | None = None) -> tuple[Screened, np.ndarray]:
-        """Fit ``model`` from the scaled values ``near``; return also the scaled values found."""
-        start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
-        sloped = float(model.drift == "linear")
-
-        def rows(z: np.ndarray) -> np.ndarray:
-            """(m, n) residuals at (m, free), always evaluated in one batch of fixed size."""
-            whole = np.tile(start, (len(NAMES) + 1, 1))
-            whole[: len(z), free] = z
-            thetas = {name: jnp.asarray(value) for name, value in self.theta(whole).items()}
-            return np.asarray(_batch(self.time, self.values, thetas, sloped, self.side, self.number))[: len(z)]
-
-        def jacobian(z: np.ndarray) -> np.ndarray:
-            sign = np.where(z > high - 2.0 * STEP, -1.0, 1.0)
-            points = rows(np.concatenate([z[None], z + STEP * np.diag(sign)]))
-            return (points[1:] - points[:1]).T / (STEP * sign)
-
-        low, high = np.array([BOUNDS[NAMES[i]] for i in free]).T
-        first = np.clip(start[free], low + 1e-3, high - 1e-3)
-        unit = float(np.std(self.values))
-        found = least_squares(
-            lambda z: rows(z[None])[0] / unit,
-            first,
-            jac=lambda z: jacobian(z) / unit,  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
-            bounds=(low, high),
-            x_scale="jac",
-            max_nfev=EVALUATIONS,
-        )
-        z = start.copy()
-        z[free] = found.x
-        n, unknowns = len(self.time), len(free) + 2 + int(sloped)
-        deviance = n * (np.log(2.0 * found.cost * unit**2 / n) + 1.0 + LOG_2PI)
-        values = {name: float(value) for name, value in self.theta(z).items()}
-        return Screened(float(deviance + unknowns * np.log(n)), values, found.fun), z
 
 
 def open_models(record: "FreeVibration") -> tuple[list[DecayModel], list[DecayModel]]:
@@ -285,11 +141,14 @@ def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
     thinned = [Screening(record, coarse) for record in records]
     best = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])[0]
     others = [replace(model, damping=best.model.damping, cubic=best.model.cubic) for model in others]
-    best = rank(thinned, others, best)[0]
+    ranked = rank(thinned, others, best)
+    best = ranked[0]
     if records[0].table.settings.every is not None:
         return best
-    every = max(1, max(record.n for record in records) // LONGEST)
     fewest = max(coarse, thinning(records[0], FEWEST_SAMPLES_PER_PERIOD))
+    # More samples of the same record show the same misfit with more certainty.
+    offered = any(one.white for one in ranked)
+    every = max(1, max(record.n for record in records) // LONGEST) if offered else fewest
     while every <= fewest:
         screenings = [Screening(record, every) for record in records]
         rich = rank(screenings, [replace(best.model, noise=others[-1].noise)], best)[0]
@@ -301,16 +160,23 @@ def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
 
 
 def second_models(
-    records: Sequence["FreeVibration"],
+    records: Sequence["FreeVibration"], readings: Sequence[Finding] = ()
 ) -> tuple[list["FreeVibration"], list[Finding]]:
-    """Return ``records`` under the model that they demand, and findings that name it."""
+    """Return ``records`` under the model that they demand, and findings that name it.
+
+    Records with more than a free decay according to ``readings``, the findings on the readings, keep their model.
+    """
     level = LEVEL / len(records)
-    chosen, findings = list(records), []
+    chosen, findings = list(records), list[Finding]()
     groups: dict[Any, list[int]] = {}
+    no_decay = {finding.experiment for finding in readings if finding.code in NO_DECAY}
     for i, record in enumerate(records):
         settings = record.table.settings
         stated = settings.damping, settings.stiffness, settings.drift, settings.noise
-        groups.setdefault(stated, []).append(i)
+        if record.label not in no_decay:
+            groups.setdefault(stated, []).append(i)
+        elif None in stated:
+            findings.append(Finding("decays.first_fit", "warn", {"record": record.label}, record.label))
     for stated, members in groups.items():
         own = [records[i] for i in members]
         if None not in stated:

@@ -1,0 +1,1 @@
+"""Second fit of free decays whose record contradicts the stated model."""
