@@ -9,9 +9,9 @@ import pytest
 from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.declaration import MESSAGES
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.second_fit.screening import demands_another, second_models
 from capsule_id.experiments.free_vibration.settings import DecayModel
-from capsule_id.views import Finding
 from tests.experiments import bench
 
 TIME = np.arange(250) / 500.0
@@ -70,13 +70,25 @@ def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str
     assert (finding.code, finding.level, finding.experiment) == ("decays.second_fit", "warn", "decay")
 
 
-def test_a_record_that_is_no_free_decay_keeps_its_model() -> None:
-    """A record with rest before its release gets no second fit; without that finding it does."""
-    own = record(0.0, DRY)
-    (same,), (finding,) = second_models([own], [Finding("decays.release", "fail", {}, "decay")])
-    assert same is own
+def test_a_record_with_rest_before_its_release_keeps_its_model() -> None:
+    """The finding on its readings stops the second fit; the line that the finding states brings it back."""
+    whole = record(0.0, DRY)
+    rest = 100 / 500.0
+    noise = NOISE * np.random.default_rng(5).standard_normal(100)
+    columns = [
+        bench.column("time", np.concatenate([TIME[:100], TIME + rest])),
+        bench.column("x_rel", np.concatenate([noise, whole.values])),
+    ]
+    table = bench.table("free_vibration", columns, "decay")
+    uncut = FreeVibration(table, bench.rig(table))
+    readings = list(lint_decay(table, uncut.rig))
+    (same,), (finding,) = second_models([uncut], readings)
+    assert same is uncut
     assert (finding.code, finding.level) == ("decays.first_fit", "warn")
-    ((other,), _) = second_models([own], [Finding("decays.release", "fail", {}, "another record")])
+    (release,) = [found for found in readings if found.code == "decays.release"]
+    cut = bench.table("free_vibration", columns, "decay", start=release.facts["start"])
+    record_cut = FreeVibration(cut, bench.rig(cut))
+    ((other,), _) = second_models([record_cut], list(lint_decay(cut, record_cut.rig)))
     assert other.model == DecayModel(("dry",))
 
 
