@@ -87,11 +87,10 @@ def test_a_record_of_ones_own_gives_k1(tmp_path: Path) -> None:
     """The steps of README, from a file with headers of a laboratory program to k1."""
     rig, m1, k1, c = tmp_path / "my-rig", 0.11, 1420.0, 1.9
     rig.mkdir()
-    (description,) = blocks("toml")
+    description, columns = blocks("toml")
     (rig / "rig.toml").write_text(description, encoding="utf-8")
     header, *readings = blocks("csv")[0].splitlines()
-    (wrong,) = re.findall(r"begins with `(.*?)`", README)
-    assert re.findall(r"replace that line by `(.*?)`", README) == [header]
+    (own,) = re.findall(r"its own headers, such as `(.*?)`", README)
 
     begin, second = (float(line.split(",")[0]) for line in readings)
     time = begin + (second - begin) * np.arange(1000)
@@ -105,12 +104,15 @@ def test_a_record_of_ones_own_gives_k1(tmp_path: Path) -> None:
 
     check, fit = (line.removeprefix(".venv/bin/").split() for line in blocks("sh")[2].splitlines())
     names = {"capsule-id": "capsule_id", "fit-params": "fit_params"}
-    table.write_text(f"{wrong}\n{body}", encoding="utf-8")
+    table.write_text(f"{header}\n{body}", encoding="utf-8")
+    checked = run(*check[1:], cwd=tmp_path, name=names[check[0]])
+    assert (checked.returncode, checked.stdout.splitlines()[-1]) == (0, "no findings")
+
+    table.write_text(f"{own}\n{body}", encoding="utf-8")
     refused = run(*check[1:], cwd=tmp_path, name=names[check[0]])
     assert refused.returncode == cli.BAD_INPUT
-    assert header.split(",")[0] in refused.stderr
-
-    table.write_text(f"{header}\n{body}", encoding="utf-8")
+    assert columns.strip() in refused.stderr
+    (rig / "rig.toml").write_text(description + columns, encoding="utf-8")
     checked = run(*check[1:], cwd=tmp_path, name=names[check[0]])
     assert (checked.returncode, checked.stdout.splitlines()[-1]) == (0, "no findings")
     done = run(*fit[1:], "--no-sample", "--quiet", cwd=tmp_path, name=names[fit[0]])
