@@ -7,6 +7,7 @@ comments; above the numbers they may hold the headers.
 import json
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from capsule_id.rig.formats.cells import BLANKS, cells_of, number_in, read_numbe
 from capsule_id.rig.formats.export import Export, Layout
 
 _COMMENTS = ("#", "%")
+_NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
 
 
 def read_text(content: bytes, path: Path, layout: Layout) -> Export:
@@ -39,8 +41,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     if not numbers:
         raise InputError("a table must have rows of numbers", "none", "export the readings", path, len(lines), 1)
     delimiter = _delimiter(lines[numbers[0]], layout)
-    rows = [_split(lines[i], delimiter) for i in numbers]
-    if len(rows[0]) > 1 and not any(row[-1] for row in rows):  # a separator at the end of every line
+    rows = [lines[i].split(delimiter) for i in numbers]
+    if len(rows[0]) > 1 and not any(row[-1].strip(BLANKS) for row in rows):  # a separator at the end of every line
         rows = [row[:-1] for row in rows]
     width = len(rows[0])
     for i, row in zip(numbers, rows, strict=True):
@@ -51,7 +53,7 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     found = [(i, names) for i in range(first - 1, -1, -1) if (names := _headers(lines[i], delimiter, width, layout))]
 
     def values(column: int) -> np.ndarray:
-        return _column([row[column] for row in rows], delimiter, layout, lambda k: (path, *place(k, column)))
+        return _column([_bare(row[column]) for row in rows], delimiter, layout, lambda k: (path, *place(k, column)))
 
     def place(row: int | None, column: int) -> tuple[int, int]:
         line = numbers[row] if row is not None else found[0][0] if found else numbers[0]
@@ -97,6 +99,13 @@ def _column(
     present = [text for text in texts if text not in layout.missing]
     marks = re.search("[.,]", "\n".join(present)) if delimiter != "," else None
     decimal = marks[0] if marks else "."
+    if len(present) == len(texts) and (_NUMBER_CHARACTERS | {decimal}).issuperset(
+        "".join(texts)
+    ):  # quickly, where all are numbers
+        with suppress(ValueError):
+            values = np.array([float(text.replace(decimal, ".")) for text in texts])
+            if np.isfinite(values).all():
+                return values
     values = np.full(len(texts), np.nan)
     for k, text in enumerate(texts):
         if text in layout.missing:
@@ -123,8 +132,12 @@ def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tu
 
 def _split(line: str, delimiter: str | None) -> list[str]:
     """The cells of a line without blanks and quotation marks around them."""
-    cells = line.split() if delimiter is None else line.split(delimiter)
-    return [cell.strip(BLANKS).strip('"') for cell in cells]
+    return [_bare(cell) for cell in line.split(delimiter)]
+
+
+def _bare(cell: str) -> str:
+    """A cell without blanks and quotation marks around it."""
+    return cell.strip(BLANKS).strip('"')
 
 
 def _delimiter(line: str, layout: Layout) -> str | None:

@@ -1,0 +1,74 @@
+"""MATLAB files: read as SciPy reads them, and damaged ones end in a clean error."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+
+from capsule_id.errors import InputError, collecting
+from capsule_id.rig.formats.export import Layout
+from capsule_id.rig.formats.mat import read_mat
+
+PATH = Path("m.mat")
+
+
+def mat_file(compressed: bool) -> bytes:
+    """Variables of every type that is a column, and of types that are none."""
+    t = np.arange(7)
+    content = io.BytesIO()
+    variables = {
+        "double": t / 3.0,
+        "single": (t / 3.0).astype(np.float32)[:, None],
+        "one": 4.5,
+        "small": np.array([[1, -2, 3]], np.int8),
+        "large": t.astype(np.uint64) << 40,
+        "logical": t > 3,
+        "matrix": np.arange(6.0).reshape(2, 3),
+        "text": "text",
+        "complex": 1j * t,
+        "record": {"a": t},
+        "cell": np.array([t, "a"], object),
+        "empty": np.zeros((0, 1)),
+        "cube": np.zeros((2, 2, 2)),
+    }
+    savemat(content, variables, do_compression=compressed)
+    return content.getvalue()
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_numbers_are_those_that_scipy_reads(compressed: bool) -> None:
+    content = mat_file(compressed)
+    export, expected = read_mat(content, PATH, Layout()), loadmat(io.BytesIO(content))
+    (names,) = export.headers
+    vectors = ["double", "single", "one", "small", "large", "logical"]
+    assert names == (*vectors, "matrix(:,1)", "matrix(:,2)", "matrix(:,3)")
+    for index, name in enumerate(vectors):
+        np.testing.assert_array_equal(export.values(index), expected[name].ravel().astype(float))
+    for column in range(3):
+        np.testing.assert_array_equal(export.values(6 + column), expected["matrix"][:, column])
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_every_changed_or_missing_byte_reads_or_is_refused(compressed: bool) -> None:
+    content = mat_file(compressed)
+    refused = 0
+    for position in range(len(content)):
+        changed = bytearray(content)
+        changed[position] ^= 0x5B
+        for damaged in (bytes(changed), content[:position]):
+            faults: list[InputError] = []
+            with collecting(faults):
+                export = read_mat(damaged, PATH, Layout(missing=("NaN",)))
+                for column in range(export.width):
+                    export.values(column)
+            assert all(str(fault).isprintable() for fault in faults)
+            refused += len(faults)
+    assert refused > len(content) // 2
+
+
+def test_version_7_3_names_the_command_that_saves_version_7() -> None:
+    with pytest.raises(InputError, match=r"7\.3") as caught:
+        read_mat(b"MATLAB 7.3 MAT-file".ljust(520) + b"\x89HDF", PATH, Layout())
+    assert "'-v7'" in caught.value.remedy
