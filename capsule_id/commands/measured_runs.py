@@ -69,6 +69,9 @@ def overlay(
     motions, left_out = [], []
     for table in rig.tables:
         if isinstance(table.settings, RunSettings):
+            if table.settings.drive == "base" or table.settings.spring is None:
+                left_out.append(f"{table.label} (no harmonic force, or no support spring)")
+                continue
             found = _point_or_reason(table, _settings(table, known), span, values, spring)
             if isinstance(found, MeasuredPoint):
                 motions.append(found)

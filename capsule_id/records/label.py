@@ -13,7 +13,7 @@ from capsule_id.errors import InputError
 from capsule_id.records.contacts import Contacts, Cycle, find_contacts
 from capsule_id.records.mean_velocity import MeanVelocity, fit_mean_velocity
 from capsule_id.records.repeat import DECIDED, Repeat, find_period, period_word
-from capsule_id.records.stated_settings import stated_gap, stated_Omega
+from capsule_id.records.stated_settings import relative_position, stated_gap, stated_Omega
 from capsule_id.records.tone import Harmonic, fit_harmonic, recorded_drive
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Table
@@ -58,7 +58,7 @@ def measured_motion(table: Table) -> MeasuredMotion:
 
     Parameters
     ----------
-    table : a ``forced_run`` of a rig; period and contacts need x_rel, direction needs x_capsule
+    table : a ``forced_run`` of a rig; period and contacts need x_rel (or x_base and x_capsule), direction needs x_capsule
 
     The label describes the record, not a settled motion of the model: "P-1" means that it repeats within the scatter
     from cycle to cycle. The probability of a whole label is the product of those of period, direction and contacts.
@@ -73,24 +73,27 @@ def measured_motion(table: Table) -> MeasuredMotion:
         return MeasuredMotion(
             UNDECIDED, float("nan"), Evidence(drive, Omega, None, None, None, (reason,)), float("nan")
         )
-    if drive is None and "x_rel" in columns:
-        Omega = fit_harmonic(time, table["x_rel"], Omega).Omega
+    relative = relative_position(table)
+    if drive is None and relative:
+        Omega = fit_harmonic(time, relative[0], Omega).Omega
     T = 2.0 * np.pi / Omega
-    repeat = find_period(time, table["x_rel"], T, columns["x_rel"].reading_sd) if "x_rel" in columns else None
+    repeat = find_period(time, relative[0], T, relative[1]) if relative else None
     period = repeat.period if repeat else None
     velocity = fit_mean_velocity(time, table["x_capsule"], T, period) if "x_capsule" in columns else None
     scatter = float(np.hypot(repeat.noise_sd, repeat.scatter)) if repeat else 0.0
-    contacts = find_contacts(_cycle(table, Omega, period * T, scatter)) if period else None
+    contacts = None
+    if period and relative and table.settings.spring is not None:
+        contacts = find_contacts(_cycle(table, relative[0], Omega, period * T, scatter))
     mean_velocity = velocity.velocity if velocity else float("nan")
     label, probability, reasons = _label(repeat, velocity, contacts)
     evidence = Evidence(drive, Omega, repeat, velocity, contacts, reasons)
     return MeasuredMotion(label, mean_velocity, evidence, probability)
 
 
-def _cycle(table: Table, Omega: float, period: float, noise_sd: float) -> Cycle:
+def _cycle(table: Table, x_rel: np.ndarray, Omega: float, period: float, noise_sd: float) -> Cycle:
     gap = stated_gap(table)
     acceleration = table["acceleration_rod"] if "acceleration_rod" in table.columns else None
-    return Cycle(table["time"], table["x_rel"], acceleration, Omega, period, gap.value, gap.sd, noise_sd)
+    return Cycle(table["time"], x_rel, acceleration, Omega, period, gap.value, gap.sd, noise_sd)
 
 
 def _label(
@@ -107,6 +110,8 @@ def _label(
     reasons = [part.reason for part in (velocity, contacts) if part is not None and part.reason]
     if velocity is None:
         reasons.append("x_capsule was not recorded")
+    if contacts is None:
+        reasons.append("spring and gap are not stated")
     if reasons or velocity is None or contacts is None or contacts.count is None:
         return period, repeat.probability, tuple(reasons)
     whole = f"{period}-{velocity.direction}-{Fraction(contacts.count, repeat.period)}"

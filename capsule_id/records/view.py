@@ -41,7 +41,7 @@ class RecordView:
     channels : raw, (n,) by column name
     x_rel, rate : (n,) filtered, and its derivative
     section_x_rel, section_rate : (m,) where the drive's phase is a multiple of 2 pi, without half windows at the ends
-    gap : as stated
+    gap : as stated; infinite without a support spring
     gap_seen : x_rel where contacts begin, None if the record does not determine it
     force : (n,) K times the current without its offset, N, None without current or K
     samples : window of the filter

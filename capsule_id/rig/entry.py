@@ -1,7 +1,7 @@
 """One ``[[experiment]]`` during its check: its table, and the places for error lines."""
 
 from dataclasses import dataclass
-from typing import Generic
+from typing import Any, Generic
 
 from capsule_id.errors import InputError
 from capsule_id.rig.model import S, Table
@@ -30,6 +30,20 @@ class Entry(Generic[S]):
         """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
         path = (*self.path, key) if key else self.path
         return self.document.error(path, rule, value, remedy, of_key)
+
+    def check_spring_with_gap(self) -> None:
+        """Require a gap where a spring is within reach.
+
+        Raises
+        ------
+        InputError
+            At the one of spring and gap that stands alone.
+        """
+        settings: Any = self.table.settings
+        if (settings.spring is None) != (settings.gap is None):
+            one, other = ("spring", "gap") if settings.gap is None else ("gap", "spring")
+            remedy = f"add {other}, or remove {one} where the support spring is out of reach"
+            raise self.error(one, "spring and gap must stand together", f"{one} alone", remedy, of_key=True)
 
     def check_length(self) -> None:
         """Refuse a record that is too short to fit.

@@ -67,6 +67,7 @@ def test_everything_is_si(tmp_path: Path) -> None:
     assert motor.settings.sd_ratio == 3.0
     assert stated(spring) == {"spring": "L60", "length": Quantity(0.06, 0.0005)}
     assert stated(run) == {
+        "drive": "harmonic",
         "spring": "L60",
         "gap": Quantity(0.001, 0.02 / 1000),
         "Omega": 34.56,

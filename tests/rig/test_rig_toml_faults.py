@@ -115,8 +115,8 @@ TOML_FAULTS = [
     ),
     (
         '[[experiment]]\nkind = "forced_run"\nspring = "L60"\n',
-        '‸[[experiment]]\nkind = "forced_run"\n',
-        "forced_run must have a spring",
+        '[[experiment]]\nkind = "forced_run"\n‸',
+        "spring and gap must stand together, gap alone",
     ),
     (f"[[experiment]]\n{RUN}Omega", f"‸[[experiment]]\n{RUN}#", "forced_run must have Omega (rad/s) or f (Hz)"),
     ('damping = "dry"', 'damping = "dry"\ndamping = "dry"‸', "the file must be valid TOML"),

@@ -7,7 +7,9 @@ from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.families.friction_model import SurfaceExperiment
-from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory, simulate
+from capsule_id.physics.drive import Drive
+from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.views import Facts
 
@@ -47,11 +49,15 @@ class CapsuleForward(SurfaceExperiment):
         )
 
     def simulated(
-        self, theta: ValuesBySymbol, p: CapsuleParameters, e: Excitation, times: ArrayLike, initial: Any = None
+        self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
     ) -> Trajectory:
         """Call ``simulate`` with this experiment's model and the friction law at ``theta``."""
-        model, law = "exact" if self.smoothing is None else "smooth", self.friction.force(theta)
-        return simulate(p, e, times, initial, model=model, smoothing=self.smoothing, friction=law)
+        model = "exact" if self.smoothing is None else "smooth"
+        return simulate(p, e, times, initial, model=model, smoothing=self.smoothing, friction=self.law(theta))
+
+    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
+        """The friction law at ``theta``, N."""
+        return self.friction.force(theta)
 
     def noise_facts(self) -> Facts:
         return {"model": "capsule"}

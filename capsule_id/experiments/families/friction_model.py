@@ -176,7 +176,7 @@ class FrictionModel:
                 raise InputError(rule, f"{row.symbol}: {known[row.symbol].meaning}", "rename it")
 
     def force(self, theta: ValuesBySymbol) -> FrictionLaw:
-        """The law at ``theta``, N; theta has m1, m2 and g."""
+        """The law at ``theta``, N; theta has m1, m2 and g, or N."""
         return self._at(theta, _weight(theta))
 
     def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
@@ -203,6 +203,9 @@ def _prior_of(row: Parameter) -> Prior:
 
 
 def _weight(theta: ValuesBySymbol) -> Any:
+    """Normal force, N: as stated, else the weight."""
+    if NORMAL_FORCE in theta:
+        return theta[NORMAL_FORCE]
     return normal_force(theta["m1"], theta["m2"], theta["g"])
 
 

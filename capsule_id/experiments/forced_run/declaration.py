@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.lint import MESSAGES as LINT_MESSAGES
 from capsule_id.experiments.forced_run.lint import lint_run
 from capsule_id.experiments.kind import Estimate, Kind, Twin, Values, made_by
@@ -13,9 +14,14 @@ from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.run_description import describe_run
 from capsule_id.rig.domains import NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
+from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.base import Experiment
+    from capsule_id.experiments.families.friction_model import FrictionModel
 
 #: Recorded channels: name, unit, LaTeX subscript.
 _CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
@@ -45,11 +51,13 @@ RUN_SPRINGS = {"hard": 59410.0}
 class RunSettings(Settings):
     """Settings of a forced run, SI; ``<channel>_gain_sd`` and ``<channel>_delay_sd`` are sds of gain and delay."""
 
-    spring: Annotated[str, NameRule()]
-    gap: Annotated[Quantity, QuantityRule("m", NOT_NEGATIVE, has_sd=True)]
+    drive: Literal["harmonic", "base"] = "harmonic"
+    spring: Annotated[str | None, NameRule()] = None
+    gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
     Omega: Annotated[float | None, QuantityRule("rad/s")] = None
     f: Annotated[float | None, QuantityRule("Hz")] = None
     P_d: Annotated[Quantity | None, QuantityRule("N", has_sd=True)] = None
+    normal_force: Annotated[float | None, QuantityRule("N")] = None
     start: Literal["auto", "stuck", "moving", "settled"] = "auto"
     noise: Literal["white", "ar1"] = "white"
     segment: Annotated[float | None, QuantityRule("s")] = None
@@ -71,13 +79,44 @@ class RunSettings(Settings):
         return 2.0 * np.pi * self.f
 
 
+def _check_base(entry: Entry[RunSettings]) -> None:
+    """Require x_base with drive = "base" and only there, and nothing that belongs to a force on the rod."""
+    settings, columns = entry.table.settings, entry.table.columns
+    if settings.drive == "harmonic":
+        if "x_base" in columns:
+            rule, remedy = "x_base prescribes the motion of the rod", 'add drive = "base", or remove the column'
+            raise entry.error("", rule, "a harmonic force", remedy)
+        return
+    if "x_base" not in columns:
+        raise entry.error("drive", 'drive = "base" needs a column x_base', f"columns {' '.join(columns)}", "add it")
+    present = [name for name in ("acceleration_rod", "current") if name in columns]
+    if present:
+        rule = "a run with a prescribed rod has x_capsule, x_rel or both, and no other channel"
+        raise entry.error("drive", rule, f"columns {' '.join(columns)}", f"remove {' and '.join(present)}")
+    if settings.P_d is not None:
+        raise entry.error("P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True)
+    if settings.start == "settled":
+        rule, remedy = 'start = "settled" needs a harmonic force', 'write start = "auto"'
+        raise entry.error("start", rule, 'drive = "base"', remedy)
+    if settings.Omega is None and settings.f is None:
+        try:
+            sampling_step(entry.table["time"])
+        except InputError as error:
+            rule = "the frequency of a base sampled unevenly must be stated"
+            raise entry.error("", rule, error.value, 'add f = { value = ..., unit = "Hz" }') from None
+
+
 def _check_drive(entry: Entry[RunSettings]) -> None:
     """Require one frequency, and an amplitude from P_d or from the recorded current."""
     settings, columns = entry.table.settings, entry.table.columns
     stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
+    if settings.drive == "base" and not stated:
+        return
     if len(stated) != 1:
         rule = "forced_run must have Omega (rad/s) or f (Hz), not both"
         raise entry.error("f" if stated else "", rule, " and ".join(stated) or "none", "state one of them")
+    if settings.drive == "base":
+        return
     if settings.P_d is None and "current" not in columns:
         rule = "forced_run must have P_d where current is not recorded"
         remedy = 'add P_d = { value = ..., sd = ..., unit = "N" }'
@@ -89,20 +128,25 @@ def _check_drive(entry: Entry[RunSettings]) -> None:
 
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
-    from capsule_id.experiments.families.friction_model import EQUATION_1
+    from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE
     from capsule_id.experiments.forced_run.feasibility import feasibility
 
+    settings = table.settings
+    if settings.drive == "base":
+        return []
     assert rig.m1 is not None, "the reader requires both masses for a forced run"
     assert rig.m2 is not None, "the reader requires both masses for a forced run"
-    settings = table.settings
-    names = {symbol: symbol for symbol in ("k1", "c", "mu", "K")} | {"k2": f"k2[{settings.spring}]"}
+    names = {symbol: symbol for symbol in ("k1", "c", "mu", "K")}
+    if settings.spring is not None:
+        names["k2"] = f"k2[{settings.spring}]"
     if settings.P_d is not None:
         del names["K"]
     values = {symbol: estimate(name) for symbol, name in names.items()}
     guessed = [names[symbol] for symbol, (_, measured) in values.items() if not measured]
     theta = {"m1": rig.m1.value, "m2": rig.m2.value, "g": rig.g.value}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
-    F_b = float(EQUATION_1.force(theta).forward(0.0))
+    stated = {} if settings.normal_force is None else {NORMAL_FORCE: settings.normal_force}
+    F_b = float(EQUATION_1.force({**theta, **stated}).forward(0.0))
     findings = feasibility(table, theta, F_b)
     if findings and guessed:
         findings.append(Finding("runs.rough", "warn", {"names": ", ".join(guessed)}, table.label))
@@ -116,6 +160,16 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     return measure(values, seed)
 
 
+def _make(table: Table[RunSettings], rig: Rig, friction: "FrictionModel") -> tuple["Experiment", ...]:
+    reference = "base_run:BaseRun" if table.settings.drive == "base" else "experiment:ForcedRun"
+    return made_by(f"capsule_id.experiments.forced_run.{reference}")(table, rig, friction)
+
+
+def _masses(table: Table[RunSettings]) -> tuple[str, ...]:
+    # A prescribed rod needs no mass.
+    return ("m2",) if table.settings.drive == "base" else ("m1", "m2")
+
+
 TEMPLATE = """\
 #: Forced run. Columns: time [s], and any of x_rel [mm], x_capsule [mm], acceleration_rod [m/s^2], current [A].
 #: State Omega in rad/s or f in Hz. P_d is needed where current is not recorded.
@@ -126,6 +180,11 @@ TEMPLATE = """\
 # gap = { value = 1.0, sd = 0.02, unit = "mm" }
 # Omega = { value = 34.56, unit = "rad/s" }
 # P_d = { value = 4.0, sd = 0.1, unit = "N" }
+#: "harmonic" (default): P_d cos(Omega t + phase); "base": a column x_base [mm] prescribes the motion of the rod. Then
+#: x_capsule or x_rel is needed, P_d and m1 are not, and the frequency is that of x_base. spring and gap: optional
+# drive = "harmonic"
+#: normal force on the ground where it is not (m1 + m2) g
+# normal_force = { value = 6.28, unit = "N" }
 #: state of the capsule at the first sample: "auto" (default, from the record), "stuck", "moving" or "settled"
 # start = "auto"
 #: "white" (default) or "ar1": coloured noise, its correlation is estimated
@@ -226,14 +285,16 @@ KIND = Kind(
         "x_capsule": ColumnRule("m"),  # may be constant: a capsule that never moves is a valid result
         "acceleration_rod": ColumnRule("m/s^2", varies=True),
         "current": ColumnRule("A", varies=True),
+        "x_base": ColumnRule("m", varies=True),
     },
     sets=(("time",),),
+    optional=("x_base",),
     channels=tuple(NOISE),
     settings=RunSettings,
-    rules=(_check_drive, Entry.check_length),
-    masses=lambda table: ("m1", "m2"),
+    rules=(Entry.check_spring_with_gap, Entry.check_length, _check_base, _check_drive),
+    masses=_masses,
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
-    make=made_by("capsule_id.experiments.forced_run.experiment:ForcedRun"),
+    make=_make,
     template=TEMPLATE,
     informs="all of them together, and the gap",
     captions={

@@ -9,7 +9,7 @@ out too where their sd is stated. X2 = 0 at the first sample, because the offset
 
 from dataclasses import replace
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
-from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
 from capsule_id.experiments.forced_run.declaration import NOISE
 from capsule_id.experiments.forced_run.feasibility import check_feasible
 from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts
@@ -32,8 +32,11 @@ from capsule_id.experiments.forced_run.start import AboutRun, RunStart, rough_st
 from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, innovations
+from capsule_id.physics.drive import Drive
 from capsule_id.physics.forces import rod_acceleration
+from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
+from capsule_id.records.stated_settings import stated_gap, stated_Omega
 from capsule_id.records.view import view_record
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Comparison, Finding
@@ -62,6 +65,7 @@ class ForcedRun(CapsuleForward):
     gain_sd, delay_sd : (channels,) stated, 1 and s
     reading_variance : (channels,) stated, SI
     moves : factor of ``capsule_start``, 0 or 1, so that one program computes runs of both kinds
+    normal_force : stated, N; 0 where it is the weight
     """
 
     about: AboutRun = eqx.field(static=True)
@@ -76,15 +80,19 @@ class ForcedRun(CapsuleForward):
     delay_sd: np.ndarray
     reading_variance: np.ndarray
     moves: float
+    normal_force: float
     channels: tuple[str, ...] = eqx.field(static=True)
     settled: bool = eqx.field(static=True)
     gap_known: bool = eqx.field(static=True)
     drive_known: bool = eqx.field(static=True)
+    normal_force_stated: bool = eqx.field(static=True)
     has_gain: tuple[bool, ...] = eqx.field(static=True)
     has_delay: tuple[bool, ...] = eqx.field(static=True)
     coloured: bool = eqx.field(static=True)
     second_reading: bool = eqx.field(static=True)
 
+    #: Whether the record prescribes the motion of the rod.
+    prescribed: ClassVar[bool] = False
     time_series = True
     checks = (check_feasible, check_predictable)
     tables = (predicted_motion, scaled_groups)
@@ -107,16 +115,18 @@ class ForcedRun(CapsuleForward):
             second reading of the current's amplitude counts in the first part only.
         capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or estimated
         """
-        settings, gap = table.settings, table.settings.gap
+        settings, gap = table.settings, stated_gap(table)
         self.friction, self.smoothing = friction, None
         self.channels = tuple(name for name in NOISE if name in table.columns)
         self.time = table["time"]
         self.values = np.stack([table[name] for name in self.channels])
-        self.Omega = settings.angular_frequency
+        self.Omega = stated_Omega(table)
         self.gap, self.gap_known = gap.value, gap.sd == 0.0
         drive = settings.P_d if leads or not self.driven_by_current else None
         self.drive, self.drive_sd = (0.0, 0.0) if drive is None else (drive.value, drive.sd)
-        self.drive_known = drive is not None and drive.sd == 0.0
+        self.drive_known = drive is None or drive.sd == 0.0
+        self.normal_force_stated = settings.normal_force is not None
+        self.normal_force = settings.normal_force or 0.0
         reading_sd = np.array([table.columns[name].reading_sd for name in self.channels])
         self.reading_variance = reading_sd**2
         # A constant channel has zero range, so its scale is the reading error, or 1e-9 in SI units.
@@ -126,7 +136,7 @@ class ForcedRun(CapsuleForward):
         self.delay_sd, self.has_delay = self._stated(settings, "delay")
         self.second_reading = self.driven_by_current and self.drive_sd > 0.0
         self.coloured = settings.noise == "ar1"
-        rough = rough_start(self.time, dict(zip(self.channels, self.values, strict=True)), self.Omega)
+        rough = self.first_state(table)
         if capsule_rate is not None:
             rough = replace(rough, capsule_rate=capsule_rate, kind="stuck" if capsule_rate == 0.0 else "moving")
         is_open = settings.start == "auto" or not leads
@@ -135,6 +145,10 @@ class ForcedRun(CapsuleForward):
         self.moves = float(start == "moving")
         self.about = AboutRun(table, rig, (), part_of or table.label, leads, start, is_open, rough)
         self.about = replace(self.about, parameters=run_parameters(self, ranges))
+
+    def first_state(self, table: Table) -> RunStart:
+        """Starting values from the record."""
+        return rough_start(table["time"], {name: table[name] for name in self.channels}, self.Omega)
 
     @classmethod
     def make(cls, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> "tuple[ForcedRun, ...]":
@@ -154,7 +168,7 @@ class ForcedRun(CapsuleForward):
         return self._remade(self.table, self.about.leads, capsule_rate)
 
     def _remade(self, table: Table, leads: bool, capsule_rate: float | None = None) -> "ForcedRun":
-        run = ForcedRun(table, self.rig, self.friction, self.about.record, leads, capsule_rate)
+        run = type(self)(table, self.rig, self.friction, self.about.record, leads, capsule_rate)
         return run.with_smoothing(self.smoothing)
 
     def _stated(self, settings: Any, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
@@ -167,7 +181,7 @@ class ForcedRun(CapsuleForward):
         return self.about.rough
 
     @property
-    def spring(self) -> str:
+    def spring(self) -> str | None:
         return self.table.settings.spring
 
     @property
@@ -190,12 +204,18 @@ class ForcedRun(CapsuleForward):
 
     # -- the motion and its recorded channels -----------------------------------------------------------------------
 
-    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Excitation]:
+    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
+        return super().law({**theta, NORMAL_FORCE: self.normal_force} if self.normal_force_stated else theta)
+
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         """Return parameters and drive of this run; leaves as in ``theta``."""
-        gap = self.gap if self.gap_known else theta["G"]
         stated: Any = self.drive if self.drive_known else theta.get("P_d")
         force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
-        return self.parameters_of(theta, theta["k2"], gap), Excitation(force, self.Omega, theta["phase"])
+        return self.with_spring(theta), Excitation(force, self.Omega, theta["phase"])
+
+    def with_spring(self, theta: ValuesBySymbol) -> CapsuleParameters:
+        """Parameters at ``theta`` with the support spring of this run; k2 = 0 where there is none."""
+        return self.parameters_of(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
 
     def motion(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Trajectory:
         """Simulate the motion at the samples (n,), X2 = 0 at the first."""
@@ -207,7 +227,7 @@ class ForcedRun(CapsuleForward):
             X2 = settled["X2"][0]
             return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})
         Y2 = self.moves * theta.get("capsule_start", 0.0) + 0.0 * theta["x_start"]
-        initial = (theta["x_start"], theta["y_start"] + Y2, 0.0, Y2)
+        initial = (theta["x_start"], theta.get("y_start", 0.0) + Y2, 0.0, Y2)
         return self.simulated(theta, p, e, self.time, initial)
 
     def predict(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> list[Any]:
@@ -230,6 +250,7 @@ class ForcedRun(CapsuleForward):
             elif name == "acceleration_rod":
                 seen.append(rod_acceleration(p, e, self.time, x_rel, rate))
             else:
+                assert isinstance(e, Excitation), "a current belongs to a harmonic drive"
                 seen.append(I_d * e.cosine(self.time))
         return seen
 

@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.physics.forces import rod_acceleration, rod_on_capsule
 from capsule_id.physics.grazing import grazing_load
-from capsule_id.physics.model import CapsuleParameters, Excitation
+from capsule_id.physics.model import CapsuleParameters, Excitation, without_absent
+from capsule_id.records.stated_settings import stated_gap, stated_Omega
 from capsule_id.records.tone import tone_at
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
@@ -37,7 +38,7 @@ HELD_DECAYS = 50.0
 
 @dataclass(frozen=True)
 class RunConditions:
-    """Angular frequency and amplitude of the drive, and the gap, of one run, SI."""
+    """Angular frequency and amplitude of the drive, and the gap, of one run, SI; infinite without a spring."""
 
     Omega: float
     P_d: float
@@ -46,9 +47,9 @@ class RunConditions:
 
 def stated_conditions(table: Table, K: float) -> RunConditions:
     """Conditions of a forced run; P_d as stated, else ``K`` (N/A) times the current's amplitude at Omega."""
-    Omega, stated = table.settings.angular_frequency, table.settings.P_d
+    Omega, stated = stated_Omega(table), table.settings.P_d
     P_d = K * tone_at(table["time"], table["current"], Omega)[0] if stated is None else stated.value
-    return RunConditions(Omega, P_d, table.settings.gap.value)
+    return RunConditions(Omega, P_d, stated_gap(table).value)
 
 
 def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
@@ -57,8 +58,9 @@ def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
     for run in runs:
         theta = run.local(fit.values)
         p, e = run.capsule(theta)
+        assert isinstance(e, Excitation), "only runs with a harmonic force declare this check"
         conditions = RunConditions(run.Omega, float(e.P_d), float(p.G))  # pyright: ignore[reportArgumentType]
-        F_b = float(run.friction.force(theta).forward(0.0))
+        F_b = float(run.law(theta).forward(0.0))
         findings += feasibility(run.table, theta, F_b, conditions)
     return findings
 
@@ -71,7 +73,7 @@ def feasibility(
     Parameters
     ----------
     table : a ``forced_run``
-    theta : values by symbol, SI: m1, m2, k1, c, k2 (of this run's spring), and K where P_d is not stated
+    theta : values by symbol, SI: m1, m2, k1, c, k2 (of this run's spring, if any), and K where P_d is not stated
     F_b : break-away force, N
     conditions : None: as stated
     """
@@ -81,7 +83,7 @@ def feasibility(
     grazing = float(grazing_load(theta["m1"], theta["k1"], theta["c"], drive.G, drive.Omega))
     linear_force = without_contact * float(np.hypot(theta["k1"], theta["c"] * drive.Omega))
     findings = []
-    if drive.P_d < grazing and linear_force <= F_b:
+    if drive.P_d < grazing < np.inf and linear_force <= F_b:
         facts = {"Omega": drive.Omega, "gap_mm": 1e3 * drive.G, "needed": grazing, "P_d": drive.P_d}
         findings.append(Finding("runs.contact", "warn", facts, table.label))
     if reached <= F_b:
@@ -94,9 +96,9 @@ def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, b
 
     The rod starts from rest. A capsule at rest sticks while |f| <= F_b, so the test for its motion is exact.
     """
-    m1, k1, c, k2 = (float(theta[name]) for name in ("m1", "k1", "c", "k2"))
-    held = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=drive.G)
-    e = Excitation(drive.P_d, drive.Omega)
+    m1, k1, c, k2 = (float(theta.get(name, 0.0)) for name in ("m1", "k1", "c", "k2"))
+    capsule = CapsuleParameters(m1=m1, m2=np.inf, k1=k1, k2=k2, c=c, mu=np.inf, v_s=np.inf, G=drive.G)
+    held, e = without_absent(capsule, Excitation(drive.P_d, drive.Omega))
 
     def rate(t: float, state: np.ndarray) -> list[float]:
         x, y = state
@@ -112,14 +114,17 @@ def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, b
 
 
 def contact_time(m1: float, m2: float, k2: float) -> float:
-    """Half a period of the rod on the support spring, pi sqrt(m*/k2), s; m* is the reduced mass (m1 for infinite m2)."""
-    return float(np.pi * np.sqrt(1.0 / ((1.0 / m1 + 1.0 / m2) * k2)))
+    """Half a period of the rod on the support spring, pi sqrt(m*/k2), s; m* is the reduced mass (m1 for infinite m2).
+
+    Infinite without a spring, k2 = 0.
+    """
+    return float(np.pi * np.sqrt(1.0 / ((1.0 / m1 + 1.0 / m2) * k2))) if k2 > 0.0 else np.inf
 
 
 def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[Finding]:
     """Check the number of samples per contact; the shortest contact is that with a sliding capsule."""
     step = float(np.median(np.diff(table["time"])))
-    touch = contact_time(theta["m1"], theta["m2"], theta["k2"])
+    touch = contact_time(theta["m1"], theta["m2"], theta.get("k2", 0.0))
     if not touches or touch / step >= SAMPLES_PER_CONTACT:
         return []
     facts = {

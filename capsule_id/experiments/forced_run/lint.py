@@ -14,6 +14,7 @@ from capsule_id.records.faults.channels import (
     drive_power,
     phasor,
 )
+from capsule_id.records.stated_settings import stated_Omega
 from capsule_id.records.tone import recorded_drive
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Facts, Finding, Message
@@ -32,7 +33,7 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     del rig
     used = np.ones(len(table.rows), dtype=bool)
     yield from lint_times(table, used)
-    period = 2.0 * np.pi / table.settings.angular_frequency
+    period = 2.0 * np.pi / stated_Omega(table)
     faults = list(_time_scale(table, period))
     for name in table.columns:
         # A capsule may rest at an extreme position, which is no clipping.
@@ -62,7 +63,7 @@ def _time_scale(table: Table[Any], period: float) -> Iterable[Finding]:
 
 def _columns(table: Table[Any]) -> Iterable[Finding]:
     """Report columns that contradict kinematics or the sign of the power of the drive."""
-    time, Omega = table["time"], table.settings.angular_frequency
+    time, Omega = table["time"], stated_Omega(table)
     if "x_rel" not in table.columns or (time[-1] - time[0]) * Omega < FEWEST_PERIODS * 2.0 * np.pi:
         return
     whole = {name: table[name] for name in table.columns if name != "time"}

@@ -23,7 +23,9 @@ PHASE_WIDTH = np.pi
 def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...]:
     """Return the parameters sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
     of, whole, settings = run.label, run.about.record, run.table.settings
-    rows = [parameter("k1"), parameter("c"), *run.friction.parameters, parameter("k2", run.spring)]
+    rows = [parameter("k1"), parameter("c"), *run.friction.parameters]
+    if run.spring is not None:
+        rows.append(parameter("k2", run.spring))
     if not run.gap_known:
         rows.append(parameter("G", whole, Prior("positive_normal", settings.gap.value, settings.gap.sd)))
     if run.driven_by_current:
@@ -31,11 +33,13 @@ def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...
         rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
     elif not run.drive_known:
         rows.append(parameter("P_d", whole, Prior("positive_normal", run.drive, run.drive_sd)))
-    rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
+    if not run.prescribed:
+        rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
     length = NUISANCE_WIDTH * run.rough.length
     if not run.settled:
         rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
-        rows.append(parameter("y_start", of, Prior("normal", 0.0, run.Omega * length)))
+        if not run.prescribed:
+            rows.append(parameter("y_start", of, Prior("normal", 0.0, run.Omega * length)))
     if run.moves:
         rows.append(CAPSULE_START.named(of, Prior("normal", 0.0, run.Omega * length)))
     for name, scale in zip(run.channels, ranges.tolist(), strict=True):

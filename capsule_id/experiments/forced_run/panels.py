@@ -73,8 +73,11 @@ def _portrait(run: "ForcedRun", theta: ValuesBySymbol) -> list[Comparison]:
     except InputError:
         return []
     p, _ = run.capsule(theta)
-    gap = (float(p.G) + offset) * unit  # pyright: ignore[reportArgumentType]
-    low, high = float(y.min()), float(y.max())
+    lines = []
+    if run.spring is not None:
+        gap = (float(p.G) + offset) * unit  # pyright: ignore[reportArgumentType]
+        ends = np.array([y.min(), y.max()])
+        lines.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
     return [
         Comparison(
             "phase_portrait",
@@ -86,7 +89,7 @@ def _portrait(run: "ForcedRun", theta: ValuesBySymbol) -> list[Comparison]:
             (
                 Curve("this fit", x * unit, y),
                 Curve("this fit through the same filter", fitted[0] * unit, fitted[1], role="alternative"),
-                Curve("support spring", np.array([gap, gap]), np.array([low, high]), role="paper"),
+                *lines,
             ),
         )
     ]

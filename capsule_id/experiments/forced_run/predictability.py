@@ -9,8 +9,9 @@ import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted
+from capsule_id.physics.drive import Drive
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from capsule_id.views import Finding
 
 if TYPE_CHECKING:
@@ -30,15 +31,13 @@ def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
     size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
     motion = run.motion(theta, np)
     start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
-    derivative = np.asarray(
-        _derivative_of_end(*run.capsule(theta), run.friction.force(theta), run.time[[0, -1]], start)
-    )
+    derivative = np.asarray(_derivative_of_end(*run.capsule(theta), run.law(theta), run.time[[0, -1]], start))
     return float(np.linalg.norm(derivative * size / size[:, None], 2))
 
 
 @jax.jit
 def _derivative_of_end(
-    p: CapsuleParameters, e: Excitation, law: FrictionLaw, times: jax.Array, start: jax.Array
+    p: CapsuleParameters, e: Drive, law: FrictionLaw, times: jax.Array, start: jax.Array
 ) -> jax.Array:
     """(3, 3) of (x_rel, its rate, Y2) at the last of ``times`` with respect to the same at the first."""
 

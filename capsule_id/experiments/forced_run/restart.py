@@ -35,8 +35,10 @@ def corrected_start(run: "ForcedRun", theta: ValuesBySymbol) -> "tuple[ForcedRun
     better = better_start(run, theta)
     if better is None:
         return None
-    values = {f"{symbol}[{run.label}]": value for symbol, value in better.items()}
-    return run.restarted(better["capsule_start"]), values
+    restarted = run.restarted(better["capsule_start"])
+    # A prescribed rod has no initial speed to sample, and a capsule at rest none either.
+    sampled = {row.symbol for row in restarted.parameters}
+    return restarted, {f"{symbol}[{run.label}]": value for symbol, value in better.items() if symbol in sampled}
 
 
 def better_start(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float] | None:
@@ -47,7 +49,7 @@ def better_start(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float] | 
     """
     moving, own = run.restarted(1.0), float(theta.get("capsule_start", 0.0))
     speeds = np.append(TRIAL_SPEEDS, own)
-    rod = np.full((2, len(speeds)), [[theta["x_start"]], [theta["y_start"] + own]])
+    rod = np.full((2, len(speeds)), [[theta["x_start"]], [theta.get("y_start", 0.0) + own]])
     offsets = np.array([[0.0, 0.0], [DIFFERENCE_STEPS[0], 0.0], [0.0, DIFFERENCE_STEPS[1]]])
     best, where = np.full(len(speeds), np.inf), rod
     for _ in range(GAUSS_NEWTON_STEPS):

@@ -35,7 +35,7 @@ def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]
 def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
     p, e = run.capsule(theta)
     m1, m2, k1, k2, c, G = (float(leaf) for leaf in (p.m1, p.m2, p.k1, p.k2, p.c, p.G))  # pyright: ignore[reportArgumentType]
-    Omega0, F_b = np.sqrt(k1 / m1), float(run.friction.force(theta).forward(0.0))
+    Omega0, F_b = np.sqrt(k1 / m1), float(run.law(theta).forward(0.0))
     length, of = F_b / k1, run.label
     scales = {"N": ("F_b", F_b), "m/s": ("(Omega0 F_b/k1)", Omega0 * length)}
     own = [(row.symbol, *scales[row.unit]) for row in run.friction.parameters if row.unit in scales]
@@ -44,10 +44,9 @@ def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
         "zeta": c / (2.0 * m1 * Omega0),
         "m2/m1": m2 / m1,
         **{f"{symbol} / {scale}": theta[symbol] / value for symbol, scale, value in own},
-        f"k2/k1 [{run.spring}]": k2 / k1,
         f"Omega/Omega0 [{of}]": run.Omega / Omega0,
-        f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore[reportArgumentType]
-        f"G k1/F_b [{of}]": G / length,
+        f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore
+        **({f"k2/k1 [{run.spring}]": k2 / k1, f"G k1/F_b [{of}]": G / length} if run.spring is not None else {}),
     }
 
 

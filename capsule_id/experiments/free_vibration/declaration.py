@@ -41,15 +41,6 @@ DRIFT_TIME = Parameter("drift_time", "s", "correlation time of a record's drift"
 TURNING_TIME = nuisance("turning_time", "s", "time of the first turning point of a decay", "t_0")
 
 
-def _check_spring_with_gap(entry: Entry[DecaySettings]) -> None:
-    """Require a gap where a spring is within reach."""
-    spring, gap = entry.table.settings.spring, entry.table.settings.gap
-    if (spring is None) != (gap is None):
-        one, other = ("spring", "gap") if gap is None else ("gap", "spring")
-        remedy = f"add {other}, or remove {one} where the support spring is out of reach"
-        raise entry.error(one, "spring and gap must stand together", f"{one} alone", remedy, of_key=True)
-
-
 def _check_window(entry: Entry[DecaySettings]) -> None:
     """Require start < stop, both inside the record to one sampling step, and enough samples between them."""
     entry.check_length()
@@ -254,7 +245,7 @@ KIND = Kind(
     columns={"time": ColumnRule("s", increasing=True), "x_rel": ColumnRule("m", varies=True)},
     sets=(("time", "x_rel"),),
     settings=DecaySettings,
-    rules=(_check_spring_with_gap, _check_window, _check_forward, _check_turning_points),
+    rules=(Entry.check_spring_with_gap, _check_window, _check_forward, _check_turning_points),
     masses=_masses,
     parameters=(NOISE_SD, TIME_SD, AMPLITUDE, TURNING_TIME, NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME),
     make=_make,

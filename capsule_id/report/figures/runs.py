@@ -40,7 +40,8 @@ def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
     inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
     ax.plot(_MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
     below_legend = 1.0 / (1.0 + HEADROOM)
-    ax.axvline(_MM * view.gap, ymax=below_legend, color=VERMILION, ls="--", lw=1.2, label="gap as stated")
+    if np.isfinite(view.gap):
+        ax.axvline(_MM * view.gap, ymax=below_legend, color=VERMILION, ls="--", lw=1.2, label="gap as stated")
     if view.gap_seen is not None:
         line = _MM * view.gap_seen
         ax.axvline(line, ymax=below_legend, color=VERMILION, ls=":", lw=1.6, label="contacts begin")
@@ -85,7 +86,7 @@ def channel_history(view: RecordView, name: str, ax: Axes | None = None) -> Axes
     ax = own_axes(ax)
     label, scale, color = _CHANNELS[name]
     ax.plot(view.time, scale * view.channels[name], color=color, lw=0.7)
-    if name == "x_rel":
+    if name == "x_rel" and np.isfinite(view.gap):
         ax.axhline(scale * view.gap, color=VERMILION, ls="--", lw=1.2)
     set_text(ax, "time, s", label)
     return ax

@@ -1,0 +1,78 @@
+"""Runs whose record prescribes the motion of the rod: a shaken base, or a position-controlled inner mass.
+
+    x_base -> X1(t) -> capsule model -> x_capsule, x_rel
+
+Only the equation of the capsule is left. X1 is the cubic spline through x_base, whose own noise is neglected. The zeros
+of x_base and x_capsule are independent, so the extension of the rod's spring at the first sample is sampled.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.checks.context import RunRecord
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.predictability import check_predictable
+from capsule_id.experiments.forced_run.start import RunStart, rough_start
+from capsule_id.experiments.forced_run.tables import predicted_motion
+from capsule_id.physics.drives.recorded import RodMotion
+from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.records.stated_settings import relative_position
+from capsule_id.rig.model import Rig, Table
+
+
+class BaseRun(ForcedRun):
+    """One record of a capsule on a spring whose other end moves as recorded.
+
+    Attributes
+    ----------
+    base, base_rate : (n,) X1 relative to the first sample, m, and its velocity, m/s
+    """
+
+    base: np.ndarray
+    base_rate: np.ndarray
+
+    prescribed = True
+    checks = (check_predictable,)
+    tables = (predicted_motion,)
+
+    def __init__(
+        self,
+        table: Table,
+        rig: Rig,
+        friction: FrictionModel = EQUATION_1,
+        part_of: str | None = None,
+        leads: bool = True,
+        capsule_rate: float | None = None,
+    ) -> None:
+        """Make one record, or a part of one; arguments as for ``ForcedRun``."""
+        motion = RodMotion.through(table["time"], table["x_base"] - table["x_base"][0])
+        self.base, self.base_rate = np.asarray(motion.X1), np.asarray(motion.Y1)
+        super().__init__(table, rig, friction, part_of, leads, capsule_rate)
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        # The rod's mass acts through the normal force alone.
+        return ("m2",) if self.normal_force_stated or self.rig.m1 is None else ("m1", "m2")
+
+    def first_state(self, table: Table) -> RunStart:
+        relative = relative_position(table)
+        assert relative is not None, "the reader requires x_capsule or x_rel beside x_base"
+        # Friction is about as strong in both directions, so the spring is unextended near the mean.
+        seen = {name: table[name] for name in self.channels} | {"x_rel": relative[0] - np.mean(relative[0])}
+        return rough_start(table["time"], seen, self.Omega)
+
+    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
+        return super().law({"m1": 0.0, **theta})
+
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Any]:
+        X1 = jnp.add.outer(theta["x_start"], self.base)
+        return self.with_spring({"m1": 0.0, **theta}), RodMotion(self.time, X1, self.base_rate)
+
+    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
+        # The figures of the paper show a harmonic force.
+        return None

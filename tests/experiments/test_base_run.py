@@ -1,0 +1,179 @@
+"""Runs whose base moves as recorded, against SciPy; stated normal forces, runs without a spring, and the error texts."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from capsule_id.api import fit
+from capsule_id.errors import InputError
+from capsule_id.experiments.forced_run.base_run import BaseRun
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.feasibility import feasibility
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.records.label import measured_motion
+from capsule_id.rig.model import Quantity, Rig
+from tests.experiments import bench
+from tests.forced_runs import table, theta
+from tests.measured.folders import Entry, make_rig, quantity
+from tests.scipy_general import simulate_general
+
+M2, N = 0.53, 2.0
+TRUTH = {"k1": 400.0, "c": 1.5, "mu": 0.3, "v_s": 0.05}
+NOISE = 4e-6
+BASE = {"drive": '"base"', "start": '"stuck"', "normal_force": quantity(N, "N")}
+
+
+def base(t: np.ndarray | float, n: int = 0) -> np.ndarray | float:
+    """n-th derivative of 4 mm at 2 Hz with a third harmonic."""
+    angle = 4.0 * np.pi * t
+    return (
+        4e-3
+        * (4.0 * np.pi) ** n
+        * (np.cos(angle + 0.5 * n * np.pi) + 0.1 * 3**n * np.sin(3.0 * angle + 0.5 * n * np.pi))
+    )
+
+
+@cache
+def record() -> tuple[np.ndarray, np.ndarray]:
+    """Time (n,), s, and the noise-free position of the capsule, m: DOP853 from rest, normal force N alone."""
+    time = np.arange(200) / 100.0
+    absent = dict.fromkeys(("m1", "k2", "c2", "k_cubic", "k2_back", "slope", "reaction", "viscous"), 0.0)
+    far = {"G": 1e3, "G_back": 1e3, "ratio": 0.5, "mu_back": TRUTH["mu"], "m2": M2, "g": 9.81, "N0": N - M2 * 9.81}
+    states, _ = simulate_general({**TRUTH, **absent, **far}, (lambda t, on: 0.0, ()), time, rod=base)
+    return time, states[:, 2]
+
+
+def entry(drop: str = "", **settings: str) -> Entry:
+    time, X2 = record()
+    rng = np.random.default_rng(1)
+    seen = {
+        "time [s]": time,
+        "x_base [m]": base(time) + 0.01,
+        "x_capsule [m]": X2 - 3e-3 + NOISE * rng.standard_normal(len(time)),
+    }
+    return Entry("forced_run", "shaken", {k: v for k, v in seen.items() if k != drop}, {**BASE, **settings})
+
+
+def rig(folder: Path, **settings: str) -> Rig:
+    return make_rig(folder, entry(**settings), head={"m2": quantity(M2, "kg")})
+
+
+def estimate(shaken: Rig) -> tuple[dict[str, float], dict[str, float]]:
+    """Values and sds of the symbols of TRUTH: least squares of the whole posterior from 10 % away."""
+    target = LogPosterior(shaken, [BaseRun(shaken.tables[0], shaken)])
+    own = [i for i in target.located if target.names[i] != "m2"]
+    starts = {**TRUTH, "x_start[shaken]": float(base(0.0)), "noise_x_capsule[shaken]": NOISE, "m2": M2}
+    u0 = target.unconstrain(np.array([starts[name] for name in target.names]))
+
+    def residuals(v: np.ndarray) -> np.ndarray:
+        u = u0.copy()
+        u[own] = v
+        return target.plain_residuals(u)
+
+    away = u0[own] + np.where(target.positive[own], 0.1, 1e-4)
+    found = least_squares(residuals, away, x_scale="jac", diff_step=1e-6)
+    assert found.success
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    names = [target.names[i] for i in own]
+    values = {name: float(np.exp(x)) for name, x in zip(names, found.x, strict=True) if name in TRUTH}
+    return values, {
+        name: values[name] * float(np.sqrt(covariance[i, i])) for i, name in enumerate(names) if name in TRUTH
+    }
+
+
+def test_a_shaken_capsule_is_identified(tmp_path: Path) -> None:
+    shaken = rig(tmp_path / "right")
+    values, sds = estimate(shaken)
+    for name, truth in TRUTH.items():
+        assert abs(values[name] - truth) < 3.5 * sds[name], name
+        assert sds[name] < 0.05 * truth
+
+
+def test_the_stated_normal_force_replaces_the_weight(tmp_path: Path) -> None:
+    values = {**TRUTH, "m2": M2, "g": 9.81, "x_start": 0.0, "noise_x_capsule": NOISE}
+    tables = [
+        make_rig(tmp_path / str(k), entry(normal_force=quantity(k * N, "N")), head={"m2": quantity(M2, "kg")})
+        for k in (1, 2)
+    ]
+    single, double = (BaseRun(r.tables[0], r) for r in tables)
+    seen = single.predict(values, np)[0]
+    assert np.allclose(double.predict({**values, "mu": 0.5 * TRUTH["mu"]}, np)[0], seen, rtol=0.0, atol=1e-12)
+    # negative control
+    assert np.max(np.abs(double.predict(values, np)[0] - seen)) > 1e-4
+
+
+def test_a_shaken_record_is_labelled_by_its_relative_motion(tmp_path: Path) -> None:
+    time = np.arange(1500) / 250.0
+    noise = NOISE * np.random.default_rng(0).standard_normal((2, 1500))
+    columns = {"time [s]": time, "x_base [m]": base(time) + noise[0], "x_capsule [m]": base(time - 0.1) + noise[1]}
+    shaken = make_rig(tmp_path, Entry("forced_run", "shaken", columns, BASE), head={"m2": quantity(M2, "kg")})
+    motion = measured_motion(shaken.tables[0])
+    assert (motion.label, motion.evidence.Omega) == ("P-1", pytest.approx(4.0 * np.pi, rel=1e-3))
+    assert "spring and gap are not stated" in motion.evidence.reasons
+
+
+@pytest.mark.parametrize(
+    ("wrong", "remedy", "words"),
+    [
+        ({"P_d": quantity(1.0, "N")}, {}, "remove P_d"),
+        ({"start": '"settled"'}, {"start": '"auto"'}, 'write start = "auto"'),
+        ({"spring": '"L60"'}, {"spring": '"L60"', "gap": quantity(20.0, "mm")}, "add gap, or remove spring"),
+        ({"drive": '"harmonic"'}, {"drive": '"base"'}, 'add drive = "base"'),
+    ],
+)
+def test_a_wrong_setting_names_its_remedy(
+    tmp_path: Path, wrong: dict[str, str], remedy: dict[str, str], words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        rig(tmp_path / "wrong", **wrong)
+    assert rig(tmp_path / "right", **remedy).tables[0].settings.drive == "base"
+
+
+def test_columns_and_masses_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needs a column x_base"):
+        make_rig(tmp_path / "1", entry("x_base [m]"), head={"m2": quantity(M2, "kg")})
+    with pytest.raises(InputError, match="must have a channel beside time"):
+        make_rig(tmp_path / "2", entry("x_capsule [m]"), head={"m2": quantity(M2, "kg")})
+    with pytest.raises(InputError, match="forced_run needs m2"):
+        make_rig(tmp_path / "3", entry())
+
+
+def test_an_unevenly_sampled_base_needs_a_frequency(tmp_path: Path) -> None:
+    even = entry()
+    uneven = Entry(even.kind, even.label, {k: np.delete(v, [3, 50]) for k, v in even.columns.items()}, even.settings)
+    head = {"m2": quantity(M2, "kg")}
+    with pytest.raises(InputError, match="add f = "):
+        make_rig(tmp_path / "1", uneven, head=head)
+    stated = Entry(uneven.kind, uneven.label, uneven.columns, {**uneven.settings, "f": quantity(2.0, "Hz")})
+    shaken = make_rig(tmp_path / "2", stated, head=head)
+    assert BaseRun(shaken.tables[0], shaken).Omega == pytest.approx(4.0 * np.pi)
+
+
+def test_a_run_without_spring_is_one_whose_spring_is_far_away() -> None:
+    own = table(1, without=("acceleration_rod",))
+    far = replace(own.settings, gap=Quantity(1e3))
+    near, free = (replace(own, settings=s) for s in (far, replace(own.settings, spring=None, gap=None)))
+    values = {name: value for name, value in theta(1).items() if name != "G"}
+    runs = [ForcedRun(t, bench.rig(t)) for t in (near, free)]
+    assert "k2" not in {row.symbol for row in runs[1].parameters}
+    one, other = (run.predict(v, np) for run, v in zip(runs, (values, {**values, "k2": 0.0}), strict=True))
+    for x, y in zip(one, other, strict=True):
+        assert np.allclose(x, y, rtol=0.0, atol=1e-12)
+    assert feasibility(free, values, 1.0) == [
+        f for f in feasibility(near, {**values, "k2": 1.0}, 1.0) if f.code != "runs.contact"
+    ]
+
+
+@pytest.mark.slow
+def test_a_shaken_capsule_is_fitted(tmp_path: Path) -> None:
+    shaken = rig(tmp_path)
+    result = fit(shaken, budget=None)
+    for name, truth in TRUTH.items():
+        row = result.summary.loc[name]
+        assert abs(row["value"] - truth) < 3.5 * row["sd"], name
+        assert row["sd"] < 0.05 * truth
+    assert measured_motion(shaken.tables[0]).label == "P-1"
