@@ -70,7 +70,7 @@ def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str
     assert (finding.code, finding.level, finding.experiment) == ("decays.second_fit", "warn", "decay")
 
 
-def test_a_record_with_rest_before_its_release_keeps_its_model() -> None:
+def test_a_record_with_rest_before_its_release_keeps_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
     """The finding on its readings stops the second fit; the line that the finding states brings it back."""
     whole = record(0.0, DRY)
     rest = 100 / 500.0
@@ -83,8 +83,13 @@ def test_a_record_with_rest_before_its_release_keeps_its_model() -> None:
     uncut = FreeVibration(table, bench.rig(table))
     readings = list(lint_decay(table, uncut.rig))
     (same,), (finding,) = second_models([uncut], readings)
-    assert same is uncut
+    assert same.model == uncut.model
+    assert same.model == uncut.model
     assert (finding.code, finding.level) == ("decays.first_fit", "warn")
+    monkeypatch.setattr("capsule_id.experiments.free_vibration.second_fit.screening.LONGEST_UNCUT", 100)
+    (thinned,), (finding,) = second_models([uncut], readings)
+    assert (thinned.model, thinned.replaced) == (DecayModel(every=3), False)
+    assert "one sample in 3" in MESSAGES["decays.first_fit"].text("warn", finding.facts)
     (release,) = [found for found in readings if found.code == "decays.release"]
     cut = bench.table("free_vibration", columns, "decay", start=release.facts["start"])
     record_cut = FreeVibration(cut, bench.rig(cut))

@@ -226,8 +226,8 @@ MESSAGES = {
     "decays.first_fit": Message(
         "second fit of free decays",
         warn=(
-            "{record}: no second fit, because the record contains more than a free decay. Add the line that the finding on its "
-            "readings states."
+            "{record}: no second fit, because the record contains more than a free decay. The fit uses one sample in {every}. "
+            "Add the line that the finding on the readings states."
         ),
     ),
     "decays.second_fit": Message(

@@ -124,6 +124,11 @@ class FreeVibration(SurfaceExperiment):
         return second_models(records, readings)
 
     @property
+    def replaced(self) -> bool:
+        """Whether a second fit has chosen the model."""
+        return bool(self.about.known)
+
+    @property
     def closed(self) -> bool:
         """Whether the solution is closed and linear in its initial conditions."""
         return not self.model.symbols
@@ -305,8 +310,7 @@ class FreeVibration(SurfaceExperiment):
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.whole[0]))))
 
     def noise_facts(self) -> Facts:
-        stated = DecayModel.stated(self.table.settings)
-        facts = {"present": self.model.additions, "second": self.model != stated, "lines": self.model.lines}
+        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}
         return {"model": "decay", **facts, **self.damping_trend()}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

@@ -42,7 +42,7 @@ def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultT
 
 def second_fit_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
     """Compare the decays alone under the stated model and under the quoted one; [] where both are the same."""
-    replaced = [record for record in records if record.model != DecayModel.stated(record.table.settings)]
+    replaced = [record for record in records if record.replaced]
     if not replaced:
         return []
     rows = []

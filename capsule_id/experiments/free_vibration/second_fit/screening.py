@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 SAMPLES_PER_PERIOD, RESPONSE_POINTS = 16, 60
 #: Fewest samples per period of a thinned record, and largest number of samples of a second fit.
 FEWEST_SAMPLES_PER_PERIOD, LONGEST = 8, 6000
+#: Largest number of samples of a record that is no free decay.
+LONGEST_UNCUT = 1000
 #: Findings on a record that contains more than a free decay.
 NO_DECAY = ("decays.release", "decays.second")
 #: Shorter records, in samples, keep their model.
@@ -164,7 +166,8 @@ def second_models(
 ) -> tuple[list["FreeVibration"], list[Finding]]:
     """Return ``records`` under the model that they demand, and findings that name it.
 
-    Records with more than a free decay according to ``readings``, the findings on the readings, keep their model.
+    Records with more than a free decay according to ``readings``, the findings on the readings, keep their model. Their
+    fit fails in any case, so long ones are thinned.
     """
     level = LEVEL / len(records)
     chosen, findings = list(records), list[Finding]()
@@ -176,7 +179,9 @@ def second_models(
         if record.label not in no_decay:
             groups.setdefault(stated, []).append(i)
         elif None in stated:
-            findings.append(Finding("decays.first_fit", "warn", {"record": record.label}, record.label))
+            every = settings.every or max(1, record.n // LONGEST_UNCUT)
+            chosen[i] = record.with_model(replace(record.model, every=every))
+            findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "every": every}, record.label))
     for stated, members in groups.items():
         own = [records[i] for i in members]
         if None not in stated:
