@@ -9,10 +9,10 @@ from tests.experiments.decay_calibration import MISFITS, coverage, outcome
 NUMBER = 10
 
 
-def test_a_small_sample_of_misfits_is_clean_and_right() -> None:
-    found = [outcome(misfit, 0) for misfit in ("cubic", "dry")]
-    assert [each.clean for each in found] == [True, True]
-    assert np.max(np.abs([each.z for each in found])) < 4.0
+def test_a_decay_with_dry_friction_is_clean_and_right() -> None:
+    found = outcome("dry", 0)
+    assert (found.clean, found.model) == (True, "viscous + dry damping")
+    assert np.max(np.abs(found.z)) < 4.0
 
 
 def test_the_default_model_is_not_clean_and_wrong_by_many_sds() -> None:

@@ -68,7 +68,9 @@ def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
     times, heights = _half_cycles(moving_time, _smoothed(moving - level, per_period))
     if len(heights) < 4:
         return None
-    largest = int(np.argmax(heights >= FIRST_HEIGHT * np.max(heights)))
+    swings = heights[:-1] + heights[1:]  # from one turning point to the next; a drift of the zero hardly changes them
+    begins = swings[0] >= FIRST_HEIGHT * np.max(swings)
+    largest = 0 if begins else int(np.argmax(heights >= FIRST_HEIGHT * np.max(heights)))
     held = abs(float(np.median(on_grid[: moves + 1])) - level) >= HELD_HEIGHT * heights[largest]
     start = float(moving_time[0]) if held else float(times[largest])
     before = start - float(time[0])
