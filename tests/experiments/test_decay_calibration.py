@@ -9,9 +9,9 @@ from tests.experiments.decay_calibration import MISFITS, coverage, outcome
 NUMBER = 10
 
 
-def test_a_decay_with_dry_friction_is_clean_and_right() -> None:
-    found = outcome("dry", 0)
-    assert (found.clean, found.model) == (True, "viscous + dry damping")
+def test_a_drifting_decay_is_clean_and_right() -> None:
+    found = outcome("drift", 0)
+    assert (found.clean, found.model) == (True, "viscous damping, Gaussian-process drift")
     assert np.max(np.abs(found.z)) < 4.0
 
 

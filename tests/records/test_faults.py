@@ -142,9 +142,10 @@ def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
 
 def test_a_drift_of_the_zero_is_no_rest() -> None:
     """The rest position at the release differs from that at the end by 20 % of the deflection, to either side."""
-    noise = 0.02 * np.random.default_rng(0).standard_normal(len(TIME))
+    time = TIME[::4]
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(time))
     for size in (-0.4, 0.4):
-        found = find_free_decay(TIME, released(TIME, 2.0, c=1.0) + size * np.exp(-4.0 * TIME) + noise)
+        found = find_free_decay(time, released(time, 2.0, c=1.0) + size * np.exp(-4.0 * time) + noise)
         assert found is not None
         assert (found.start, found.rest) == (0.0, 0.0)
 
