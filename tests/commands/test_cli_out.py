@@ -198,7 +198,9 @@ def test_a_point_fit_in_an_odd_place(here: Path) -> None:
     assert {path.name for path in (here / "new" / "Ergebnis ä").iterdir()} == RESULT
     content = json.loads((here / "new" / "Ergebnis ä" / "parameters.json").read_text(encoding="utf-8"))
     for row in content["parameters"].values():
-        assert [row[key] for key in ("mean", "sd", "median", "ci95", "ess", "rhat")] == [None] * 6
+        assert [row[key] for key in ("mean", "median", "ci95", "ess", "rhat")] == [None] * 5
+        assert (row["basis"], row["value"]) == ("point", row["map"])
+        assert row["sd"] > 0.0
         assert row["map"] > 0.0
     reader, writer = os.pipe()
     os.close(reader)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
@@ -113,6 +114,18 @@ def test_few_lost_samples_show_in_a_quiet_record() -> None:
     jump = phase_jump(values, SAMPLES)
     assert jump is not None
     assert abs(jump.row - 80) <= 5
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.7, 0.95, 0.98])
+def test_coloured_noise_is_no_jump(correlation: float) -> None:
+    """Its deviation is large everywhere, not at one place. The white noise level alone named a jump in every record."""
+    rng = np.random.default_rng(7)
+    found = 0
+    for _ in range(20):
+        shocks = np.sqrt(1.0 - correlation**2) * rng.standard_normal(1500)
+        noise = signal.lfilter([1.0], [1.0, -correlation], shocks)[300:]
+        found += phase_jump(decay(noise=0.0) + 0.03 * noise, SAMPLES) is not None
+    assert found <= 1
 
 
 @pytest.mark.parametrize("held", [True, False])

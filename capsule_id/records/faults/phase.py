@@ -15,6 +15,8 @@ from capsule_id.records.noise import noise_level
 ORDER, SIDES, LARGE = 3, ((0.25, 0.3), (0.125, 0.06)), 0.2
 #: Smallest jump: standard deviations of the noise, and sampling steps.
 JUMP_SDS, JUMP_STEPS = 6.0, 0.7
+#: Median of the deviation under white noise: that of a Rayleigh variable.
+MEDIAN = np.sqrt(2.0 * np.log(2.0))
 #: The oscillation must be at least this many times the noise.
 AMPLITUDE_NOISE = 4.0
 
@@ -56,6 +58,9 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
     weights = np.stack([np.concatenate([value, -value[::-1]]), np.concatenate([slope, slope[::-1]])])
     precision = np.linalg.inv(weights @ weights.T * max(noise, 1e-300) ** 2)
     deviation = np.sqrt(np.einsum("in,ij,jn->n", jumps, precision, jumps))
+    # Coloured noise deviates everywhere, not at one place.
+    excess = max(1.0, float(np.median(deviation)) / MEDIAN)
+    deviation, noise = deviation / excess, noise * excess
     width = round(period)
     high, low = (f(values, width, mode="nearest") for f in (ndimage.maximum_filter1d, ndimage.minimum_filter1d))
     amplitude = 0.5 * (high - low)[side : side + len(deviation)]
