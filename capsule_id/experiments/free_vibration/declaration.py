@@ -234,8 +234,8 @@ MESSAGES = {
         "second fit of free decays",
         warn=_second_fit,
         caption=(
-            "Free decays alone, under the stated model and under the model of the quoted values. BIC is relative to the lower "
-            "one. Lines of rig.toml that state the quoted model: {lines}."
+            "Free decays alone, under the stated model and under the model of the quoted values, both on the samples of the "
+            "latter. BIC is relative to the lower one. Lines of rig.toml that state the quoted model: {lines}."
         ),
     ),
 }

@@ -1,6 +1,7 @@
 """Tables of free decays: estimates by record, and comparison of the stated with the quoted model."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,8 +47,9 @@ def second_fit_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Re
     if not replaced:
         return []
     rows = []
+    # Both fits use the same samples, so that their BIC can be compared.
     for role, members in (
-        ("stated", [r.with_model(DecayModel.stated(r.table.settings)) for r in replaced]),
+        ("stated", [r.with_model(replace(DecayModel.stated(r.table.settings), every=r.model.every)) for r in replaced]),
         ("quoted", replaced),
     ):
         found = fit.refit(members)
