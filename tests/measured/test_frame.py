@@ -1,10 +1,14 @@
 """Labels of the shaken frame of Marino and Cicirello: plainly period 1, 0.3 to 1.4 % variation from cycle to cycle."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from capsule_id.records.label import measured_motion
 from capsule_id.records.repeat import Repeat, find_period
 from capsule_id.records.tone import fit_harmonic
+from tests.measured.folders import Entry, make_rig, quantity
 from tests.measured.sources import frame
 
 
@@ -18,6 +22,16 @@ def test_the_frame_is_of_period_one(load: str) -> None:
     for record in (storey, base, base - storey):
         found = period_of(time, record)
         assert (found.period, found.probability > 0.9) == (1, True), found.reason
+
+
+@pytest.mark.parametrize("load", ["350g", "450g"])
+def test_the_frame_is_a_run_with_a_prescribed_rod(tmp_path: Path, load: str) -> None:
+    """Its label comes from x_base - x_capsule; tests/experiments/test_base_run.py fits a twin."""
+    time, storey, base = frame(load)
+    columns = {"time [s]": time, "x_base [m]": base, "x_capsule [m]": storey}
+    settings = {"drive": '"base"', "normal_force": quantity(1e-3 * float(load[:3]) * 9.81, "N")}
+    rig = make_rig(tmp_path, Entry("forced_run", load, columns, settings), head={"m2": quantity(3.0799, "kg")})
+    assert measured_motion(rig.tables[0]).label == "P-1"
 
 
 def twin(part: float) -> tuple[np.ndarray, np.ndarray]:
