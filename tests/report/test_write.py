@@ -78,7 +78,7 @@ def test_figures_are_those_of_the_page_at_150_dpi(folder: Path) -> None:
 
 def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> None:
     content = _strict((folder / "parameters.json").read_text(encoding="utf-8"))
-    assert list(content) == ["rig", "synthetic", "trust", "parameters", "verdict", "provenance"]
+    assert list(content) == ["rig", "synthetic", "trust", "parameters", "verdict", "records", "provenance"]
     assert content["rig"] == "twin"
     assert content["synthetic"] is True
     assert list(content["parameters"]) == list(result.summary.index)
@@ -99,6 +99,7 @@ def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> N
     assert content["verdict"]["clean"] is True
     keys = ["check", "level", "text", "code", "experiment", "parameters"]
     assert all(list(finding) == keys for finding in content["verdict"]["findings"])
+    assert content["records"] == {}  # no forced run
     assert content["provenance"]["files"] == dict(result.rig.files)
     assert content["provenance"]["seed"] == 0
     assert content["provenance"]["versions"] == dict(result.provenance.versions)
