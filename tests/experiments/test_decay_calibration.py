@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from tests.experiments.decay_calibration import MISFITS, coverage, outcome
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from tests.experiments import bench
+from tests.experiments.decay_calibration import MISFITS, TIME, coverage, outcome, twin
 
 #: Twins of each misfit in the study.
 NUMBER = 10
@@ -30,3 +32,10 @@ def test_clean_results_cover_the_truth() -> None:
     # Of 80 values 68 or fewer are covered with probability 0.03 where the coverage is 0.9.
     assert covered > 0.85
     assert wrong <= 0.01
+
+
+def test_the_noise_of_a_rod_that_sticks_is_no_swing() -> None:
+    """The rod stops after a few half cycles; the noise that follows crosses zero a hundred times."""
+    columns = [bench.column("time", TIME), bench.column("x_rel", twin("dry", 3))]
+    record = FreeVibration(bench.table("free_vibration", columns), bench.rig())
+    assert record.rough_decrement().Omega_o == pytest.approx(np.sqrt(bench.K1 / bench.M1), rel=0.3)

@@ -23,7 +23,13 @@ from capsule_id.experiments.free_vibration.decay_models import (
     viscous_basis,
 )
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
-from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium, logarithmic_decrement, trend
+from capsule_id.experiments.free_vibration.decrement import (
+    PEAK_NOISE_RATIO,
+    Decrement,
+    equilibrium,
+    logarithmic_decrement,
+    trend,
+)
 from capsule_id.experiments.free_vibration.noise import noise_parameters, whiten
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.tables import decay_table, second_fit_table
@@ -238,8 +244,10 @@ class FreeVibration(SurfaceExperiment):
         if decrement is not None and decrement.delta > 0.0:
             return decrement
         x = self.values - equilibrium(self.values)
-        crossings = np.flatnonzero(np.diff(np.signbit(x)))
-        spacing = np.median(np.diff(self.time[crossings])) if len(crossings) > 2 else 0.5 * self.time[-1]
+        # The noise of a rod at rest crosses zero too, so only swings beyond it count.
+        swings = np.flatnonzero(np.abs(x) > max(PEAK_NOISE_RATIO * noise_level(self.values), 0.1 * np.ptp(x)))
+        crossings = swings[1:][np.diff(np.signbit(x[swings]))]
+        spacing = np.median(np.diff(self.time[crossings])) if len(crossings) > 1 else 0.5 * self.time[-1]
         omega = float(np.pi / spacing)
         k1 = self.mass * omega**2
         return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * self.mass)))
