@@ -143,6 +143,19 @@ class Rig:
     folder: Path
     model: ModelChoices = ModelChoices()
 
+    def mass(self, symbol: Literal["m1", "m2"]) -> float:
+        """Stated mass, kg, for a kind whose ``masses`` contain ``symbol``.
+
+        Raises
+        ------
+        ValueError
+            If it is not stated; ``read_rig`` refuses such a folder.
+        """
+        stated: Quantity | None = getattr(self, symbol)
+        if stated is None:
+            raise ValueError(f"{symbol} is not stated; the kind of experiment must list it in its masses")
+        return stated.value
+
     @property
     def has_runs(self) -> bool:
         """Whether any table is a forced run."""

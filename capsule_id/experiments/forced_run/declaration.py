@@ -134,8 +134,6 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
     settings = table.settings
     if settings.drive == "base":
         return []
-    assert rig.m1 is not None, "the reader requires both masses for a forced run"
-    assert rig.m2 is not None, "the reader requires both masses for a forced run"
     names = {symbol: symbol for symbol in ("k1", "c", "mu", "K")}
     if settings.spring is not None:
         names["k2"] = f"k2[{settings.spring}]"
@@ -143,7 +141,7 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
         del names["K"]
     values = {symbol: estimate(name) for symbol, name in names.items()}
     guessed = [names[symbol] for symbol, (_, measured) in values.items() if not measured]
-    theta = {"m1": rig.m1.value, "m2": rig.m2.value, "g": rig.g.value}
+    theta = {"m1": rig.mass("m1"), "m2": rig.mass("m2"), "g": rig.g.value}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
     stated = {} if settings.normal_force is None else {NORMAL_FORCE: settings.normal_force}
     F_b = float(EQUATION_1.force({**theta, **stated}).forward(0.0))

@@ -234,9 +234,8 @@ class FreeVibration(SurfaceExperiment):
 
     @property
     def mass(self) -> float:
-        """Measured mass of the rod, kg; the schema requires it for a free vibration."""
-        assert self.rig.m1 is not None
-        return self.rig.m1.value
+        """Measured mass of the rod, kg."""
+        return self.rig.mass("m1")
 
     def rough_decrement(self) -> Decrement:
         """The paper's estimate, or one from the first zero crossings where there are too few peaks."""

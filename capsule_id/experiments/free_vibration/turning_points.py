@@ -102,10 +102,9 @@ class TurningPoints(SurfaceExperiment):
         used = np.abs(peaks) > 0.05 * np.max(np.abs(peaks))
         Omega_o = float(np.pi / np.polyfit(index, self.time, 1)[0])
         delta = float(-2.0 * np.polyfit(index[used], np.log(np.abs(peaks[used])), 1)[0])
-        m1 = self.rig.m1
-        assert m1 is not None
-        k1 = m1.value * Omega_o**2
-        return Decrement(self.time, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * m1.value)))
+        mass = self.rig.mass("m1")
+        k1 = mass * Omega_o**2
+        return Decrement(self.time, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * mass)))
 
     def starts(self) -> dict[str, Start]:
         rough = self.paper_decrement()

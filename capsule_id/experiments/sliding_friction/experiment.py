@@ -61,10 +61,7 @@ class SlidingFriction(FrictionExperiment):
         """Measured points (speed, coefficient)."""
         if self.quantity == "coefficient":
             return self.speed, self.values
-        m1, m2 = self.rig.m1, self.rig.m2
-        assert m1 is not None, "the schema requires both masses for a sliding force"
-        assert m2 is not None, "the schema requires both masses for a sliding force"
-        return self.speed, self.values / normal_force(m1.value, m2.value, self.rig.g.value)
+        return self.speed, self.values / normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value)
 
     def point_errors(self) -> tuple[np.ndarray, float]:
         """The reading error of the speed is left out: it enters through the slope of the law."""

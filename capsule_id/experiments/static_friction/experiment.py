@@ -122,10 +122,7 @@ class StaticPulls(FrictionExperiment):
         """Points by the paper's formula: mu = force/N at speed 0."""
         normal = self.normal_force
         if normal is None:
-            m1, m2 = self.rig.m1, self.rig.m2
-            assert m1 is not None, "the schema requires both masses for a pull without normal_force"
-            assert m2 is not None, "the schema requires both masses for a pull without normal_force"
-            normal = normal_force(m1.value, m2.value, self.rig.g.value)
+            normal = normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value)
         return np.zeros(self.n), self.force / normal
 
     def point_errors(self) -> tuple[np.ndarray, float]:

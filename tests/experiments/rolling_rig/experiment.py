@@ -64,9 +64,7 @@ class RollingResistance(Experiment):
         return (Misfit(self.force - predicted, self.reading_sd**2, 1.0, no_design(self.n, xp)),)
 
     def starts(self) -> dict[str, Start]:
-        assert self.rig.m1 is not None
-        assert self.rig.m2 is not None
-        weight = (self.rig.m1.value + self.rig.m2.value) * self.rig.g.value
+        weight = (self.rig.mass("m1") + self.rig.mass("m2")) * self.rig.g.value
         return {
             "c_rr": Start(float(np.mean(self.force)) / weight, 0.3),
             "rolling_scatter": Start(float(np.std(self.force)), 0.3),
