@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
+from typing import IO, cast
 
 import pytest
 
@@ -156,8 +157,8 @@ def test_one_run_at_a_time(here: Path) -> None:
     holder += "print('locked', flush=True)\nsys.stdin.read()\n"
     command = [sys.executable, "-c", holder, str(here / "out.partial" / LOCK)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        other.stdout.readline()
+        # The other process holds the lock from here on.
+        assert cast("IO[bytes]", other.stdout).readline() == b"locked\n"
         before = listing(here)
         for more in ([], ["--resume"]):
             assert fit_params(["rig", "--no-sample", "--out", "out", *more]) == 2

@@ -9,7 +9,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.errors import InputError
-from tests.measured.folders import Entry, make_rig, quantity
+from tests.measured.folders import Entry, make_rig, named_line, quantity
 
 #: Longest fit, s; two to nine on an idle core.
 BOUND = 60.0
@@ -98,7 +98,7 @@ def test_chosen_levels_are_no_reading_step(tmp_path: Path) -> None:
 def test_an_absurd_stated_error_is_refused_at_its_place(tmp_path: Path, settings: dict[str, str], words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
         make_rig(tmp_path, motor(3, **settings))
-    assert caught.value.line is not None
+    assert named_line(caught.value).startswith(f"{words.split()[0]} = ")
     assert "correct the value or its unit" in caught.value.remedy
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.api import read_rig
+from capsule_id.errors import InputError
 from capsule_id.inference.result import Result
 from capsule_id.rig.model import Rig
 from capsule_id.views import ResultTable
@@ -46,3 +47,9 @@ def note(result: Result, code: str) -> ResultTable:
     """The result's only table with this code."""
     (found,) = [table for table in result.notes if table.code == code]
     return found
+
+
+def named_line(error: InputError) -> str:
+    """The text of the line that an error names; "" where it names none."""
+    lines = Path(error.file).read_text(encoding="utf-8").splitlines()
+    return "" if error.line is None else lines[error.line - 1]

@@ -8,7 +8,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.rig.model import Rig
-from tests.measured.folders import Entry, make_rig, quantity
+from tests.measured.folders import Entry, make_rig, named_line, quantity
 from tests.measured.sources import tilt_notes
 
 #: Pair: the line of the notes with the reading, heights and length, cm.
@@ -64,4 +64,4 @@ def test_without_a_word_on_the_length_the_toolkit_asks(tmp_path: Path) -> None:
         _rig(tmp_path, "foam_box", None)
     assert "length_is" in caught.value.rule
     assert caught.value.file == str(tmp_path / "rig.toml")
-    assert caught.value.line is not None
+    assert named_line(caught.value) == "[[experiment]]"
