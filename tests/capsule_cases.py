@@ -54,3 +54,14 @@ def read_cases() -> Cases:
 def states_of(t: Trajectory) -> np.ndarray:
     """(..., n, 4): X1, Y1, X2, Y2."""
     return np.stack([np.asarray(x) for x in (t.X1, t.Y1, t.X2, t.Y2)], axis=-1)
+
+
+def assert_both_ways_as_scipy(t: Trajectory, expected: np.ndarray, contacts: int) -> None:
+    """Assert that lane 0 follows the states (n, 4) of SciPy, and that they slide in both directions."""
+    error = np.abs(states_of(t)[0] - expected).max(axis=0)
+    assert error[[0, 2]].max() < 1e-9
+    assert error[[1, 3]].max() < 1e-7
+    assert int(t.contacts[0]) == contacts
+    # Both directions of sliding are in the run, so both sides of the law are.
+    assert expected[:, 3].min() < -1e-3
+    assert expected[:, 3].max() > 1e-3

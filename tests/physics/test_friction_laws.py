@@ -17,7 +17,7 @@ from capsule_id.physics.exact.friction_series import by_chain_rule
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law, slide_distance, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
 from capsule_id.physics.series import FrictionSeries
-from tests.capsule_cases import Cases, states_of
+from tests.capsule_cases import Cases, assert_both_ways_as_scipy, states_of
 from tests.scipy_capsule import simulate_scipy
 
 # mu and v_s are undefined: a law replaces them.
@@ -98,13 +98,7 @@ def test_another_law_against_scipy(law: TwoWay) -> None:
     pair = forward, lambda speed: law.back * forward(speed)
     expected, contacts = simulate_scipy({**vars(P), **vars(E)}, times, rtol=1e-12, atol=1e-15, max_step=5e-4, law=pair)
     t = simulate(P, E, times, friction=in_a_batch(law))
-    error = np.abs(states_of(t)[0] - expected).max(axis=0)
-    assert error[[0, 2]].max() < 1e-9
-    assert error[[1, 3]].max() < 1e-7
-    assert int(t.contacts[0]) == contacts
-    # Both directions of sliding are in the run, so both sides of the law are.
-    assert expected[:, 3].min() < -1e-3
-    assert expected[:, 3].max() > 1e-3
+    assert_both_ways_as_scipy(t, expected, contacts)
 
 
 def test_eq_1_without_its_own_recursion_is_the_same_motion(cases: Cases) -> None:
