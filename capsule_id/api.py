@@ -23,7 +23,7 @@ from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.report.messages import caption_of, finding_text, messages_of
+from capsule_id.report.texts.messages import caption_of, finding_text, messages_of
 from capsule_id.report.write import write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig

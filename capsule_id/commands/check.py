@@ -9,7 +9,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.lint import lint, lint_settings
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.rough_values import rough_values
-from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig

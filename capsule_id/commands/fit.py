@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.api import fit
     from capsule_id.inference.pipeline import PACKAGES, package_versions
     from capsule_id.report.console_table import table_text, verdict_text
-    from capsule_id.report.messages import messages_of, title_of
+    from capsule_id.report.texts.messages import messages_of, title_of
     from capsule_id.report.write import write_result
 
     make_experiments(rig, args.experiments, kinds)

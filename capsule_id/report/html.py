@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from capsule_id.inference.result import Result
 from capsule_id.report.columns import columns_of, table_rows
 from capsule_id.report.gallery import Picture
-from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
+from capsule_id.report.texts.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.typography import MISSING, symbol_parts
 from capsule_id.views import Finding, Level, Message, ResultTable
 

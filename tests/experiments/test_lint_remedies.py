@@ -11,7 +11,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import default_registry
-from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 from capsule_id.rig.read import read_rig
 from capsule_id.views import Finding

@@ -15,8 +15,8 @@ from capsule_id.experiments import CHOICES, make_experiments, select_tables
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values
 from capsule_id.experiments.registry import BUILT_IN, Registry, default_registry
 from capsule_id.parameters import TABLE, scatter
-from capsule_id.report.data_messages import DATA_MESSAGES
-from capsule_id.report.messages import FIT_MESSAGES, messages_of
+from capsule_id.report.texts.messages import FIT_MESSAGES, messages_of
+from capsule_id.report.texts.readings import DATA_MESSAGES
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
 from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ChoiceRule, ColumnRule, CountRule, NameRule, QuantityRule, SettingRule, WordsRule

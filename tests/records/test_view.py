@@ -12,7 +12,7 @@ from capsule_id.records.run_description import describe_run
 from capsule_id.records.view import SMALLEST_RATE_GAIN, RecordView, view_record
 from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
 from capsule_id.report.figures.style import new_figure, png
-from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.rig.filters import filter_gain
 from tests.experiments import bench
 from tests.records.runs import Known, noisier, reference, table_of

@@ -14,7 +14,7 @@ from capsule_id.experiments.registry import Registry
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
-from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.views import Finding, Message, ResultTable, Text
 
 EMPTY = {"meta", "img", "br"}

@@ -16,7 +16,7 @@ from capsule_id.experiments.checks.context import RunRecord
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.predictability import check_predictable
-from capsule_id.experiments.forced_run.start import RunStart, rough_start
+from capsule_id.experiments.forced_run.start_state.rough import RunStart, rough_start
 from capsule_id.experiments.forced_run.tables import predicted_motion
 from capsule_id.physics.drives.recorded import RodMotion
 from capsule_id.physics.friction import FrictionLaw

@@ -27,8 +27,8 @@ from capsule_id.experiments.forced_run.nuisances import run_parameters, run_star
 from capsule_id.experiments.forced_run.panels import run_comparisons
 from capsule_id.experiments.forced_run.parts import parts_of
 from capsule_id.experiments.forced_run.predictability import check_predictable, predictable_parts
-from capsule_id.experiments.forced_run.restart import corrected_start
-from capsule_id.experiments.forced_run.start import AboutRun, RunStart, rough_start
+from capsule_id.experiments.forced_run.start_state.restart import corrected_start
+from capsule_id.experiments.forced_run.start_state.rough import AboutRun, RunStart, rough_start
 from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, innovations

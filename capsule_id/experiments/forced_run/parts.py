@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from capsule_id.experiments.forced_run.start import PARABOLA_SAMPLES
+from capsule_id.experiments.forced_run.start_state.rough import PARABOLA_SAMPLES
 from capsule_id.rig.model import Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 

@@ -19,7 +19,7 @@ from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.messages import finding_text, messages_of
+from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Finding
 

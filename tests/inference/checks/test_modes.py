@@ -16,7 +16,7 @@ from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.pipeline import higher_maximum, sample_posterior, stage_seeds
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.messages import FIT_MESSAGES, finding_text
+from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig
 from tests.measured.sources import rack_friction

@@ -10,7 +10,7 @@ from capsule_id.inference.checks.experiment_checks import check_whiteness
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.messages import FIT_MESSAGES, finding_text
+from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import PriorOverride, Quantity
 from capsule_id.views import Finding
 from tests.experiments import bench

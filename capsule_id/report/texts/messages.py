@@ -5,8 +5,8 @@ from typing import Literal
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
-from capsule_id.report.data_messages import DATA_MESSAGES
-from capsule_id.report.posterior_messages import POSTERIOR_MESSAGES, stated_p
+from capsule_id.report.texts.posterior import POSTERIOR_MESSAGES, stated_p
+from capsule_id.report.texts.readings import DATA_MESSAGES
 from capsule_id.views import Facts, Finding, Level, Message, ResultTable
 
 #: Errors of a text that does not match its facts.

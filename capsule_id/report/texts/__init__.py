@@ -1,0 +1,1 @@
+"""Texts of findings and captions of tables, by code."""
