@@ -97,12 +97,14 @@ def test_dependencies_are_what_is_imported() -> None:
     imported = {"pillow" if name == "PIL" else name for name in found - sys.stdlib_module_names - {"capsule_id"}}
     # xarray writes through h5netcdf: it needs no import of ours.
     imported |= {"h5netcdf"} if 'engine="h5netcdf"' in text else set()
-    required, maps = (
+    imported = {{"nptdms": "npTDMS"}.get(name, name) for name in imported}
+    extras = SETTINGS["project"]["optional-dependencies"]
+    required, optional = (
         {re.split(r"[<>=\[]", line)[0] for line in lines}
-        for lines in (SETTINGS["project"]["dependencies"], SETTINGS["project"]["optional-dependencies"]["maps"])
+        for lines in (SETTINGS["project"]["dependencies"], extras["maps"] + extras["formats"])
     )
     assert required - imported == set()
-    assert imported - required == maps
+    assert imported - required == optional
 
 
 def test_the_package_states_its_version_and_its_types() -> None:

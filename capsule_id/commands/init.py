@@ -16,11 +16,13 @@ HEAD = """\
 #: A quantity is { value = ..., sd = ..., unit = "..." }; without sd the value is exact.
 #: A table is a CSV file: a header `name [unit]` per column (dimensionless: [1]), then a row of numbers per reading.
 #: Comma, semicolon or tab separates the cells; a decimal comma needs semicolon or tab.
-#: Files of another layout (.mat too) are read by a column map in the experiment; columns that it leaves out are ignored:
+#: Files of another layout (also .lvm .tdms .mat .xlsx .npz .h5 .parquet) are read by a column map.
+#: Columns of the file that the map leaves out are ignored:
 #:   columns = { time = { from = "Time (s)", unit = "s" }, x_rel = { from = 3, unit = "mm", scale = -1, offset = 0.2 } }
 #:   from is a header, or a number counted from 1; the result is (from - minus) * scale + offset, in unit.
 #:   Without a time column: time = { rate = { value = 1000, unit = "Hz" } }. Further keys, where needed:
-#:   data_from_line = 3; missing = ["--", "NaN"]; where = { tau = 30 }; files = ["a.csv", "b.csv"] instead of file.
+#:   files = ["a.csv", "b.csv"] instead of file; data_from_line = 3
+#:   decimal = ","; missing = ["--", "NaN"]; where = { tau = 30 }.
 #: Every experiment has three optional keys: label = "..." is its unique name (default: the file without suffix);
 #: <column>_sd states a reading error; <column>_resolution states a reading step.
 

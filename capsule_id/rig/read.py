@@ -13,8 +13,8 @@ from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
 from capsule_id.rig.choices import check_masses_of_free, read_model
-from capsule_id.rig.decode import decode
 from capsule_id.rig.entry import Entry
+from capsule_id.rig.formats.text.decode import decode
 from capsule_id.rig.maps.declared import MAP_KEYS
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, KindRule, parameter_rows

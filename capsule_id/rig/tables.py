@@ -12,7 +12,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
-from capsule_id.rig.formats import EXPORTS, READERS
+from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.maps.declared import ColumnMap, read_map
@@ -75,7 +75,7 @@ def table_path(document: TomlDocument, path: KeyPath, name: str) -> Path:
         raise document.error(path, "file must exist", shown(name), "correct the name or add the file")
     if not regular:
         raise document.error(path, "file must be a regular file", shown(name), "name a table, not a folder or device")
-    if file.suffix.lower() not in EXPORTS:
+    if suffix_of(file) not in EXPORTS:
         known = " ".join(EXPORTS)
         raise document.error(path, f"file must be a table of a known kind ({known})", shown(name), "export it as CSV")
     return file
@@ -107,7 +107,7 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
         table = _read_plain(document, places[0][0], files[first], contents[first], hashes, kind)
     else:
         _check_map_names(document, path, column_map, kind)
-        read = [EXPORTS[file.suffix.lower()](contents[name], file, column_map.layout) for name, file in files.items()]
+        read = [EXPORTS[suffix_of(file)](contents[name], file, column_map.layout) for name, file in files.items()]
         mapped = apply_map(document, path, read, column_map)
         table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other)
     table.raw.rows.flags.writeable = False
@@ -134,7 +134,7 @@ def _read_plain(
     document: TomlDocument, place: KeyPath, file: Path, content: bytes, hashes: Mapping[str, str], kind: KindRule
 ) -> TableFile:
     """A file with the column names of the kind; an error about its header proposes a column map."""
-    suffix = file.suffix.lower()
+    suffix = suffix_of(file)
     if suffix not in READERS:
         remedy = f"add {_proposal(content, file, kind, Layout())}"
         raise document.error(place, f"a {suffix} file needs a column map", "no columns", remedy)
@@ -154,7 +154,7 @@ def _proposal(content: bytes, file: Path, kind: KindRule, layout: Layout) -> str
     """The column map that reads a file as ``kind``."""
     export: Export | None = None
     with suppress(InputError):
-        export = EXPORTS[file.suffix.lower()](content, file, layout)
+        export = EXPORTS[suffix_of(file)](content, file, layout)
     return proposal(kind, export)
 
 

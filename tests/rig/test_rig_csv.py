@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.csv import _read_cells, _read_fast, read_csv
+from capsule_id.rig.formats.text.csv import _read_cells, _read_fast, read_csv
 
 DIALECTS = [
     (delimiter, decimal, ending, mark)

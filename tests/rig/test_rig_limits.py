@@ -7,7 +7,7 @@ import pytest
 
 import capsule_id
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.csv import read_csv
+from capsule_id.rig.formats.text.csv import read_csv
 from capsule_id.rig.toml_document import DEEPEST_KEY, LARGEST_TEXT, parse_toml
 
 TOML, TABLE = Path("rig.toml"), Path("table.csv")

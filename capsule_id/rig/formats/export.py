@@ -15,10 +15,12 @@ class Layout:
     ----------
     data_from_line : 1-based line of the first row of numbers (None: the first line that holds a number)
     missing : texts of cells without a reading, such as ``--`` or ``NaN``
+    decimal : decimal mark of a text table, "." or "," (None: found in the file)
     """
 
     data_from_line: int | None = None
     missing: tuple[str, ...] = ()
+    decimal: str | None = None
 
 
 @dataclass(frozen=True)

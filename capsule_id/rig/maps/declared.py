@@ -1,4 +1,4 @@
-"""Reads the column map of an experiment: ``columns``, ``data_from_line``, ``missing`` and ``where`` of ``rig.toml``."""
+"""Reads the column map of an experiment in ``rig.toml``: ``columns`` and the keys that go with it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from capsule_id.rig.formats.export import Layout
 from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import (
+    read_choice,
     read_quantity,
     read_string,
     read_table,
@@ -19,7 +20,7 @@ from capsule_id.rig.toml_values import (
 )
 
 #: Keys of an experiment that go with ``columns``.
-MAP_KEYS = ("columns", "files", "data_from_line", "missing", "where")
+MAP_KEYS = ("columns", "files", "data_from_line", "missing", "decimal", "where")
 _EXAMPLE = '{ from = "...", unit = "..." }'
 Header = str | int  #: a header, or a column's number counted from 1
 
@@ -72,7 +73,7 @@ def read_map(
     InputError
         At the key or value of ``rig.toml`` that is wrong.
     """
-    layout = Layout(_line(document, path, entry), _markers(document, path, entry))
+    layout = Layout(_line(document, path, entry), _markers(document, path, entry), _decimal(document, path, entry))
     if "columns" not in entry:
         for key in MAP_KEYS[1:]:
             if key in entry:
@@ -148,6 +149,12 @@ def _markers(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) ->
         remedy = 'write missing = ["--", "NaN"]'
         raise document.error(place, "missing must be a list of texts", shown(value), remedy)
     return tuple(value)
+
+
+def _decimal(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> str | None:
+    """``decimal``, None where it is not stated."""
+    place = (*path, "decimal")
+    return read_choice(document, place, entry["decimal"], (".", ",")) if "decimal" in entry else None
 
 
 def _where(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> dict[str, float]:

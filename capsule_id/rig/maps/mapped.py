@@ -105,7 +105,12 @@ class _Part:
 
     def __init__(self, document: TomlDocument, path: KeyPath, exports: Sequence[Export]) -> None:
         self.document, self.path, self.exports = document, path, exports
-        self.rows = 0  # of the columns found, 0 before the first one
+        self._rows: int | None = None  # of the columns found, None before the first one
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of the columns found."""
+        return self._rows or 0
 
     def find(self, place: KeyPath, header: Header) -> _Found:
         """The column ``header``, stated at ``place`` of ``rig.toml``."""
@@ -121,7 +126,7 @@ class _Part:
             value = f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}"
             raise self.document.error(place, f"{place[-1]} must be a header of the file", value, remedy)
         first = found[0]
-        self.rows = self.rows or first.values.size
+        self._rows = first.values.size if self._rows is None else self._rows
         for each in found:
             if each.values.size != self.rows:
                 rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {each.values.size}"

@@ -8,8 +8,8 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from capsule_id.errors import InputError, collecting
+from capsule_id.rig.formats.binary.mat import read_mat
 from capsule_id.rig.formats.export import Layout
-from capsule_id.rig.formats.mat import read_mat
 
 PATH = Path("m.mat")
 
@@ -66,9 +66,3 @@ def test_every_changed_or_missing_byte_reads_or_is_refused(compressed: bool) -> 
             assert all(str(fault).isprintable() for fault in faults)
             refused += len(faults)
     assert refused > len(content) // 2
-
-
-def test_version_7_3_names_the_command_that_saves_version_7() -> None:
-    with pytest.raises(InputError, match=r"7\.3") as caught:
-        read_mat(b"MATLAB 7.3 MAT-file".ljust(520) + b"\x89HDF", PATH, Layout())
-    assert "'-v7'" in caught.value.remedy

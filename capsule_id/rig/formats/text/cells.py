@@ -1,6 +1,9 @@
 """Splits the lines of a text table into cells and reads their numbers. Places are 1-based."""
 
+import json
 import re
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,7 @@ from capsule_id.errors import InputError
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
+_NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
 _LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
 
@@ -55,6 +59,47 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
         remedy = "write a smaller number: float64 ends at 1.8e308"
         raise InputError("a cell must be a finite number", shown_cell(cell), remedy, path, line, column)
     return value
+
+
+def read_column(
+    texts: Sequence[str],
+    decimal: str | None,
+    missing: Sequence[str],
+    place: Callable[[int], tuple[Path, int, int]],
+) -> np.ndarray:
+    """The numbers of one column, (n,); NaN at a missing marker.
+
+    Parameters
+    ----------
+    texts : the cells
+    decimal : decimal mark (None: the first point or comma of the column)
+    missing : texts of cells without a reading
+    place : file, line and column of a cell, for error lines
+
+    Raises
+    ------
+    InputError
+        At the first cell that is neither a finite number nor a marker.
+    """
+    marks = None if decimal else re.search("[.,]", "\n".join(text for text in texts if text not in missing))
+    mark = decimal or (marks[0] if marks else ".")
+    if (_NUMBER_CHARACTERS | {mark}).issuperset("".join(texts)):  # quickly, where all are numbers
+        with suppress(ValueError):
+            values = np.array([float(text.replace(mark, ".")) for text in texts])
+            if np.isfinite(values).all():
+                return values
+    values = np.full(len(texts), np.nan)
+    for k, text in enumerate(texts):
+        if text in missing:
+            continue
+        value = number_in(text, mark)
+        if value is None:
+            remedy = (
+                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row"
+            )
+            raise InputError("a cell must be a number", shown_cell(text), remedy, *place(k))
+        values[k] = value if np.isfinite(value) else read_number(text, mark, *place(k))
+    return values
 
 
 def shown_cell(cell: str) -> str:

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.decode import decode
-from capsule_id.rig.formats.cells import cells_of, read_number, shown_cell
 from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.formats.text.cells import cells_of, read_number, shown_cell
+from capsule_id.rig.formats.text.decode import decode
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE \t\n")  # plus the decimal mark

@@ -4,21 +4,18 @@ Headers are found in the lines above the numbers that have as many cells as the 
 comments; above the numbers they may hold the headers.
 """
 
-import json
 import re
-from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.decode import decode
-from capsule_id.rig.formats.cells import BLANKS, cells_of, number_in, read_number, shown_cell
 from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_column, shown_cell
+from capsule_id.rig.formats.text.decode import decode
 
 _COMMENTS = ("#", "%")
-_NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
+_COMMA_BETWEEN_DIGITS = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 
 def read_text(content: bytes, path: Path, layout: Layout) -> Export:
@@ -41,6 +38,7 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     if not numbers:
         raise InputError("a table must have rows of numbers", "none", "export the readings", path, len(lines), 1)
     delimiter = _delimiter(lines[numbers[0]], layout)
+    _refuse_ambiguous_comma([lines[i] for i in numbers], delimiter, layout, path, numbers[0] + 1)
     rows = [lines[i].split(delimiter) for i in numbers]
     if len(rows[0]) > 1 and not any(row[-1].strip(BLANKS) for row in rows):  # a separator at the end of every line
         rows = [row[:-1] for row in rows]
@@ -53,7 +51,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     found = [(i, names) for i in range(first - 1, -1, -1) if (names := _headers(lines[i], delimiter, width, layout))]
 
     def values(column: int) -> np.ndarray:
-        return _column([_bare(row[column]) for row in rows], delimiter, layout, lambda k: (path, *place(k, column)))
+        texts = [_bare(row[column]) for row in rows]
+        decimal = "." if delimiter == "," else layout.decimal
+        return read_column(texts, decimal, layout.missing, lambda k: (path, *place(k, column)))
 
     def place(row: int | None, column: int) -> tuple[int, int]:
         line = numbers[row] if row is not None else found[0][0] if found else numbers[0]
@@ -92,34 +92,6 @@ def _first_row(lines: list[str], layout: Layout, path: Path) -> int:
     raise InputError(rule, shown_cell(lines[begun].strip()), remedy, path, begun + 1, 1)
 
 
-def _column(
-    texts: list[str], delimiter: str | None, layout: Layout, place: Callable[[int], tuple[Path, int, int]]
-) -> np.ndarray:
-    """The numbers of one column; NaN at a missing marker. ``place`` gives the place of a row for error lines."""
-    present = [text for text in texts if text not in layout.missing]
-    marks = re.search("[.,]", "\n".join(present)) if delimiter != "," else None
-    decimal = marks[0] if marks else "."
-    if len(present) == len(texts) and (_NUMBER_CHARACTERS | {decimal}).issuperset(
-        "".join(texts)
-    ):  # quickly, where all are numbers
-        with suppress(ValueError):
-            values = np.array([float(text.replace(decimal, ".")) for text in texts])
-            if np.isfinite(values).all():
-                return values
-    values = np.full(len(texts), np.nan)
-    for k, text in enumerate(texts):
-        if text in layout.missing:
-            continue
-        value = number_in(text, decimal)
-        if value is None:
-            remedy = (
-                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row"
-            )
-            raise InputError("a cell must be a number", shown_cell(text), remedy, *place(k))
-        values[k] = value if np.isfinite(value) else read_number(text, decimal, *place(k))
-    return values
-
-
 def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:
     """The headers in a line above the numbers; () if it holds none."""
     cells = _split(line.lstrip(BLANKS).lstrip("".join(_COMMENTS)), delimiter)
@@ -146,11 +118,21 @@ def _delimiter(line: str, layout: Layout) -> str | None:
         if mark in line:
             return mark
     words = line.split()
+    if layout.decimal == ",":  # a tab separates nothing in a line with one cell
+        return None if len(words) > 1 else "\t"
     if "," not in line:
         return None if len(words) > 1 else ","
     if all(_is_reading(cell, layout) for cell in _split(line, ",")):
         return ","
     return None if len(words) > 1 and all(_is_reading(word, layout) for word in words) else ","
+
+
+def _refuse_ambiguous_comma(rows: list[str], delimiter: str | None, layout: Layout, path: Path, line: int) -> None:
+    """Refuse rows such as ``1,25``: two whole numbers, or one number with a decimal comma."""
+    if delimiter == "," and layout.decimal is None and all(_COMMA_BETWEEN_DIGITS.fullmatch(row) for row in rows):
+        rule = "a comma between digits must be stated as a separator or a decimal mark"
+        remedy = 'state decimal = "," for one column of numbers, decimal = "." for two'
+        raise InputError(rule, shown_cell(rows[0].strip()), remedy, path, line, 1)
 
 
 def _is_comment(line: str) -> bool:

@@ -1,0 +1,1 @@
+"""Readers of binary tables: of arrays or sheets with names."""

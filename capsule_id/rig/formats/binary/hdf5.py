@@ -1,0 +1,52 @@
+"""Reads HDF5 files, among them MATLAB files of version 7.3: every real numeric data set is a column, or a matrix.
+
+h5py reads them. Links, and data sets whose numbers lie in other files, are left out: only the bytes of this file count.
+"""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.rig.formats.binary.arrays import export_of_arrays
+from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.limits import complete, refuse_large
+
+
+def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read the data sets of an HDF5 file; their names are paths such as ``group/x``.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : ``missing`` may hold "NaN"
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, too large, or has no numeric data set.
+    """
+    import h5py
+
+    arrays: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    # MATLAB stores the columns of a matrix one after the other, which HDF5 sees as rows.
+    by_columns = content.startswith(b"MATLAB 7.3")
+
+    def visit(name: str, found: object) -> None:
+        if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu" or found.ndim not in (1, 2):
+            return
+        # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
+        text = found.attrs.get("MATLAB_class") == b"char" or name.startswith("#") or "MATLAB_empty" in found.attrs
+        if not (text or found.is_virtual or found.external):
+            refuse_large(found.size * found.dtype.itemsize + sum(array.nbytes for array in arrays.values()), path)
+            array = np.asarray(found[()])
+            arrays[name] = array.T if by_columns else array
+            unit = found.attrs.get("units", found.attrs.get("unit"))
+            if isinstance(unit, str):
+                units[name] = unit
+
+    with complete(path, "export it again"), h5py.File(io.BytesIO(content), "r") as file:
+        file.visititems(visit)
+    return export_of_arrays(arrays, path, layout, units)

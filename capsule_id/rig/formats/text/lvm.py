@@ -1,0 +1,182 @@
+"""Reads LabVIEW measurement files (``.lvm``): a header of the file, then segments with a header and rows of numbers.
+
+The layout is that of "LabVIEW Measurement File", National Instruments. The package lvm_read reads a damaged cell as NaN
+and loads pickled copies that lie beside a file, so this reader is the package's own.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.rig.formats.binary.arrays import refuse_line
+from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_column, shown_cell
+from capsule_id.rig.formats.text.decode import decode
+
+_END = "***End_of_Header***"
+_SPECIAL, _END_SPECIAL = "***Start_Special***", "***End_Special***"
+_TIMES, _COMMENT = "X_Value", "Comment"
+_REMEDY = "export the record again"
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """One segment: cells of its header by key, names of the columns, 0-based lines of its rows, and their cells."""
+
+    keys: dict[str, list[str]]
+    names: tuple[str, ...]
+    lines: list[int]
+    rows: list[list[str]]
+
+
+@dataclass(frozen=True)
+class _File:
+    """A file taken apart; ``times_computed``: its rows hold no times."""
+
+    path: Path
+    lines: list[str]
+    separator: str
+    decimal: str | None
+    missing: tuple[str, ...]
+    times_computed: bool
+    segments: list[_Segment]
+
+    def stored(self, column: int) -> np.ndarray:
+        """The numbers of a column; blank cells at the end of a segment are no readings."""
+        parts = []
+        for segment in self.segments:
+            texts = [row[column].strip(BLANKS + '"') if column < len(row) else "" for row in segment.rows]
+            while len(texts) > 1 and not texts[-1]:
+                texts.pop()
+            place = [(self.path, *self.place(line, column)) for line in segment.lines[: len(texts)]]
+            parts.append(read_column(texts, self.decimal, self.missing, place.__getitem__))
+        return np.concatenate(parts)
+
+    def clocks(self, channel: int) -> list[tuple[float, float]]:
+        """First time and step of a channel, counted from 1, in every segment.
+
+        Raises
+        ------
+        InputError
+            If a header states none.
+        """
+        found = []
+        for segment in self.segments:
+            cells = [([*segment.keys.get(key, []), *[""] * channel])[channel - 1] for key in ("X0", "Delta_X")]
+            start, step = (number_in(cell, self.decimal or ".") for cell in cells)
+            if start is None or step is None or not np.isfinite([start, step]).all() or step <= 0.0:
+                rule = "a file without times must state X0 and a positive Delta_X for every channel"
+                raise InputError(rule, shown_cell(" ".join(cells)), _REMEDY, self.path, segment.lines[0] + 1, 1)
+            found.append((start, step))
+        return found
+
+    def computed(self, channel: int) -> np.ndarray:
+        """The times of a channel, counted from 1."""
+        pairs = zip(self.clocks(channel), self.segments, strict=True)
+        return np.concatenate([start + step * np.arange(len(segment.rows)) for (start, step), segment in pairs])
+
+    def place(self, line: int, column: int) -> tuple[int, int]:
+        """1-based line and character of a cell."""
+        cells = cells_of(self.lines[line], self.separator)
+        return line + 1, cells[column][1] if column < len(cells) else len(self.lines[line]) + 1
+
+
+def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read the columns of a LabVIEW measurement file; segments follow one another.
+
+    ``X_Value`` is the column of times (or another abscissa). A file without such columns has them computed from X0 and
+    Delta_X: one where they are the same for every channel, else one before each channel. Comments are left out.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : ``missing`` may hold texts of cells
+
+    Raises
+    ------
+    InputError
+        If the headers are incomplete, or segments have different channels.
+    """
+    refuse_line(layout, path)
+    file = _take_apart(decode(content, path).split("\n"), path, layout.missing)
+    names = file.segments[0].names
+    channels = range(1, len(names))
+    #: A column of the file, or the computed times of channel k as -k.
+    sources = list(range(len(names)))
+    if file.times_computed:
+        alike = len({tuple(file.clocks(channel)) for channel in channels}) == 1
+        sources = [-1, *channels] if alike else [source for channel in channels for source in (-channel, channel)]
+
+    def values(column: int) -> np.ndarray:
+        source = sources[column]
+        return file.stored(source) if source >= 0 else file.computed(-source)
+
+    numbers = [line for segment in file.segments for line in segment.lines]
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        return file.place(numbers[0] - 1 if row is None else numbers[row], max(sources[column], 0))
+
+    headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
+    return Export(path, (headers,), len(headers), np.asarray(numbers) + 1, values, place)
+
+
+def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:
+    """Headers and segments of a file."""
+    word = "Separator"
+    stated = next((line for line in lines if line.startswith(word)), word + "\t")
+    separator = "," if stated[len(word) :].startswith(",") else "\t"
+    head, position = _header(lines, 0, separator, path)
+    segments: list[_Segment] = []
+    while (start := _next_header(lines, position, separator)) is not None:
+        keys, first = _header(lines, start, separator, path)
+        segment, position = _segment(lines, first, separator, keys)
+        if not segment.lines:
+            raise InputError("a segment must have rows", "none", _REMEDY, path, min(first + 1, len(lines)), 1)
+        if segments and segment.names != segments[0].names:
+            value = shown_cell(" ".join(segment.names))
+            raise InputError("segments must have the same columns", value, _REMEDY, path, first + 1, 1)
+        segments.append(segment)
+    if not segments:
+        raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, len(lines), 1)
+    if len(segments[0].names) < 2:
+        raise InputError("a segment must have channels", "none", _REMEDY, path, segments[0].lines[0], 1)
+    decimal = (head.get("Decimal_Separator") or [""])[0]
+    computed = (head.get("X_Columns") or [""])[0].lower() == "no"
+    return _File(path, lines, separator, decimal if decimal in (".", ",") else None, missing, computed, segments)
+
+
+def _next_header(lines: list[str], position: int, separator: str) -> int | None:
+    """The first line of the next header, None at the end of the file; special blocks are skipped."""
+    special = False
+    for number in range(position, len(lines)):
+        word = lines[number].split(separator)[0].strip()
+        special = (special or word == _SPECIAL) and word != _END_SPECIAL
+        if not special and word and word != _END_SPECIAL:
+            return number
+    return None
+
+
+def _header(lines: list[str], position: int, separator: str, path: Path) -> tuple[dict[str, list[str]], int]:
+    """The cells behind each key of a header, and the line after it."""
+    keys: dict[str, list[str]] = {}
+    for number in range(position, len(lines)):
+        key, *cells = (cell.strip() for cell in lines[number].split(separator))
+        if key == _END:
+            return keys, number + 1
+        keys[key] = cells
+    raise InputError(f"a header must end with {_END}", "the end of the file", _REMEDY, path, len(lines), 1)
+
+
+def _segment(lines: list[str], position: int, separator: str, keys: dict[str, list[str]]) -> tuple[_Segment, int]:
+    """The columns and rows of a segment, and the line after it."""
+    names = [" ".join(name.split()) for name in lines[position].split(separator)] if position < len(lines) else []
+    while names and names[-1] in ("", _COMMENT):
+        names.pop()
+    stop = position + 1
+    while stop < len(lines) and lines[stop].strip() and not lines[stop].startswith(("***", "Channels")):
+        stop += 1
+    numbers = list(range(position + 1, stop))
+    return _Segment(keys, tuple(names), numbers, [lines[number].split(separator) for number in numbers]), stop

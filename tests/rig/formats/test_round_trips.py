@@ -1,0 +1,115 @@
+"""The twin's forced run, written in every format by another program, is read back to rounding."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capsule_id
+from capsule_id.errors import InputError
+from capsule_id.rig.model import Table
+from tests.rig.formats.writers import WRITERS, lvm, mat_5, tdms
+
+RUN = capsule_id.read_rig(Path(__file__).parents[3] / "data").tables[-4]
+#: The run in the units of its file; times as LabVIEW makes them, from a rate.
+COLUMNS = {name: column.values * column.to_display for name, column in RUN.columns.items()}
+UNITS = {name: column.unit for name, column in RUN.columns.items()}
+#: Largest relative difference after the round trip.
+ROUNDING = 1e-12
+
+
+def entry(file: str, time: str | int | None, **others: int) -> str:
+    """A rig whose run is read from ``file``; ``time`` names its column, ``others`` the numbers of other columns."""
+    sources = {name: others.get(name, f'"{name}"') for name in COLUMNS}
+    sources["time"] = f'"{time}"' if isinstance(time, str) else str(time)
+    maps = [f'{name} = {{ from = {source}, unit = "{UNITS[name]}" }}' for name, source in sources.items()]
+    if time is None:
+        maps[0] = 'time = { rate = { value = 1000, unit = "Hz" } }'
+    return f"""\
+[rig]
+name = "round-trip"
+m1 = {{ value = 0.11, unit = "kg" }}
+m2 = {{ value = 0.53, unit = "kg" }}
+[[experiment]]
+kind = "forced_run"
+file = "{file}"
+Omega = {{ value = 34.56, unit = "rad/s" }}
+columns = {{ {", ".join(maps)} }}
+"""
+
+
+def read(folder: Path, file: str, content: bytes, time: str | int | None, **others: int) -> Table:
+    (folder / file).write_bytes(content)
+    (folder / "rig.toml").write_text(entry(file, time, **others), encoding="utf-8")
+    (table,) = capsule_id.read_rig(folder).tables
+    return table
+
+
+def assert_same(table: Table) -> None:
+    for name, column in RUN.columns.items():
+        expected = column.values
+        np.testing.assert_allclose(table[name], expected, rtol=ROUNDING, atol=ROUNDING * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_round_trip(tmp_path: Path, name: str) -> None:
+    suffix, write = WRITERS[name]
+    time = {".lvm": "X_Value", ".tdms": "wf_time"}.get(suffix, "time")
+    multi = name == "LabVIEW text, times of each channel"
+    assert_same(read(tmp_path, f"run{suffix}", write(COLUMNS), 1 if multi else time))
+
+
+def test_tdms_without_waveform_properties_needs_a_rate(tmp_path: Path) -> None:
+    content = tdms(COLUMNS, waveform=False)
+    with pytest.raises(InputError, match="from must be a header of the file, 'wf_time'"):
+        read(tmp_path, "run.tdms", content, "wf_time")
+    assert_same(read(tmp_path, "run.tdms", content, None))
+
+
+def test_channels_of_a_labview_file_with_different_rates_have_times_of_their_own(tmp_path: Path) -> None:
+    text = lvm(COLUMNS, "No").decode()
+    rates = next(line for line in text.split("\n") if line.startswith("Delta_X"))
+    changed = text.replace(rates, rates.replace("0.001", "0.002", 1))
+    assert changed != text
+    with pytest.raises(InputError, match="a header must be unique"):
+        read(tmp_path, "run.lvm", changed.encode(), "X_Value")
+    table = read(tmp_path, "run.lvm", changed.encode(), 1)
+    np.testing.assert_allclose(table["time"], 2.0 * RUN["time"], rtol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("fault", "repaired", "rule"),
+    [
+        ("***End_of_Header***", "***End_of_Header***", None),
+        ("X_Columns\tNo\n", "X_Columns\tOne\n", "a cell must be a number"),
+        ("Delta_X\t", "Delta_Y\t", "must state X0 and a positive Delta_X"),
+        ("\tcurrent\t", "\tstrom\t", "must be a header"),
+        ("***End_of_Header***", "***End***", "a header must end with"),
+    ],
+)
+def test_faults_of_a_labview_file(tmp_path: Path, fault: str, repaired: str, rule: str | None) -> None:
+    """The file without times as it is, and with one word of it changed."""
+    text = lvm(COLUMNS, "No").decode().replace(fault, repaired)
+    if rule is None:
+        assert_same(read(tmp_path, "run.lvm", text.encode(), "X_Value"))
+        return
+    with pytest.raises(InputError, match=rule):
+        read(tmp_path, "run.lvm", text.encode(), "X_Value")
+
+
+@pytest.mark.parametrize("name", ["npTDMS", "openpyxl", "pyarrow"])
+def test_a_package_that_is_not_installed_is_named(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    suffix = {"npTDMS": ".tdms", "openpyxl": ".xlsx", "pyarrow": ".parquet"}[name]
+    monkeypatch.setitem(sys.modules, name.lower(), None)
+    with pytest.raises(InputError, match=rf"needs the package {name}, not installed, run pip install"):
+        read(tmp_path, f"run{suffix}", b"any", "time")
+
+
+def test_keys_of_text_files_are_refused_elsewhere(tmp_path: Path) -> None:
+    for line, key in (("data_from_line = 2", "data_from_line"), ('decimal = ","', "decimal")):
+        (tmp_path / "run.mat").write_bytes(mat_5(COLUMNS))
+        text = entry("run.mat", "time")
+        (tmp_path / "rig.toml").write_text(f"{text}{line}\n", encoding="utf-8")
+        with pytest.raises(InputError, match=f"a .mat file has no {key}, .* remove {key}"):
+            capsule_id.read_rig(tmp_path)
