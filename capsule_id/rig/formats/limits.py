@@ -56,5 +56,4 @@ def complete(path: Path, remedy: str) -> Iterator[None]:
         raise
     except Exception as error:
         value = " ".join(f"{type(error).__name__}: {error}".split())
-        value = "".join(mark if mark.isprintable() else "?" for mark in value)[:200]
-        raise InputError(f"a {path.suffix} file must be complete", value, remedy, path) from None
+        raise InputError(f"a {path.suffix} file must be complete", value[:200], remedy, path) from None
