@@ -1,5 +1,6 @@
 """Limits and errors that all readers of files share."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,7 +42,7 @@ def installed(package: str, path: Path) -> Iterator[None]:
 
 @contextmanager
 def complete(path: Path, remedy: str) -> Iterator[None]:
-    """Turn every exception of a library about a damaged file into an error line.
+    """Turn every exception of a library about a damaged file into an error line; its warnings are not shown.
 
     Libraries document no list of exceptions for damaged files, and fuzzing finds most of Python's.
 
@@ -51,7 +52,9 @@ def complete(path: Path, remedy: str) -> Iterator[None]:
         Where the body raises an exception; an ``InputError`` passes unchanged.
     """
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
     except InputError:
         raise
     except Exception as error:

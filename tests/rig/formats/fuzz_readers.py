@@ -12,9 +12,10 @@ from pathlib import Path
 import atheris
 import numpy as np
 
-with atheris.instrument_imports(include=["capsule_id.rig", "nptdms", "openpyxl"]):
+with atheris.instrument_imports(include=["capsule_id.rig", "nptdms", "openpyxl", "pyfive"]):
     import nptdms  # noqa: F401  (imported here to be instrumented)
     import openpyxl  # noqa: F401
+    import pyfive  # noqa: F401
 
     from capsule_id.errors import InputError
     from capsule_id.rig.formats import EXPORTS, READERS

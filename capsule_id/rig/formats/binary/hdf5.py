@@ -1,6 +1,7 @@
 """Reads HDF5 files, among them MATLAB files of version 7.3: every real numeric data set is a column, or a matrix.
 
-h5py reads them. Links, and data sets whose numbers lie in other files, are left out: only the bytes of this file count.
+pyfive reads them. It is written in Python; h5py's C library never returns from some damaged files. A file
+with links to other files is refused: only its own bytes count.
 """
 
 import io
@@ -10,7 +11,7 @@ import numpy as np
 
 from capsule_id.rig.formats.binary.arrays import export_of_arrays
 from capsule_id.rig.formats.export import Export, Layout
-from capsule_id.rig.formats.limits import complete, refuse_large
+from capsule_id.rig.formats.limits import complete, installed, refuse_large
 
 
 def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
@@ -27,7 +28,8 @@ def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
     InputError
         If the file is damaged, too large, or has no numeric data set.
     """
-    import h5py
+    with installed("pyfive", path):
+        import pyfive
 
     arrays: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
@@ -35,11 +37,13 @@ def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
     by_columns = content.startswith(b"MATLAB 7.3")
 
     def visit(name: str, found: object) -> None:
-        if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu" or found.ndim not in (1, 2):
+        if not isinstance(found, pyfive.Dataset) or found.ndim not in (1, 2):
+            return
+        if getattr(found.dtype, "kind", "") not in ("f", "i", "u"):
             return
         # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
         text = found.attrs.get("MATLAB_class") == b"char" or name.startswith("#") or "MATLAB_empty" in found.attrs
-        if not (text or found.is_virtual or found.external):
+        if not text:
             refuse_large(found.size * found.dtype.itemsize + sum(array.nbytes for array in arrays.values()), path)
             array = np.asarray(found[()])
             arrays[name] = array.T if by_columns else array
@@ -47,6 +51,6 @@ def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
             if isinstance(unit, str):
                 units[name] = unit
 
-    with complete(path, "export it again"), h5py.File(io.BytesIO(content), "r") as file:
+    with complete(path, "export it again"), pyfive.File(io.BytesIO(content)) as file:
         file.visititems(visit)
     return export_of_arrays(arrays, path, layout, units)

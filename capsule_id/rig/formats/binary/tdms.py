@@ -12,6 +12,9 @@ from capsule_id.rig.formats.limits import complete, installed, refuse_large
 
 #: Name of the column of times of a waveform, which the file holds as an offset and an increment.
 TIME = "wf_time"
+#: Most scales of a channel.
+MOST_SCALES = 1000
+_SCALES = "NI_Number_Of_Scales"
 
 
 def read_tdms(content: bytes, path: Path, layout: Layout) -> Export:
@@ -38,7 +41,12 @@ def read_tdms(content: bytes, path: Path, layout: Layout) -> Export:
     units: dict[str, str] = {}
     clocks: dict[str, tuple[float, float, int]] = {}
     with complete(path, "export it again, or as text"), nptdms.TdmsFile.open(io.BytesIO(content)) as file:
-        channels = [channel for group in file.groups() for channel in group.channels() if channel.dtype.kind in "fiu"]
+        groups = file.groups()
+        everything = [channel for group in groups for channel in group.channels()]
+        for properties in (file.properties, *(each.properties for each in (*groups, *everything))):
+            if not 0 <= properties.get(_SCALES, 0) <= MOST_SCALES:  # npTDMS makes a list of so many elements
+                raise ValueError(f"{properties[_SCALES]} scales of a channel")
+        channels = [channel for channel in everything if channel.dtype.kind in "fiu"]
         refuse_large(8 * sum(len(channel) for channel in channels), path)
         names = [channel.name for channel in channels]
         for channel in channels:

@@ -89,7 +89,7 @@ def _texts(row: list[float | str], width: int) -> list[str]:
 
 def _in_sheet(error: InputError, lines: list[str]) -> InputError:
     """The error with the column of the sheet instead of the character of the line."""
-    if error.line is None:
+    if error.line is None or error.line > len(lines):
         return error
     column = lines[error.line - 1][: (error.column or 1) - 1].count("\t") + 1
     return InputError(error.rule, error.value, error.remedy, error.file, error.line, column)

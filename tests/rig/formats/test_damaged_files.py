@@ -1,0 +1,149 @@
+"""Damaged and hostile files end in one clean error line. The files with numbers were found by ``fuzz_readers.py``."""
+
+import gzip
+import io
+import random
+import time
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from capsule_id.errors import InputError
+from capsule_id.rig import formats
+from capsule_id.rig.formats import EXPORTS, limits
+from capsule_id.rig.formats.export import Layout
+from tests.rig.formats.writers import WRITERS, hdf5, lvm, mat_73, npz, tdms, xlsx
+
+TIME = np.arange(6) * 0.25
+COLUMNS = {"t": TIME, "x": np.round(np.cos(TIME), 3)}
+LAYOUT = Layout(missing=("NaN", ""))
+#: Limit in these tests; the package's own is 1 GiB.
+LIMIT = 1 << 26
+#: Damaged copies of each file in the default run.
+COPIES = 60
+
+
+def refusal(suffix: str, content: bytes) -> InputError | None:
+    """The error about a file, None if it reads."""
+    try:
+        export = EXPORTS[suffix](content, Path(f"f{suffix}"), LAYOUT)
+        for column in range(export.width):
+            export.values(column)
+    except InputError as error:
+        return error
+    return None
+
+
+def damaged(content: bytes, chance: random.Random) -> bytes:
+    changed = bytearray(content[: chance.randrange(1, len(content))] if chance.random() < 0.2 else content)
+    for _ in range(chance.randint(1, 4)):
+        changed[chance.randrange(len(changed))] = chance.choice((0, 1, 127, 128, 255, chance.randrange(256)))
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_files_read_or_end_in_one_clean_line(name: str) -> None:
+    suffix, write = WRITERS[name]
+    content, chance = write(COLUMNS), random.Random(name)
+    assert refusal(suffix, content) is None
+    refused = 0
+    for _ in range(COPIES):
+        error = refusal(suffix, damaged(content, chance))
+        refused += error is not None
+        assert error is None or str(error).isprintable()
+    assert refused > 0
+
+
+def with_npy(header: bytes, body: bytes) -> bytes:
+    """An archive with one array whose header is ``header``."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + body)
+    return content.getvalue()
+
+
+def bomb() -> bytes:
+    """Less than 1 MB that unpacks to 128 MB, made of blocks of zeros."""
+    return gzip.compress(bytes(1 << 22), 1) * 32
+
+
+def hidden_file() -> bytes:
+    """An HDF5 file whose data set is in another file."""
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file["x"] = TIME
+        file["y"] = h5py.ExternalLink("../secret.h5", "/y")
+    return content.getvalue()
+
+
+def workbook_with(sheet: bytes) -> bytes:
+    """The workbook with the text of its sheet replaced."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(xlsx(COLUMNS))) as old, zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, sheet if name.endswith(("sheet1.xml", "sheet2.xml")) else old.read(name))
+    return content.getvalue()
+
+
+_SHEET = b'<worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main">%s</worksheet>'
+_ROWS = b"<sheetData>%s</sheetData>"
+_CELL = b'<row r="1"><c r="A1"><v>1</v></c></row>'
+#: Suffix, file, and a part of the error.
+HOSTILE = {
+    "gzip bomb": (".csv.gz", bomb, f"at most {LIMIT >> 20} MiB"),
+    "pickle": (".npz", lambda: with_npy(b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }", b"\x80\x04."), "numeric"),
+    "array larger than its bytes": (
+        ".npz",
+        lambda: with_npy(b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000,), }", bytes(80)),
+        "complete",
+    ),
+    "link to another file": (".h5", hidden_file, "complete"),
+    "entities": (
+        ".xlsx",
+        lambda: workbook_with(
+            b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaaaaaaaaaaaa">'
+            + b"".join(b'<!ENTITY a%d "%s">' % (k, b"&a%s;" % (b"%d" % (k - 1) if k else b"") * 20) for k in range(9))
+            + b"]>"
+            + _SHEET % (_ROWS % b'<row r="1"><c r="A1" t="str"><v>&a8;</v></c></row>')
+        ),
+        "complete",
+    ),
+    "2. more rows stated than written": (
+        ".xlsx",
+        lambda: workbook_with(_SHEET % (b'<dimension ref="A1:XFD1048576"/>' + _ROWS % b"")),
+        "rows of numbers",
+    ),
+    "1. control characters in a header": (".lvm", lambda: lvm(COLUMNS).replace(b"\tx\t", b"\t\x01\t"), None),
+    "1. other channels": (".lvm", lambda: lvm(COLUMNS, parts=2).replace(b"\tx\t", b"\t\x01\t", 1), "same columns"),
+    "3. scales of a channel": (
+        ".tdms",
+        lambda: tdms(COLUMNS).replace(b"Scales\x07\0\0\0\x01\0\0\0", b"Scales\x07\0\0\0\xff\xff\xff\x7f"),
+        "2147483647 scales",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_are_refused_in_time(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (formats, limits):
+        monkeypatch.setattr(module, "LARGEST_CONTENT", LIMIT)
+    suffix, write, part = HOSTILE[name]
+    content = write()
+    began = time.process_time()
+    error = refusal(suffix, content)
+    assert time.process_time() - began < 5.0
+    if part is None:
+        assert error is None
+    else:
+        assert error is not None
+        assert part in str(error)
+        assert str(error).isprintable()
+
+
+def test_only_numbers_of_an_archive_are_columns() -> None:
+    """Texts, objects and MATLAB's characters are no columns."""
+    for suffix, content in ((".npz", npz(COLUMNS)), (".mat", mat_73(COLUMNS)), (".h5", hdf5(COLUMNS))):
+        assert EXPORTS[suffix](content, Path(f"f{suffix}"), LAYOUT).headers[0] == ("t", "x")
