@@ -19,7 +19,7 @@ from capsule_id.inference.pipeline import (
     stage_seeds,
 )
 from capsule_id.inference.result import Result
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
+from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.physics.friction import FrictionLaw
@@ -82,6 +82,7 @@ def fit(
     progress: OnProgress | None = None,
     registry: Registry | None = None,
     friction: type[FrictionLaw] | None = None,
+    ess: float = DEFAULT_ESS,
 ) -> Fit:
     """Fit a rig: point estimate, posterior, checks. The command ``fit-params`` chooses every one of the parameters.
 
@@ -95,11 +96,12 @@ def fit(
     progress : called with (draws done, draws until the next check, the stage)
     registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
     friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
+    ess : sampling stops at this bulk and tail effective sample size of every parameter
 
     Raises
     ------
     InputError
-        If the rig holds nothing to fit, ``experiments`` is another word, ``seed`` or ``budget`` is out of range, or
+        If the rig holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or ``ess`` is out of range, or
         ``friction`` cannot be fitted.
     """
     if not isinstance(seed, int) or seed < 0:
@@ -108,6 +110,8 @@ def fit(
         raise InputError(
             "budget must be positive", str(budget), "give 1 or more steps, or None for the point fit alone"
         )
+    if not 0 < ess < float("inf"):
+        raise InputError("ess must be positive and finite", str(ess), f"give {DEFAULT_ESS:.0f}, the default")
     law = friction_of(rig, friction)
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
     made_from = provenance(rig, seed, experiments, law.source)
@@ -117,5 +121,5 @@ def fit(
     made, second = second_models(make_experiments(rig, experiments, kinds, friction), readings)
     target = LogPosterior(rig, made)
     point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
-    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress), (*readings, *second))
+    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress, ess), (*readings, *second))
     return make_result(checked, kinds, seeds.report, made_from, Fit)

@@ -80,6 +80,8 @@ def test_parameters_json_keeps_the_contract(job: Job) -> None:
         "median",
         "ci95",
         "ess",
+        "ess_bulk",
+        "ess_tail",
         "rhat",
         "informed",
     }

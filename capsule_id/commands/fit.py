@@ -13,7 +13,7 @@ from capsule_id.experiments.registry import default_registry
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress
 from capsule_id.rig.read import read_rig
 
-DEFAULT_MAX_STEPS = 20_000
+DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 4000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"most emcee steps per ensemble (default {DEFAULT_MAX_STEPS})",
     )
+    parser.add_argument(
+        "--ess",
+        type=int,
+        default=DEFAULT_ESS,
+        metavar="N",
+        help=f"stop at this bulk and tail effective sample size of every parameter (default {DEFAULT_ESS})",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
 
 
@@ -48,6 +55,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
     if args.max_steps < 1:
         raise InputError("--max-steps must be positive", str(args.max_steps), "give 1 or more")
+    if args.ess < 1:
+        raise InputError("--ess must be positive", str(args.ess), "give 1 or more")
     kinds = default_registry()
     rig = read_rig(args.data, kinds)
     directory = args.out if args.out is not None else Path("results") / rig.name
@@ -72,10 +81,11 @@ def run(args: argparse.Namespace) -> int:
         "seed": args.seed,
         "experiments": args.experiments,
         "max-steps": budget,
+        "ess": args.ess,
         "versions": {**package_versions(PACKAGES), **kinds.packages},
     }
     with work_in_progress(directory, fingerprint, args.resume) as partial, Progress(not args.quiet) as progress:
-        result = fit(rig, args.seed, args.experiments, budget, partial / CHAINS, progress, kinds)
+        result = fit(rig, args.seed, args.experiments, budget, partial / CHAINS, progress, kinds, ess=args.ess)
         progress(0, 1, "report")
         write_result(result, partial)
         publish(partial, directory)

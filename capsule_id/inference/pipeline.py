@@ -36,7 +36,7 @@ from capsule_id.inference.checks.widening import widenings
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import PointStage
 from capsule_id.inference.result import PointFit, PointwiseLogLikelihood, Posterior, Provenance, Result
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, sample
+from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS, sample
 from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.tables.parameter_table import parameter_tables
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -96,6 +96,7 @@ def sample_posterior(
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
     progress: OnProgress | None = None,
+    ess: float = DEFAULT_ESS,
 ) -> Setting:
     """Sample the posterior; return the point fit with its sample, without checks.
 
@@ -103,11 +104,11 @@ def sample_posterior(
     ----------
     budget : emcee steps of an ensemble after burn-in; None draws no sample
     store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
-    progress : see ``capsule_id.inference.sampling.ensembles.sample``
+    progress, ess : see ``capsule_id.inference.sampling.ensembles.sample``
     """
     target, posterior = point.target, None
     if budget is not None:
-        posterior = sample(MarginalPosterior(target, point.fit), seed, budget, store, progress)
+        posterior = sample(MarginalPosterior(target, point.fit), seed, budget, store, progress, ess)
     fit = point.fit if posterior is None else higher_maximum(point, posterior)
     values, draws = {**target.fixed, **fit.values}, _draws(target, posterior)
     return Setting(target, fit, posterior, values, draws, point.seed, findings=point.findings, bench=point.bench)

@@ -66,8 +66,11 @@ class Posterior:
     lp : (ensemble, draw, walker) log-posterior density in the unconstrained space
     acceptance : (ensemble, walker)
     tau : (d,) largest integrated autocorrelation time over the ensembles, in stored draws
-    rhat, ess : (d,)
-    converged : every parameter has N > 50 tau and R-hat <= 1.01
+    rhat : (d,) split R-hat of the ensembles
+    ess : (d,) draws over emcee's autocorrelation time; too large for short chains
+    ess_bulk, ess_tail : (d,) effective sample sizes for the stopping rule, see ``diagnostics.bulk_and_tail_size``
+    ess_wanted : the bulk and tail effective sample size that every parameter had to reach
+    converged : every parameter has N > 20 tau, R-hat <= 1.01, and both sizes reach ``ess_wanted``
     moves : pilot measurement: move -> largest tau, steps; the first move is used
     steps, thin : emcee steps after burn-in, and steps per stored draw
     """
@@ -79,6 +82,9 @@ class Posterior:
     tau: np.ndarray
     rhat: np.ndarray
     ess: np.ndarray
+    ess_bulk: np.ndarray
+    ess_tail: np.ndarray
+    ess_wanted: float
     converged: bool
     moves: Mapping[str, float]
     steps: int
@@ -119,8 +125,9 @@ class Result:
     ----------
     registry : kinds of the rig's experiments, which declare the texts of their panels and checks
     summary : a row per physical parameter (index ``name``), SI, missing numbers NaN; columns unit, meaning, value, sd,
-        basis, trust, paper, map, standard_error, mean, median, lower, upper, ess, rhat, informed. Quote value and sd:
-        the median and sd of the sample (basis "sample"), or the maximum and its standard error (basis "point")
+        basis, trust, paper, map, standard_error, mean, median, lower, upper, ess, ess_bulk, ess_tail, rhat, informed.
+        Quote value and sd: the median and sd of the sample (basis "sample"), or the maximum and its standard error
+        (basis "point")
     nuisances : the same columns for scatters and noise
     fixed : constants by name, SI
     observed : (n,) readings that enter the likelihood, SI, by label

@@ -126,6 +126,8 @@ COLUMNS = (
     OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),
     OutputColumn("ci95_unwidened", value=lambda values: _ends(values, "_unwidened"), outputs=frozenset({"json"})),
     OutputColumn("ess", "ESS", lambda row: fixed(float(row.values["ess"]), 0), outputs=EVERYWHERE - {"console"}, sampled=True),
+    OutputColumn("ess_bulk", outputs=FILES),
+    OutputColumn("ess_tail", outputs=FILES),
     OutputColumn("rhat", "R-hat", lambda row: fixed(float(row.values["rhat"]), 3), sampled=True),
     OutputColumn("informed", "informed", _informed, sampled=True, numeric=False),
 )  # fmt: skip

@@ -51,6 +51,7 @@ def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ..
         (("a", "--seed", "-1"), "-1"),
         (("a", "--seed", ""), "--seed"),
         (("a", "--max-steps", "0"), "--max-steps"),
+        (("a", "--ess", "0"), "--ess"),
         (("a", "--experiments", "some"), "bench"),
         (("a", "--out"), "--out"),
         (("a", "two\nlines"), "two lines"),

@@ -51,7 +51,8 @@ def _frame(rows: dict[str, tuple[str, str, float, float, float]], rng: np.random
             "unit": unit, "meaning": meaning, "value": mean, "basis": "sample", "trust": "trusted", "paper": paper,
             "map": value, "standard_error": 0.97 * sd, "mean": mean,
             "sd": sd, "median": mean, "lower": mean - 1.96 * sd, "upper": mean + 1.96 * sd,
-            "ess": 4100.0 + 100 * rng.normal(), "rhat": 1.002, **NOT_WIDENED, "informed": name not in ("m1", "m2"),
+            "ess": 4100.0 + 100 * rng.normal(), "ess_bulk": 4050.0, "ess_tail": 4010.0, "rhat": 1.002, **NOT_WIDENED,
+            "informed": name not in ("m1", "m2"),
         }  # fmt: skip
     frame = pd.DataFrame.from_dict(table, orient="index")
     frame.index.name = "name"
@@ -131,7 +132,7 @@ def _posterior(rng: np.random.Generator, ensembles: int, draws: int, walkers: in
     d = len(names)
     return Posterior(
         names, centre + sd * z, 1234.5 - 0.5 * (z**2).sum(-1), np.full((ensembles, walkers), 0.28),
-        np.full(d, 3.0), np.full(d, 1.002), np.full(d, 4100.0), True, {"DE + snooker": 61.0, "stretch": 142.0},
+        np.full(d, 3.0), np.full(d, 1.002), *np.full((3, d), 4100.0), 4000.0, True, {"DE + snooker": 61.0, "stretch": 142.0},
         steps=10000, thin=20,
     )  # fmt: skip
 
@@ -158,8 +159,8 @@ COLOURED = {
     "lines": "",
 }
 CHAINS = {
-    "draws": 1000, "length": 12.0, "slowest": "v_s", "rhat": 1.2, "worst": "mu", "length_wanted": 50.0,
-    "rhat_wanted": 1.01,
+    "draws": 1000, "length": 12.0, "slowest": "v_s", "rhat": 1.2, "worst": "mu", "length_wanted": 20.0,
+    "rhat_wanted": 1.01, "size": 900.0, "smallest": "v_s", "size_wanted": 4000.0,
 }  # fmt: skip
 
 

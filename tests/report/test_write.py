@@ -85,7 +85,7 @@ def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> N
     assert content["trust"] == "trusted"
     keys = [
         "unit", "value", "sd", "sd_unwidened", "widening", "basis", "trust", "paper", "map", "mean", "median", "ci95",
-        "ci95_unwidened", "ess", "rhat", "informed",
+        "ci95_unwidened", "ess", "ess_bulk", "ess_tail", "rhat", "informed",
     ]  # fmt: skip
     for name, entry in content["parameters"].items():
         row = result.summary.loc[name]

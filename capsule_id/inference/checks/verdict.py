@@ -74,12 +74,16 @@ def _chains(s: Setting) -> list[Finding]:
     if p is None:
         return [Finding("chains.converged", "warn")]
     worst_tau, worst_rhat = int(np.argmax(p.tau)), int(np.argmax(p.rhat))
+    sizes = np.minimum(p.ess_bulk, p.ess_tail)
     facts = {
         "draws": p.draws.shape[1],
         "length": p.draws.shape[1] / p.tau[worst_tau],
         "slowest": p.names[worst_tau],
         "rhat": p.rhat[worst_rhat],
         "worst": p.names[worst_rhat],
+        "size": np.min(sizes),
+        "smallest": p.names[int(np.argmin(sizes))],
+        "size_wanted": p.ess_wanted,
         "length_wanted": LENGTH_IN_TAU,
         "rhat_wanted": MAX_RHAT,
     }

@@ -3,12 +3,16 @@
 import emcee
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtri
+from scipy.stats import rankdata
 
 #: Stored draws of independent ensembles.
 Draws = Float[np.ndarray, "ensemble draw walker d"]
 
 #: Summation window of autocovariances, in autocorrelation times (Sokal 1997, section 3); beyond it they are noise.
 WINDOW = 5.0
+#: Probabilities of the quantiles whose effective sample size is that of the tails (Vehtari et al. 2021, section 4.3).
+TAILS = (0.05, 0.95)
 
 
 def integrated_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
@@ -61,3 +65,16 @@ def effective_sample_size(draws: Draws, tau: Float[np.ndarray, "ensemble d"]) ->
     It never exceeds the number of draws, because the estimate of tau from a few draws may be 0.
     """
     return np.sum(draws.shape[1] * draws.shape[2] / np.maximum(tau, 1.0), axis=0)
+
+
+def bulk_and_tail_size(draws: Draws) -> Float[np.ndarray, "2 d"]:
+    """(2, d) effective sample sizes of the bulk and of the tails (Vehtari et al. 2021, sections 4.1 and 4.3).
+
+    Bulk: of the normal scores of the ranks over all ensembles. Tails: the smaller one of the two indicators that a
+    draw lies below the 5 % or the 95 % quantile. Both use ``ensemble_time``, which holds for short chains.
+    """
+    flat = draws.reshape(-1, draws.shape[-1])
+    scores = ndtri((rankdata(flat, axis=0) - 0.375) / (len(flat) + 0.25)).reshape(draws.shape)
+    tails = [np.asarray(draws <= edge, dtype=float) for edge in np.quantile(flat, TAILS, axis=0)]
+    bulk, *ends = (effective_sample_size(x, ensemble_time(x)) for x in (scores, *tails))
+    return np.stack([bulk, np.min(ends, axis=0)])

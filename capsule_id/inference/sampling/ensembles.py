@@ -12,7 +12,13 @@ from emcee import State
 from capsule_id.console import OnProgress
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling.chain_store import ChainStore
-from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time, integrated_time, split_rhat
+from capsule_id.inference.sampling.diagnostics import (
+    bulk_and_tail_size,
+    effective_sample_size,
+    ensemble_time,
+    integrated_time,
+    split_rhat,
+)
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import LARGE, Moves, block_move, candidates
 
@@ -20,8 +26,11 @@ from capsule_id.inference.sampling.moves import LARGE, Moves, block_move, candid
 ENSEMBLES = 4
 #: Smallest number of walkers of an ensemble: one batch of the log-posterior. There are at least two per parameter.
 MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
-#: Convergence requires more draws than this many autocorrelation times for every parameter.
-LENGTH_IN_TAU = 50.0
+#: Convergence requires more draws than this many autocorrelation times for every parameter. The time is an average
+#: over the walkers of an ensemble, 32 or more. Its standard error at this length is 20 % or less (Sokal 1997, eq. 3.19).
+LENGTH_IN_TAU = 20.0
+#: Convergence requires this bulk and tail effective sample size for every parameter, unless stated.
+DEFAULT_ESS = 4000.0
 #: Convergence requires a split R-hat of at most this for every parameter.
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks.
@@ -83,6 +92,7 @@ def sample(
     budget: int = DEFAULT_BUDGET,
     store: Path | None = None,
     progress: OnProgress | None = None,
+    ess: float = DEFAULT_ESS,
 ) -> Posterior:
     """Sample the posterior with ``ENSEMBLES`` independent ensembles.
 
@@ -92,6 +102,7 @@ def sample(
     budget : emcee steps of an ensemble after burn-in
     store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
     progress : called with (draws done, draws until the next check, name of the stage)
+    ess : bulk and tail effective sample size of every parameter at which the sampling stops
     """
     report = progress or (lambda done, total, text: None)
     report(0, 1, "pilot")
@@ -103,9 +114,7 @@ def sample(
         done = [sampler.stored for sampler in samplers]
         draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
         last = max(budget // schedule.thin, 2)
-        for goal in _checks(last):
-            if goal < last and min(done) > goal:
-                continue
+        for goal in _checks(min(done), last):
             for i, sampler in enumerate(samplers):
                 for _ in sampler.advance(goal - done[i], schedule.thin):
                     done[i] += 1
@@ -113,14 +122,14 @@ def sample(
                         chains.between_draws()
                     report(sum(done), ENSEMBLES * goal, schedule.move)
             located = np.stack([sampler.chain[:goal] for sampler in samplers])
-            if goal == last or _converged(located):
+            if goal == last or _converged(located, ess):
                 draws, lp = target.restore(located, restore_seed)
-                if _converged(draws):
+                if _converged(draws, ess):
                     break
         if chains is not None:
             chains.save()
         acceptance = np.stack([sampler.acceptance for sampler in samplers])
-    theta = target.theta(draws)
+    theta, (bulk, tail) = target.theta(draws), bulk_and_tail_size(draws)
     return Posterior(
         names=target.names,
         draws=theta,
@@ -129,17 +138,21 @@ def sample(
         tau=np.max(ensemble_time(draws), axis=0),
         rhat=split_rhat(theta),
         ess=effective_sample_size(draws, integrated_time(theta)),
-        converged=_converged(draws),
+        ess_bulk=bulk,
+        ess_tail=tail,
+        ess_wanted=ess,
+        converged=_converged(draws, ess),
         moves={schedule.move: schedule.measured[schedule.move], **schedule.measured},
         steps=draws.shape[1] * schedule.thin,
         thin=schedule.thin,
     )
 
 
-def _converged(draws: np.ndarray) -> bool:
+def _converged(draws: np.ndarray, ess: float) -> bool:
     """Whether draws (ensemble, draw, walker, d) are long enough and their ensembles agree."""
     tau, rhat = ensemble_time(draws), split_rhat(draws)
-    return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT))
+    long_enough = np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT)
+    return bool(long_enough and np.all(bulk_and_tail_size(draws) >= ess))
 
 
 def pilot(target: Target, seed: int) -> Schedule:
@@ -172,12 +185,9 @@ def pilot(target: Target, seed: int) -> Schedule:
     return Schedule(best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
 
 
-def _checks(last: int) -> Iterator[int]:
-    """Numbers of stored draws at which convergence is checked."""
-    goal = FIRST_CHECK
-    while goal < last:
-        yield goal
-        goal += CHECK_EVERY
+def _checks(done: int, last: int) -> Iterator[int]:
+    """Numbers of stored draws at which convergence is checked, from ``done`` on."""
+    yield from (goal for goal in range(FIRST_CHECK, last, CHECK_EVERY) if goal >= done)
     yield last
 
 

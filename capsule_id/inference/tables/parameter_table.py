@@ -17,7 +17,8 @@ from capsule_id.parameters import Parameter, parameter
 
 SUMMARY_COLUMNS = (
     "unit", "meaning", "value", "sd", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
-    "upper", "ess", "rhat", "informed", "widening", "sd_unwidened", "lower_unwidened", "upper_unwidened",
+    "upper", "ess", "ess_bulk", "ess_tail", "rhat", "informed", "widening", "sd_unwidened", "lower_unwidened",
+    "upper_unwidened",
 )  # fmt: skip
 
 
@@ -93,5 +94,7 @@ def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
         "lower": lower,
         "upper": upper,
         "ess": posterior.ess[i],
+        "ess_bulk": posterior.ess_bulk[i],
+        "ess_tail": posterior.ess_tail[i],
         "rhat": posterior.rhat[i],
     }

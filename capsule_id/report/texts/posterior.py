@@ -84,8 +84,8 @@ def _modes(facts: Facts) -> str:
 
 
 _CHAINS = (
-    "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, largest split R-hat {rhat:.4f} "
-    "({worst})"
+    "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, smallest effective sample size "
+    "{size:.0f} ({smallest}), largest split R-hat {rhat:.4f} ({worst})"
 )
 
 
@@ -101,7 +101,8 @@ POSTERIOR_MESSAGES: Mapping[str, Message] = {
         ok=_CHAINS,
         warn="no sample was drawn: there are no intervals",
         fail=(
-            "expected more than {length_wanted:.0f} autocorrelation times and R-hat <= {rhat_wanted}; found "
+            "expected more than {length_wanted:.0f} autocorrelation times, bulk and tail effective sample sizes of "
+            "{size_wanted:.0f}, and R-hat <= {rhat_wanted}; found "
             + _CHAINS
             + " when the steps were used up. Raise --max-steps, or look for a parameter that the data do not inform."
         ),

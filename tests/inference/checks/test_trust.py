@@ -27,7 +27,7 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> Setting:
     fit = point_fit(target, 0, 1)
     nothing = np.zeros(target.dimension)
     draws = np.zeros((1, 1, 1, target.dimension))
-    posterior = Posterior(target.names, draws, draws[..., 0], nothing, nothing, nothing, nothing, True, {}, 1, 1)
+    posterior = Posterior(target.names, draws, draws[..., 0], *[nothing] * 6, 1.0, True, {}, 1, 1)
     return Setting(target, fit, posterior, {**target.fixed, **fit.values})
 
 

@@ -5,7 +5,12 @@ import emcee
 import numpy as np
 import pytest
 
-from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time, split_rhat
+from capsule_id.inference.sampling.diagnostics import (
+    bulk_and_tail_size,
+    effective_sample_size,
+    ensemble_time,
+    split_rhat,
+)
 
 
 def autoregressive(rho: float, shape: tuple[int, int, int, int], seed: int) -> np.ndarray:
@@ -65,6 +70,34 @@ def test_integrated_time_and_ess(rho: float) -> None:
     chains = x.transpose(0, 2, 1, 3).reshape(128, 600, 2)
     expected = [float(arviz.ess(chains[..., i], method="mean")) for i in range(2)]
     np.testing.assert_allclose(ess, expected, rtol=0.1)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
+def test_bulk_and_tail_sizes_are_those_of_arviz(rho: float) -> None:
+    """Independent walkers as chains, normal and with heavy tails."""
+    x = autoregressive(rho, (4, 800, 32, 2), 8)
+    x[..., 1] = np.sign(x[..., 1]) * x[..., 1] ** 4
+    chains = x.transpose(0, 2, 1, 3).reshape(128, 800, 2)
+    standard_error = np.sqrt(4.0 * (10.0 * (1.0 + rho) / (1.0 - rho) + 1.0) / x.size)  # Sokal (1997), M = 5 tau
+    expected = [[float(arviz.ess(chains[..., i], method=method)) for i in range(2)] for method in ("bulk", "tail")]
+    np.testing.assert_allclose(bulk_and_tail_size(x), expected, rtol=3.0 * standard_error)
+
+
+def test_a_walker_that_hardly_moves_costs_effective_draws() -> None:
+    """Each walker keeps to its own place: the pooled draws look right, their effective sizes are small."""
+    x = autoregressive(0.5, (4, 150, 32, 1), 9)
+    own = np.random.default_rng(10).standard_normal((4, 1, 32, 1))
+    kept = np.sqrt(0.5) * (x + own)
+    assert np.std(kept) == pytest.approx(1.0, abs=0.1)
+    assert np.all(bulk_and_tail_size(x) > 4000.0)
+    assert np.all(bulk_and_tail_size(kept) < 1000.0)
+
+
+def test_the_time_is_known_to_a_fifth_from_twenty_times() -> None:
+    """Standard error of ``ensemble_time`` at the length that convergence requires, with the fewest walkers."""
+    times = [ensemble_time(autoregressive(0.8, (1, 180, 32, 1), seed))[0, 0] for seed in range(60)]
+    assert np.mean(times) == pytest.approx(9.0, rel=0.1)
+    assert np.std(times) < 0.2 * 9.0
 
 
 def test_each_walkers_own_mean_would_understate() -> None:

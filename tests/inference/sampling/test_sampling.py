@@ -9,7 +9,7 @@ import pytest
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling import ensembles
 from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time
-from capsule_id.inference.sampling.ensembles import ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
+from capsule_id.inference.sampling.ensembles import DEFAULT_ESS, ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
 from tests.inference.stub import Gaussian
 
 #: Largest |z| of the 16 numbers tested at once: false alarm in 1 of 1000.
@@ -49,7 +49,7 @@ def test_known_gaussian(posterior: Posterior) -> None:
     assert np.max(np.abs(scores(posterior.draws, KNOWN))) < LIMIT
     assert np.all(posterior.rhat <= MAX_RHAT)
     assert np.all(posterior.draws.shape[1] > LENGTH_IN_TAU * posterior.tau)
-    assert np.all(posterior.ess > 400.0)
+    assert np.min([posterior.ess_bulk, posterior.ess_tail]) >= DEFAULT_ESS
 
 
 def test_blocks_are_accepted_one_by_one() -> None:
@@ -103,6 +103,17 @@ def test_a_spent_budget_is_not_convergence() -> None:
     posterior = draw(1, budget=60)
     assert not posterior.converged
     assert posterior.draws.shape[0] == ENSEMBLES
+
+
+def test_sampling_stops_at_the_effective_sample_size() -> None:
+    """Five times the size needs more draws; both stop within one interval of checks."""
+    little, much = (sample(KNOWN, 1, ess=ess) for ess in (DEFAULT_ESS, 5.0 * DEFAULT_ESS))
+    sizes = [np.min([one.ess_bulk, one.ess_tail]) for one in (little, much)]
+    assert little.converged
+    assert much.converged
+    assert sizes[0] >= DEFAULT_ESS
+    assert 5.0 * DEFAULT_ESS <= sizes[1] < 7.0 * DEFAULT_ESS
+    assert much.draws.shape[1] > little.draws.shape[1]
 
 
 def test_log_density_belongs_to_the_draws(posterior: Posterior) -> None:
