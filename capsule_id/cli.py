@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from capsule_id import console
+from capsule_id.compilation import discard_damaged
 from capsule_id.errors import InputError
 from capsule_id.interruption import INTERRUPTED, interruptible
 
@@ -109,7 +110,10 @@ def _show_warning(
 ) -> None:
     """Print a warning in one line on standard error. The signature is that of ``warnings.showwarning``."""
     place = f"{Path(filename).name}:{lineno}"
-    print(" ".join(f"{program}: warning: {category.__name__}: {message} ({place})".split()), file=sys.stderr)
+    text = discard_damaged(str(message))
+    if text == str(message):
+        text = f"{category.__name__}: {message} ({place})"
+    print(" ".join(f"{program}: warning: {text}".split()), file=sys.stderr)
 
 
 def _one_line(error: Exception) -> str:

@@ -15,10 +15,10 @@ from capsule_id.commands.capsule_options import (
     capsule_values,
     fitted_values,
     number,
-    set_loop_option,
 )
 from capsule_id.commands.progress import Progress
 from capsule_id.commands.sweep_output import prepare_store, publish_pair, remove_store
+from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import default_registry
@@ -91,6 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--quiet", action="store_true", help="no progress on standard error")
     text = "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)"
     group.add_argument("--out", metavar="FILE", type=Path, help=text)
+    add_cache_argument(group)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
     out = args.out if args.out is not None else _default_out(rig.name if rig is not None else None, axes)
     store = prepare_store(out, args.resume)
     set_loop_option()
+    if not args.no_cache:
+        keep_programs()
     with Progress(not args.quiet, unit="point") as progress, _dask_client(args.scheduler) as client:
         data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
         data.attrs["rig"] = rig.name if rig is not None else ""

@@ -3,8 +3,6 @@
 import argparse
 import json
 import math
-import os
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,9 +21,6 @@ DEFAULTS: Mapping[str, float] = {
     **{name: leaf.default for name, leaf in LEAVES.items() if isinstance(leaf.default, float)},
     **{name: TABLE_1[name] for name in LEAVES if name in TABLE_1},
 }
-
-# XLA then compiles each loop of an engine as one function: a single run is several times faster. CPU only.
-XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 
 
 def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str, float] = DEFAULTS) -> None:
@@ -128,13 +123,6 @@ def number(name: str, text: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"--{name} must be finite", repr(text), "give a plain number in SI units")
     return value
-
-
-def set_loop_option() -> None:
-    """Set ``XLA_LOOP_OPTION`` for this process, unless JAX is imported or the user has set such options."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "jax" not in sys.modules and "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {XLA_LOOP_OPTION}".strip()
 
 
 def fitted_values(directory: Path) -> dict[str, float]:

@@ -4,8 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from capsule_id.commands.capsule_options import set_loop_option
 from capsule_id.commands.progress import Progress
+from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments import CHOICES, make_experiments
@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"stop at this bulk and tail effective sample size of every parameter (default {DEFAULT_ESS})",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    add_cache_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -66,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(rule, "it holds posterior.nc", remedy, directory)
     if args.experiments != "bench" and rig.has_runs:
         set_loop_option()
+    if not args.no_cache:
+        keep_programs()
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.api import fit
     from capsule_id.inference.pipeline import PACKAGES, package_versions

@@ -12,8 +12,8 @@ from capsule_id.commands.capsule_options import (
     capsule_and_drive,
     capsule_values,
     number,
-    set_loop_option,
 )
+from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("output")
     group.add_argument("--out", metavar="FILE", type=Path, required=True, help="table: FILE.csv or FILE.nc (NetCDF)")
     group.add_argument("--figure", metavar="FILE", type=Path, help="figure: FILE.png")
+    add_cache_argument(group)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -64,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
     set_loop_option()
+    if not args.no_cache:
+        keep_programs()
     import numpy as np
 
     from capsule_id.physics.model import Status, simulate, status_message

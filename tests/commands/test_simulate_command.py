@@ -107,15 +107,3 @@ def test_outputs_must_have_a_known_suffix_and_a_folder(tmp_path: Path) -> None:
         _run(*DRIVE, "--out", str(tmp_path / "run.txt"))
     with pytest.raises(InputError, match="folder of the output must exist"):
         _run(*DRIVE, "--out", str(tmp_path / "missing" / "run.csv"))
-
-
-def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(options.sys, "modules", {})
-    for before, after in (
-        ("", options.XLA_LOOP_OPTION),
-        ("--xla_a=1", f"--xla_a=1 {options.XLA_LOOP_OPTION}"),
-        ("--xla_backend_extra_options=other", "--xla_backend_extra_options=other"),
-    ):
-        monkeypatch.setenv("XLA_FLAGS", before)
-        options.set_loop_option()
-        assert options.os.environ["XLA_FLAGS"] == after

@@ -1,0 +1,74 @@
+"""Options of XLA for a command, and the cache of compiled programs between commands. All act before JAX is imported."""
+
+import argparse
+import hashlib
+import os
+import platform
+import shutil
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+# XLA then compiles each loop of an engine as one function: a single run is several times faster. CPU only.
+XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+#: Programs that take longer than this to compile are kept, s.
+WORTH_KEEPING = 0.3
+#: Largest size of the cache, bytes; JAX removes the programs that were not used for the longest time.
+LARGEST_CACHE = 256 * 2**20
+#: Variable of JAX with the directory of the cache, and how JAX's warning about a damaged program begins.
+DIRECTORY, DAMAGED = "JAX_COMPILATION_CACHE_DIR", "Error reading persistent compilation cache entry"
+
+
+def set_loop_option() -> None:
+    """Set ``XLA_LOOP_OPTION`` for this process, unless JAX is imported or the user has set such options."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "jax" not in sys.modules and "xla_backend_extra_options" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {XLA_LOOP_OPTION}".strip()
+
+
+def add_cache_argument(options: argparse._ActionsContainer) -> None:
+    """Add ``--no-cache`` to a parser or a group."""
+    options.add_argument(
+        "--no-cache", action="store_true", help="compile everything anew, and keep no compiled program"
+    )
+
+
+def keep_programs() -> None:
+    """Keep compiled programs in the user's cache directory; JAX's own variables, where set, have precedence.
+
+    Processes share the cache under a file lock. Nothing is kept where the directory cannot be written.
+    """
+    if "jax" in sys.modules or DIRECTORY in os.environ:
+        return
+    directory = cache_directory()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(directory, os.W_OK | os.X_OK):
+        os.environ[DIRECTORY] = str(directory)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_CACHE))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(WORTH_KEEPING))
+
+
+def cache_directory() -> Path:
+    """Directory of the cache: a compiled program serves one version of JAX on one model of processor."""
+    try:
+        information = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0]
+        processor = "".join(line for line in information.splitlines() if line.startswith(("flags", "model name")))
+    except OSError:
+        processor = platform.processor()
+    key = hashlib.sha256(f"{platform.machine()} {processor}".encode()).hexdigest()[:12]
+    return user_cache_path("capsule-id", appauthor=False) / f"jax-{version('jax')}-{version('jaxlib')}-{key}"
+
+
+def discard_damaged(message: str) -> str:
+    """Remove the cache if ``message``, a warning, is JAX's about a damaged program; return the text to print."""
+    if not message.startswith(DAMAGED) or DIRECTORY not in os.environ:
+        return message
+    if Path(os.environ[DIRECTORY]) != cache_directory():
+        return message  # the user's own
+    shutil.rmtree(cache_directory(), ignore_errors=True)
+    return "the cache of compiled programs was damaged and is removed"

@@ -1,0 +1,76 @@
+"""Options of XLA and the cache of compiled programs: a faster second run, no effect on any number."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from capsule_id import compilation
+from tests.cli_tools import environment, run
+
+MOTION = ("simulate", "--k2", "18960", "--P_d", "4", "--Omega", "34.56", "--G", "1e-3", "--periods", "1")
+
+
+def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compilation.sys, "modules", {})
+    for before, after in (
+        ("", compilation.XLA_LOOP_OPTION),
+        ("--xla_a=1", f"--xla_a=1 {compilation.XLA_LOOP_OPTION}"),
+        ("--xla_backend_extra_options=other", "--xla_backend_extra_options=other"),
+    ):
+        monkeypatch.setenv("XLA_FLAGS", before)
+        compilation.set_loop_option()
+        assert compilation.os.environ["XLA_FLAGS"] == after
+
+
+def simulated(folder: Path, cache: Path, *options: str) -> tuple[bytes, str]:
+    """The table that ``simulate`` writes with a cache in ``cache``, and its standard error."""
+    variables = dict.fromkeys((name for name in os.environ if name.startswith("JAX_")), None)
+    out = folder / "run.csv"
+    words = (*MOTION, "--out", str(out), *options)
+    done = run(*words, cwd=folder, name="capsule_id", env=environment(**variables, XDG_CACHE_HOME=str(cache)))
+    assert done.returncode == 0, done.stderr
+    return out.read_bytes(), done.stderr
+
+
+def test_programs_are_kept_and_a_damaged_cache_is_replaced(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    plain = simulated(tmp_path, cache, "--no-cache")
+    assert not cache.exists()
+    assert simulated(tmp_path, cache) == plain
+    damaged = {program: program.read_bytes()[:-100] for program in cache.glob("capsule-id/*/*-cache")}
+    assert damaged
+    for program, content in damaged.items():
+        program.write_bytes(content)
+    found, said = simulated(tmp_path, cache)
+    assert found == plain[0]
+    assert "the cache of compiled programs was damaged and is removed" in said
+    assert not any(program.exists() and program.read_bytes() == content for program, content in damaged.items())
+
+
+@pytest.fixture
+def variables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, str]:
+    """The environment of a process that has not imported JAX; the user's cache directory is ``tmp_path``."""
+    environ = {"XDG_CACHE_HOME": str(tmp_path), "HOME": str(tmp_path)}
+    monkeypatch.setattr(compilation.os, "environ", environ)
+    monkeypatch.setattr(compilation.sys, "modules", {})
+    return environ
+
+
+def test_a_cache_that_cannot_be_written_is_left_out(variables: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "capsule-id").write_text("")
+    compilation.keep_programs()
+    assert compilation.DIRECTORY not in variables
+    (tmp_path / "capsule-id").unlink()
+    compilation.keep_programs()  # negative control
+    assert Path(variables[compilation.DIRECTORY]).parent == tmp_path / "capsule-id"
+
+
+def test_the_users_own_cache_is_left_alone(variables: dict[str, str], tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    own.mkdir()
+    variables[compilation.DIRECTORY] = str(own)
+    compilation.keep_programs()
+    assert variables[compilation.DIRECTORY] == str(own)
+    assert compilation.discard_damaged(f"{compilation.DAMAGED} for x: error").startswith(compilation.DAMAGED)
+    assert own.exists()
