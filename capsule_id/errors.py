@@ -29,9 +29,9 @@ class InputError(ValueError):
         self.file, self.line, self.column = str(file), line, column
         place = ":".join(str(part) for part in (self.file, line, column) if part not in ("", None))
         message = f"{rule}, {value}, {remedy}"
-        line = " ".join((f"{place}: {message}" if place else message).split())
+        text = " ".join((f"{place}: {message}" if place else message).split())
         # Names in damaged files may hold control characters.
-        super().__init__("".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in line))
+        super().__init__("".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in text))
 
 
 #: Most errors that are printed at once.

@@ -44,8 +44,9 @@ def read_tdms(content: bytes, path: Path, layout: Layout) -> Export:
         groups = file.groups()
         everything = [channel for group in groups for channel in group.channels()]
         for properties in (file.properties, *(each.properties for each in (*groups, *everything))):
-            if not 0 <= properties.get(_SCALES, 0) <= MOST_SCALES:  # npTDMS makes a list of so many elements
-                raise ValueError(f"{properties[_SCALES]} scales of a channel")
+            scales: Any = properties.get(_SCALES, 0)
+            if not 0 <= scales <= MOST_SCALES:  # npTDMS makes a list of so many elements
+                raise ValueError(f"{scales} scales of a channel")
         channels = [channel for channel in everything if channel.dtype.kind in "fiu"]
         refuse_large(8 * sum(len(channel) for channel in channels), path)
         names = [channel.name for channel in channels]
