@@ -42,7 +42,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "stiffness": (ChoiceRule(("linear", "cubic")), None),
         "drift": (ChoiceRule(("none", "linear", "gp")), None),
         "noise": (ChoiceRule(("white", "ar1", "arma")), None),
-        "every": (CountRule(), None),
+        "thin": (CountRule(), None),
         "samples": (ChoiceRule(("record", "turning_points")), "record"),
         "smoothing_window": (QuantityRule("s"), None),
         "spring": (NameRule(), None),

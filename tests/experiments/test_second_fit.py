@@ -70,28 +70,25 @@ def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str
     assert (finding.code, finding.level, finding.experiment) == ("decays.second_fit", "warn", "decay")
 
 
-def test_a_record_with_rest_before_its_release_keeps_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_record_with_two_excitations_keeps_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
     """The finding on its readings stops the second fit; the line that the finding states brings it back."""
     whole = record(0.0, DRY)
-    rest = 100 / 500.0
-    noise = NOISE * np.random.default_rng(5).standard_normal(100)
     columns = [
-        bench.column("time", np.concatenate([TIME[:100], TIME + rest])),
-        bench.column("x_rel", np.concatenate([noise, whole.values])),
+        bench.column("time", np.arange(500) / 500.0),
+        bench.column("x_rel", np.concatenate([whole.values, whole.values])),
     ]
     table = bench.table("free_vibration", columns, "decay")
     uncut = FreeVibration(table, bench.rig(table))
     readings = list(lint_decay(table, uncut.rig))
     (same,), (finding,) = second_models([uncut], readings)
     assert same.model == uncut.model
-    assert same.model == uncut.model
     assert (finding.code, finding.level) == ("decays.first_fit", "warn")
     monkeypatch.setattr("capsule_id.experiments.free_vibration.second_fit.screening.LONGEST_UNCUT", 100)
     (thinned,), (finding,) = second_models([uncut], readings)
-    assert (thinned.model, thinned.replaced) == (DecayModel(every=3), False)
-    assert "one sample in 3" in MESSAGES["decays.first_fit"].text("warn", finding.facts)
-    (release,) = [found for found in readings if found.code == "decays.release"]
-    cut = bench.table("free_vibration", columns, "decay", start=release.facts["start"])
+    assert (thinned.model, thinned.replaced) == (DecayModel(thin=5), False)
+    assert "means of 5 samples" in MESSAGES["decays.first_fit"].text("warn", finding.facts)
+    (again,) = [found for found in readings if found.code == "decays.second"]
+    cut = bench.table("free_vibration", columns, "decay", stop=again.facts["stop"])
     record_cut = FreeVibration(cut, bench.rig(cut))
     ((other,), _) = second_models([record_cut], list(lint_decay(cut, record_cut.rig)))
     assert other.model == DecayModel(("dry",))
@@ -111,7 +108,7 @@ def test_the_lines_of_the_finding_state_the_quoted_model() -> None:
         lines.replace(", stiffness", "\nstiffness")
         .replace(", drift", "\ndrift")
         .replace(", noise", "\nnoise")
-        .replace(", every", "\nevery")
+        .replace(", thin", "\nthin")
     )
     own = record(0.0, DRY, **{**stated, "damping": tuple(stated["damping"])})
     assert own.model == second.model

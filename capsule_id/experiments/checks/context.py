@@ -31,23 +31,6 @@ class Tension:
 
 
 @dataclass(frozen=True)
-class Refit:
-    """A fit of some experiments under another model.
-
-    Attributes
-    ----------
-    values, standard_errors : SI, by name
-    agree : whether every start ended at the same maximum
-    bic : Schwarz's criterion
-    """
-
-    values: Mapping[str, float]
-    standard_errors: Mapping[str, float]
-    agree: bool
-    bic: float
-
-
-@dataclass(frozen=True)
 class RunRecord:
     """A recorded run as in the figures of the paper; ``force`` (n,) is the fitted drive at its samples, N."""
 
@@ -83,8 +66,8 @@ class Fitted(Protocol):
         """Likelihood-ratio test that two groups of experiments share their parameters."""
         ...
 
-    def refit(self, experiments: Sequence["Experiment"]) -> Refit:
-        """Point fit of ``experiments`` alone."""
+    def correlation(self, names: Sequence[str]) -> np.ndarray:
+        """(n, n) correlations of parameters, of the draws or, without a sample, at the maximum."""
         ...
 
 

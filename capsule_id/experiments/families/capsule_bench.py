@@ -20,6 +20,8 @@ from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import DecayAbout, FreeVibration
+from capsule_id.experiments.free_vibration.settings import DecayModel
+from capsule_id.experiments.free_vibration.starts import starts_of_motion
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Prior, parameter
 from capsule_id.physics.model import Excitation
@@ -49,7 +51,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     tables = ()
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        FreeVibration.__init__(self, table, rig, friction)
+        FreeVibration.__init__(self, table, rig, friction, DecayModel())
         self.smoothing = None
         gap = table.settings.gap
         self.within_reach = gap is not None
@@ -87,7 +89,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         return Experiment.summaries(self, theta, xp)
 
     def starts(self) -> dict[str, Start]:
-        starts = super().starts() | self.starts_of_motion(self.rough_decrement())
+        starts = super().starts() | starts_of_motion(self, self.rough_decrement())
         if not self.gap_known:
             starts[f"G[{self.label}]"] = Start(self.gap, 0.5 * self.table.settings.gap.sd / self.gap)
         return starts

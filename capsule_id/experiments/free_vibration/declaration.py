@@ -10,7 +10,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
 from capsule_id.experiments.free_vibration.lint import lint_decay
-from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings, decay_window
+from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings, cut_at_release, decay_window
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.kind import Kind, Values, made_by
 from capsule_id.parameters import Parameter, Prior, nuisance, scatter
@@ -85,7 +85,7 @@ def _check_turning_points(entry: Entry[DecaySettings]) -> None:
     settings = entry.table.settings
     if settings.samples == "record":
         return
-    for key, default in (("drift", "none"), ("noise", "white"), ("every", 1)):
+    for key, default in (("drift", "none"), ("noise", "white"), ("thin", 1)):
         value = getattr(settings, key)
         if value not in (None, default):
             rule = "turning points have white noise and no drift, and each of them counts"
@@ -115,13 +115,13 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
 
 
 def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":
-    """Make the experiment of the class that the settings demand."""
+    """Make the experiment of the class that the settings demand; its record begins with the release."""
     points = made_by("capsule_id.experiments.free_vibration.turning_points:TurningPoints")
     record = made_by(
         "capsule_id.experiments.free_vibration.experiment:FreeVibration",
         capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
     )
-    return (record if table.settings.samples == "record" else points)(table, rig, friction)
+    return (record if table.settings.samples == "record" else points)(cut_at_release(table), rig, friction)
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ TEMPLATE = """\
 # [[experiment]]
 # kind = "free_vibration"
 # file = "free_vibration_1.csv"
-#: the part of the record that is free decay; default: the whole record
+#: the part of the record that is free decay; default: from the release, where rest before it is found, to the end
 # start = { value = 0.0, unit = "s" }
 # stop = { value = 0.5, unit = "s" }
 #: "held" (default) or "free"
@@ -168,8 +168,9 @@ TEMPLATE = """\
 #: "white" (default), "ar1" (correlated, one correlation time) or "arma" (correlated and white). The last two include
 #: stated reading errors
 # noise = "white"
-#: use one sample in so many; a record that is sampled far faster than its noise changes needs no more
-# every = 10
+#: fit means of so many consecutive samples; default: 1 for records of up to 2000 samples, longer ones keep about 32
+#: means per period
+# thin = 1
 #: "record" (default), or "turning_points": a row per turning point. Those of one side are amplitudes about the rest
 #: position
 # samples = "record"
@@ -223,10 +224,17 @@ MESSAGES = {
             "noise."
         ),
     ),
+    "decays.damping": Message(
+        "Damping parameters",
+        caption=(
+            "Correlations of the damping parameters. Near -1 or 1 the record determines a combination of two parameters better "
+            "than each of them. A record over a wider range of amplitudes separates them."
+        ),
+    ),
     "decays.first_fit": Message(
         "second fit of free decays",
         warn=(
-            "{record}: no second fit, because the record contains more than a free decay. The fit uses one sample in {every}. "
+            "{record}: no second fit, because the record is not one free decay. The fit uses means of {thin} samples. "
             "Add the line that the finding on the readings states."
         ),
     ),
@@ -234,8 +242,9 @@ MESSAGES = {
         "second fit of free decays",
         warn=_second_fit,
         caption=(
-            "Free decays alone, under the stated model and under the model of the quoted values, both on the samples of the "
-            "latter. BIC is relative to the lower one. Lines of rig.toml that state the quoted model: {lines}."
+            "Free decays alone, under the stated model and under the model of the quoted values, both by maximum likelihood on "
+            "the readings of the latter; records weighted by their errors. BIC is relative to the lower one. Lines of rig.toml "
+            "that state the quoted model: {lines}."
         ),
     ),
 }

@@ -1,15 +1,14 @@
 """Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.errors import InputError
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label, band
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
@@ -30,16 +29,21 @@ from capsule_id.experiments.free_vibration.decrement import (
     logarithmic_decrement,
     trend,
 )
-from capsule_id.experiments.free_vibration.noise import noise_parameters, whiten
+from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, default_block_size, is_even
+from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
-from capsule_id.experiments.free_vibration.tables import decay_table, second_fit_table
+from capsule_id.experiments.free_vibration.starts import decay_starts
+from capsule_id.experiments.free_vibration.tables import damping_table, decay_table, second_fit_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.noise import noise_level
-from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay
+from capsule_id.rig.filters import choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Finding, Points
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 
 #: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
@@ -51,9 +55,17 @@ SMOOTHING_ORDER = 3
 
 @dataclass(frozen=True)
 class DecayAbout(About):
-    """``known``: estimates by symbol, SI, from a screening of models; they give the starting point of a fit."""
+    """``screened``: a fit of the record by a screening of models; it gives the starting point of a fit."""
 
-    known: Mapping[str, float] = field(default_factory=dict, compare=False)
+    screened: "Screened | None" = field(default=None, compare=False)
+
+
+def stated_model(table: Table) -> DecayModel:
+    """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
+    model = DecayModel.stated(table.settings)
+    if table.settings.thin is not None:
+        return model
+    return replace(model, thin=default_block_size(*decay_window(table)))
 
 
 class FreeVibration(SurfaceExperiment):
@@ -61,10 +73,17 @@ class FreeVibration(SurfaceExperiment):
 
     For viscous damping and a linear spring the two solutions enter linearly and are integrated out. Any other decay
     starts at its last turning point before the record, which is sampled. Offset and linear drift are integrated out.
+
+    The readings are block means of the record (``capsule_id.experiments.free_vibration.readings.blocks``), at ``time``
+    (n,); ``relative_sd`` is the sd of one over that of a sample, () or (n,).
     """
 
     time: np.ndarray
     values: np.ndarray
+    times: ReadingTimes
+    nodes: np.ndarray
+    weights: np.ndarray
+    relative_sd: np.ndarray
     width: float
     reading_sd: float
     side: float
@@ -77,7 +96,7 @@ class FreeVibration(SurfaceExperiment):
 
     time_series = True
     checks = (check_stiffness, check_free_decay)
-    tables = (decay_table, second_fit_table)
+    tables = (decay_table, damping_table, second_fit_table)
 
     def __init__(
         self,
@@ -85,21 +104,29 @@ class FreeVibration(SurfaceExperiment):
         rig: Rig,
         friction: FrictionModel = EQUATION_1,
         model: DecayModel | None = None,
-        known: Mapping[str, float] | None = None,
+        screened: "Screened | None" = None,
     ) -> None:
-        """Make one record; ``model`` None: as stated in the settings; ``known`` estimates by symbol for starts."""
+        """Make one record; ``model`` None: as stated in the settings; ``screened`` gives starts."""
         self.friction = friction
-        self.model = model or DecayModel.stated(table.settings)
-        time, self.values = (values[:: self.model.every] for values in decay_window(table))
-        self.time = time - float(time[0])
+        self.model = model or stated_model(table)
+        time, values = decay_window(table)
+        blocks = block_means(time - float(time[0]), values, self.model.thin)
+        self.time, self.values, self.nodes, self.weights = blocks.time, blocks.values, blocks.nodes, blocks.weights
+        self.times = ReadingTimes.of(blocks)
+        self.relative_sd = np.squeeze(1.0 / np.sqrt(self.times.count))
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.reading_sd = table.columns["x_rel"].reading_sd
         step = uniform_step(self.time)
-        self.uniform = step is not None and self.model == DecayModel(every=self.model.every)
+        self.uniform = (
+            step is not None and self.model == DecayModel(thin=self.model.thin) and self.relative_sd.ndim == 0
+        )
+        if self.uniform:
+            # Means of equal blocks of a viscous decay are such a decay, sampled at their middles.
+            self.nodes, self.weights = self.time[:, None], np.ones((len(self.time), 1))
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side, self.half_cycles = 1.0, 0
-        self.about = DecayAbout(table, rig, (), known or {})
+        self.about = DecayAbout(table, rig, (), screened)
         rows = [parameter("k1"), parameter("c"), NOISE_SD.named(table.label, self.noise_prior())]
         if self.model.whitened:
             period = 2.0 * np.pi / self.rough_decrement().Omega_o
@@ -107,19 +134,19 @@ class FreeVibration(SurfaceExperiment):
         if not self.closed:
             rough, turning = self.rough_decrement(), self.first_turning_point()
             self.side = float(np.sign(turning[1]))
-            # The margin allows for a frequency 1.5 times the rough estimate.
-            self.half_cycles = int(1.5 * rough.Omega_o * float(self.time[-1]) / np.pi) + 5
+            # The margin allows for a frequency 1.25 times the rough estimate.
+            self.half_cycles = int(1.25 * rough.Omega_o * float(self.time[-1]) / np.pi) + 5
             hardening = Prior("normal", 0.0, rough.k1 / self.largest_deflection**2)
             rows += [parameter(s, prior=hardening if s == "k_cubic" else None) for s in self.model.symbols]
             rows += [
                 AMPLITUDE.named(table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH)),
                 TURNING_TIME.named(table.label, Prior("normal", 0.0, float(self.time[-1]))),
             ]
-        self.about = DecayAbout(table, rig, tuple(rows), known or {})
+        self.about = DecayAbout(table, rig, tuple(rows), screened)
 
-    def with_model(self, model: DecayModel, known: Mapping[str, float] | None = None) -> "FreeVibration":
-        """Return the same record with another model; ``known`` estimates by symbol, SI, give its starting point."""
-        return FreeVibration(self.table, self.rig, self.friction, model, known)
+    def with_model(self, model: DecayModel, screened: "Screened | None" = None) -> "FreeVibration":
+        """Return the same record with another model; its fit ``screened`` gives the starting point."""
+        return FreeVibration(self.table, self.rig, self.friction, model, screened)
 
     @classmethod
     def second_models(
@@ -132,7 +159,7 @@ class FreeVibration(SurfaceExperiment):
     @property
     def replaced(self) -> bool:
         """Whether a second fit has chosen the model."""
-        return bool(self.about.known)
+        return self.about.screened is not None
 
     @property
     def closed(self) -> bool:
@@ -174,19 +201,21 @@ class FreeVibration(SurfaceExperiment):
         trend = xp.ones((self.n, 1))
         if self.model.drift == "linear":
             trend = xp.stack([xp.ones(self.n), xp.asarray(self.time) / self.time[-1] - 0.5], axis=1)
+        nodes = xp.asarray(self.nodes).ravel()
         if self.closed:
-            basis = viscous_basis(self.time, theta["k1"], theta["c"], theta["m1"], xp)
+            basis = viscous_basis(nodes, theta["k1"], theta["c"], theta["m1"], xp)
+            basis = block_mean(basis, self.weights, xp)
             return self.values, xp.concatenate([basis, trend], axis=1)
         forces = {symbol: theta[symbol] for symbol in ("k1", "c", "m1", *self.model.symbols)}
-        motion = decay(self.time, forces, theta["amplitude"], theta["turning_time"], self.half_cycles)
-        return self.values - self.side * xp.asarray(motion.x_rel), trend
+        motion = decay(nodes, forces, theta["amplitude"], theta["turning_time"], self.half_cycles)
+        return self.values - self.side * block_mean(xp.asarray(motion.x_rel), self.weights, xp), trend
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         raw, design = self.unwhitened(theta, xp)
         if not self.model.whitened:
-            return (Misfit(raw, self.reading_sd**2, 1.0, self.width * design),)
+            return (Misfit(raw, (self.reading_sd * self.relative_sd) ** 2, self.relative_sd, self.width * design),)
         columns = xp.concatenate([xp.reshape(raw, (-1, 1)), self.width * design], axis=1)
-        white = xp.asarray(whiten(self.time, columns, self.model, theta))
+        white = xp.asarray(whiten(self.times, columns, self.model, theta))
         return (Misfit(white[:, 0], 0.0, 1.0, white[:, 1:]),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
@@ -194,7 +223,8 @@ class FreeVibration(SurfaceExperiment):
             return super().summaries(theta, xp)
         gamma, omega = rates(theta["k1"], theta["c"], theta["m1"])
         yy, ay, aa = decay_moments(self.folded, self.n, self.step, gamma, omega)
-        return (Moments(yy, self.width * ay, self.width**2 * aa, self.n, self.reading_sd**2),)
+        variance = (self.reading_sd * self.relative_sd) ** 2
+        return (Moments(yy, self.width * ay, self.width**2 * aa, self.n, variance, self.relative_sd),)
 
     # -- the paper's estimator and starts ---------------------------------------------------------------------------
 
@@ -207,11 +237,7 @@ class FreeVibration(SurfaceExperiment):
     @property
     def even(self) -> bool:
         """Whether the record is evenly sampled, as the paper's filter requires."""
-        try:
-            sampling_step(self.whole[0])
-        except InputError:
-            return False
-        return True
+        return is_even(self.whole[0])
 
     def smoothed(self) -> np.ndarray:
         """The whole record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
@@ -252,35 +278,7 @@ class FreeVibration(SurfaceExperiment):
         return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * self.mass)))
 
     def starts(self) -> dict[str, Start]:
-        rough = self.rough_decrement()
-        # A phase error of the start over the decay leads the fit to a side lobe, a local maximum.
-        ringing = min(self.time[-1], 4.0 * self.mass / rough.c)
-        spread = min(0.3, 1.0 / (rough.Omega_o * ringing))
-        noise = max(noise_level(self.values), 1e-4 * float(np.ptp(self.values)))
-        starts = {
-            "k1": Start(rough.k1, spread),
-            "c": Start(rough.c, 0.3),
-            f"noise_sd[{self.label}]": Start(noise, 0.2),
-        }
-        if not self.closed:
-            time, peak = self.first_turning_point()
-            size = abs(peak)
-            forces = {
-                "F_dry": Start(0.02 * rough.k1 * size, 0.3),
-                "c_q": Start(0.5 * rough.c / (rough.Omega_o * size), 0.3),
-                "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
-            }
-            starts |= {symbol: forces[symbol] for symbol in self.model.symbols}
-            starts[f"amplitude[{self.label}]"] = Start(size, 0.05)
-            starts[f"turning_time[{self.label}]"] = Start(time, 0.05 / rough.Omega_o)
-        for row in self.parameters:
-            if row.symbol in self.about.known:
-                value = self.about.known[row.symbol]
-                near = starts.get(row.name, Start(value, 0.1))
-                # An absent term is no starting point of a logarithm.
-                floor = 1e-3 * near.centre if row.positive else -np.inf
-                starts[row.name] = Start(max(value, floor), 0.3 * near.spread)
-        return starts
+        return decay_starts(self)
 
     def first_turning_point(self) -> tuple[float, float]:
         """Rough time, s, and signed x_rel, m, of the last turning point before the record, or at its first samples."""
@@ -289,15 +287,6 @@ class FreeVibration(SurfaceExperiment):
         back = int(np.ceil(rough.times[0] / half_period - LATEST_TURNING_POINT))
         growth = float(np.exp(0.5 * max(rough.delta, 0.0) * back))
         return float(rough.times[0] - back * half_period), float(rough.peaks[0] * (-1.0) ** back * growth)
-
-    def starts_of_motion(self, rough: Decrement) -> dict[str, Start]:
-        """Starts of x_rel and its rate at the first sample."""
-        size = abs(float(rough.peaks[0]))
-        rate = np.polyfit(self.time[:5], self.values[:5], 1)[0]
-        return {
-            f"x_start[{self.label}]": Start(float(self.values[0] - equilibrium(self.values)), 0.02 * size),
-            f"y_start[{self.label}]": Start(float(rate), 0.05 * rough.Omega_o * size),
-        }
 
     # -- interface to the report and the checks ---------------------------------------------------------------------
 

@@ -1,10 +1,11 @@
 """Settings of a free vibration, the model that they state, and the window that contains the free decay."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
 
+from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.schema import CountRule, NameRule, QuantityRule, WordsRule
@@ -32,7 +33,7 @@ class DecaySettings(Settings):
     stiffness: Literal["linear", "cubic"] | None = None
     drift: Literal["none", "linear", "gp"] | None = None
     noise: Literal["white", "ar1", "arma"] | None = None
-    every: Annotated[int | None, CountRule()] = None
+    thin: Annotated[int | None, CountRule()] = None
     samples: Literal["record", "turning_points"] = "record"
     smoothing_window: Annotated[float | None, QuantityRule("s")] = None
     spring: Annotated[str | None, NameRule()] = None
@@ -49,25 +50,25 @@ class DecayModel:
     damping : words of ``DAMPING``, in that order
     cubic : whether the spring has a cubic term
     drift, noise : as in ``DecaySettings``
-    every : the likelihood uses every n-th sample
+    thin : the likelihood uses means of so many consecutive samples
     """
 
     damping: tuple[str, ...] = ()
     cubic: bool = False
     drift: str = "none"
     noise: str = "white"
-    every: int = 1
+    thin: int = 1
 
     @classmethod
     def stated(cls, settings: DecaySettings) -> "DecayModel":
-        """Return the model that ``settings`` state."""
+        """Return the model that ``settings`` state; without ``thin`` it uses every sample."""
         damping = tuple(word for word in DAMPING if word in (settings.damping or ()))
         return cls(
             damping,
             settings.stiffness == "cubic",
             settings.drift or "none",
             settings.noise or "white",
-            settings.every or 1,
+            settings.thin or 1,
         )
 
     @property
@@ -76,7 +77,7 @@ class DecayModel:
         damping = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
         stiffness = "cubic" if self.cubic else "linear"
         words = f'damping = [{damping}], stiffness = "{stiffness}", drift = "{self.drift}", noise = "{self.noise}"'
-        return f"{words}, every = {self.every}"
+        return f"{words}, thin = {self.thin}"
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -107,7 +108,7 @@ class DecayModel:
         words += ["cubic spring"] if self.cubic else []
         words += [_DRIFTS[self.drift]] if self.drift != "none" else []
         words += [_NOISES[self.noise]] if self.noise != "white" else []
-        words += [f"one sample in {self.every}"] if self.every > 1 else []
+        words += [f"means of {self.thin} samples"] if self.thin > 1 else []
         return ", ".join(words)
 
 
@@ -123,3 +124,22 @@ def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
     """Return (time, x_rel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
     inside = rows_in_window(table)
     return table["time"][inside], table["x_rel"][inside]
+
+
+def release_time(decay: FreeDecay) -> float:
+    """Start of a free decay, s, rounded to a hundredth of its period."""
+    return round(decay.start, max(0, int(np.ceil(-np.log10(0.01 * decay.period)))))
+
+
+def cut_at_release(table: Table[DecaySettings]) -> Table[DecaySettings]:
+    """Return the table with the release found in its record as ``start``, where there is rest before it.
+
+    A stated ``start`` stays, and a table of turning points has no rest.
+    """
+    settings = table.settings
+    if settings.start is not None or settings.samples != "record":
+        return table
+    decay = find_free_decay(*decay_window(table))
+    if decay is None or decay.rest == 0.0:
+        return table
+    return replace(table, settings=replace(settings, start=release_time(decay)))

@@ -11,6 +11,7 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
 from capsule_id.experiments.free_vibration.checks import stiffness_by_record
+from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.views import ResultTable
 
@@ -41,34 +42,48 @@ def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultT
     return [ResultTable("decays.records", pd.DataFrame(rows).set_index("record"))]
 
 
+def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
+    """Correlations of the damping parameters; [] where all damping is viscous."""
+    symbols = dict.fromkeys(symbol for record in records for symbol in record.model.symbols if symbol != "k_cubic")
+    if not symbols:
+        return []
+    names = ["c", *symbols]
+    frame = pd.DataFrame(fit.correlation(names), index=pd.Index(names, name="correlation"), columns=names)
+    return [ResultTable("decays.damping", frame)]
+
+
 def second_fit_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
     """Compare the decays alone under the stated model and under the quoted one; [] where both are the same."""
-    replaced = [record for record in records if record.replaced]
+    del fit
+    replaced = [(record, record.about.screened) for record in records if record.about.screened is not None]
     if not replaced:
         return []
-    rows = []
     # Both fits use the same samples, so that their BIC can be compared.
-    for role, members in (
-        ("stated", [r.with_model(replace(DecayModel.stated(r.table.settings), every=r.model.every)) for r in replaced]),
-        ("quoted", replaced),
+    thins = [replace(DecayModel.stated(record.table.settings), thin=record.model.thin) for record, _ in replaced]
+    stated = [Screening(record, model.thin).fit(model)[0] for (record, _), model in zip(replaced, thins, strict=True)]
+    rows = []
+    for role, model, fits in (
+        ("stated", thins[0], stated),
+        ("quoted", replaced[0][0].model, [screened for _, screened in replaced]),
     ):
-        found = fit.refit(members)
-        residuals = [series for e in members for _, series in e.records(e.local(found.values))]
-        white = all(ljung_box(series)[1] * len(records) >= LEVEL for series in residuals)
-        symbols = ("k1", "c", *members[0].model.symbols)
+        means = {symbol: _weighted_mean(fits, symbol) for symbol in ("k1", "c", *model.symbols)}
+        white = all(ljung_box(one.residuals)[1] * len(records) >= LEVEL for one in fits)
         rows.append(
             {
                 "fit": role,
-                "model": members[0].model.name,
-                "parameters": ", ".join(
-                    f"{name} = {found.values[name]:.5g} ± {found.standard_errors[name]:.2g}" for name in symbols
-                ),
-                "noise, m": float(np.mean([found.values[f"noise_sd[{e.label}]"] for e in members])),
-                "BIC": found.bic,
+                "model": model.name,
+                "parameters": ", ".join(f"{name} = {mean:.5g} ± {sd:.2g}" for name, (mean, sd) in means.items()),
+                "noise, m": float(np.mean([one.noise for one in fits])),
+                "BIC": sum(one.bic for one in fits),
                 "residuals white": "yes" if white else "no",
-                "starts agree": "yes" if found.agree else "no",
             }
         )
     frame = pd.DataFrame(rows).set_index("fit")
     frame["BIC"] -= frame["BIC"].min()
-    return [ResultTable("decays.second_fit", frame, {"lines": replaced[0].model.lines})]
+    return [ResultTable("decays.second_fit", frame, {"lines": replaced[0][0].model.lines})]
+
+
+def _weighted_mean(fits: "Sequence[Screened]", symbol: str) -> tuple[float, float]:
+    """Mean of the estimates of every record, weighted by their standard errors, and its standard error."""
+    weight = np.array([one.errors[symbol] for one in fits]) ** -2.0
+    return float(np.average([one.values[symbol] for one in fits], weights=weight)), float(np.sum(weight) ** -0.5)

@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks.context import Refit, Tension
+from capsule_id.experiments.checks.context import Tension
 from capsule_id.inference.checks.tension import tension
-from capsule_id.inference.fit.point_fit import bic, point_fit
 from capsule_id.inference.fit.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -51,8 +52,9 @@ class Setting:
     def tension(self, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
         return tension(self.rig, one, other)
 
-    def refit(self, experiments: Sequence[Experiment]) -> Refit:
-        target = LogPosterior(self.rig, experiments)
-        fit = point_fit(target, self.seed)
-        values = target.mapping(target.theta(fit.u))
-        return Refit(values, fit.standard_errors, fit.agree, bic(target, fit))
+    def correlation(self, names: Sequence[str]) -> np.ndarray:
+        if self.draws:
+            return np.atleast_2d(np.corrcoef([[draw[name] for draw in self.draws] for name in names]))
+        chosen = [self.target.names.index(name) for name in names]
+        sd = np.sqrt(np.diag(self.fit.covariance))[chosen]
+        return self.fit.covariance[np.ix_(chosen, chosen)] / np.outer(sd, sd)

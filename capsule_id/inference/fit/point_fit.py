@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.curvature import BATCH, gradient, hessian, in_batches, jacobian, root_of_inverse
 from capsule_id.inference.fit.least_squares import Solver, least_squares
@@ -171,20 +170,3 @@ def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> 
     matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
     errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
     return dict(zip(target.names, (float(e) for e in errors), strict=True))
-
-
-def bic(target: LogPosterior, fit: PointFit) -> float:
-    """Schwarz's criterion p log n - 2 log L at the point fit, linear nuisances at their maximum and counted in p.
-
-    Integrated likelihoods with different numbers of nuisances are not comparable by this criterion: each integral
-    adds its own Occam factor.
-    """
-    values = target.mapping(target.theta(fit.u))
-    unknowns, readings, deviance = target.dimension, 0, 0.0
-    for e in target.experiments:
-        theta = e.local(values)
-        misfit, rest = e.misfit(theta), np.asarray(e.residuals(theta, np))[: e.n]
-        deviance += float(rest @ rest + e.n * LOG_2PI + 2.0 * np.sum(np.log(misfit.sd)))
-        unknowns += misfit.design.shape[1]
-        readings += e.n
-    return unknowns * float(np.log(readings)) + deviance

@@ -64,7 +64,7 @@ def test_coloured_noise_of_a_decay_widens_k1(tmp_path: Path) -> None:
     noise = drifting(np.random.default_rng(3), 1200, 0.95)
     columns = {"time [s]": time, "x_rel [mm]": 2.0 * 1e3 * released(time, 1e-3, c=0.3) + 0.02 * noise}
     # Stated words keep the model, so there is no second fit with coloured noise.
-    words = {"damping": '"viscous"', "stiffness": '"linear"', "noise": '"white"', "drift": '"none"', "every": "1"}
+    words = {"damping": '"viscous"', "stiffness": '"linear"', "noise": '"white"', "drift": '"none"', "thin": "1"}
     rig = make_rig(tmp_path, Entry("free_vibration", "decay", columns, words), head={"m1": quantity(M1, "kg")})
     k1 = cid.fit(rig, budget=None).summary.loc["k1"]
     assert k1["trust"] == "not trusted"

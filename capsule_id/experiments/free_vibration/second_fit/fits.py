@@ -11,7 +11,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from capsule_id.experiments.free_vibration.decay_models import HalfCycles, half_cycles, interpolate
-from capsule_id.experiments.free_vibration.noise import whiten_by_shape
+from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means
+from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, whiten_by_shape
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.experiments.linear import LOG_2PI
 
@@ -42,10 +43,19 @@ NAMES = tuple(BOUNDS)
 
 @dataclass(frozen=True)
 class Screened:
-    """A fit of one thinned record: its BIC, values by symbol, SI, and whitened residuals (n,)."""
+    """A fit of one thinned record.
+
+    Attributes
+    ----------
+    values, errors : estimates and standard errors of the free unknowns by symbol, SI; all values, fixed ones included
+    noise : innovation sd of the noise, m
+    residuals : (n,) whitened
+    """
 
     bic: float
     values: Mapping[str, float]
+    errors: Mapping[str, float]
+    noise: float
     residuals: np.ndarray
 
 
@@ -67,18 +77,19 @@ def _paths(thetas: Mapping[str, Any], number: int) -> HalfCycles:
 
 
 @jax.jit
-def _positions(paths: HalfCycles, time: Any) -> Any:
-    """(batch, n) x_rel, m, at the sample times."""
-    return jax.vmap(lambda path: interpolate(path, time).x_rel)(paths)
+def _positions(paths: HalfCycles, nodes: Any, weights: Any) -> Any:
+    """(batch, n) block means of x_rel, m."""
+    return jax.vmap(lambda path: block_mean(interpolate(path, nodes.ravel()).x_rel, weights, jnp))(paths)
 
 
 @jax.jit
-def _whitened(time: Any, raw: Any, thetas: Mapping[str, Any], sloped: Any) -> Any:
+def _whitened(times: ReadingTimes, raw: Any, thetas: Mapping[str, Any], sloped: Any) -> Any:
     """(batch, n) whitened residuals at the best offset and, where ``sloped`` is 1, the best slope."""
+    time = times.time
     slope = sloped * (time - jnp.mean(time)) / (time[-1] - time[0])
 
     def one(raw: Any, shape: Mapping[str, Any]) -> Any:
-        white = whiten_by_shape(time, jnp.stack([raw, jnp.ones_like(raw), slope], axis=1), "arma", shape)
+        white = whiten_by_shape(times, jnp.stack([raw, jnp.ones_like(raw), slope], axis=1), "arma", shape)
         own, design = white[:, 0], white[:, 1:]
         normal, moment = design.T @ design, design.T @ own
         a, b, d = normal[0, 0], normal[0, 1], normal[1, 1] + 1e-9
@@ -91,15 +102,17 @@ def _whitened(time: Any, raw: Any, thetas: Mapping[str, Any], sloped: Any) -> An
 
 
 class Screening:
-    """Maximum-likelihood fits of one record, of which every n-th sample is used."""
+    """Maximum-likelihood fits of one record, by means of ``thin`` samples (default: as the record)."""
 
-    def __init__(self, record: "FreeVibration", every: int = 1) -> None:
+    def __init__(self, record: "FreeVibration", thin: int | None = None) -> None:
         rough = record.rough_decrement()
         self.turning_time, peak = record.first_turning_point()
         self.side, self.size = float(np.sign(peak)), abs(peak)
         self.m1, self.k1, self.c, self.omega = record.mass, rough.k1, rough.c, rough.Omega_o
         period, length = 2.0 * np.pi / self.omega, float(record.time[-1])
-        self.time, self.values = record.time[::every], record.values[::every]
+        blocks = block_means(*record.whole, thin or record.model.thin)
+        self.values, self.nodes, self.weights = blocks.values, blocks.nodes, blocks.weights
+        self.times = ReadingTimes.of(blocks)
         # The margin allows for a frequency 1.25 times the rough estimate.
         self.number = int(2.5 * length / period) + 5
         self.noise_time, self.drift_time = 0.1 * period, period
@@ -153,8 +166,8 @@ class Screening:
             whole = np.tile(start, (len(NAMES) + 1, 1))
             whole[: len(free) + 1, free] = np.concatenate([z[None], z + STEP * np.diag(sign)])
             thetas = {name: jnp.asarray(value) for name, value in self.theta(whole).items()}
-            raw = self.values[None] - self.side * _positions(_paths(thetas, self.number), self.time)
-            points = np.asarray(_whitened(self.time, raw, thetas, sloped))[: len(free) + 1] / unit
+            raw = self.values[None] - self.side * _positions(_paths(thetas, self.number), self.nodes, self.weights)
+            points = np.asarray(_whitened(self.times, raw, thetas, sloped))[: len(free) + 1] / unit
             jacobians[z.tobytes()] = (points[1:] - points[:1]).T / (STEP * sign)
             return points[0]
 
@@ -171,7 +184,14 @@ class Screening:
         )
         z = start.copy()
         z[free] = found.x
-        n, unknowns = len(self.time), len(free) + 2 + int(sloped)
+        n, unknowns = len(self.values), len(free) + 2 + int(sloped)
         deviance = n * (np.log(2.0 * found.cost * unit**2 / n) + 1.0 + LOG_2PI)
         values = {name: float(value) for name, value in self.theta(z).items()}
-        return Screened(float(deviance + unknowns * np.log(n)), values, found.fun), z
+        variances = np.maximum(np.diag(np.linalg.pinv(found.jac.T @ found.jac, hermitian=True)), 0.0)
+        sd = np.sqrt(variances * 2.0 * found.cost / max(n - unknowns, 1))
+        moved = {name: self.theta(z + STEP * np.eye(len(NAMES))[NAMES.index(name)]) for name in free_symbols(model)}
+        errors = {
+            name: float(abs(moved[name][name] - values[name]) / STEP * own) for name, own in zip(moved, sd, strict=True)
+        }
+        noise = float(np.sqrt(2.0 * found.cost / n)) * unit
+        return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun), z

@@ -17,6 +17,7 @@ from scipy.signal import lsim
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
 from capsule_id.experiments.free_vibration.decay_models import viscous_basis
+from capsule_id.experiments.free_vibration.readings.blocks import block_size
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
 from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
 from capsule_id.records.noise import noise_level
@@ -25,14 +26,12 @@ from capsule_id.views import Finding
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
 
-#: Records are thinned to this many samples per period before their models are ranked; points per period of the responses.
-SAMPLES_PER_PERIOD, RESPONSE_POINTS = 16, 60
-#: Fewest samples per period of a thinned record, and largest number of samples of a second fit.
-FEWEST_SAMPLES_PER_PERIOD, LONGEST = 8, 6000
+#: Records are thinned to this many readings per period before their models are ranked; points per period of the responses.
+READINGS_PER_PERIOD, RESPONSE_POINTS = 16, 60
+#: Fewest readings per period of a thinned record.
+FEWEST_PER_PERIOD = 8
 #: Largest number of samples of a record that is no free decay.
 LONGEST_UNCUT = 1000
-#: Findings on a record that contains more than a free decay.
-NO_DECAY = ("decays.release", "decays.second")
 #: Shorter records, in samples, keep their model.
 SHORTEST = 40
 #: Residuals with a larger p-value of the Ljung–Box test count as white here; the check after the fit is more lenient.
@@ -101,10 +100,9 @@ def response_p(record: "FreeVibration", theta: Mapping[str, float]) -> float:
     return float(stats.f.sf((own - further) / extra.shape[1] * freedom / further, extra.shape[1], freedom))
 
 
-def thinning(record: "FreeVibration", samples_per_period: float) -> int:
-    """Return n such that every n-th sample leaves about ``samples_per_period``."""
-    period = 2.0 * np.pi / record.rough_decrement().Omega_o
-    return max(1, int(record.n * period / float(record.time[-1]) / samples_per_period))
+def thinning(record: "FreeVibration", per_period: float) -> int:
+    """Return the block size that leaves about ``per_period`` readings; no less than that of the record."""
+    return max(record.model.thin, block_size(*record.whole, per_period))
 
 
 @dataclass(frozen=True)
@@ -139,26 +137,26 @@ def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
     correlated.
     """
     forces, others = open_models(records[0])
-    coarse = thinning(records[0], SAMPLES_PER_PERIOD)
+    coarse = thinning(records[0], READINGS_PER_PERIOD)
     thinned = [Screening(record, coarse) for record in records]
     best = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])[0]
     others = [replace(model, damping=best.model.damping, cubic=best.model.cubic) for model in others]
     ranked = rank(thinned, others, best)
     best = ranked[0]
-    if records[0].table.settings.every is not None:
+    if records[0].table.settings.thin is not None:
         return best
-    fewest = max(coarse, thinning(records[0], FEWEST_SAMPLES_PER_PERIOD))
+    fewest = max(coarse, thinning(records[0], FEWEST_PER_PERIOD))
     # More samples of the same record show the same misfit with more certainty.
     offered = any(one.white for one in ranked)
-    every = max(1, max(record.n for record in records) // LONGEST) if offered else fewest
-    while every <= fewest:
-        screenings = [Screening(record, every) for record in records]
+    thin = records[0].model.thin if offered else fewest
+    while thin <= fewest:
+        screenings = [Screening(record, thin) for record in records]
         rich = rank(screenings, [replace(best.model, noise=others[-1].noise)], best)[0]
         if rich.white:
             ranked = rank(screenings, others, rich)
-            return next((replace(one, model=replace(one.model, every=every)) for one in ranked if one.white), rich)
-        every *= 2
-    return replace(best, model=replace(best.model, every=coarse))
+            return next((replace(one, model=replace(one.model, thin=thin)) for one in ranked if one.white), rich)
+        thin *= 2
+    return replace(best, model=replace(best.model, thin=coarse))
 
 
 def second_models(
@@ -172,16 +170,16 @@ def second_models(
     level = LEVEL / len(records)
     chosen, findings = list(records), list[Finding]()
     groups: dict[Any, list[int]] = {}
-    no_decay = {finding.experiment for finding in readings if finding.code in NO_DECAY}
+    no_decay = {f.experiment for f in readings if f.level == "fail" and f.code in ("decays.release", "decays.second")}
     for i, record in enumerate(records):
         settings = record.table.settings
         stated = settings.damping, settings.stiffness, settings.drift, settings.noise
         if record.label not in no_decay:
             groups.setdefault(stated, []).append(i)
         elif None in stated:
-            every = settings.every or max(1, record.n // LONGEST_UNCUT)
-            chosen[i] = record.with_model(replace(record.model, every=every))
-            findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "every": every}, record.label))
+            thin = settings.thin or max(1, len(record.whole[0]) // LONGEST_UNCUT)
+            chosen[i] = record.with_model(replace(record.model, thin=thin))
+            findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "thin": thin}, record.label))
     for stated, members in groups.items():
         own = [records[i] for i in members]
         if None not in stated:
@@ -194,6 +192,6 @@ def second_models(
         if model != own[0].model:
             facts = {"labels": contradicting, "first": own[0].model.name, "second": model.name, "lines": model.lines}
             findings.append(Finding("decays.second_fit", "warn", facts, contradicting[0]))
-            for i, (known, _) in zip(members, ranking.fits, strict=True):
-                chosen[i] = records[i].with_model(model, known.values)
+            for i, (screened, _) in zip(members, ranking.fits, strict=True):
+                chosen[i] = records[i].with_model(model, screened)
     return chosen, findings

@@ -1,0 +1,1 @@
+"""Readings of a free decay: block means of long records, and their coloured noise."""

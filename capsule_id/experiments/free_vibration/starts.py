@@ -1,0 +1,56 @@
+"""Starting points of a fit of free decays."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from capsule_id.experiments.base import Start
+from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium
+from capsule_id.records.noise import noise_level
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.free_vibration.experiment import FreeVibration
+
+
+def decay_starts(e: "FreeVibration") -> dict[str, Start]:
+    """Start of every parameter of the record ``e``, from its paper's estimate or the values of a screening."""
+    rough = e.rough_decrement()
+    # A phase error of the start over the decay leads the fit to a side lobe, a local maximum.
+    ringing = min(e.time[-1], 4.0 * e.mass / rough.c)
+    spread = min(0.3, 1.0 / (rough.Omega_o * ringing))
+    noise = max(noise_level(e.values), 1e-4 * float(np.ptp(e.values)))
+    starts = {
+        "k1": Start(rough.k1, spread),
+        "c": Start(rough.c, 0.3),
+        f"noise_sd[{e.label}]": Start(noise, 0.2),
+    }
+    if not e.closed:
+        time, peak = e.first_turning_point()
+        size = abs(peak)
+        forces = {
+            "F_dry": Start(0.02 * rough.k1 * size, 0.3),
+            "c_q": Start(0.5 * rough.c / (rough.Omega_o * size), 0.3),
+            "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
+        }
+        starts |= {symbol: forces[symbol] for symbol in e.model.symbols}
+        starts[f"amplitude[{e.label}]"] = Start(size, 0.05)
+        starts[f"turning_time[{e.label}]"] = Start(time, 0.05 / rough.Omega_o)
+    known = {} if e.about.screened is None else e.about.screened.values
+    for row in e.parameters:
+        if row.symbol in known:
+            value = known[row.symbol]
+            near = starts.get(row.name, Start(value, 0.1))
+            # An absent term is no starting point of a logarithm.
+            floor = 1e-3 * near.centre if row.positive else -np.inf
+            starts[row.name] = Start(max(value, floor), 0.3 * near.spread)
+    return starts
+
+
+def starts_of_motion(e: "FreeVibration", rough: Decrement) -> dict[str, Start]:
+    """Starts of x_rel and its rate at the first sample."""
+    size = abs(float(rough.peaks[0]))
+    rate = np.polyfit(e.time[:5], e.values[:5], 1)[0]
+    return {
+        f"x_start[{e.label}]": Start(float(e.values[0] - equilibrium(e.values)), 0.02 * size),
+        f"y_start[{e.label}]": Start(float(rate), 0.05 * rough.Omega_o * size),
+    }
