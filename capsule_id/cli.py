@@ -56,13 +56,14 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands import bifurcate, check, init, report, simulate, synthesize
+    from capsule_id.commands import bifurcate, check, import_file, init, report, simulate, synthesize
 
     parser = _parser(program, "Make, check, simulate and report; fit-params fits.")
     parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
     commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
     for name, module, text in (
-        ("init", init, "an empty rig folder with a commented rig.toml"),
+        ("init", init, "a rig folder with a commented rig.toml, or one that reads given exports"),
+        ("import", import_file, "describe an export and propose the entry that reads it"),
         ("check", check, "check a rig folder and list problems before a fit"),
         ("synthesize", synthesize, "a rig folder with known truth"),
         ("simulate", simulate, "the capsule model: time histories and phase plane"),

@@ -1,12 +1,15 @@
-"""``capsule-id init DIR``: an empty rig folder with a commented ``rig.toml`` to fill in."""
+"""``capsule-id init DIR``: a rig folder with a commented ``rig.toml`` to fill in, or one that reads the given exports."""
 
 import argparse
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
+from capsule_id.commands.import_file import read_file
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry, default_registry
+from capsule_id.importing.entry import entry_of
 from capsule_id.rig.toml_values import NAME_PATTERN
 
 # Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
@@ -51,19 +54,23 @@ name = "@NAME@"
 """
 
 
-def template(kinds: Registry, name: str) -> str:
-    """The commented ``rig.toml`` of a rig called ``name``, with an entry for each of ``kinds``."""
+def template(kinds: Registry, name: str, entries: Sequence[str] | None = None) -> str:
+    """The commented ``rig.toml`` of a rig called ``name``, with ``entries``, or a commented one for each of ``kinds``."""
     stated = [row for row in kinds.parameters.values() if row.prior_can_be_stated]
     lognormal = ['"k2[<spring>]"' if row.symbol == "k2" else row.symbol for row in stated if not row.scatter]
     head = HEAD.replace("@NAME@", name).replace("@LOGNORMAL@", " ".join(lognormal))
     head = head.replace("@HALFNORMAL@", " ".join(row.symbol for row in stated if row.scatter))
     head = head.replace("@OPTIONAL@", " ".join(row.symbol for row in kinds.parameters.values() if row.optional))
-    return "\n".join([head, *(kind.template for kind in kinds.values())])
+    return "\n".join([head, *(entries or [kind.template for kind in kinds.values()])])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DIR."""
-    parser.add_argument("dir", metavar="DIR", help="new or empty folder")
+    """Add DIR and the exports."""
+    parser.add_argument("dir", metavar="DIR", help="new or empty folder; with --from it may hold the files")
+    parser.add_argument(
+        "--from", dest="files", nargs="+", type=Path, default=[], metavar="FILE",
+        help="exports of loggers and programs: copy them into DIR and guess the entries that read them",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -72,20 +79,37 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        If DIR is not empty, is no folder, or cannot be written.
+        If DIR holds other files, is no folder, or cannot be written; if an export cannot be read.
     """
-    folder = Path(args.dir)
+    folder, files = Path(args.dir), list(args.files)
+    kinds = default_registry()
+    contents = {path.name: read_file(path) for path in files}
+    if len(contents) < len(files):
+        raise InputError("files must have different names", "two of one name", "rename one of them", folder)
+    guesses = {path.name: entry_of(contents[path.name], path, path.name, kinds) for path in files}
     try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        own = {path.resolve() for path in files}
+        if folder.exists() and (not folder.is_dir() or any(each.resolve() not in own for each in folder.iterdir())):
             raise InputError("DIR must be new or an empty folder", str(folder), "name another one", folder)
         folder.mkdir(parents=True, exist_ok=True)
         name = folder.resolve().name
         usable = re.fullmatch(NAME_PATTERN, name) and name.strip(".")
-        text = template(default_registry(), name if usable else "rig")
+        text = template(kinds, name if usable else "rig", [entry for entry, _ in guesses.values()])
         (folder / "rig.toml").write_text(text, encoding="utf-8")
+        for file, content in contents.items():
+            if (folder / file).resolve() not in own:
+                (folder / file).write_bytes(content)
     except OSError as error:
         raise InputError("DIR must be writable", str(error.strerror), "name another one", folder) from None
-    say(
-        f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of their entries, then run capsule-id check {folder}"
-    )
+    if not files:
+        say(
+            f"wrote {folder / 'rig.toml'}: add tables, remove the `# ` of their entries, then run capsule-id check {folder}"
+        )
+        return 0
+    lines = [f"wrote {folder / 'rig.toml'}:"]
+    lines += [
+        f"{file}: {'kind unsure' if guessed is None else guessed.kind}{', unsure' if guessed and guessed.unsure else ''}"
+        for file, (_, guessed) in guesses.items()
+    ]
+    say("\n".join([*lines, f"check its guesses, state the masses, then run capsule-id check {folder}"]))
     return 0

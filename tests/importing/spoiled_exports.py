@@ -169,12 +169,12 @@ def _runs() -> list[Spoiled]:
     ]
 
 
-def _tables() -> list[Spoiled]:
-    def table(file: str, text: str | bytes, kind: str, **columns: np.ndarray) -> Spoiled:
-        return Spoiled(file, text.encode() if isinstance(text, str) else text, kind, columns)
+def table(file: str, text: str | bytes, kind: str, **columns: np.ndarray) -> Spoiled:
+    return Spoiled(file, text.encode() if isinstance(text, str) else text, kind, columns)
 
+
+def _friction() -> list[Spoiled]:
     radians = np.deg2rad(TILTS)
-    grams = NEWTONS / 9.80665e-3
     return [
         table(
             "tilt.csv",
@@ -203,6 +203,12 @@ def _tables() -> list[Spoiled]:
             speed=SPEED,
             force=FRICTION,
         ),
+    ]
+
+
+def _lines() -> list[Spoiled]:
+    grams = NEWTONS / 9.80665e-3
+    return [
         table(
             "motor.xlsx",
             workbook([["Motor", "calibration"], ["I", "F"], ["A", "N"]], [AMPERES, NEWTONS]),
@@ -248,7 +254,7 @@ def _tables() -> list[Spoiled]:
     ]
 
 
-GROUPS: tuple[Callable[[], list[Spoiled]], ...] = (_decays, _runs, _tables)
+GROUPS: tuple[Callable[[], list[Spoiled]], ...] = (_decays, _runs, _friction, _lines)
 
 
 def spoiled_exports() -> list[Spoiled]:

@@ -90,6 +90,7 @@ LAYOUTS = {
     "semicolons, decimal commas, a row of units": ("t;T;x\ns;K;mm\n" + rows(";", ",", THREE), BY_NAME),
     "tabs and decimal commas": ("t\tT\tx\n" + rows("\t", ",", THREE), BY_NAME),
     "spaces": ("t   T   x\n" + rows("   ", ".", THREE), BY_NAME),
+    "spaces, headers of several words": ("a clock   T (K)   x (mm)\n" + rows("   ", ".", THREE), BY_NUMBER),
     "spaces and decimal commas": (rows("  ", ",", THREE), BY_NUMBER),
     "no header": (rows(",", ".", THREE), BY_NUMBER),
     "a comma and a space": ("t, T, x\n" + rows(", ", ".", THREE), BY_NAME),

@@ -1,6 +1,7 @@
 """Reads TDMS files of LabVIEW by npTDMS: every channel of numbers, scaled, and the times of waveforms."""
 
 import io
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,9 @@ def read_tdms(content: bytes, path: Path, layout: Layout) -> Export:
     """
     with installed("npTDMS", path):
         import nptdms
+        from nptdms.log import log_manager
 
+    log_manager.set_level(logging.CRITICAL)  # its remarks on damaged files go to standard error otherwise
     arrays: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
     clocks: dict[str, tuple[float, float, int]] = {}

@@ -37,7 +37,7 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     numbers = [i for i in range(first, len(lines)) if lines[i].strip() and not _is_comment(lines[i])]
     if not numbers:
         raise InputError("a table must have rows of numbers", "none", "export the readings", path, len(lines), 1)
-    delimiter = _delimiter(lines[numbers[0]], layout)
+    delimiter = delimiter_of(lines[numbers[0]], layout)
     _refuse_ambiguous_comma([lines[i] for i in numbers], delimiter, layout, path, numbers[0] + 1)
     rows = [lines[i].split(delimiter) for i in numbers]
     if len(rows[0]) > 1 and not any(row[-1].strip(BLANKS) for row in rows):  # a separator at the end of every line
@@ -75,7 +75,7 @@ def _first_row(lines: list[str], layout: Layout, path: Path) -> int:
     for i, line in enumerate(lines):
         if _is_comment(line):
             continue
-        cells = _split(line, _delimiter(line, layout))
+        cells = _split(line, delimiter_of(line, layout))
         if begun is None and any(_is_number(cell) for cell in cells):
             begun = i
         if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
@@ -94,7 +94,10 @@ def _first_row(lines: list[str], layout: Layout, path: Path) -> int:
 
 def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:
     """The headers in a line above the numbers; () if it holds none."""
-    cells = _split(line.lstrip(BLANKS).lstrip("".join(_COMMENTS)), delimiter)
+    bare = line.lstrip(BLANKS).lstrip("".join(_COMMENTS))
+    cells = _split(bare, delimiter)
+    if delimiter is None and len(cells) != width:  # headers of several words, two spaces or more between them
+        cells = re.split(r"\s{2,}", bare.strip())
     if len(cells) == width + 1 and not cells[-1]:
         cells.pop()
     if len(cells) != width or not any(cells) or any(_is_number(cell) for cell in cells):
@@ -112,7 +115,7 @@ def _bare(cell: str) -> str:
     return cell.strip(BLANKS).strip('"')
 
 
-def _delimiter(line: str, layout: Layout) -> str | None:
+def delimiter_of(line: str, layout: Layout) -> str | None:
     """The separator of a row: tab, semicolon, comma, or None for spaces; a comma may be the decimal mark."""
     for mark in "\t;":
         if mark in line:

@@ -1,0 +1,42 @@
+"""``capsule-id import FILE``: describe an export and propose the entry of ``rig.toml`` that reads it; writes nothing."""
+
+import argparse
+from pathlib import Path
+
+from capsule_id.console import say
+from capsule_id.errors import InputError
+from capsule_id.experiments.registry import default_registry
+from capsule_id.importing.report import import_report
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add FILE."""
+    parser.add_argument("file", metavar="FILE", type=Path, help="table as a logger or a program exports it")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the report to standard output; 0.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    say("\n".join(import_report(read_file(args.file), args.file, default_registry())))
+    return 0
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a regular file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        if not path.is_file():
+            raise InputError("FILE must be a regular file", "no such file", "correct the name", path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None

@@ -1,0 +1,141 @@
+"""Writes the entry of ``rig.toml`` that reads an export, with a comment and a confidence at every guess."""
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.kind import Kind
+from capsule_id.importing.guess import TIME, ColumnGuess, Guess, free_part, guess
+from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
+from capsule_id.rig.filters import dominant_frequency
+from capsule_id.rig.formats.text.any_layout import delimiter_of
+from capsule_id.rig.units import factor_to_si, scale
+
+_SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
+_LONGEST_HEADER = 40  # characters; a column with a longer header is named by its number
+
+
+def dimensions_of(kinds: Mapping[str, Kind]) -> tuple[str, ...]:
+    """The SI units of all columns of all kinds."""
+    return tuple(sorted({rule.si for kind in kinds.values() for rule in kind.columns.values()}))
+
+
+def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
+    """The lines of ``[[experiment]]`` for one export, and the guess; without a guess the lines are comments.
+
+    Parameters
+    ----------
+    content, path : the bytes of the file, and its name for error lines
+    file : its name in ``rig.toml``
+    kinds : the kinds of experiments
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    found = find_layout(content, path, dimensions_of(kinds))
+    guessed = guess(found, kinds)
+    if guessed is None:
+        words = " ".join(kinds)
+        headers = ", ".join(name for name in found.names if name) or "none"
+        lines = [
+            f"#: {file}: unsure. No kind fits its headers: {headers}.",
+            f"#: Write one of {words}, and the columns of that kind.",
+            "# [[experiment]]",
+            '# kind = "..."',
+            f"# file = {json.dumps(file)}",
+            '# columns = { ... = { from = 1, unit = "..." } }',
+        ]
+        return "\n".join(lines) + "\n", None
+    kind = kinds[guessed.kind]
+    lines = ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
+    lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
+    lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
+    lines += _setting_lines(found, guessed, kind, file)
+    lines += ["[experiment.columns]", *_column_lines(found, guessed)]
+    return "\n".join(lines) + "\n", guessed
+
+
+def _commented(line: str, confidence: str, reason: str) -> str:
+    """A line with the confidence of its guess as a comment."""
+    return f"{line}  # {confidence}: {' '.join(reason.split())}"
+
+
+def _description(found: FoundLayout, content: bytes) -> str:
+    """Rows and separator of a file in words."""
+    rows = len(found.export.lines)
+    text = f"{rows} rows"
+    if found.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
+        return text
+    line = content.decode("utf-8-sig", "replace").replace("\r\n", "\n").split("\n")[int(found.export.lines[0]) - 1]
+    return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
+
+
+def _layout_lines(found: FoundLayout, used: Any) -> Iterable[str]:
+    """The keys of the layout that differ from the default."""
+    if used.data_from_line is not None:
+        yield _commented(f"data_from_line = {used.data_from_line}", "sure", "the first row of readings")
+    if used.decimal is not None:
+        yield _commented(f'decimal = "{used.decimal}"', "likely", "one column with a comma in every number")
+    if used.missing:
+        texts = json.dumps(list(used.missing), ensure_ascii=False)
+        yield _commented(f"missing = {texts}", "likely", "texts of cells without a reading; their rows are not used")
+
+
+def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) -> Iterable[str]:
+    """Settings that the record or the name of the file suggests."""
+    for key in kind.required:
+        stem = "".join(mark if mark.isalnum() or mark in "._-" else "_" for mark in Path(file).name.split(".")[0])
+        yield _commented(f'{key} = "{stem}"', "unsure", "from the name of the file")
+    channel = next((name for name in guessed.columns if name != TIME), None)
+    if TIME not in kind.columns or channel is None:
+        return
+    time, values = _times(found, guessed), found.columns[guessed.columns[channel].index]
+    here = np.isfinite(values) & np.isfinite(time)
+    time, values = time[here], values[here]
+    if "start" in kind.setting_rules and (part := free_part(time, values)) is not None:
+        start, stop = part
+        yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")
+        if stop is not None:
+            yield _commented(f'stop = {{ value = {stop:.6g}, unit = "s" }}', "likely", "another excitation begins here")
+    if "f" in kind.setting_rules:
+        even = np.linspace(time[0], time[-1], len(time))
+        try:
+            frequency = dominant_frequency(even, np.interp(even, time, values))
+        except InputError:
+            return
+        reason = f"the strongest frequency of {channel}; state the set value"
+        yield _commented(f'f = {{ value = {frequency:.4g}, unit = "Hz" }}', "unsure", reason)
+
+
+def _times(found: FoundLayout, guessed: Guess) -> np.ndarray:
+    """The times of a record, (n,) s; sample numbers where neither times nor a rate are known."""
+    if TIME in guessed.columns:
+        column = guessed.columns[TIME]
+        return scale(found.columns[column.index], factor_to_si(column.unit, "s"))
+    return np.arange(len(next(iter(found.columns.values())))) / (guessed.rate or 1.0)
+
+
+def _column_lines(found: FoundLayout, guessed: Guess) -> Iterable[str]:
+    """A line for each column of the map."""
+    if TIME not in guessed.columns and guessed.rate is not None:
+        line = f'{TIME} = {{ rate = {{ value = {guessed.rate:g}, unit = "Hz" }} }}'
+        yield _commented(line, "likely", "the file states this rate and no times")
+    elif TIME not in guessed.columns and guessed.confidence == "unsure" and "sampling rate" in guessed.reason:
+        yield _commented(f'{TIME} = {{ rate = {{ value = 1000, unit = "Hz" }} }}', "unsure", "the file states no rate")
+    for name, column in guessed.columns.items():
+        source = f'{{ from = {_source(found, column)}, unit = "{column.unit}" }}'
+        yield _commented(f"{name} = {source}", column.confidence, column.reason)
+
+
+def _source(found: FoundLayout, column: ColumnGuess) -> str:
+    """The header of a column, or its number where the header is not unique, long or absent."""
+    header = found.names[column.index]
+    everything = [name for row in found.export.headers for name in row]
+    usable = header and header.isprintable() and len(header) <= _LONGEST_HEADER and everything.count(header) == 1
+    return json.dumps(header, ensure_ascii=False) if usable else str(column.index + 1)

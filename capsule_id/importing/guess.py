@@ -1,0 +1,203 @@
+"""Guesses the kind of experiment of an export, and which of its columns and units are those of the kind."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.kind import Kind
+from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
+from capsule_id.importing.layout import FoundLayout
+from capsule_id.records.faults.release import find_free_decay
+
+Confidence = Literal["sure", "likely", "unsure"]
+TIME = "time"
+#: Fewest rows of a record in time.
+FEWEST_SAMPLES = 50
+#: Score of a unit that fits a column, of a column that is left out, and the smallest lead of a kind that is sure.
+UNIT_SCORE, LEFT_OUT, LEAD = 1.0, -0.25, 1.0
+#: A record whose last fifth has less than this fraction of the amplitude of its largest part decays; above the second
+#: fraction it is driven.
+DECAYS, DRIVEN = 0.5, 0.8
+_PARTS = 5
+
+
+@dataclass(frozen=True)
+class ColumnGuess:
+    """A column of the kind: index in the file, unit, and what the guess rests on."""
+
+    index: int
+    unit: str
+    confidence: Confidence
+    reason: str
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What an export holds.
+
+    Attributes
+    ----------
+    kind : name of the most probable kind
+    columns : by name of the kind's column
+    rate : sampling rate of a record without times, Hz
+    confidence, reason : of the kind, and of the rate where there is one
+    """
+
+    kind: str
+    columns: Mapping[str, ColumnGuess]
+    rate: float | None
+    confidence: Confidence
+    reason: str
+
+    @property
+    def unsure(self) -> bool:
+        """Whether the kind or any column is a guess without a reason."""
+        return "unsure" in (self.confidence, *(column.confidence for column in self.columns.values()))
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    kind: Kind
+    columns: Mapping[str, ColumnGuess]
+    score: float
+
+
+def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
+    """The most probable kind and columns of an export; None where no kind fits."""
+    candidates = [candidate for kind in kinds.values() for candidate in _candidates(found, kind)]
+    if not candidates:
+        return _without_names(found, kinds)
+    best = max(candidate.score for candidate in candidates)
+    leading = [candidate for candidate in candidates if candidate.score > best - LEAD]
+    names = sorted({candidate.kind.name for candidate in leading})
+    if len(names) == 1:
+        chosen = max(candidates, key=lambda candidate: candidate.score)
+        return _guess(found, chosen, "sure", "the columns fit no other kind as well")
+    by_motion = _by_motion(found, leading)
+    if by_motion is not None:
+        return _guess(found, *by_motion)
+    chosen = max(leading, key=lambda candidate: candidate.score)
+    return _guess(found, chosen, "unsure", f"the columns fit {' and '.join(names)}")
+
+
+def _guess(found: FoundLayout, candidate: _Candidate, confidence: Confidence, reason: str) -> Guess:
+    """The guess of a candidate; a missing time column needs a stated rate."""
+    needs_rate = TIME in candidate.kind.columns and TIME not in candidate.columns
+    if needs_rate and found.rate is None:
+        confidence, reason = "unsure", f"{reason}; the file states no times and no sampling rate"
+    return Guess(candidate.kind.name, candidate.columns, found.rate if needs_rate else None, confidence, reason)
+
+
+def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
+    """The assignments of file columns to each set of columns of a kind."""
+    dimensions = sorted({rule.si for rule in kind.columns.values()})
+    for columns in kind.sets:
+        wanted = [*columns, *kind.channels, *kind.optional]
+        needed = set(columns) - {TIME}
+        scores = np.full((len(wanted), len(found.columns)), -1e3)
+        guesses = {}
+        for (i, name), (j, index) in product(enumerate(wanted), enumerate(found.columns)):
+            scored = _score(found, index, name, kind.columns[name].si, dimensions)
+            if scored is not None:
+                scores[i, j], guesses[i, j] = scored
+        rows, places = linear_sum_assignment(scores, maximize=True)
+        chosen = {
+            wanted[i]: (guesses[i, j], scores[i, j]) for i, j in zip(rows, places, strict=True) if (i, j) in guesses
+        }
+        if not needed <= set(chosen) or (kind.channels and not set(kind.channels) & set(chosen)):
+            continue
+        if TIME in columns and not _is_record(found, chosen[TIME][0].index if TIME in chosen else None):
+            continue
+        score = sum(score for _, score in chosen.values()) + LEFT_OUT * (len(columns) - len(set(columns) & set(chosen)))
+        yield _Candidate(kind, {name: column for name, (column, _) in chosen.items()}, float(score))
+
+
+def _score(
+    found: FoundLayout, index: int, name: str, si: str, dimensions: list[str]
+) -> tuple[float, ColumnGuess] | None:
+    """How well a column of the file fits the column ``name`` of a kind; None where it cannot be."""
+    stem, text = name_and_unit(found.names[index], dimensions)
+    text = text if text is not None else found.units[index] or None
+    by_name = fits_name(stem, name)
+    unit = None if text is None else unit_of(text, [si])
+    if text is not None and unit is None and text.strip():
+        return None
+    if by_name == 0:
+        return None
+    if unit is None:
+        if si == "1":
+            return float(by_name), ColumnGuess(index, "1", "likely", "a number without unit")
+        return float(by_name), ColumnGuess(index, si, "unsure", "the file states no unit")
+    exact = unit == (text or "").strip()
+    reason = f"the file says {found.names[index]!r}" + ("" if exact else f", read as {unit}")
+    return by_name + UNIT_SCORE, ColumnGuess(index, unit, "sure" if exact else "likely", reason)
+
+
+def _is_record(found: FoundLayout, time: int | None) -> bool:
+    """Whether a file is a record in time: long enough, with increasing times."""
+    rows = len(next(iter(found.columns.values())))
+    if time is None:
+        return rows >= FEWEST_SAMPLES
+    values = found.columns[time]
+    values = values[np.isfinite(values)]
+    return rows >= 8 and bool(np.all(np.diff(values) > 0.0))
+
+
+def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidate, Confidence, str] | None:
+    """Of kinds with the same columns, the bench test where the record decays, the other where it is driven."""
+    records = [each for each in leading if TIME in each.kind.columns]
+    if {each.kind.bench for each in records} != {True, False} or len(records) < len(leading):
+        return None
+    sample = next(iter(records))
+    index = next(column.index for name, column in sample.columns.items() if name != TIME)
+    values = found.columns[index]
+    parts = [np.ptp(part) for part in np.array_split(values[np.isfinite(values)], _PARTS)]
+    ratio = float(parts[-1] / max(*parts, 1e-300))
+    bench = ratio < 0.5 * (DECAYS + DRIVEN)
+    chosen = max((each for each in records if each.kind.bench == bench), key=lambda each: each.score)
+    clear = ratio < DECAYS or ratio > DRIVEN
+    words = "decays" if bench else "is driven"
+    return (
+        chosen,
+        "sure" if clear else "unsure",
+        f"the motion {words}: its amplitude ends at {ratio:.0%} of its largest",
+    )
+
+
+def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
+    """A guess for a record whose headers say nothing: times that increase evenly, and one channel."""
+    rows = len(next(iter(found.columns.values()), ()))
+    times = [index for index in found.columns if _is_even(found.columns[index])]
+    channels = [index for index in found.columns if index not in times]
+    if rows < FEWEST_SAMPLES or len(times) > 1 or len(channels) != 1:
+        return None
+    reason = "no header names the column"
+    candidates = []
+    for kind in kinds.values():
+        name = next((name for name in (*kind.sets[0], *kind.channels) if name != TIME), None)
+        if TIME in kind.columns and name is not None:
+            wanted = {name: channels[0]} | dict.fromkeys([TIME] * len(times), times[0] if times else 0)
+            columns = {n: ColumnGuess(i, kind.columns[n].si, "unsure", reason) for n, i in wanted.items()}
+            candidates.append(_Candidate(kind, columns, 0.0))
+    by_motion = _by_motion(found, candidates)
+    return None if by_motion is None else _guess(found, by_motion[0], "unsure", f"{reason}; {by_motion[2]}")
+
+
+def _is_even(values: np.ndarray) -> bool:
+    """Whether values increase by nearly equal steps."""
+    steps = np.diff(values)
+    return bool(len(steps) and np.all(steps > 0.0) and np.max(steps) < 3.0 * np.median(steps))
+
+
+def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None] | None:
+    """Start and stop of the free decay in a record, s; None where all of it is free or nothing swings."""
+    try:
+        decay = find_free_decay(time, values)
+    except InputError:
+        return None
+    return None if decay is None or (decay.rest == 0.0 and decay.stop is None) else (decay.start, decay.stop)

@@ -1,0 +1,88 @@
+"""Reads names and units from headers, as loggers, spreadsheets and students write them."""
+
+import re
+from collections.abc import Mapping, Sequence
+
+from capsule_id.rig.units import UnitError, factor_to_si
+
+#: Words for a column of a kind, by its name; a column is always known by its own name too.
+WORDS: Mapping[str, tuple[str, ...]] = {
+    "time": ("time", "t", "zeit", "temps", "elapsed", "timestamp", "clock", "value"),
+    "x_rel": ("relative", "displacement", "disp", "deflection", "position", "pos", "x", "weg", "laser", "auslenkung"),
+    "x_capsule": ("capsule", "kapsel", "housing"),
+    "x_base": ("base", "shaker"),
+    "acceleration_rod": ("acceleration", "acc", "accel", "accelerometer", "beschleunigung", "a"),
+    "velocity": ("velocity", "speed", "v", "geschwindigkeit"),
+    "acceleration": ("acceleration", "acc", "accel", "accelerometer", "beschleunigung", "a"),
+    "current": ("current", "strom", "i", "courant", "amps", "coil"),
+    "force": ("force", "kraft", "f", "load", "friction", "weight", "pull"),
+    "angle": ("angle", "tilt", "winkel", "inclination", "neigung", "theta", "alpha"),
+    "height": ("height", "hoehe", "höhe", "h"),
+    "length": ("length", "laenge", "länge", "l", "board"),
+    "speed": ("speed", "velocity", "v", "geschwindigkeit", "vitesse"),
+    "distance": ("distance", "travel", "slide", "strecke", "weg", "x", "d", "displacement"),
+    "deflection": ("deflection", "displacement", "disp", "compression", "extension", "verformung", "weg", "x"),
+    "coefficient": ("coefficient", "mu", "reibwert"),
+    "reading": ("reading", "counts", "adc", "raw", "cell"),
+}
+#: Units of headers that state none: names that programs give to their columns.
+UNITS_OF_NAMES: Mapping[str, str] = {"X_Value": "s"}
+#: Other ways to write a unit.
+SPELLINGS: Mapping[str, str] = {
+    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s", "sekunden": "s", "msec": "ms", "usec": "us",
+    "millimeter": "mm", "millimetre": "mm", "meter": "m", "metre": "m", "m/s2": "m/s^2", "m/s**2": "m/s^2",
+    "newton": "N", "amp": "A", "amps": "A", "ampere": "A", "degree": "deg", "degrees": "deg", "grad": "deg",
+    "counts": "1", "count": "1", "-": "1",
+}  # fmt: skip
+_BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*")
+_SEPARATED = re.compile(r"(.*?)(?:\s+/\s*|\s*,\s+|\s+in\s+)([^\s/,]\S*)")
+
+
+def unit_of(text: str, dimensions: Sequence[str]) -> str | None:
+    """The unit that ``text`` writes, if it has one of the ``dimensions`` (SI units); else None."""
+    text = text.strip()
+    written = SPELLINGS.get(text.lower(), text)
+    for si in dimensions:
+        # A lone g beside an acceleration is standard gravity.
+        candidate = "g_n" if written in ("g", "G") and si == "m/s^2" else written
+        try:
+            factor_to_si(candidate, si)
+        except UnitError:
+            continue
+        return candidate
+    return None
+
+
+def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | None]:
+    """Name and text of the unit of a header; None where it states none.
+
+    ``dimensions`` are the SI units that columns may have. A suffix such as ``_mm`` counts only if it is such a unit.
+    """
+    if header in UNITS_OF_NAMES:
+        return header, UNITS_OF_NAMES[header]
+    for pattern in (_BRACKETS, _SEPARATED):
+        found = pattern.fullmatch(header)
+        if found:
+            return found[1], next(group for group in found.groups()[1:] if group is not None).strip()
+    parts = header.split("_")
+    for k in range(1, len(parts)):
+        suffix = "_".join(parts[k:])
+        if unit_of(suffix, dimensions) is not None:
+            return "_".join(parts[:k]), suffix
+    return header, None
+
+
+def fits_name(name: str, column: str) -> int:
+    """3 for the name of the column itself, 2 for one of its words, 0 for another name."""
+    bare = name.strip().lower()
+    if bare == column.lower():
+        return 3
+    words = re.split(r"[\W_]+", bare)
+    return 2 if any(word in words for word in WORDS.get(column, ())) else 0
+
+
+def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
+    """Whether at least half of the cells of a header row are units; empty cells do not count."""
+    cells = [cell for cell in row if cell.strip(" []()")]
+    units = [cell for cell in cells if unit_of(cell.strip(" []()"), dimensions) is not None]
+    return bool(cells) and 2 * len(units) >= len(cells)

@@ -1,0 +1,91 @@
+"""Describes an export before it is used: channels, units, sampling, gaps, clipping, drop-outs, first and last rows."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.experiments.kind import Kind
+from capsule_id.importing.entry import dimensions_of, entry_of
+from capsule_id.importing.guess import TIME, guess
+from capsule_id.importing.headers import name_and_unit, unit_of
+from capsule_id.importing.layout import FoundLayout, find_layout
+from capsule_id.records.faults.clipping import clipped_samples
+from capsule_id.records.faults.duplicates import reading_step
+from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples
+from capsule_id.rig.units import factor_to_si, scale
+
+_SHOWN_ROWS = 3
+_SHOWN_COLUMNS = 20
+
+
+def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list[str]:
+    """The report of one file, line by line, the proposed entry of ``rig.toml`` last.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    dimensions = dimensions_of(kinds)
+    found = find_layout(content, path, dimensions)
+    rows = len(next(iter(found.columns.values())))
+    lines = [f"{path.name}: {rows} rows of {found.export.width} columns, {len(found.columns)} with numbers"]
+    guessed = guess(found, kinds)
+    time = None
+    if guessed is not None and TIME in guessed.columns:
+        column = guessed.columns[TIME]
+        time = scale(found.columns[column.index], factor_to_si(column.unit, "s"))
+        lines += _sampling(time[np.isfinite(time)])
+    elif found.rate is not None:
+        lines.append(f"sampling: {found.rate:g} Hz, as the file states; it holds no times")
+    for index in list(found.columns)[:_SHOWN_COLUMNS]:
+        lines += _channel(found, index, dimensions, time is not None)
+    if len(found.columns) > _SHOWN_COLUMNS:
+        lines.append(f"{len(found.columns) - _SHOWN_COLUMNS} more columns")
+    lines += _rows(found, rows)
+    text, _ = entry_of(content, path, path.name, kinds)
+    return [*lines, "", text.rstrip()]
+
+
+def _sampling(time: np.ndarray) -> Iterable[str]:
+    """Rate, jitter and gaps of the times, (n,) s."""
+    steps = np.diff(time)
+    if len(steps) < 2 or not np.all(steps > 0.0):
+        yield f"sampling: the times do not increase at {int(np.sum(steps <= 0.0))} rows"
+        return
+    step = float(np.median(steps))
+    jitter = float(np.sqrt(np.mean((steps[steps < 1.5 * step] / step - 1.0) ** 2)))
+    yield f"sampling: {1.0 / step:.6g} Hz from {time[0]:.6g} to {time[-1]:.6g} s, jitter {jitter:.2%} of a step (rms)"
+    gaps = find_gaps(time)
+    if gaps is not None:
+        first = time[gaps.rows[0]]
+        yield f"gaps: {len(gaps.rows)}, {int(gaps.lost.sum())} samples lost, the first after {first:.6g} s"
+
+
+def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record: bool) -> Iterable[str]:
+    """Range, reading step and faults of one column."""
+    values = found.columns[index]
+    missing, values = int(np.sum(np.isnan(values))), values[np.isfinite(values)]
+    name, text = name_and_unit(found.names[index], dimensions)
+    unit = unit_of(text or found.units[index], dimensions) or "unit unknown"
+    step = reading_step(values)
+    line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"
+    line += f", reading step {step:.3g}" if step else ""
+    line += f", {missing} missing" if missing else ""
+    faults = []
+    if record and len(values) > 2 and np.ptp(values) > 0.0:
+        for clipped in clipped_samples(values, np.inf):
+            faults.append(f"{len(clipped.rows)} samples clipped at {clipped.level:g}")
+        for what, rows in (("drop-outs", dropouts(values)), ("samples of a frozen sensor", frozen_samples(values))):
+            if len(rows):
+                faults.append(f"{len(rows)} {what}, the first in line {found.export.lines[rows[0]]}")
+    yield "; ".join([line, *faults])
+
+
+def _rows(found: FoundLayout, rows: int) -> Iterable[str]:
+    """The first and last rows of numbers."""
+    shown = [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]
+    for row in shown:
+        cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
+        yield f"line {found.export.lines[row]}: {'  '.join(cells)}"

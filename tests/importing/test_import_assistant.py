@@ -1,0 +1,116 @@
+"""The import assistant on thirty spoiled exports: kind, columns and units, judged by the readings in SI."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capsule_id
+from capsule_id import cli
+from tests.importing.spoiled_exports import Spoiled, spoiled_exports
+
+EXPORTS = spoiled_exports()
+#: Least share of exports read correctly, and largest share of unsure guesses.
+CORRECT, UNSURE = 0.9, 0.1
+
+
+def written(folder: Path, export: Spoiled) -> str:
+    """The rig.toml that ``init --from`` writes for one export, with the masses stated."""
+    folder.mkdir()
+    (folder / export.file).write_bytes(export.content)
+    assert cli.capsule_id(["init", str(folder / "rig"), "--from", str(folder / export.file)]) == 0
+    text = (folder / "rig" / "rig.toml").read_text(encoding="utf-8")
+    for mass in ("m1", "m2"):
+        text = text.replace(f"# {mass} = ", f"{mass} = ")
+    # The tilts by height and length: no file states which side was measured.
+    return text.replace("[experiment.columns]\nheight", 'length_is = "board"\n[experiment.columns]\nheight')
+
+
+def outcome(folder: Path, export: Spoiled) -> str:
+    """ "correct", "unsure" or "wrong"."""
+    text = written(folder, export)
+    entry = text[text.index(f'file = "{export.file}"') - 200 :]
+    columns = entry[entry.find("[experiment.columns]") :] if "[experiment.columns]" in entry else ""
+    kinds = [line for line in entry.split("\n") if "kind = " in line]
+    if not columns or any("# unsure:" in line for line in (*kinds, *columns.split("\n"))):
+        return "unsure"
+    (folder / "rig" / "rig.toml").write_text(text, encoding="utf-8")
+    (table,) = capsule_id.read_rig(folder / "rig").tables
+    same = table.kind == export.kind and set(table.columns) == set(export.columns)
+    return "correct" if same and all(_equal(table[name], true) for name, true in export.columns.items()) else "wrong"
+
+
+def _equal(found: np.ndarray, true: np.ndarray) -> bool:
+    return found.shape == true.shape and np.allclose(found, true, rtol=1e-9, atol=1e-9 * np.max(np.abs(true)))
+
+
+def test_most_exports_are_read_correctly_and_none_silently_wrong(tmp_path: Path) -> None:
+    outcomes = {export.file: outcome(tmp_path / str(k), export) for k, export in enumerate(EXPORTS)}
+    assert len(outcomes) == 30
+    found = list(outcomes.values())
+    assert "wrong" not in found, outcomes
+    assert found.count("correct") >= CORRECT * len(found), outcomes
+    assert found.count("unsure") <= UNSURE * len(found), outcomes
+
+
+@pytest.mark.parametrize("factor", [1e3, -1.0])
+def test_a_wrong_unit_or_sign_would_be_found(tmp_path: Path, factor: float) -> None:
+    """Negative control: the same reading of the same file against another truth."""
+    export = EXPORTS[0]
+    other = replace(export, columns={**export.columns, "x_rel": factor * export.columns["x_rel"]})
+    assert outcome(tmp_path / "a", export) == "correct"
+    assert outcome(tmp_path / "b", other) == "wrong"
+
+
+def test_the_release_is_proposed_where_a_record_rests_before_it(tmp_path: Path) -> None:
+    rest = np.zeros(800)
+    export = EXPORTS[0]
+    x = 1e3 * np.concatenate([rest, export.columns["x_rel"]]) + 1e-3 * np.sin(np.arange(2000.0))
+    time = np.arange(2000) * 1e-3
+    text = "Time (s),Disp (mm)\n" + "".join(f"{t:.4f},{value:.4f}\n" for t, value in zip(time, x, strict=True))
+    lines = written(tmp_path / "a", replace(export, content=text.encode())).split("\n")
+    (start,) = (line for line in lines if line.startswith("start = "))
+    assert "# likely: the free decay begins here" in start
+    assert abs(float(start.split("value = ")[1].split(",")[0]) - 0.8) < 0.03
+
+
+def test_the_import_report_names_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    time = np.delete(np.arange(1200) * 1e-3, [300, 301, 302])
+    x = np.round(np.minimum(3.6 * np.exp(-4.0 * time) * np.cos(113.0 * time), 2.5), 3)
+    x[[500, 700]] = -99.0
+    rows = "".join(
+        f"{t:.4f};{'--' if k == 900 else f'{value:.3f}'}\n" for k, (t, value) in enumerate(zip(time, x, strict=True))
+    )
+    file = tmp_path / "log.csv"
+    file.write_text("Time (s);Disp (mm)\n" + rows, encoding="utf-8")
+    assert cli.capsule_id(["import", str(file)]) == 0
+    out = capsys.readouterr().out
+    for part in (
+        "log.csv: 1197 rows of 2 columns",
+        "sampling: 1000 Hz from 0 to 1.199 s",
+        "gaps: 1, 3 samples lost, the first after 0.299 s",
+        "column 2 Disp [mm]: -99 to 2.5, reading step 0.001, 1 missing",
+        "samples clipped at 2.5",
+        "2 drop-outs, the first in line 502",
+        "line 2: 0  2.5",
+        "line 1198: 1.199",
+        'x_rel = { from = "Disp (mm)", unit = "mm" }  # sure',
+        'missing = ["--"]  # likely',
+    ):
+        assert part in out, part
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log.csv"]
+
+
+def test_files_that_cannot_be_read_are_refused_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "words.csv").write_text("no numbers here\n", encoding="utf-8")
+    (tmp_path / "photo.png").write_bytes(b"\x89PNG")
+    for name, part in (("words.csv", "rows of numbers"), ("photo.png", "known format"), ("none.csv", "no such file")):
+        for words in (["import"], ["init", str(tmp_path / "rig"), "--from"]):
+            assert cli.capsule_id([*words, str(tmp_path / name)]) == 2
+            err = capsys.readouterr().err
+            assert part in err
+            assert err.count("\n") == 1
+    assert not (tmp_path / "rig").exists()
