@@ -13,7 +13,8 @@ The pipeline; each stage makes a frozen value for the next one:
 
     rig = capsule_id.read_rig("data/")
     result = capsule_id.fit(rig, seed=0)
-    result.write("results/twin")
+    result.write("results/twin")                             # capsule_id.load("results/twin") gives it back
+    result.trust, result.summary, result.plot_corner()
 
 Glossary:
 
@@ -48,7 +49,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
     from capsule_id.api import Fit as Fit
+    from capsule_id.api import compare as compare
     from capsule_id.api import fit as fit
+    from capsule_id.api import load as load
     from capsule_id.api import read_rig as read_rig
     from capsule_id.errors import InputError as InputError
     from capsule_id.motions.response import Response as Response
@@ -71,12 +74,14 @@ if TYPE_CHECKING:
 
 _MODULE_OF = {
     "CapsuleParameters": "capsule_id.physics.model",
+    "compare": "capsule_id.api",
     "continuation": "capsule_id.motions.sweep",
     "diagram": "capsule_id.motions.sweep",
     "Excitation": "capsule_id.physics.model",
     "Fit": "capsule_id.api",
     "fit": "capsule_id.api",
     "InputError": "capsule_id.errors",
+    "load": "capsule_id.api",
     "motion_map": "capsule_id.motions.sweep",
     "Pulses": "capsule_id.physics.drives.pulses",
     "read_rig": "capsule_id.api",

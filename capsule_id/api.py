@@ -1,13 +1,15 @@
-"""What the commands do, as functions: read a rig folder, fit it."""
+"""What the commands do, as functions: read a rig folder, fit it, load the result."""
 
-from dataclasses import dataclass
+from contextlib import nullcontext
 from pathlib import Path
 
-from capsule_id.console import OnProgress
+from capsule_id.console import OnProgress, Progress
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.families.friction_model import friction_of
 from capsule_id.experiments.registry import Registry, default_registry
+from capsule_id.fitted import Fit as Fit
+from capsule_id.fitted import compare as compare
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.pipeline import (
     check_fit,
@@ -18,40 +20,12 @@ from capsule_id.inference.pipeline import (
     second_models,
     stage_seeds,
 )
-from capsule_id.inference.result import Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.report.texts.messages import caption_of, finding_text, messages_of
-from capsule_id.report.write import write_result
+from capsule_id.report.saved import load as load_fields
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
-from capsule_id.views import Finding, ResultTable
-
-
-@dataclass(frozen=True)
-class Fit(Result):
-    """A ``Result`` in words and files."""
-
-    def text(self, item: Finding | ResultTable) -> str:
-        """What a finding says (what was expected, what was found, what to do), or the caption of a table."""
-        messages = messages_of(self.registry)
-        return finding_text(item, messages) if isinstance(item, Finding) else caption_of(item, messages)
-
-    def write(self, directory: str | Path) -> None:
-        """Write parameters.json, parameters.csv, posterior.nc, report.html and figures/ into ``directory``.
-
-        Raises
-        ------
-        InputError
-            If it exists and is not a result of this package.
-        """
-        path = Path(directory)
-        check_directory(path)
-        with work_in_progress(path, {}, resume=False) as partial:
-            write_result(self, partial)
-            publish(partial, path)
 
 
 def read_rig(folder: str | Path, registry: Registry | None = None, friction: type[FrictionLaw] | None = None) -> Rig:
@@ -79,7 +53,7 @@ def fit(
     experiments: Choice = "all",
     budget: int | None = DEFAULT_BUDGET,
     store: Path | None = None,
-    progress: OnProgress | None = None,
+    progress: OnProgress | bool | None = None,
     registry: Registry | None = None,
     friction: type[FrictionLaw] | None = None,
     ess: float = DEFAULT_ESS,
@@ -93,7 +67,8 @@ def fit(
     experiments : "bench", "runs" or "all"
     budget : emcee steps of an ensemble after burn-in; None for the point fit alone
     store : HDF5 file for the chains while they run; the draws in its saved copy are taken up
-    progress : called with (draws done, draws until the next check, the stage)
+    progress : called with (draws done, draws until the next check, the stage); True or False: shown or not, by default
+        on a terminal and in a notebook
     registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
     friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
     ess : sampling stops at this bulk and tail effective sample size of every parameter
@@ -115,11 +90,26 @@ def fit(
     law = friction_of(rig, friction)
     kinds, seeds = registry or default_registry(), stage_seeds(seed)
     made_from = provenance(rig, seed, experiments, law.source)
-    if progress:
-        progress(0, 1, "point fit")
-    readings = check_readings(rig, experiments, kinds)
-    made, second = second_models(make_experiments(rig, experiments, kinds, friction), readings)
-    target = LogPosterior(rig, made)
-    point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
-    checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, progress, ess), (*readings, *second))
-    return make_result(checked, kinds, seeds.report, made_from, Fit)
+    with Progress(progress) if isinstance(progress, bool | None) else nullcontext(progress) as show:
+        show(0, 1, "point fit")
+        readings = check_readings(rig, experiments, kinds)
+        made, second = second_models(make_experiments(rig, experiments, kinds, friction), readings)
+        target = LogPosterior(rig, made)
+        point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
+        checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, show, ess), (*readings, *second))
+        return make_result(checked, kinds, seeds.report, made_from, Fit)
+
+
+def load(directory: str | Path, registry: Registry | None = None) -> Fit:
+    """The result that ``fit-params`` or ``Fit.write`` wrote into ``directory``, equal to the one that ``fit`` returned.
+
+    Parameters
+    ----------
+    registry : the kinds of the fit, by default the built-in ones and those of installed packages
+
+    Raises
+    ------
+    InputError
+        If ``directory`` holds no result, or one that another version wrote.
+    """
+    return Fit(**load_fields(Path(directory), registry or default_registry()))

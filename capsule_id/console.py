@@ -1,12 +1,20 @@
-"""Standard streams that may be closed or have another encoding; the type of progress callbacks."""
+"""Standard streams that may be closed or have another encoding; the progress of long computations."""
 
 import io
 import os
+import shutil
 import sys
+import time
 from collections.abc import Callable
+from importlib import import_module
+from typing import Any
 
 #: Called with (number of draws or points done, total number, name of the stage).
 OnProgress = Callable[[int, int, str], None]
+#: Seconds between two updates of the progress, on a terminal and in a file.
+TERMINAL_INTERVAL, FILE_INTERVAL = 0.1, 10.0
+#: Width of the bar in a notebook, characters.
+NOTEBOOK_WIDTH = 100
 
 
 def prepare() -> None:
@@ -40,3 +48,70 @@ def finish() -> None:
 
 def _discard() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class Progress:
+    """Stage, rate and time left: a bar on a terminal or in a notebook, a line every ``FILE_INTERVAL`` in a file.
+
+    enabled : None: on a terminal and in a notebook
+    """
+
+    def __init__(self, enabled: bool | None = None, unit: str = "draw") -> None:
+        # A kernel's streams take no escape codes: there the bar is an output that is replaced.
+        self._notebook = type(sys.stderr).__module__.startswith("ipykernel.")
+        self._display: Any = None
+        self._terminal = sys.stderr.isatty() or self._notebook
+        self._enabled, self._unit = self._terminal if enabled is None else enabled, unit
+        self._stage, self._began, self._first, self._shown = "", 0.0, 0, 0.0
+        self._open = False
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_line()
+
+    def __call__(self, done: int, total: int, stage: str) -> None:
+        """Show ``done`` of ``total`` draws (or points) in ``stage``; a stage without a count has total 1."""
+        if not self._enabled:
+            return
+        now = time.monotonic()
+        if stage != self._stage:
+            self._end_line()
+            self._stage, self._began, self._first = stage, now, done
+        elif now - self._shown < (TERMINAL_INTERVAL if self._terminal else FILE_INTERVAL):
+            return
+        self._shown = now
+        self._show(self._line(done, total, now - self._began))
+
+    def _line(self, done: int, total: int, elapsed: float) -> str:
+        if total <= 1:
+            return f"{self._stage} ..."
+        from tqdm import tqdm
+
+        width = NOTEBOOK_WIDTH if self._notebook else shutil.get_terminal_size().columns - 1 if self._terminal else None
+        plain = not self._terminal
+        return tqdm.format_meter(done, total, elapsed, width, self._stage, plain, self._unit, initial=self._first)
+
+    def _show(self, line: str) -> None:
+        if self._notebook:
+            self._show_in_notebook(line)
+            return
+        try:
+            sys.stderr.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
+            sys.stderr.flush()
+        except OSError:
+            self._enabled = False  # the stream is closed
+        self._open = self._terminal
+
+    def _show_in_notebook(self, line: str) -> None:
+        bundle = {"text/plain": line}
+        if self._display is None:
+            self._display = import_module("IPython.display").display(bundle, raw=True, display_id=True)
+        else:
+            self._display.update(bundle, raw=True)
+
+    def _end_line(self) -> None:
+        if self._open and self._enabled:
+            sys.stderr.write("\n")
+            self._open = False

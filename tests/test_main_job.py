@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+import capsule_id as cid
 from capsule_id.synthetic import Truth
 from tests.cli_tools import DATA, ROOT, argv, environment
 
@@ -98,6 +99,14 @@ def test_parameters_json_keeps_the_contract(job: Job) -> None:
     }  # fmt: skip
 
 
+def test_it_is_loaded_as_an_object(job: Job) -> None:
+    result = cid.load(job.directory)
+    assert (result.trust, list(result.summary.index)) == ("trusted", names(job))
+    assert [result.summary.at[name, "value"] for name in names(job)] == [
+        job.parameters["parameters"][name]["value"] for name in names(job)
+    ]
+
+
 def test_groups_and_dimensions(job: Job) -> None:
     groups = set(job.idata.groups())
     assert {"posterior", "sample_stats", "observed_data", "log_likelihood", "prior"} <= {g.strip("/") for g in groups}
@@ -114,7 +123,8 @@ def test_groups_and_dimensions(job: Job) -> None:
     assert job.idata.sample_stats["lp"].dims == WALKER
     assert np.all((job.idata.sample_stats["acceptance"] > 0.0) & (job.idata.sample_stats["acceptance"] <= 1.0))
     for label, data in job.idata.observed_data.data_vars.items():
-        assert job.idata.log_likelihood[label].shape[-1] == data.size
+        assert job.idata.posterior_predictive[label].shape[-1] == data.size
+        assert int(np.sum(job.idata.log_likelihood["experiment"] == label)) == data.size
     assert isinstance(posterior, xr.Dataset)
 
 

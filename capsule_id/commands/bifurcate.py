@@ -16,10 +16,9 @@ from capsule_id.commands.capsule_options import (
     fitted_values,
     number,
 )
-from capsule_id.commands.progress import Progress
 from capsule_id.commands.sweep_output import prepare_store, publish_pair, remove_store
 from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
-from capsule_id.console import say
+from capsule_id.console import Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import default_registry
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT

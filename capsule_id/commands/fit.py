@@ -4,9 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from capsule_id.commands.progress import Progress
 from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
-from capsule_id.console import say
+from capsule_id.console import Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments import CHOICES, make_experiments
 from capsule_id.experiments.registry import default_registry

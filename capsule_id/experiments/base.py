@@ -220,11 +220,12 @@ class Experiment(eqx.Module):
         """(p,) conditional mean of the linear nuisances, in units of their priors."""
         return self.misfit(theta).at_nuisance_mean(np)[1]
 
-    def pointwise(self, theta: ValuesBySymbol, rng: np.random.Generator) -> np.ndarray:
-        """(n,) log-density of each reading, conditional on one draw of the linear nuisances."""
+    def pointwise(self, theta: ValuesBySymbol, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) log-density and replicate (SI) of each reading, given one draw of the nuisances; coloured: and the past."""
         misfit = self.misfit(theta)
         scaled = misfit.at_nuisance_draw(rng)
-        return -0.5 * scaled**2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
+        density = -0.5 * scaled**2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
+        return density, self.observed + misfit.sd * (rng.standard_normal(self.n) - scaled)
 
     def predictive_p(self, draws: list[ValuesBySymbol], rng: np.random.Generator) -> float | None:
         """Posterior predictive p-value of the chi-square discrepancy; None without draws.

@@ -35,7 +35,7 @@ from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.checks.widening import widenings
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import PointStage
-from capsule_id.inference.result import PointFit, PointwiseLogLikelihood, Posterior, Provenance, Result
+from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS, sample
 from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.tables.parameter_table import parameter_tables
@@ -47,8 +47,8 @@ from capsule_id.views import Comparison, Finding
 
 #: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
-#: Largest number of stored pointwise log-likelihoods. It limits the number of walkers where there are many readings.
-POINTWISE_SIZE = 2_000_000
+#: Largest number of stored pointwise log-likelihoods, and the draws at which they are stored.
+POINTWISE_SIZE, FEWEST_POINTWISE, MOST_POINTWISE = 2_000_000, 64, 256
 #: Packages whose versions the provenance records.
 PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
@@ -170,7 +170,7 @@ def make_result(
         fixed={name: value for name, value in target.fixed.items() if name != "g"},
         observed={e.label: e.observed for e in target.experiments},
         prior=target.sample_prior(rng, PRIOR_DRAWS),
-        log_likelihood=None if posterior is None else _pointwise(target, posterior, rng),
+        pointwise=None if posterior is None else _pointwise(target, posterior, rng),
         provenance=replace(made_from, versions={**made_from.versions, **registry.packages}),
     )
 
@@ -208,11 +208,17 @@ def _comparisons(
     return tuple(panels)
 
 
-def _pointwise(target: LogPosterior, posterior: Posterior, rng: np.random.Generator) -> PointwiseLogLikelihood:
-    """Pointwise log-likelihood of every walker's last draw, or of fewer walkers where there are many readings."""
-    ensembles, draws, walkers, _ = posterior.draws.shape
-    every = max(1, ensembles * walkers * sum(e.n for e in target.experiments) // POINTWISE_SIZE)
-    chains = np.arange(0, ensembles * walkers, every)
-    values = [target.mapping(theta) for theta in posterior.draws[:, -1].reshape(ensembles * walkers, -1)[chains]]
-    densities = {e.label: np.stack([e.pointwise(e.local(v), rng) for v in values])[:, None] for e in target.experiments}
-    return PointwiseLogLikelihood(densities, chains, np.array([draws - 1]))
+def _pointwise(target: LogPosterior, posterior: Posterior, rng: np.random.Generator) -> Pointwise:
+    """Log-densities and replicates of the readings on an even grid of walkers and stored draws."""
+    ensembles, draws, walkers, d = posterior.draws.shape
+    readings = sum(e.n for e in target.experiments)
+    number = max(FEWEST_POINTWISE, min(MOST_POINTWISE, POINTWISE_SIZE // readings))
+    draw = np.unique(np.linspace(0, draws - 1, round(number**0.5)).astype(int))
+    chain = np.unique(np.linspace(0, ensembles * walkers - 1, number // len(draw)).astype(int))
+    by_chain = posterior.draws.transpose(0, 2, 1, 3).reshape(ensembles * walkers, draws, d)
+    values = [target.mapping(theta) for theta in by_chain[np.ix_(chain, draw)].reshape(-1, d)]
+    density, replicates = {}, {}
+    for e in target.experiments:
+        pairs = np.stack([e.pointwise(e.local(v), rng) for v in values], axis=1)
+        density[e.label], replicates[e.label] = pairs.reshape(2, len(chain), len(draw), e.n)
+    return Pointwise(density, replicates, chain, draw)

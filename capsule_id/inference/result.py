@@ -92,16 +92,17 @@ class Posterior:
 
 
 @dataclass(frozen=True)
-class PointwiseLogLikelihood:
-    """Log-density of every reading at some draws.
+class Pointwise:
+    """Log-density and a replicate of every reading at some draws, evenly spaced over the sample.
 
     Attributes
     ----------
-    values : (chain, draw, n) by label of the experiment
+    log_likelihood, replicates : (chain, draw, n) by label of the experiment; the replicates in SI
     chain, draw : indices of the walkers and of the stored draws
     """
 
-    values: Mapping[str, np.ndarray]
+    log_likelihood: Mapping[str, np.ndarray]
+    replicates: Mapping[str, np.ndarray]
     chain: np.ndarray
     draw: np.ndarray
 
@@ -132,7 +133,7 @@ class Result:
     fixed : constants by name, SI
     observed : (n,) readings that enter the likelihood, SI, by label
     prior : (draws,) prior draws by parameter name, SI
-    log_likelihood : None without a sample
+    pointwise : None without a sample
     """
 
     rig: Rig
@@ -148,7 +149,7 @@ class Result:
     fixed: Mapping[str, float]
     observed: Mapping[str, np.ndarray]
     prior: Mapping[str, np.ndarray]
-    log_likelihood: PointwiseLogLikelihood | None
+    pointwise: Pointwise | None
     provenance: Provenance
 
     @property

@@ -71,8 +71,8 @@ def pictures(result: Result) -> tuple[Picture, ...]:
         trace_caption = (
             f"A few walkers of each ensemble, one colour per ensemble ({len(result.posterior.draws)} ensembles)."
         )
-        drawn.append(_picture(result, "corner", "sample", "Corner plot", corner_caption, corner(result)))
-        drawn.append(_picture(result, "traces", "sample", "Traces", trace_caption, traces(result)))
+        drawn.append(_picture(result, "corner", "sample", "Corner plot", corner_caption, figure_of(corner(result))))
+        drawn.append(_picture(result, "traces", "sample", "Traces", trace_caption, figure_of(traces(result))))
     starts = figure_of(figures.point_fit_starts(result.point_fit))
     starts_caption = "Where each start began and where it ended, in standard deviations of the Laplace approximation."
     drawn.append(_picture(result, "point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts))
@@ -91,7 +91,7 @@ def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Pict
     )
     word = view.label if view.label == UNDECIDED else f"{view.label} (probability {view.probability:.2g})"
     title = f"{record.name}: the record, {word}"
-    drawn = [_picture(result, f"record_{label}", "measured", title, caption, run_overview(view))]
+    drawn = [_picture(result, f"record_{label}", "measured", title, caption, figure_of(run_overview(view)))]
     if view.force is not None:
         figure = figure_of(force_on_rod(view, model=(view.time, record.force)))
         text = (

@@ -10,7 +10,8 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from capsule_id.inference.result import Result
-from capsule_id.report.columns import columns_of, table_rows
+from capsule_id.report.columns import Output, columns_of, table_rows
+from capsule_id.report.console_table import verdict_text
 from capsule_id.report.gallery import Picture
 from capsule_id.report.texts.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.typography import MISSING, symbol_parts
@@ -23,6 +24,42 @@ _WORDS: Mapping[Level, str] = {"ok": "✓ ok", "warn": "! warning", "fail": "✗
 
 def render(result: Result, pictures: Sequence[Picture]) -> str:
     """The page for ``result``; ``pictures`` as ``gallery.pictures`` draws them. The same input gives the same text."""
+    messages = messages_of(result.registry)
+    worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
+    titles = {finding.code: title_of(finding.code, messages) for finding in result.findings}
+    return (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            result=result,
+            sections={name: _section(pictures, name) for name in ("measured", "sample", "point_fit")},
+            parameters=_parameters(result.summary),
+            nuisances=_parameters(result.nuisances),
+            checks=_checks(result.findings, titles),
+            findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
+            words=_WORDS,
+            failed=list(dict.fromkeys(titles[finding.code] for finding in result.findings if finding.level == "fail")),
+            starts=_starts(result),
+            notes=[_note(note, messages) for note in result.notes],
+            missing=MISSING,
+        )
+    )
+
+
+def summary_html(result: Result) -> str:
+    """Verdict and parameter table, for a notebook."""
+    messages = messages_of(result.registry)
+    failed = sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
+    verdict = verdict_text(result.trust, failed)
+    table = _parameters(result.summary, "console")
+    return (
+        _environment()
+        .get_template("summary.html.j2")
+        .render(result=result, verdict=verdict, table=table, missing=MISSING)
+    )
+
+
+def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -30,23 +67,8 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    messages = messages_of(result.registry)
-    worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
-    titles = {finding.code: title_of(finding.code, messages) for finding in result.findings}
     environment.filters |= {"symbol_parts": symbol_parts, "number": _number, "embed": _embed}
-    return environment.get_template("report.html.j2").render(
-        result=result,
-        sections={name: _section(pictures, name) for name in ("measured", "sample", "point_fit")},
-        parameters=_parameters(result.summary),
-        nuisances=_parameters(result.nuisances),
-        checks=_checks(result.findings, titles),
-        findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
-        words=_WORDS,
-        failed=list(dict.fromkeys(titles[finding.code] for finding in result.findings if finding.level == "fail")),
-        starts=_starts(result),
-        notes=[_note(note, messages) for note in result.notes],
-        missing=MISSING,
-    )
+    return environment
 
 
 def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
@@ -54,9 +76,9 @@ def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
     return sorted((picture for picture in pictures if picture.section == name), key=lambda picture: picture.wide)
 
 
-def _parameters(frame: pd.DataFrame) -> dict[str, object]:
+def _parameters(frame: pd.DataFrame, output: Output = "html") -> dict[str, object]:
     """Columns, and rows of name and printed cells."""
-    columns = columns_of("html", frame)
+    columns = columns_of(output, frame)
     rows = [(row.name, [(column, column.text(row)) for column in columns]) for row in table_rows(frame)]
     return {"columns": columns, "rows": rows}
 

@@ -1,12 +1,13 @@
 """``posterior.nc``: the sample in the groups and dimensions that ArviZ knows."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from capsule_id.inference.result import PointwiseLogLikelihood, Posterior, Result
+from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import TABLE
 
 # The extra dimension of bracketed names; every other family gets "<base>_of".
@@ -16,9 +17,21 @@ _DIMENSIONS = {"k2": "spring"}
 def write_posterior(result: Result, path: Path) -> None:
     """Write the sample of ``result`` as netCDF (h5netcdf), to be opened by ``arviz.from_netcdf``.
 
-    Groups: ``posterior`` and ``sample_stats`` (dimensions ``chain``: every walker of every ensemble, with the
-    coordinate ``ensemble``; and ``draw``), ``observed_data``, ``log_likelihood`` and ``prior`` where the result has
-    them. A family of names such as ``k2[soft]``, ``k2[stiff]`` is one variable with one dimension more.
+    Raises
+    ------
+    ValueError
+        If nothing was sampled, or a name is used both alone and as a family.
+    """
+    data_tree(result).to_netcdf(path, engine="h5netcdf")
+
+
+def data_tree(result: Result) -> xr.DataTree:
+    """The sample of ``result`` in the groups of ArviZ.
+
+    ``posterior``, ``sample_stats``: dimensions ``chain`` (every walker of every ensemble, with the coordinate
+    ``ensemble``) and ``draw``. ``log_likelihood`` (one variable ``readings``) and ``posterior_predictive``: at every so
+    many of these chains and draws, whose labels they keep. ``observed_data``, ``prior``. A family of names such as
+    ``k2[soft]``, ``k2[stiff]`` is one variable with one dimension more. Groups without variables are left out.
 
     Raises
     ------
@@ -26,7 +39,7 @@ def write_posterior(result: Result, path: Path) -> None:
         If nothing was sampled, or a name is used both alone and as a family.
     """
     if result.posterior is None:
-        raise ValueError("nothing was sampled (point fit only): there is no posterior to write")
+        raise ValueError("nothing was sampled (point fit only): there is no posterior")
     # Exact masses and g need no row in the tables of the result.
     units = {symbol: row.unit for symbol, row in TABLE.items()}
     for frame in (result.summary, result.nuisances):
@@ -35,12 +48,52 @@ def write_posterior(result: Result, path: Path) -> None:
         "posterior": _posterior(result.posterior, result.fixed, units),
         "sample_stats": _sample_stats(result.posterior),
         "observed_data": _observed(result.observed),
-        "log_likelihood": _log_likelihood(result.log_likelihood),
         "prior": _families({name: draws[np.newaxis] for name, draws in result.prior.items()}, units),
     }
+    if result.pointwise is not None:
+        groups |= {
+            "log_likelihood": _log_likelihood(result.pointwise),
+            "posterior_predictive": _replicates(result.pointwise),
+        }
     tree = xr.DataTree.from_dict({name: group for name, group in groups.items() if group.data_vars})
     tree.attrs = {"rig": result.rig.name, "synthetic": int(result.rig.synthetic)}
-    tree.to_netcdf(path, engine="h5netcdf")
+    return tree
+
+
+def read_sample(path: Path, saved: Posterior) -> tuple[Posterior, dict[str, np.ndarray], Pointwise | None]:
+    """The arrays of ``posterior.nc``: ``saved`` with its draws, the prior draws by name, the pointwise values.
+
+    Raises
+    ------
+    OSError, KeyError, ValueError
+        If the file is absent, damaged, or another fit wrote it.
+    """
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
+        tree.load()
+    shape = (saved.acceptance.shape[0], -1, saved.acceptance.shape[1])
+    columns = _members_of(tree["posterior"].to_dataset())
+    by_chain = np.stack([columns[name] for name in saved.names], axis=-1)  # (chain, draw, d)
+    _, draws, d = by_chain.shape
+    by_walker = by_chain.reshape(shape[0], shape[2], draws, d)
+    lp = tree["sample_stats"]["lp"].to_numpy().reshape(shape[0], shape[2], draws)
+    posterior = replace(saved, draws=by_walker.transpose(0, 2, 1, 3), lp=lp.transpose(0, 2, 1))
+    prior = {
+        name: values[0] for name, values in (_members_of(tree["prior"].to_dataset()) if "prior" in tree else {}).items()
+    }
+    if "log_likelihood" not in tree:
+        return posterior, prior, None
+    density, replicates = tree["log_likelihood"]["readings"], tree["posterior_predictive"].to_dataset()
+    label = density["experiment"].to_numpy()
+    return (
+        posterior,
+        prior,
+        Pointwise(
+            {str(name): density.to_numpy()[..., label == name] for name in replicates.data_vars},
+            {str(name): values.to_numpy() for name, values in replicates.data_vars.items()},
+            density["chain"].to_numpy(),
+            density["draw"].to_numpy(),
+        ),
+    )
 
 
 def _posterior(posterior: Posterior, fixed: Mapping[str, float], units: Mapping[str, str]) -> xr.Dataset:
@@ -77,13 +130,23 @@ def _observed(observed: Mapping[str, np.ndarray]) -> xr.Dataset:
     )
 
 
-def _log_likelihood(pointwise: PointwiseLogLikelihood | None) -> xr.Dataset:
-    if pointwise is None:
-        return xr.Dataset()
+def _log_likelihood(pointwise: Pointwise) -> xr.Dataset:
+    """One variable with all readings, whose experiment and row are coordinates: ``arviz.loo`` needs no argument."""
+    values = pointwise.log_likelihood
+    labels = np.repeat(list(values), [part.shape[-1] for part in values.values()])
+    rows = np.concatenate([np.arange(part.shape[-1]) for part in values.values()])
+    together = np.concatenate(list(values.values()), axis=-1)
+    dataset = xr.Dataset({"readings": (("chain", "draw", "reading"), together, {"units": "1"})})
+    return dataset.assign_coords(
+        chain=pointwise.chain, draw=pointwise.draw, experiment=("reading", labels), row=("reading", rows)
+    )
+
+
+def _replicates(pointwise: Pointwise) -> xr.Dataset:
     dataset = xr.Dataset(
         {
-            label: (("chain", "draw", f"{label}_row"), np.asarray(values, np.float64), {"units": "1"})
-            for label, values in pointwise.values.items()
+            label: (("chain", "draw", f"{label}_row"), values, {"units": "SI"})
+            for label, values in pointwise.replicates.items()
         }
     )
     return dataset.assign_coords(chain=pointwise.chain, draw=pointwise.draw)
@@ -111,6 +174,18 @@ def _families(arrays: Mapping[str, np.ndarray], units: Mapping[str, str]) -> xr.
         variables[base] = xr.Variable(("chain", "draw", dimension), stacked, {"units": units.get(members[0], "")})
         coordinates[dimension] = [name[len(base) + 1 : -1] for name in members]
     return xr.Dataset(variables, coords=coordinates)
+
+
+def _members_of(dataset: xr.Dataset) -> dict[str, np.ndarray]:
+    """Variables (chain, draw) by name of the parameter; the inverse of ``_families``."""
+    found: dict[str, np.ndarray] = {}
+    for base, variable in dataset.data_vars.items():
+        if variable.ndim == 2:
+            found[str(base)] = variable.to_numpy()
+            continue
+        dimension = variable.dims[-1]
+        found |= {f"{base}[{of}]": variable.sel({dimension: of}).to_numpy() for of in variable[dimension].to_numpy()}
+    return found
 
 
 def _members(base: str, names: Mapping[str, np.ndarray]) -> set[str]:

@@ -15,11 +15,13 @@ from capsule_id.report.columns import columns_of
 from capsule_id.report.gallery import pictures
 from capsule_id.report.html import render
 from capsule_id.report.netcdf import write_posterior
+from capsule_id.report.saved import save
 from capsule_id.report.texts.messages import finding_text, messages_of, title_of
 
 
 def write_result(result: Result, directory: Path) -> None:
-    """Write parameters.json, parameters.csv, posterior.nc (where there is a sample), report.html and figures/*.png.
+    """Write parameters.json, parameters.csv, posterior.nc (where there is a sample), report.html, figures/*.png
+    and figures/data.npz.
 
     Raises
     ------
@@ -31,6 +33,7 @@ def write_result(result: Result, directory: Path) -> None:
     drawn = pictures(result)
     for picture in drawn:
         (figures / f"{picture.name}.png").write_bytes(picture.png)
+    save(result, directory)
     (directory / "report.html").write_text(render(result, drawn), encoding="utf-8")
     if result.posterior is not None:
         write_posterior(result, directory / "posterior.nc")

@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 
 from capsule_id.cli import fit_params
-from capsule_id.commands.fit import Progress
+from capsule_id.console import Progress
 from capsule_id.experiments.registry import default_registry
 from tests.cli_tools import CODE, environment, listing, same_result, small_rig
 

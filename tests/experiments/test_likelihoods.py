@@ -254,7 +254,7 @@ class TestPointwise:
         covariance = np.linalg.inv(np.eye(3) + a.T @ a)
         marginal = float(experiment.log_likelihood(self.THETA, np))
         for seed in range(5):
-            pointwise = experiment.pointwise(self.THETA, np.random.default_rng(seed))
+            pointwise, _ = experiment.pointwise(self.THETA, np.random.default_rng(seed))
             # The same generator gives the same draw b by another route.
             z = np.random.default_rng(seed).standard_normal(3)
             b = covariance @ (a.T @ y) + np.linalg.solve(np.linalg.cholesky(np.linalg.inv(covariance)).T, z)
@@ -274,7 +274,7 @@ class TestPointwise:
         spread = np.trace(np.linalg.solve(np.eye(3) + a.T @ a, a.T @ a))
         expected = -0.5 * (at_mean + spread + 160 * np.log(2.0 * np.pi)) - np.sum(np.log(misfit.sd))
         rng = np.random.default_rng(8)
-        sums = np.array([experiment.pointwise(self.THETA, rng).sum() for _ in range(4000)])
+        sums = np.array([experiment.pointwise(self.THETA, rng)[0].sum() for _ in range(4000)])
         error = np.std(sums) / np.sqrt(4000)
         assert abs(np.mean(sums) - expected) < 3.5 * error
         assert abs(np.mean(sums) - (expected + 0.5 * spread)) > 20.0 * error  # negative control: a plug-in mean

@@ -51,10 +51,11 @@ def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None
     assert result.provenance == whole.provenance
     assert [note.code for note in result.notes] == [note.code for note in whole.notes]
     assert [item.predictive_p for item in result.comparisons] == [item.predictive_p for item in whole.comparisons]
-    assert result.log_likelihood is not None
-    assert whole.log_likelihood is not None
-    for label, values in result.log_likelihood.values.items():
-        np.testing.assert_array_equal(values, whole.log_likelihood.values[label])
+    assert result.pointwise is not None
+    assert whole.pointwise is not None
+    for label, values in result.pointwise.log_likelihood.items():
+        np.testing.assert_array_equal(values, whole.pointwise.log_likelihood[label])
+        np.testing.assert_array_equal(result.pointwise.replicates[label], whole.pointwise.replicates[label])
     # Negative control: another seed gives another sample.
     assert isinstance(point, PointStage)
     other = sample_posterior(point, stage_seeds(4).walkers, BUDGET)

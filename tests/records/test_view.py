@@ -11,7 +11,7 @@ from capsule_id.experiments.registry import default_registry
 from capsule_id.records.run_description import describe_run
 from capsule_id.records.view import SMALLEST_RATE_GAIN, RecordView, view_record
 from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
-from capsule_id.report.figures.style import new_figure, png
+from capsule_id.report.figures.style import figure_of, new_figure, png
 from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.rig.filters import filter_gain
 from tests.experiments import bench
@@ -91,9 +91,9 @@ def test_pictures_draw_what_they_are_given(view: RecordView) -> None:
     force = force_on_rod(view, model=model)
     assert [line.get_label() for line in force.lines] == ["K times current", "model"]
     assert channel_history(view, "acceleration_rod").get_ylabel().endswith("m/s²")
-    assert png(run_overview(view)).startswith(b"\x89PNG")
+    assert png(figure_of(run_overview(view))).startswith(b"\x89PNG")
     fewer = replace(view, channels={"x_rel": view.channels["x_rel"]}, gap_seen=None, force=None)
-    assert len(run_overview(fewer).axes) == 2
+    assert len(figure_of(run_overview(fewer)).axes) == 2
     with pytest.raises(ValueError, match="no force"):
         force_on_rod(fewer)
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.result import PointFit, PointwiseLogLikelihood, Posterior, Provenance, Result
+from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.rig.model import Quantity, Rig
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
@@ -137,10 +137,11 @@ def _posterior(rng: np.random.Generator, ensembles: int, draws: int, walkers: in
     )  # fmt: skip
 
 
-def _log_likelihood(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> PointwiseLogLikelihood:
+def _pointwise(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> Pointwise:
     chains, draws = np.arange(0, 8, 2), np.arange(0, 20, 4)
     shapes = {item.label: (len(chains), len(draws), item.points[0].y.size) for item in comparisons}
-    return PointwiseLogLikelihood({label: rng.normal(size=shape) for label, shape in shapes.items()}, chains, draws)
+    density, replicates = ({label: rng.normal(size=shape) for label, shape in shapes.items()} for _ in range(2))
+    return Pointwise(density, replicates, chains, draws)
 
 
 #: What a check of an outlier has found, and the same of coloured residuals.
@@ -216,7 +217,7 @@ def make_result(seed: int = 0, ensembles: int = 4, draws: int = 60, walkers: int
         fixed={"g": 9.81},
         observed={item.label: item.points[0].y for item in comparisons},
         prior={name: np.exp(rng.normal(size=500)) for name in SAMPLED},
-        log_likelihood=_log_likelihood(rng, comparisons),
+        pointwise=_pointwise(rng, comparisons),
         provenance=Provenance(seed, "bench", "eq. (1)", versions, files),
     )
 
@@ -255,7 +256,7 @@ def unsampled(result: Result) -> Result:
         frame[columns] = np.nan
         frame["value"], frame["sd"], frame["basis"] = frame["map"], frame["standard_error"], "point"
         frame["trust"] = "not judged"
-    return dataclasses.replace(result, summary=summary, nuisances=nuisances, posterior=None, log_likelihood=None)
+    return dataclasses.replace(result, summary=summary, nuisances=nuisances, posterior=None, pointwise=None)
 
 
 @pytest.fixture

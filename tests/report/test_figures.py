@@ -41,11 +41,11 @@ def test_every_panel_has_labels_with_units(result: Result) -> None:
     for item in result.comparisons:
         _assert_units(figures.comparison_figure(item))
     _assert_units(figure_of(figures.point_fit_starts(result.point_fit)))
-    _assert_units(traces(result))
+    _assert_units(figure_of(traces(result)))
 
 
 def test_corner_names_every_physical_parameter_with_its_unit(result: Result) -> None:
-    (ax,) = corner(result).axes
+    (ax,) = corner(result).figure.axes
     labels = [text.get_text() for text in ax.texts if "[" in text.get_text()]
     # Each on the horizontal axis, and all but the first, which has a histogram in its row, on the vertical one.
     assert len(labels) == 2 * len(result.summary) - 1
@@ -68,7 +68,7 @@ def _inside(polygons: list[np.ndarray], points: np.ndarray) -> np.ndarray:
 def test_contours_hold_the_shares_they_claim(maker: Callable[..., Result]) -> None:
     result = maker(draws=250, walkers=32)
     assert result.posterior is not None
-    (ax,) = corner(result).axes
+    (ax,) = corner(result).figure.axes
     n = len(result.summary)
     draws = result.posterior.draws.reshape(-1, len(result.posterior.names))[:, :2]
     low, high = np.percentile(draws, (0.1, 99.9), axis=0)
@@ -96,15 +96,15 @@ def test_a_frozen_chain_is_drawn(result: Result) -> None:
     posterior = result.posterior
     assert posterior is not None
     frozen = dataclasses.replace(posterior, draws=np.broadcast_to(posterior.draws[:1, :1, :1], posterior.draws.shape))
-    assert png(corner(dataclasses.replace(result, posterior=frozen)))
-    assert png(traces(dataclasses.replace(result, posterior=frozen)))
+    assert png(figure_of(corner(dataclasses.replace(result, posterior=frozen))))
+    assert png(figure_of(traces(dataclasses.replace(result, posterior=frozen))))
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_few_parameters(result: Result, count: int) -> None:
     few = dataclasses.replace(result, summary=result.summary.iloc[:count])
-    assert len(traces(few).axes) == 2 * ((count + 1) // 2)
-    assert png(corner(few))
+    assert len(figure_of(traces(few)).axes) == 2 * ((count + 1) // 2)
+    assert png(figure_of(corner(few)))
 
 
 def test_no_sample_is_refused(unsampled: Result) -> None:

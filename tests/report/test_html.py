@@ -184,7 +184,7 @@ def test_provenance_is_complete_and_undated(result: Result, page: str) -> None:
 
 def test_minimal_result(result: Result) -> None:
     bare = dataclasses.replace(
-        result, posterior=None, findings=(), comparisons=(), notes=(), log_likelihood=None, nuisances=result.nuisances.iloc[:0],
+        result, posterior=None, findings=(), comparisons=(), notes=(), pointwise=None, nuisances=result.nuisances.iloc[:0],
         summary=result.summary.iloc[:1],
     )  # fmt: skip
     text = Page(render(bare, pictures(bare))).text

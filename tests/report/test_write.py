@@ -58,6 +58,7 @@ def test_files(folder: Path, result: Result) -> None:
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     figures = {name for name in names if name.startswith("figures/")}
     assert names - figures == {"parameters.json", "parameters.csv", "posterior.nc", "report.html"}
+    figures.remove("figures/data.npz")
     labels = {"friction", "motor_current", "corner", "traces", "point_fit_starts"}
     labels |= {f"support_spring_{s}" for s in ("soft", "medium", "stiff")} | {f"free_vibration_{i}" for i in (1, 2, 3)}
     assert figures == {f"figures/{label}.png" for label in labels}
@@ -69,7 +70,7 @@ def test_figures_are_those_of_the_page_at_150_dpi(folder: Path) -> None:
     from PIL import Image
 
     page = (folder / "report.html").read_text(encoding="utf-8")
-    for path in (folder / "figures").iterdir():
+    for path in (folder / "figures").glob("*.png"):
         assert b64encode(path.read_bytes()).decode() in page
         with Image.open(path) as image:
             assert image.info["dpi"] == pytest.approx((150, 150), abs=0.1)
@@ -211,7 +212,8 @@ def test_same_result_same_bytes(folder: Path, maker: Callable[..., Result], tmp_
 
 def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType) -> None:
     data = arviz.from_netcdf(str(folder / "posterior.nc"))
-    assert set(data.groups()) == {"posterior", "sample_stats", "observed_data", "log_likelihood", "prior"}
+    read = {"posterior", "sample_stats", "observed_data", "log_likelihood", "posterior_predictive", "prior"}
+    assert set(data.groups()) == read
     posterior = result.posterior
     assert posterior is not None
     ensembles, draws, walkers, _ = posterior.draws.shape
@@ -222,8 +224,9 @@ def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType
     assert all(variable.dtype == np.float64 for variable in data.posterior.data_vars.values())
     summary = arviz.summary(data, var_names=["k1", "k2"], kind="stats")
     assert summary.loc["k2[stiff]", "mean"] == pytest.approx(posterior.draws[..., 9].mean(), rel=1e-3)
-    assert list(data.log_likelihood.chain.values) == [0, 2, 4, 6]
-    assert list(data.log_likelihood.draw.values) == [0, 4, 8, 12, 16]
+    for group in (data.log_likelihood, data.posterior_predictive):
+        assert list(group.chain.values) == [0, 2, 4, 6]
+        assert list(group.draw.values) == [0, 4, 8, 12, 16]
 
 
 def test_every_draw_is_in_its_place(folder: Path, result: Result) -> None:
@@ -252,21 +255,25 @@ def test_every_draw_is_in_its_place(folder: Path, result: Result) -> None:
 
 
 def test_the_other_groups_hold_what_was_given(folder: Path, result: Result) -> None:
-    for group in ("observed_data", "log_likelihood", "prior"):
+    for group in ("observed_data", "log_likelihood", "posterior_predictive", "prior"):
         with xr.open_dataset(folder / "posterior.nc", group=group, engine="h5netcdf") as data:
             assert all(len(variable.attrs["units"]) > 0 for variable in data.data_vars.values())
             if group == "prior":
                 np.testing.assert_array_equal(data["k2"].sel(spring="stiff")[0], result.prior["k2[stiff]"])
                 continue
-            assert result.log_likelihood is not None
-            given = result.observed if group == "observed_data" else result.log_likelihood.values
+            assert result.pointwise is not None
+            if group == "log_likelihood":
+                for label, values in result.pointwise.log_likelihood.items():
+                    np.testing.assert_array_equal(data["readings"][..., data["experiment"] == label], values)
+                continue
+            given = result.observed if group == "observed_data" else result.pointwise.replicates
             for label, values in given.items():
                 np.testing.assert_array_equal(data[label], values)
                 assert data[label].dims[-1] == f"{label}_row"
 
 
 def test_without_arrays_only_the_sample_is_written(result: Result, tmp_path: Path, arviz: ModuleType) -> None:
-    bare = dataclasses.replace(result, fixed={}, observed={}, prior={}, log_likelihood=None)
+    bare = dataclasses.replace(result, fixed={}, observed={}, prior={}, pointwise=None)
     write_posterior(bare, tmp_path / "x.nc")
     assert set(arviz.from_netcdf(str(tmp_path / "x.nc")).groups()) == {"posterior", "sample_stats"}
 

@@ -5,6 +5,7 @@ inform a parameter, and where a warning names it, its number is not judged: no c
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from capsule_id.inference.checks.setting import Setting
 from capsule_id.views import Finding, Trust
 
 #: Weighed constants: their prior is a reading.
-MASSES = ("m1", "m2")
+MASSES: Final = ("m1", "m2")
 
 
 def concerned(finding: Finding, experiments: Sequence[Experiment]) -> frozenset[str] | None:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from capsule_id.inference.result import Result
-from capsule_id.report.figures.style import BLACK, BLUE, GREY, PALE_BLUE, SMALL, TEXT, VERMILION, new_figure
+from capsule_id.report.figures.style import BLACK, BLUE, GREY, PALE_BLUE, SMALL, TEXT, VERMILION, figure_of, new_figure
 from capsule_id.report.sampled_parameters import SampledParameters, sampled_parameters
 from capsule_id.report.typography import fixed
 
@@ -30,7 +29,14 @@ _SIDE = 0.94
 _TICK_MARGIN = 0.1
 
 
-def corner(result: Result) -> Figure:
+def corner_size(n: int) -> tuple[float, float, float]:
+    """Width of a panel, width and height of the figure of ``n`` parameters, inches."""
+    panel = 2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
+    # The key stands in the empty upper triangle, or above the panels where that is too small.
+    return panel, 1.25 + panel * n, 1.25 + panel * n + (0.8 if n <= 2 else 0.0)
+
+
+def corner(result: Result, ax: Axes | None = None) -> Axes:
     """Histogram of every sampled physical parameter and contours (68 %, 95 %) of every pair.
 
     The point fit is marked in black, the paper's estimate, where it lies in the picture, in vermilion.
@@ -42,12 +48,14 @@ def corner(result: Result) -> Figure:
     """
     columns = sampled_parameters(result)
     n = len(columns.names)
-    panel = 2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
-    # The key stands in the empty upper triangle, or above the panels where that is too small.
-    head = 0.8 if n <= 2 else 0.0
-    width, height = 1.25 + panel * n, 1.25 + panel * n + head
-    figure = new_figure(width, height)
-    ax = figure.add_axes((1.1 / width, 1.0 / height, panel * n / width, panel * n / height), frameon=False)
+    panel, width, height = corner_size(n)
+    if ax is None:
+        ax = new_figure(width, height).add_axes(
+            (1.1 / width, 1.0 / height, panel * n / width, panel * n / height), frameon=False
+        )
+    else:
+        ax.set_frame_on(False)
+        panel = ax.get_window_extent().width / figure_of(ax).dpi / n
     ax.set(xlim=(0, n), ylim=(0, n), xticks=[], yticks=[])
     low, high = _limits(columns)
     flat = columns.draws.reshape(-1, n)
@@ -60,9 +68,9 @@ def corner(result: Result) -> Figure:
     _marks(ax, (columns.map - low) / (high - low), BLACK, "+", "-")
     _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
     _axes(ax, columns, low, high, panel)
-    corner_place = (1 - 0.1 / width, 1 - 0.1 / height)
-    figure.legend(handles=_key(), fontsize=TEXT, frameon=False, loc="upper right", bbox_to_anchor=corner_place)
-    return figure
+    above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)} if n <= 2 else {"loc": "upper right"}
+    ax.legend(handles=_key(), fontsize=TEXT, frameon=False, borderaxespad=0.2, **above)
+    return ax
 
 
 def _limits(columns: SampledParameters) -> tuple[np.ndarray, np.ndarray]:

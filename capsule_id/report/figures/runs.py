@@ -5,7 +5,6 @@ Every figure is ``(view, ax=None) -> ax`` and draws into ``ax`` or into a figure
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from capsule_id.records.view import RecordView
 from capsule_id.report.figures.style import (
@@ -21,6 +20,7 @@ from capsule_id.report.figures.style import (
     own_axes,
     set_legend,
     set_text,
+    subfigure_at,
 )
 
 _MM = 1e3
@@ -92,15 +92,19 @@ def channel_history(view: RecordView, name: str, ax: Axes | None = None) -> Axes
     return ax
 
 
-def run_overview(view: RecordView) -> Figure:
-    """Every recorded channel above each other, the phase plane beside them."""
+def overview_size(view: RecordView) -> tuple[float, float]:
+    """Width and height of ``run_overview``, inches."""
+    return 10.0, 1.2 + 1.25 * max(sum(name in view.channels for name in _CHANNELS), 3)
+
+
+def run_overview(view: RecordView, ax: Axes | None = None) -> Axes:
+    """Every recorded channel above each other, the phase plane beside them. Returns the phase plane."""
     names = [name for name in _CHANNELS if name in view.channels]
-    figure = new_figure(10.0, 1.2 + 1.25 * max(len(names), 3))
+    figure = new_figure(*overview_size(view)) if ax is None else subfigure_at(ax)
     grid = figure.add_gridspec(len(names), 2, left=0.1, right=0.98, bottom=0.11, top=0.93, wspace=0.24, hspace=0.3)
     for row, name in enumerate(names):
-        ax = channel_history(view, name, figure.add_subplot(grid[row, 0]))
+        history = channel_history(view, name, figure.add_subplot(grid[row, 0]))
         if row + 1 < len(names):
-            ax.set_xlabel("")
-            ax.tick_params(labelbottom=False)
-    phase_plane_of_run(view, figure.add_subplot(grid[:, 1]))
-    return figure
+            history.set_xlabel("")
+            history.tick_params(labelbottom=False)
+    return phase_plane_of_run(view, figure.add_subplot(grid[:, 1]))

@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.gridspec import GridSpec
 from PIL import Image
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -48,6 +49,13 @@ def figure_of(ax: Axes) -> Figure:
     if figure is None:
         raise ValueError("these axes have been removed from their figure")
     return figure
+
+
+def subfigure_at(ax: Axes) -> SubFigure:
+    """A part of the figure of ``ax`` for several panels, in the place of ``ax``, whose own frame is hidden."""
+    ax.set_axis_off()
+    figure = figure_of(ax)
+    return figure.add_subfigure(ax.get_subplotspec() or GridSpec(1, 1, figure=figure)[0])
 
 
 def set_text(ax: Axes, x_label: str, y_label: str, title: str = "") -> None:

@@ -1,0 +1,241 @@
+"""The object that ``fit`` and ``load`` return: words, tables, plots, draws, files."""
+
+import dataclasses
+import re
+import shutil
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import arviz
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import capsule_id as cid
+from capsule_id.errors import InputError
+from capsule_id.fitted import Fit, compare
+from tests.cli_tools import DATA, listing, small_rig
+
+TABLES = ("free_vibration_1", "static_friction", "dynamic_friction", "support_spring_soft")
+TIMES = np.linspace(0.0, 0.3, 40)
+DRIVE = cid.Excitation(P_d=4.0, Omega=34.56)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Fit:
+    folder = small_rig(tmp_path_factory.mktemp("rig") / "rig", "lab", ("motor_current", "support_spring_soft"))
+    return cid.fit(cid.read_rig(folder), budget=60)
+
+
+@pytest.fixture(scope="module")
+def capsule(tmp_path_factory: pytest.TempPathFactory) -> Fit:
+    """A fit of every leaf that a simulation needs; few steps, so it is not converged."""
+    folder = tmp_path_factory.mktemp("rig") / "rig"
+    folder.mkdir()
+    lines = (DATA / "rig.toml").read_text(encoding="utf-8").partition("[[experiment]]")[0].splitlines()
+    for table in TABLES:
+        kind = re.sub(r"_(1|soft)$", "", table)
+        lines += ["[[experiment]]", f'kind = "{kind}"', f'file = "{table}.csv"']
+        lines += ['spring = "soft"'] if kind == "support_spring" else []
+        shutil.copy(DATA / f"{table}.csv", folder)
+    (folder / "rig.toml").write_text("\n".join(lines).replace('"k2[hard]"', '"k2[soft]"'), encoding="utf-8")
+    return cid.fit(cid.read_rig(folder), budget=20)
+
+
+@pytest.fixture(autouse=True)
+def no_figure_stays_open() -> Iterator[None]:
+    yield
+    plt.close("all")
+
+
+def test_a_written_result_is_loaded_to_the_last_bit(capsule: Fit, tmp_path: Path) -> None:
+    """Equal objects, and whatever is written from the loaded one has the same bytes."""
+    fit = capsule
+    fit.write(tmp_path / "one")
+    again = cid.load(tmp_path / "one")
+    again.write(tmp_path / "two")
+    assert listing(tmp_path / "one") == listing(tmp_path / "two")
+    assert type(again) is Fit
+    pd.testing.assert_frame_equal(again.summary, fit.summary, check_exact=True)
+    pd.testing.assert_frame_equal(again.nuisances, fit.nuisances, check_exact=True)
+    assert again.posterior is not None
+    assert fit.posterior is not None
+    np.testing.assert_array_equal(again.posterior.draws, fit.posterior.draws)
+    assert [again.text(item) for item in again.findings] == [fit.text(item) for item in fit.findings]
+    assert (again.trust, again.provenance, repr(again)) == (fit.trust, fit.provenance, repr(fit))
+    assert again.rig.tables[0].settings == fit.rig.tables[0].settings
+    assert type(again.rig.tables[0].settings) is type(fit.rig.tables[0].settings)
+
+
+def test_a_result_without_sample_is_loaded_too(tmp_path: Path) -> None:
+    fit = cid.fit(cid.read_rig(small_rig(tmp_path / "rig")), budget=None)
+    fit.write(tmp_path / "one")
+    cid.load(tmp_path / "one").write(tmp_path / "two")
+    assert listing(tmp_path / "one") == listing(tmp_path / "two")
+    with pytest.raises(InputError, match="draws need a sample"):
+        fit.simulate(DRIVE, TIMES)
+
+
+def test_another_seed_is_another_result(fitted: Fit, tmp_path: Path) -> None:
+    """Negative control of the round trip: the bytes depend on the result."""
+    fitted.write(tmp_path / "one")
+    other = dataclasses.replace(fitted, summary=fitted.summary.assign(value=fitted.summary["value"] * (1 + 1e-15)))
+    other.write(tmp_path / "two")
+    one, two = listing(tmp_path / "one"), listing(tmp_path / "two")
+    assert {name for name in one if one[name] != two[name]} >= {"parameters.json", "figures/data.npz"}
+
+
+def test_what_is_no_result_is_refused(fitted: Fit, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="run fit-params again"):
+        cid.load(tmp_path)
+    fitted.write(tmp_path / "one")
+    saved = tmp_path / "one" / "figures" / "data.npz"
+    with np.load(saved) as arrays:
+        kept = dict(arrays)
+    tree = kept["tree"].tobytes().replace(b'"capsule_id.rig.model", "Rig"', b'"subprocess", "Popen"')
+    np.savez(saved, **{**kept, "tree": np.frombuffer(tree, np.uint8)})
+    with pytest.raises(InputError, match=re.escape("subprocess.Popen belongs to no package of this result")):
+        cid.load(tmp_path / "one")
+    (tmp_path / "one" / "posterior.nc").write_bytes(b"damaged")
+    with pytest.raises(InputError, match="run fit-params again"):
+        cid.load(tmp_path / "one")
+
+
+def test_it_shows_itself_in_short(fitted: Fit) -> None:
+    assert len(repr(fitted)) < 250
+    assert repr(fitted).startswith(f"<Fit of lab: {fitted.trust}; K = ")
+    html = fitted._repr_html_()
+    assert html.count("<tr>") == 1 + len(fitted.summary)
+    assert f"verdict: {fitted.trust}" in html
+    assert str(fitted).splitlines()[-1].startswith(f"verdict: {fitted.trust}")
+
+
+def test_the_table_is_parameters_csv(fitted: Fit, tmp_path: Path) -> None:
+    fitted.write(tmp_path / "one")
+    read = pd.read_csv(tmp_path / "one" / "parameters.csv", index_col="name")
+    table = fitted.to_dataframe()
+    assert list(read.columns) == list(table.columns)
+    np.testing.assert_array_equal(read["value"], table["value"].astype(float))
+
+
+@pytest.mark.parametrize(
+    "name", ["plot_comparison", "plot_residuals", "plot_autocorrelation", "plot_corner", "plot_traces", "plot_starts"]
+)
+def test_every_plot_draws_into_given_axes_or_a_pyplot_figure(capsule: Fit, name: str) -> None:
+    plot = getattr(capsule, name)
+    ax = plot()
+    assert isinstance(ax, Axes)
+    assert plt.get_fignums() == [1]
+    figure = Figure()
+    given = figure.subplots(1, 2)[1]
+    assert plot(ax=given).get_figure(root=True) is figure
+    assert plt.get_fignums() == [1]
+    figure.canvas.draw()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_plots_of_absent_data_say_what_is_there(fitted: Fit) -> None:
+    with pytest.raises(InputError, match="fit experiments that have it"):
+        fitted.plot_record()
+    with pytest.raises(InputError, match="choose from motor_current, support_spring_soft"):
+        fitted.plot_comparison("pushes")
+
+
+def test_simulate_runs_the_capsule_for_draws(capsule: Fit) -> None:
+    motion = capsule.simulate(DRIVE, TIMES, draws=5, spring="soft", gap=1e-3, seed=3)
+    assert motion.X1.shape == (5, len(TIMES))
+    assert capsule.posterior is not None
+    flat = capsule.posterior.draws.reshape(-1, len(capsule.posterior.names))
+    chosen = flat[np.random.default_rng(3).choice(len(flat), 5, replace=False)]
+    one = dict(zip(capsule.posterior.names, chosen[2], strict=True))
+    leaves = {name: one[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s")}
+    p = cid.CapsuleParameters(**leaves, k2=one["k2[soft]"], G=1e-3)
+    np.testing.assert_array_equal(motion.X1[2], cid.simulate(p, DRIVE, TIMES).X1)
+    assert np.all(np.std(motion.X1[:, -1]) > 0.0)
+
+
+def test_simulate_names_what_it_lacks(fitted: Fit, capsule: Fit) -> None:
+    with pytest.raises(InputError, match="the fit has no m1, m2, k1, c, mu, v_s") as error:
+        fitted.simulate(DRIVE, TIMES, draws=2)
+    given: dict[str, float] = {}
+    while "the fit has no" in str(error.value):  # the remedy, until nothing is missing
+        (name,) = re.findall(r"given=\{'(\w+)'", str(error.value))
+        given[name] = {"m1": 0.11, "m2": 0.53, "k1": 1420.0}.get(name, 0.5)
+        try:
+            fitted.simulate(DRIVE, TIMES, draws=2, given=given)
+            break
+        except InputError as again:
+            error.value.args = (str(again),)
+            error = pytest.ExceptionInfo.from_exception(again)
+    assert len(given) == 6
+    with pytest.raises(InputError, match="choose from soft"):
+        capsule.simulate(DRIVE, TIMES, draws=2, spring="stiff")
+    with pytest.raises(InputError, match="give at most"):
+        capsule.simulate(DRIVE, TIMES, draws=10**9)
+
+
+def test_compare_counts_sds_and_names_what_differs(fitted: Fit) -> None:
+    same = cid.compare(fitted, fitted)
+    assert list(same.index) == ["K", "k2[soft]"]
+    assert not same["differs"].any()
+    assert (same["sds"] == 0.0).all()
+    summary = fitted.summary.copy()
+    sd = float(summary.at["K", "sd"])
+    summary.loc["K", "value"] += 5.0 * sd
+    moved = compare(fitted, dataclasses.replace(fitted, summary=summary))
+    assert moved.at["K", "sds"] == pytest.approx(5.0 / np.sqrt(2.0))
+    assert dict(moved["differs"]) == {"K": True, "k2[soft]": False}
+    assert moved.at["K", "sd"] == pytest.approx(np.sqrt(2.0) * sd)
+
+
+def test_compare_finds_two_equal_rigs_equal(fitted: Fit) -> None:
+    """1 pair in 20 of results of equal rigs shows a difference; with sds half as large, far more do."""
+    rng = np.random.default_rng(0)
+    found = {1.0: 0, 0.5: 0}
+    centre, sd = fitted.summary["value"].to_numpy(float), fitted.summary["sd"].to_numpy(float)
+    for stated in found:
+        for _ in range(200):
+            pair = [
+                dataclasses.replace(
+                    fitted, summary=fitted.summary.assign(value=centre + sd * rng.normal(size=2), sd=stated * sd)
+                )
+                for _ in range(2)
+            ]
+            found[stated] += bool(cid.compare(*pair)["differs"].any())
+    assert 2 <= found[1.0] <= 20
+    assert found[0.5] > 50
+
+
+def test_arviz_needs_no_arguments(capsule: Fit, tmp_path: Path) -> None:
+    capsule.write(tmp_path / "out")
+    readings = sum(len(values) for values in capsule.observed.values())
+    for data in (arviz.from_netcdf(str(tmp_path / "out" / "posterior.nc")), capsule.to_arviz()):
+        shown: Any = data
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of ArviZ about matplotlib, and about this short chain
+            loo = arviz.loo(shown)
+        assert (loo.n_data_points, np.isfinite(loo.elpd_loo)) == (readings, True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert len(np.ravel(arviz.plot_ppc(capsule.to_arviz()))) == len(capsule.observed)
+        assert arviz.plot_trace(capsule.to_arviz().sel(chain=[0, 33])).shape[1] == 2
+
+
+def test_replicates_scatter_as_the_readings(capsule: Fit) -> None:
+    """Replicates of a decay that the model fits: the readings lie in the 95 % band of their replicates."""
+    assert capsule.pointwise is not None
+    low, high = np.quantile(capsule.pointwise.replicates["free_vibration_1"], [0.025, 0.975], axis=(0, 1))
+    y = capsule.observed["free_vibration_1"]
+    assert np.mean((low <= y) & (y <= high)) == pytest.approx(0.95, abs=0.025)
+
+
+def test_help_lists_the_public_names() -> None:
+    import pydoc
+
+    text = pydoc.plain(pydoc.render_doc(cid))
+    for word in ("rig folder", "Glossary", "capsule_id.load", "class Fit", "fit(", "load(", "compare("):
+        assert word in text, word
