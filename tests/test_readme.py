@@ -238,4 +238,16 @@ def test_the_examples_in_python_give_what_they_say(capsys: pytest.CaptureFixture
         exec(block, names)
         (promised,) = re.findall(r"print\(.*\)  # (\S+)", block)
         assert capsys.readouterr().out.split() == [promised]
-    assert len(examples) == EVERYTHING.count("```python") == 2
+    assert len(examples) == EVERYTHING.count("```python") - len(blocks("python", GUIDE["results"])) == 2
+
+
+def test_the_example_of_a_result_uses_what_there_is() -> None:
+    """Every attribute of its lines, and every plot that its comment lists; a plot of another name would fail."""
+    (example,) = blocks("python", GUIDE["results"])
+    compile(example, "results.md", "exec")
+    used = {tuple(pair) for pair in re.findall(r"\b(cid|result)\.(\w+)", example)}
+    fields_of_fit = {field.name for field in fields(cid.Fit)}
+    owners = {"cid": set(dir(cid)), "result": set(dir(cid.Fit)) | fields_of_fit}
+    assert [(owner, name) for owner, name in used if name not in owners[owner]] == []
+    plots = {"plot_comparison", *(f"plot{name}" for name in re.findall(r"\b_[a-z]+", example.partition("also ")[2]))}
+    assert plots == {name for name in dir(cid.Fit) if name.startswith("plot_")}

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """
     kinds = default_registry()
     rig = read_rig(args.data, kinds)
-    lines = [f"{rig.name}: {len(rig.tables)} experiments{', SYNTHETIC data' if rig.synthetic else ''}"]
+    lines = [f"{rig.name}: {_number(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
     lines += [f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)]
     findings = (*lint(rig, kinds, rig.tables), *lint_settings(rig, kinds, rough_values(rig, kinds)))
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     lines += [f"{finding.level}: {finding_text(finding, messages)}" for finding in findings]
     if args.figures is not None:
         lines += _draw(rig, findings, args.figures)
-    say("\n".join([*lines, _number(len(findings))]))
+    say("\n".join([*lines, _number(len(findings), "finding")]))
     return 0
 
 
@@ -67,9 +67,9 @@ def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
     return [f"figures: {len(rig.tables)} in {folder}"]
 
 
-def _number(findings: int) -> str:
-    """Number of findings in words."""
-    return {0: "no findings", 1: "1 finding"}.get(findings, f"{findings} findings")
+def _number(count: int, what: str) -> str:
+    """``no findings``, ``1 finding``, ``2 findings``."""
+    return f"{count or 'no'} {what}{'' if count == 1 else 's'}"
 
 
 def _summary(table: Table) -> str:

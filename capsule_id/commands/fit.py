@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"stop at this bulk and tail effective sample size of every parameter (default {DEFAULT_ESS})",
     )
+    parser.add_argument("--json", action="store_true", help="print parameters.json instead of the table")
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     add_cache_argument(parser)
 
@@ -93,8 +94,11 @@ def run(args: argparse.Namespace) -> int:
         publish(partial, directory)
     report = directory / "report.html"
     failed = sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
-    table = table_text(result.summary, synthetic=rig.synthetic)
-    say("\n".join([table, f"report: {report}", verdict_text(result.trust, failed)]))
+    if args.json:
+        say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
+    else:
+        table = table_text(result.summary, synthetic=rig.synthetic)
+        say("\n".join([table, f"report: {report}", verdict_text(result.trust, failed)]))
     if result.clean:
         return 0
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)

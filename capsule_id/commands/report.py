@@ -10,8 +10,9 @@ from capsule_id.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add DIR."""
+    """Add DIR and the option of the format."""
     parser.add_argument("directory", metavar="DIR", type=Path, help="result directory of fit-params")
+    parser.add_argument("--json", action="store_true", help="print parameters.json instead of the table")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -24,13 +25,17 @@ def run(args: argparse.Namespace) -> int:
     """
     path = args.directory / "parameters.json"
     try:
-        saved = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        saved = json.loads(text)
         findings, clean = saved["verdict"]["findings"], bool(saved["verdict"]["clean"])
         rows = {name: _row(entry) for name, entry in saved["parameters"].items()}
         trust = saved["trust"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         rule, remedy = "DIR must be a result of fit-params", "run fit-params first"
         raise InputError(rule, type(error).__name__, remedy, path) from error
+    if args.json:
+        say(text.rstrip())
+        return 0 if clean else 3
     import pandas as pd
 
     from capsule_id.report.console_table import table_text, verdict_text

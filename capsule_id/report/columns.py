@@ -1,7 +1,8 @@
 """The columns of a parameter table, declared once for parameters.json, parameters.csv, the page and standard output.
 
 All numbers of a row keep two digits of the posterior sd (without a sample: of the standard error), the point fit those
-of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m).
+of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m); all rows of a symbol
+(G[run_1], G[run_2]) have the same unit.
 """
 
 from collections.abc import Callable, Hashable, Mapping
@@ -11,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from capsule_id.parameters import symbol_of
 from capsule_id.report.typography import MISSING, decimals_for, fixed, prefix_for
 
 Output = Literal["json", "csv", "html", "console"]
@@ -46,14 +48,29 @@ class Row:
         known = centre != MISSING and decimals_for(float(self.values[error])) is not None
         return f"{centre} ± {self.number(error, decimals)}" if known else centre
 
+    @property
+    def concise(self) -> str:
+        """Value and sd as ``1422.4(27) N/m``: the digits in parentheses count in the last place of the value."""
+        places = self.decimals
+        centre, sd = self.number("value"), float(self.values["sd"]) * self.scale
+        if places is None or decimals_for(sd) is None:
+            return f"{centre} {self.unit}" if self.unit != "1" else centre
+        digits = f"{sd:.0f}" if places <= 0 else f"{sd * 10.0**places:.0f}"
+        return f"{centre}({fixed(float(digits), min(places, 0))})" + ("" if self.unit == "1" else f" {self.unit}")
+
 
 def table_rows(frame: pd.DataFrame) -> list[Row]:
     """The rows of ``frame`` in their order."""
-    return [_row(str(name), values) for name, values in frame.to_dict("index").items()]
+    rows = {str(name): values for name, values in frame.to_dict("index").items()}
+    largest: dict[str, float] = {}
+    for name, values in rows.items():
+        symbol, size = symbol_of(name), abs(float(values["map"]))
+        largest[symbol] = max(largest.get(symbol, 0.0), size if np.isfinite(size) else 0.0)
+    return [_row(name, values, largest[symbol_of(name)]) for name, values in rows.items()]
 
 
-def _row(name: str, values: Mapping[Hashable, Any]) -> Row:
-    scale, unit = prefix_for(str(values["unit"]), float(values["map"]))
+def _row(name: str, values: Mapping[Hashable, Any], magnitude: float) -> Row:
+    scale, unit = prefix_for(str(values["unit"]), magnitude)
     sample, point = (decimals_for(float(values[column]) * scale) for column in ("sd", "standard_error"))
     decimals = point if sample is None else sample
     return Row(name, values, scale, unit, decimals, decimals if point is None else point)
@@ -116,6 +133,8 @@ COLUMNS = (
     OutputColumn("widening", outputs=FILES),
     OutputColumn("basis", outputs=FILES),
     OutputColumn("trust", "trust", lambda row: str(row.values["trust"]), numeric=False),
+    OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),
+    OutputColumn("quoted", "to copy", lambda row: row.concise, outputs=frozenset({"html"})),
     OutputColumn("paper", "paper", lambda row: row.number("paper")),
     OutputColumn("map", "MAP ± s.e.", lambda row: row.plus_minus("map", "standard_error", row.point_decimals), sampled=True),
     OutputColumn("standard_error", outputs=frozenset({"csv"})),
@@ -123,7 +142,6 @@ COLUMNS = (
     OutputColumn("median", outputs=FILES),
     OutputColumn("lower", outputs=frozenset({"csv"})),
     OutputColumn("upper", outputs=frozenset({"csv"})),
-    OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),
     OutputColumn("ci95_unwidened", value=lambda values: _ends(values, "_unwidened"), outputs=frozenset({"json"})),
     OutputColumn("ess", "ESS", lambda row: fixed(float(row.values["ess"]), 0), outputs=EVERYWHERE - {"console"}, sampled=True),
     OutputColumn("ess_bulk", outputs=FILES),

@@ -1,5 +1,7 @@
 """The parameter table for standard output."""
 
+import shutil
+import textwrap
 from collections.abc import Sequence
 
 import pandas as pd
@@ -7,33 +9,39 @@ import pandas as pd
 from capsule_id.report.columns import columns_of, table_rows
 from capsule_id.views import Trust
 
+#: Width of the table where standard output is no terminal.
 WIDTH = 110
-_SHORTEST_NAME = 8
+#: Columns that are printed at any width: unit, value ± sd and trust.
+KEPT = 3
 _GAP = "  "
 
 SYNTHETIC = "*** SYNTHETIC RIG: computer-made data, nothing here was measured ***"
 
 
-def table_text(summary: pd.DataFrame, *, synthetic: bool) -> str:
-    """The parameter table as aligned text, at most 110 columns wide.
+def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = None) -> str:
+    """The parameter table as aligned text. Columns at the right give way where the terminal is narrow; names are whole.
 
     Parameters
     ----------
     summary : as ``Result.summary``; without a sample the sampled columns are left out
     synthetic : the rig is a synthetic one: said in a line of its own
+    width : columns of the terminal; None: those of standard output
     """
+    width = shutil.get_terminal_size((WIDTH, 24)).columns if width is None else width
     columns = columns_of("console", summary)
     table = [["", *(column.header for column in columns)]]
     for row in table_rows(summary):
         cells = [column.text(row) for column in columns]
         table.append([row.name, *("NO" if cell == "no" else cell for cell in cells)])
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    # Only names can be of any length (a spring may be called anything), so they give way.
-    others = sum(widths[1:]) + len(_GAP) * (len(widths) - 1)
-    widths[0] = min(widths[0], max(WIDTH - others, _SHORTEST_NAME))
-    lines = [_line(cells, widths) for cells in table]
+    shown = len(widths)
+    while shown > 1 + KEPT and sum(widths[:shown]) + len(_GAP) * (shown - 1) > width:
+        shown -= 1
+    lines = [_line(cells[:shown], widths[:shown]) for cells in table]
     rule = "-" * max(map(len, lines))
-    return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:]])
+    left_out = ", ".join(table[0][shown:])
+    more = textwrap.wrap(f"in a wider terminal and in report.html: {left_out}", max(width, 20)) if left_out else []
+    return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:], *more])
 
 
 def verdict_text(trust: Trust, failed: Sequence[str]) -> str:
@@ -46,7 +54,6 @@ def verdict_text(trust: Trust, failed: Sequence[str]) -> str:
 
 
 def _line(cells: list[str], widths: list[int]) -> str:
-    name = cells[0] if len(cells[0]) <= widths[0] else cells[0][: widths[0] - 1] + "…"
-    words = [name.ljust(widths[0]), cells[1].ljust(widths[1])]
+    words = [cells[0].ljust(widths[0]), cells[1].ljust(widths[1])]
     words += [cell.rjust(width) for cell, width in zip(cells[2:], widths[2:], strict=True)]
     return _GAP.join(words).rstrip()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from capsule_id.inference.result import Result
+from capsule_id.report.columns import table_rows
 from capsule_id.report.console_table import SYNTHETIC, WIDTH, table_text, verdict_text
 
 
@@ -46,11 +47,57 @@ def test_the_verdict_is_one_line_with_the_word_and_the_failed_checks() -> None:
     assert verdict_text("not judged", []).startswith("verdict: not judged; no check failed, but ")
 
 
-def test_width_holds_for_long_names(result: Result) -> None:
-    long = result.summary.rename(index={"k2[soft]": "k2[" + "x" * 80 + "]", "v_s": "ü" * 60})
-    for frame in (result.summary, result.nuisances, long):
-        lines = table_text(frame, synthetic=True).splitlines()
-        assert max(map(len, lines)) <= WIDTH
+@pytest.mark.parametrize("width", [200, 110, 80, 60])
+def test_columns_give_way_to_the_width_of_the_terminal(result: Result, width: int) -> None:
+    lines = table_text(result.summary, synthetic=False, width=width).splitlines()
+    assert max(map(len, lines)) <= width
+    left_out = " ".join(lines).partition("wider terminal")[2]
+    for header in ("95 % interval", "paper", "R-hat", "informed"):
+        assert (header in lines[0]) != (header in left_out)
+    assert ("wider terminal" in " ".join(lines)) == (width < 110)
+
+
+def test_names_are_never_cut(result: Result) -> None:
+    spring = "k2[" + "x" * 80 + "]"
+    text = table_text(result.summary.rename(index={"k2[soft]": spring}), synthetic=False, width=80)
+    (row,) = [line for line in text.splitlines() if line.startswith(spring)]
+    assert row.endswith("trusted")
+    assert "…" not in text
+
+
+def test_the_width_is_that_of_the_terminal(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    widest = {}
+    for columns in ("60", "110"):
+        monkeypatch.setenv("COLUMNS", columns)
+        widest[columns] = max(map(len, table_text(result.summary, synthetic=False).splitlines()))
+    assert widest["60"] <= 60 < widest["110"] <= WIDTH
+
+
+def test_one_unit_for_all_rows_of_a_symbol(result: Result) -> None:
+    """Gaps of 0.99926 mm and 1.50037 mm: before, the first was in µm and the second in m."""
+    gaps = result.summary.loc[["k1", "k1"]].set_axis(["G[run_1]", "G[run_2]"])
+    gaps = gaps.assign(unit="m", value=[9.9926e-4, 1.50037e-3], map=[9.9926e-4, 1.50037e-3], sd=5e-6)
+    assert [row.unit for row in table_rows(gaps)] == ["m", "m"]
+    assert [row.number("value") for row in table_rows(gaps)] == ["0.0009993", "0.0015004"]
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "unit", "expected"),
+    [
+        (1422.43, 1.64, "N/m", "1422.4(16) N/m"),
+        (18968.2, 37.1, "N/m", "18968(37) N/m"),
+        (18968.2, 371.0, "N/m", "18970(370) N/m"),
+        (0.65138, 0.0056, "1", "0.6514(56)"),
+        (0.11, 0.0, "kg", "0.11 kg"),
+        (2.02e-5, 4.6e-7, "m", "20.20(46) µm"),
+        (3.0, 0.996, "N", "3.0(10) N"),
+    ],
+)
+def test_the_concise_form_has_the_digits_of_the_sd(
+    result: Result, value: float, sd: float, unit: str, expected: str
+) -> None:
+    row = result.summary.loc[["k1"]].assign(value=value, map=value, sd=sd, standard_error=sd, unit=unit)
+    assert table_rows(row)[0].concise == expected
 
 
 def test_point_fit_only(unsampled: Result) -> None:

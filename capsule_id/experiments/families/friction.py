@@ -56,7 +56,10 @@ MESSAGES = {
     ),
     "friction.one_surface": Message(
         "experiments agree",
-        ok="mu = {mu_tilts:.3f} by tilting, {mu_slides:.3f} by sliding (p = {p:.2g})",
+        ok=(
+            "tilts and slides agree on one surface: mu = {mu_tilts:.3f} from the tilts alone, {mu_slides:.3f} from the slides "
+            "alone; a difference this large is expected from their errors with probability {p:.2g}"
+        ),
         fail=(
             "{tilts} and {slides}: expected one surface; found mu = {mu_tilts:.3f} by tilting and {mu_slides:.3f} by "
             "sliding (p = {p:.2g}). Measure both on the same surface, and read the tilt at break-away."
