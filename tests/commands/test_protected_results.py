@@ -1,5 +1,6 @@
 """A command never replaces a sample by less; options are written out; both commands state their version and help."""
 
+import json
 import shutil
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +28,16 @@ def test_no_sample_keeps_a_posterior(here: Path, capsys: pytest.CaptureFixture[s
     assert listing(here / "out") == before
     shutil.move(here / "out", here / "moved")  # the remedy
     assert fit_params(["rig", "--no-sample", "--quiet", "--out", "out"]) in (0, 3)
+
+
+def test_json_prints_the_file_and_nothing_else(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    code = fit_params(["rig", "--no-sample", "--quiet", "--json", "--out", "second"])
+    printed = capsys.readouterr().out
+    assert printed == (here / "second" / "parameters.json").read_text(encoding="utf-8")
+    assert json.loads(printed)["trust"] == "not judged"
+    assert capsule_id(["report", "second", "--json"]) == code
+    assert capsys.readouterr().out == printed
 
 
 def test_a_sweep_is_not_written_into_a_result(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
