@@ -134,7 +134,6 @@ COLUMNS = (
     OutputColumn("basis", outputs=FILES),
     OutputColumn("trust", "trust", lambda row: str(row.values["trust"]), numeric=False),
     OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),
-    OutputColumn("quoted", "to copy", lambda row: row.concise, outputs=frozenset({"html"})),
     OutputColumn("paper", "paper", lambda row: row.number("paper")),
     OutputColumn("map", "MAP ± s.e.", lambda row: row.plus_minus("map", "standard_error", row.point_decimals), sampled=True),
     OutputColumn("standard_error", outputs=frozenset({"csv"})),
@@ -148,6 +147,7 @@ COLUMNS = (
     OutputColumn("ess_tail", outputs=FILES),
     OutputColumn("rhat", "R-hat", lambda row: fixed(float(row.values["rhat"]), 3), sampled=True),
     OutputColumn("informed", "informed", _informed, sampled=True, numeric=False),
+    OutputColumn("quoted", "to copy", lambda row: row.concise, outputs=frozenset({"html"})),
 )  # fmt: skip
 
 

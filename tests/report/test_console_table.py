@@ -9,7 +9,7 @@ from capsule_id.report.console_table import SYNTHETIC, WIDTH, table_text, verdic
 
 
 def test_rows_in_order_and_aligned(result: Result) -> None:
-    header, rule, *rows = table_text(result.summary, synthetic=False).splitlines()
+    header, rule, *rows = table_text(result.summary, synthetic=False, width=WIDTH).splitlines()
     assert [row.split()[0] for row in rows] == list(result.summary.index)
     assert set(rule) == {"-"}
     # Right-aligned columns: the R-hat of every row ends under the end of its title.
@@ -18,7 +18,7 @@ def test_rows_in_order_and_aligned(result: Result) -> None:
 
 
 def test_row_holds_both_estimates_rounded_to_the_sd(result: Result) -> None:
-    text = table_text(result.summary, synthetic=False)
+    text = table_text(result.summary, synthetic=False, width=WIDTH)
     (row,) = [line for line in text.splitlines() if line.startswith("k1 ")]
     value = result.summary.at["k1", "value"]
     assert "1386.0" in row
@@ -31,7 +31,7 @@ def test_row_holds_both_estimates_rounded_to_the_sd(result: Result) -> None:
 def test_uninformed_parameter_is_marked(result: Result) -> None:
     summary = result.summary.copy()
     summary.loc["K", "informed"] = False
-    lines = table_text(summary, synthetic=False).splitlines()
+    lines = table_text(summary, synthetic=False, width=WIDTH).splitlines()
     assert [line.split()[0] for line in lines if line.endswith("NO")] == ["K"]
     assert [line.split()[0] for line in lines if line.endswith("weighed")] == ["m1", "m2"]
 

@@ -72,7 +72,8 @@ def test_every_number_of_the_table_is_there(result: Result, page: str) -> None:
         assert number in text
     assert "0.302 ± 0.033" in text
     # The nuisance in micrometres, its unit beside it.
-    assert re.search(r"µm \d\d\.\d\d ± 0\.46 trusted 20\.20 ± 0\.45", text)
+    assert re.search(r"µm \d\d\.\d\d ± 0\.46 trusted \d\d\.\d\d to \d\d\.\d\d (– )?20\.20 ± 0\.45", text)
+    assert f"{row['value']:.1f}(31) N/m" in text
     assert page.count("<td>weighed</td>") == 2
 
 

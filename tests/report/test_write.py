@@ -85,7 +85,7 @@ def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> N
     assert list(content["parameters"]) == list(result.summary.index)
     assert content["trust"] == "trusted"
     keys = [
-        "unit", "value", "sd", "sd_unwidened", "widening", "basis", "trust", "paper", "map", "mean", "median", "ci95",
+        "unit", "value", "sd", "sd_unwidened", "widening", "basis", "trust", "ci95", "paper", "map", "mean", "median",
         "ci95_unwidened", "ess", "ess_bulk", "ess_tail", "rhat", "informed",
     ]  # fmt: skip
     for name, entry in content["parameters"].items():
@@ -152,7 +152,7 @@ def test_a_column_declared_once_is_in_every_output(
         entry = json.loads((folder / "parameters.json").read_text(encoding="utf-8"))["parameters"]["k1"]
         table = pd.read_csv(folder / "parameters.csv", index_col="name")
         page = (folder / "report.html").read_text(encoding="utf-8")
-        console = table_text(result.summary, synthetic=False)
+        console = table_text(result.summary, synthetic=False, width=200)
         number = f"{row['paper'] - row['mean']:+.9f}"
         assert ("z_paper" in entry) == ("z_paper" in table) == bool(times)
         # The page has a table of physical parameters and one of nuisances, and the paper estimates no nuisance.
