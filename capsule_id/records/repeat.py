@@ -1,6 +1,6 @@
 """Probability of each period of a recorded motion, in excitation periods, given its cycle-to-cycle scatter.
 
-record -> polynomial over every excitation period -> power of the sequence of cycles at the frequencies of each period
+record -> spline -> polynomial over every excitation period -> power of the sequence of cycles at the frequencies of each period
        -> Bayesian comparison of the periods 1 to 16 and of an aperiodic motion
 
 The coefficients y_c of cycle c are a slow drift in c, a part that repeats after n cycles, and scatter. The part has
@@ -11,13 +11,12 @@ as that of fewer, independent ones (Satterthwaite). Standard deviations are rela
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import pairwise
 from math import gcd
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import logsumexp
+from scipy.interpolate import CubicSpline
 
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import Record
@@ -25,18 +24,22 @@ from capsule_id.rig.filters import Record
 LONGEST_PERIOD = 16  # excitation periods; ``response`` uses the same bound
 #: Shortest record, in excitation periods, and fewest samples per excitation period.
 FEWEST_PERIODS, FEWEST_SAMPLES = 4, 4
+#: Shortest record of an aperiodic motion, in excitation periods: it holds every period and two more.
+FEWEST_APERIODIC = LONGEST_PERIOD + 2
 #: A period is decided where its probability reaches this.
 DECIDED = 0.9
 #: Prior probability of an aperiodic motion. That of the period n falls as n to this power.
-APERIODIC_PRIOR, PERIOD_EXPONENT = 0.1, -3.0
+APERIODIC_PRIOR, PERIOD_EXPONENT = 0.07, -3.0
 #: Ranges of standard deviations with log-uniform priors: cycle-to-cycle scatter of period 1 and of an aperiodic motion,
 #: and the part that repeats after n cycles only. A smaller part counts as a repeat. The largest scatter of period n is
 #: n times smaller: scatter hides the fine bands of long periods.
 PERIODIC_SCATTER, APERIODIC_SCATTER, PART = (0.003, 0.06), (0.02, 1.0), (0.003, 1.0)
+#: Largest scatter of most periodic records; above it the prior falls with this power.
+COMMON_SCATTER, SCATTER_EXPONENT = 0.015, 3.0
 #: Largest number of bands of an aperiodic motion, visited in turn.
 MOST_BANDS = 4
-#: A period is decided only where a smaller part of another one than this would be visible.
-LARGEST_VISIBLE = 0.02
+#: A period is decided only where noise and scatter hide no larger part of another one than this.
+LARGEST_HIDDEN = 0.02
 #: Correlations of the scatter of successive cycles.
 CORRELATIONS = np.linspace(-0.6, 0.6, 5)
 _HIGHEST_DEGREE = 16  # of the polynomial over a cycle; a high degree on few samples amplifies their noise
@@ -45,8 +48,7 @@ _GRID = 25  # standard deviations per range
 _DIFFERENCE_ORDER = 6  # of the differences for the noise level; the motion vanishes in them
 _CYCLES_PER_DRIFT_TERM = 4  # of the polynomial drift, at most quadratic
 _MOST_DRIFT_TERMS = 3
-_FOLDED_PERIODS = 2  # excitation periods, of the longest wave that is folded
-_DENSE = 4  # points of a folded wave per sample
+_DENSE = 4  # points of the spline per sample
 _FEWEST_FREE_CYCLES = 3  # beyond drift and period
 
 
@@ -58,6 +60,7 @@ class Repeat:
     probabilities : (17,) of an aperiodic motion and of the periods 1 to 16; longer ones than half the record take the rest
     periods : length of the record in excitation periods
     scatter : rms difference of a cycle from the periodic motion beyond the noise, drift removed, m
+    hidden : rms of the largest part of another period that noise and scatter hide, m
     motion : rms of x_rel about its mean without the noise, m
     noise_sd : of x_rel, m
     reason : why the record is inconclusive, or ""
@@ -67,6 +70,7 @@ class Repeat:
     probabilities: np.ndarray
     periods: float
     scatter: float
+    hidden: float
     motion: float
     noise_sd: float
     reason: str = ""
@@ -101,22 +105,27 @@ def find_period(time: Record, x_rel: Record, T: float, floor: float = 0.0) -> Re
     elif motion <= noise_sd:
         reason = f"noise: its standard deviation is {1e6 * noise_sd:.3g} um, the motion {1e6 * motion:.3g} um"
     if reason:
-        return Repeat(None, np.zeros(LONGEST_PERIOD + 1), periods, float("nan"), motion, noise_sd, reason)
+        nan = float("nan")
+        return Repeat(None, np.zeros(LONGEST_PERIOD + 1), periods, nan, nan, motion, noise_sd, reason)
     cycles, gain = _polynomials(time - time[0], x_rel / motion, T)
     evidence = _Evidence(cycles, gain * (noise_sd / motion) ** 2)
     probabilities = evidence.probabilities()
     best = int(np.argmax(probabilities))
+    hidden = evidence.hidden(max(best, 1))
     if probabilities[best] < DECIDED:
         order = np.argsort(-probabilities)[:2]
         words = ", ".join(f"{period_word(int(i))} {probabilities[i]:.2f}" for i in order)
         reason = f"period: probabilities {words}; record more than {periods:.0f} periods of the drive"
-    elif best and evidence.visible(best) > LARGEST_VISIBLE:
-        visible = f"{evidence.visible(best):.1%} of the motion"
-        reason = f"noise and scatter: a part of another period is visible from {visible}; record more periods"
+    elif best and hidden > LARGEST_HIDDEN:
+        part = f"{hidden:.1%} of the motion"
+        reason = f"noise and scatter: they hide a part of another period below {part}; record more periods"
     elif 2 * best > periods:
         reason = f"repeats after {best} periods of the drive, but holds only {periods:.1f}"
-    period = None if reason else best
-    return Repeat(period, probabilities, periods, motion * evidence.scatter(max(best, 1)), motion, noise_sd, reason)
+    elif best == 0 and periods < FEWEST_APERIODIC:
+        needed = f"{FEWEST_APERIODIC} periods of the drive are needed"
+        reason = f"no repeat; the record of {periods:.1f} periods is too short for longer ones, {needed}"
+    scatter = motion * evidence.scatter(max(best, 1))
+    return Repeat(None if reason else best, probabilities, periods, scatter, motion * hidden, motion, noise_sd, reason)
 
 
 def period_word(period: int) -> str:
@@ -128,55 +137,27 @@ def _polynomials(time: Record, x: Record, T: float) -> tuple[Float[np.ndarray, "
     """Legendre coefficients of every whole excitation period, (c, k), and the sum of their variances for unit noise.
 
     The sum of their squares is the mean square of x over the cycle. Where the samples lie in a cycle changes from cycle
-    to cycle and repeats after a few of them. A contact of few samples then seems to repeat as slowly. Waves of a short
-    period are therefore folded, and their coefficients are taken from the dense folded wave.
+    to cycle. The coefficients are therefore those of the cubic spline through the record, at the same dense places.
     """
     step = time[-1] / (len(time) - 1)
     whole = int((time[-1] + step) / T * (1.0 + 1e-9))
-    bounds = np.searchsorted(time, T * np.arange(whole + 1) - 0.5e-9 * T)
     degree = min(_HIGHEST_DEGREE, int(1.5 * np.sqrt(T / step)))
     dense = (np.arange(int(_DENSE * T / step)) + 0.5) / int(_DENSE * T / step)
-    rows = np.zeros((whole, degree + 1))
-    for n in range(1, min(_FOLDED_PERIODS, whole // 2) + 1):
-        places = T * (np.arange(n)[:, None] + dense).ravel()
-        wave, at_samples = (_fold(time % (n * T), x, n * T, at, step) for at in (places, time % (n * T)))
-        rows += (wave.reshape(n, -1) @ np.linalg.pinv(_legendre(dense, degree)).T)[np.arange(whole) % n]
-        x = x - at_samples
-    variance = 0.0
-    for c, (low, high) in enumerate(pairwise(bounds.tolist())):
-        inverse = np.linalg.pinv(_legendre(time[low:high] / T - c, degree))
-        rows[c] += inverse @ x[low:high]
-        variance += float(np.sum(inverse**2)) / whole
-    return rows, variance
-
-
-def _legendre(place: np.ndarray, degree: int) -> np.ndarray:
-    """Orthonormal Legendre polynomials on [0, 1], (n, degree + 1)."""
-    return np.polynomial.legendre.legvander(2.0 * place - 1.0, degree) * np.sqrt(2.0 * np.arange(degree + 1) + 1.0)
-
-
-def _fold(phase: np.ndarray, values: np.ndarray, period: float, places: np.ndarray, half: float) -> np.ndarray:
-    """Local straight lines through a folded record at ``places``, from running sums: quick for long records."""
-    sort = np.argsort(phase)
-    axis = (phase[sort] + period * np.array([-1.0, 0.0, 1.0])[:, None]).ravel()
-    y = np.tile(values[sort], 3)
-    low, high = np.searchsorted(axis, places - half), np.searchsorted(axis, places + half)
-    sums = [np.concatenate([[0.0], np.cumsum(term)]) for term in (np.ones_like(y), axis, axis**2, y, axis * y)]
-    count, u, uu, v, uv = (one[high] - one[low] for one in sums)
-    count = np.maximum(count, 1.0)
-    u, v = u / count, v / count
-    spread = uu / count - u**2
-    slope = np.where(spread > 1e-3 * half**2, (uv / count - u * v) / np.maximum(spread, 1e-12 * half**2), 0.0)
-    return v + slope * (places - u)
+    legendre = np.polynomial.legendre.legvander(2.0 * dense - 1.0, degree) * np.sqrt(2.0 * np.arange(degree + 1) + 1.0)
+    places = np.minimum(T * (np.arange(whole)[:, None] + dense), time[-1])
+    return CubicSpline(time, x)(places) @ np.linalg.pinv(legendre).T, (degree + 1) * step / T
 
 
 @dataclass(frozen=True)
 class _Level:
-    """Frequencies j/m of one m: power of the cycles there, number of dimensions, gain of the AR(1) filter."""
+    """Frequencies j/m of one m, for each of the correlations (r,): power of the filtered cycles there, filter gain.
 
-    power: float
+    dimensions : number of waves
+    """
+
+    power: Float[np.ndarray, " r"]
+    gain: Float[np.ndarray, " r"]
     dimensions: int
-    gain: float
 
 
 class _Evidence:
@@ -184,84 +165,115 @@ class _Evidence:
 
     def __init__(self, cycles: Float[np.ndarray, "c k"], noise: float) -> None:
         self._cycles, self._noise = cycles, noise
-        self._levels = lru_cache(maxsize=None)(self._project)
-        self._longest = min(LONGEST_PERIOD, max(len(cycles) - self._drift_terms - _FEWEST_FREE_CYCLES, 1))
-        residuals, freedom = self._levels(1, 0.0)[1], len(cycles) - self._drift_terms
+        self._drift_terms = int(np.clip(len(cycles) // _CYCLES_PER_DRIFT_TERM, 1, _MOST_DRIFT_TERMS))
+        residuals, freedom = self._residuals(1), len(cycles) - self._drift_terms
+        self._longest = min(LONGEST_PERIOD, max(freedom - _FEWEST_FREE_CYCLES, 1))
         covariance = residuals.T @ residuals / freedom
         total, square = float(np.trace(covariance)), float(np.sum(covariance**2))
         # The sample covariance of few cycles is too uneven: correct its square.
         square = max(square - total**2 / freedom, total**2 / cycles.shape[1])
         self._independent = float(np.clip(total**2 / square, 1.0, cycles.shape[1])) if total > 0.0 else 1.0
 
-    def visible(self, n: int) -> float:
-        """Smallest part of another period that stands out of the noise and the scatter of period n, rms."""
+    def hidden(self, n: int) -> float:
+        """Largest part of another period that the noise and the scatter of period n hide, rms."""
         variance = self._noise + self.scatter(n) ** 2
         return float(np.sqrt(variance * _STANDARD_ERRORS * np.sqrt(2.0 / self._independent) / len(self._cycles)))
 
     def scatter(self, n: int) -> float:
         """rms difference of a cycle from the motion of period n beyond the noise, drift removed."""
-        rest = float(np.sum(self._levels(n, 0.0)[1] ** 2)) / (len(self._cycles) - self._drift_terms - n + 1)
+        rest = float(np.sum(self._residuals(n) ** 2)) / (len(self._cycles) - self._drift_terms - n + 1)
         return float(np.sqrt(max(rest - self._noise, 0.0)))
-
-    @property
-    def _drift_terms(self) -> int:
-        return int(np.clip(len(self._cycles) // _CYCLES_PER_DRIFT_TERM, 1, _MOST_DRIFT_TERMS))
 
     def probabilities(self) -> Float[np.ndarray, " n"]:
         """(17,) posterior probabilities of an aperiodic motion and of the periods 1 to 16."""
         n = np.arange(1, LONGEST_PERIOD + 1)
         prior = (1.0 - APERIODIC_PRIOR) * n**PERIOD_EXPONENT / np.sum(n**PERIOD_EXPONENT)
-        low, high = PERIODIC_SCATTER
-        periodic = np.array([self._log_evidence(int(k), (low, high / k)) for k in n[: self._longest]])
-        bands = min(self._longest, MOST_BANDS)
-        scattered = np.array([self._log_evidence(int(k), APERIODIC_SCATTER) for k in n[:bands]])
-        parts = [logsumexp(scattered) + np.log(APERIODIC_PRIOR / bands), *(periodic + np.log(prior[: self._longest]))]
+        levels = [self._levels(int(k)) for k in n[: self._longest]]
+        periodic = np.array([self._log_evidence(one, *_periodic_scatter(k)) for k, one in enumerate(levels, start=1)])
+        bands, wide = levels[:MOST_BANDS], np.geomspace(*APERIODIC_SCATTER, _GRID)
+        scattered = np.array([self._log_evidence(one, wide) for one in bands])
+        aperiodic = _log_sum(scattered) + np.log(APERIODIC_PRIOR / len(bands))
+        parts = [aperiodic, *(periodic + np.log(prior[: self._longest]))]
         if self._longest < LONGEST_PERIOD:  # a longer period looks like scatter of any size
-            parts.append(self._log_evidence(1, PART) + np.log(np.sum(prior[self._longest :])))
-        posterior = np.exp(np.array(parts) - logsumexp(parts))
+            parts.append(
+                self._log_evidence(levels[0], np.geomspace(*PART, _GRID)) + np.log(np.sum(prior[self._longest :]))
+            )
+        posterior = np.exp(np.array(parts) - _log_sum(np.array(parts)))
         found = np.zeros(LONGEST_PERIOD + 1)
         found[: self._longest + 1] = posterior[: self._longest + 1]
         return found
 
-    def _log_evidence(self, n: int, scatter: tuple[float, float]) -> float:
-        """Log-likelihood of period n, scatter log-uniform in the range, integrated over all that is unknown."""
-        q = np.geomspace(*scatter, _GRID)
-        parts = []
-        for correlation in CORRELATIONS.tolist():
-            levels, rest = self._levels(n, correlation)
-            variance = (1.0 + correlation**2) * self._noise + (1.0 - correlation**2) * q**2
-            power = float(np.sum(rest**2)) + sum(level.power for level in levels.values())
-            dimensions = len(self._cycles) - 1 - self._drift_terms
-            value = -0.5 * self._independent * (dimensions * np.log(variance) + power / variance)
-            for m, level in levels.items():
-                ratio = self._log_ratio(level, variance)
-                value = value + (ratio if m == n else np.logaddexp(0.0, ratio) - np.log(2.0))
-            parts.append(logsumexp(value) - np.log(_GRID))
-        return float(logsumexp(parts) - np.log(len(CORRELATIONS)))
+    def _log_evidence(
+        self, levels: list[_Level], q: Float[np.ndarray, " q"], weight: Float[np.ndarray, " q"] | float = 1.0 / _GRID
+    ) -> float:
+        """Log-likelihood of a period with these levels, integrated over scatters q of prior ``weight`` and the rest.
 
-    def _log_ratio(self, level: _Level, variance: Float[np.ndarray, " q"]) -> Float[np.ndarray, " q"]:
+        The first level is what the drift and the others leave; the last one must be present.
+        """
+        r = CORRELATIONS[:, None]
+        variance = (1.0 + r**2) * self._noise + (1.0 - r**2) * q**2
+        power = np.sum([level.power for level in levels], axis=0)[:, None]
+        dimensions = sum(level.dimensions for level in levels)
+        value = -0.5 * self._independent * (dimensions * np.log(variance) + power / variance)
+        for level in levels[1:]:
+            ratio = self._log_ratio(level, variance)
+            value = value + (ratio if level is levels[-1] else np.logaddexp(0.0, ratio) - np.log(2.0))
+        return float(_log_sum((value + np.log(weight)).ravel()) - np.log(len(r)))
+
+    def _log_ratio(self, level: _Level, variance: Float[np.ndarray, "r q"]) -> Float[np.ndarray, "r q"]:
         """Log of the likelihood of a level over that of scatter alone, for each variance of the scatter."""
-        part = np.geomspace(*PART, _GRID)[:, None]
-        more = variance + level.gain * len(self._cycles) * part**2 / level.dimensions
-        terms = level.dimensions * np.log(more / variance) + level.power * (1.0 / more - 1.0 / variance)
-        return logsumexp(-0.5 * self._independent * terms, axis=0) - np.log(_GRID)
+        part = np.geomspace(*PART, _GRID)[:, None, None]
+        more = variance + level.gain[:, None] * len(self._cycles) * part**2 / level.dimensions
+        terms = level.dimensions * np.log(more / variance) + level.power[:, None] * (1.0 / more - 1.0 / variance)
+        return _log_sum(-0.5 * self._independent * terms) - np.log(_GRID)
 
-    def _project(self, n: int, correlation: float) -> tuple[dict[int, _Level], Float[np.ndarray, "c k"]]:
-        """Levels of the divisors of n, by m, and what they and the drift leave of the filtered cycles."""
-        y = self._cycles[1:] - correlation * self._cycles[:-1] if correlation else self._cycles
-        c = np.arange(len(y))
-        design = [np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, len(y)), self._drift_terms - 1)]
-        members: dict[int, tuple[int, float]] = {}
-        for m in (m for m in range(2, n + 1) if n % m == 0):
-            angles = [2.0 * np.pi * j / m for j in range(1, m // 2 + 1) if gcd(j, m) == 1]
-            waves = [wave(a * c) for a in angles for wave in ((np.cos, np.sin) if a < 3.14 else (np.cos,))]
-            gain = float(np.mean([1.0 - 2.0 * correlation * np.cos(a) + correlation**2 for a in angles]))
-            design.append(np.stack(waves, axis=1))
-            members[m] = (len(waves), gain)
-        basis = np.linalg.qr(np.concatenate(design, axis=1))[0]
-        power = np.sum((basis.T @ y) ** 2, axis=1)
-        levels, first = {}, self._drift_terms
-        for m, (number, gain) in members.items():
-            levels[m] = _Level(float(np.sum(power[first : first + number])), number, gain)
+    def _levels(self, n: int) -> list[_Level]:
+        """What the drift and period n leave of the filtered cycles, then the levels of the divisors of n, n last."""
+        last, before = self._cycles[1:], self._cycles[:-1]
+        basis, divisors = self._basis(len(last), n)
+        r = CORRELATIONS[:, None]
+        rows, r_rows = (basis.T @ y for y in (last, before)), r[:, :, None]
+        one, other = rows
+        power = np.sum((one - r_rows * other) ** 2, axis=2)
+        total = np.array([np.sum((last - x * before) ** 2) for x in CORRELATIONS.tolist()])
+        levels, first = [], self._drift_terms
+        rest = _Level(total - np.sum(power, axis=1), np.ones_like(CORRELATIONS), len(last) - basis.shape[1])
+        for m, angles in divisors.items():
+            number = sum(1 if 2 * j == m else 2 for j in angles)
+            cosine = np.cos(2.0 * np.pi * np.array(angles) / m)
+            gain = np.mean(1.0 - 2.0 * r * cosine + r**2, axis=1)
+            levels.append(_Level(np.sum(power[:, first : first + number], axis=1), gain, number))
             first += number
-        return levels, y - basis @ (basis.T @ y)
+        return [rest, *levels]
+
+    def _basis(self, count: int, n: int) -> tuple[Float[np.ndarray, "count b"], dict[int, list[int]]]:
+        """Orthonormal basis of the drift and period n over ``count`` cycles, with the j of each divisor m of n."""
+        c, design = (
+            np.arange(count),
+            [np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, count), self._drift_terms - 1)],
+        )
+        divisors = {m: [j for j in range(1, m // 2 + 1) if gcd(j, m) == 1] for m in range(2, n + 1) if n % m == 0}
+        for m, angles in divisors.items():
+            phase = 2.0 * np.pi / m * np.multiply.outer(c, angles)
+            design.append(np.cos(phase))
+            if m > 2:
+                design.append(np.sin(phase))
+        return np.linalg.qr(np.concatenate(design, axis=1))[0], divisors
+
+    def _residuals(self, n: int) -> Float[np.ndarray, "c k"]:
+        """What the drift and period n leave of the cycles."""
+        basis, _ = self._basis(len(self._cycles), n)
+        return self._cycles - basis @ (basis.T @ self._cycles)
+
+
+def _periodic_scatter(n: int) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+    """Scatters of a motion of period n and their prior probabilities."""
+    q = np.geomspace(PERIODIC_SCATTER[0], PERIODIC_SCATTER[1] / n, _GRID)
+    weight = np.minimum(1.0, (COMMON_SCATTER / q) ** SCATTER_EXPONENT)
+    return q, weight / np.sum(weight)
+
+
+def _log_sum(logs: Float[np.ndarray, "n ..."]) -> Any:
+    """Log of the sum of exponentials over the first axis; SciPy's takes ten times as long on small arrays."""
+    largest = np.max(logs, axis=0)
+    return largest + np.log(np.sum(np.exp(logs - largest), axis=0))

@@ -38,8 +38,9 @@ def test_reference_cases_have_the_label_of_the_model() -> None:
 def test_longer_periods_and_aperiodic_motions() -> None:
     found = outcomes(longer())
     assert wrong(found) == {}
-    # chaos in two narrow bands is not told apart from a noisy period two
-    assert list(found.values()).count("right") >= 8
+    assert list(found.values()).count("right") >= 9
+    # Chaos in two narrow bands looks like a period two that scatters.
+    assert list(found.values()).count(UNDECIDED) <= 1
 
 
 def test_mean_velocities_are_those_of_the_model() -> None:
@@ -67,9 +68,14 @@ def test_the_record_places_the_impact_line() -> None:
 
 
 def test_ten_times_the_noise_makes_no_label_wrong() -> None:
-    found = outcomes(reference(), 10.0)
+    """The period shows through ten times the noise, most contacts do not: 25 labels of 0.9 or more, about 0.2 wrong."""
+    motions = {case.name: case.motion(10.0) for case in reference()}
+    found = {case.name: outcome(motions[case.name].label, case.label) for case in reference()}
     assert wrong(found) == {}
-    assert list(found.values()).count("right") < 8
+    stated = np.array([motions[name].probability for name, one in found.items() if one != UNDECIDED])
+    assert np.all(stated >= 0.9)
+    assert np.sum(1.0 - stated) < 1.0
+    assert list(found.values()).count("right") < 12
 
 
 def test_the_probability_is_that_of_the_label() -> None:
@@ -94,7 +100,7 @@ def scattered_outcomes(cases: tuple[Known, ...], seed: int) -> list[str]:
 def test_cycles_that_scatter_by_one_percent_have_their_label() -> None:
     found = scattered_outcomes((*reference()[::3], *longer()[:3]), 0)
     assert [one for one in found if one not in ("right", "period", UNDECIDED)] == []
-    assert found.count(UNDECIDED) <= 2
+    assert found.count(UNDECIDED) <= 1
 
 
 @pytest.mark.slow

@@ -24,13 +24,16 @@ def noise(seed: int, sd: float = NOISE_SD) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 8, 11])
 def test_the_period_is_the_smallest_that_repeats(n: int) -> None:
-    for seed in range(4):
+    for seed in range(20):
         assert find_period(TIME, motion(n) + noise(seed), T).period == n
 
 
-def test_what_does_not_repeat_is_aperiodic() -> None:
+def test_what_does_not_repeat_is_aperiodic_if_the_record_is_long_enough() -> None:
     golden = motion(1) + 2e-4 * np.cos(2.0 * np.pi * TIME / T * 0.5 * (np.sqrt(5.0) - 1.0) + 0.3) + noise(0)
     assert find_period(TIME, golden, T).period == 0
+    shorter = find_period(TIME[:1200], golden[:1200], T)
+    assert shorter.period is None
+    assert "too short" in shorter.reason
 
 
 def test_a_long_period_needs_two_of_them() -> None:
@@ -39,16 +42,22 @@ def test_a_long_period_needs_two_of_them() -> None:
     assert "repeats after 13" in found.reason
 
 
-def test_noise_hides_a_second_period() -> None:
-    assert find_period(TIME, motion(2, 0.03) + noise(3), T).period == 2
-    hidden = find_period(TIME, motion(2, 0.03) + noise(4, 2e-4), T)
-    assert hidden.period is None
-    assert "a part of another period is visible from" in hidden.reason
+def test_noise_limits_the_visible_part() -> None:
+    """``hidden`` states the largest part of another period that noise hides."""
+    quiet = find_period(TIME, motion(1) + noise(2), T)
+    assert quiet.hidden < 0.003 * quiet.motion
+    found = [find_period(TIME, motion(2, 0.016) + noise(seed), T).period for seed in range(20)]
+    assert set(found) == {2}  # 11 um, where the noise is 10 um
+    below = [find_period(TIME, motion(2, 0.7 * quiet.hidden / 1e-3) + noise(seed), T).period for seed in range(20)]
+    assert 2 not in below
+    loud = [find_period(TIME, motion(n, part) + noise(4, 2e-4), T) for n, part in ((2, 0.2), (2, 0.03), (1, 0.0))]
+    assert [one.period for one in loud] == [None, None, None]
+    assert "they hide a part of another period below" in loud[2].reason
     assert find_period(TIME, motion(2) + noise(4, 2e-3), T).reason.startswith("noise: its standard deviation is")
 
 
 def test_no_false_second_period_in_noise() -> None:
-    assert {find_period(TIME, motion(1) + noise(seed), T).period for seed in range(40)} == {1}
+    assert {find_period(TIME, motion(1) + noise(seed), T).period for seed in range(300)} == {1}
 
 
 def uneven(seed: int, part: float, scatter: float = 0.01) -> np.ndarray:
