@@ -5,6 +5,7 @@ with links to other files is refused: only its own bytes count.
 """
 
 import io
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ import numpy as np
 from capsule_id.rig.formats.binary.arrays import export_of_arrays
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.limits import complete, installed, refuse_large
+
+#: Fewest bytes of a chunk with its entry in the index.
+SMALLEST_CHUNK = 16
 
 
 def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
@@ -45,6 +49,9 @@ def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
         text = found.attrs.get("MATLAB_class") == b"char" or name.startswith("#") or "MATLAB_empty" in found.attrs
         if not text:
             refuse_large(found.size * found.dtype.itemsize + sum(array.nbytes for array in arrays.values()), path)
+            chunks = prod(-(-size // step) for size, step in zip(found.shape, found.chunks or found.shape, strict=True))
+            if chunks > max(len(content) // SMALLEST_CHUNK, 1):  # pyfive looks for every one of them
+                raise ValueError(f"{name} states {chunks} chunks in a file of {len(content)} bytes")
             array = np.asarray(found[()])
             arrays[name] = array.T if by_columns else array
             unit = found.attrs.get("units", found.attrs.get("unit"))
