@@ -78,7 +78,11 @@ def _summary(table: Table) -> str:
     text = f"{table.kind} {table.label}: {len(table.rows)} rows of {columns}"
     dropped = [
         f"{number} rows {why}"
-        for number, why in ((table.other, "outside where"), (table.missing, "with a missing reading"))
+        for number, why in (
+            (table.other, "outside where"),
+            (table.missing, "with a missing reading"),
+            (table.rejected, "with an outlier"),
+        )
         if number
     ]
     text += f" ({' and '.join(dropped)} not used)" if dropped else ""

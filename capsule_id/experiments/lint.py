@@ -30,6 +30,9 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
         if table.missing:
             facts = {"file": table.file, "rows": table.missing, "used": len(table.rows)}
             findings.append(Finding("readings.missing", "warn", facts, table.label))
+        if table.rejected:
+            facts = {"file": table.file, "rows": table.rejected, "used": len(table.rows)}
+            findings.append(Finding("readings.rejected", "warn", facts, table.label))
         findings += [found for lint_table in kinds[table.kind].lint for found in lint_table(table, rig)]
     return (*findings, *_same_files(rig, tables), *_repeated_blocks(rig, tables))
 

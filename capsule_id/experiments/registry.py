@@ -27,6 +27,7 @@ BUILT_IN = (
     "sliding_friction",
     "motor_current",
     "support_spring",
+    "transducer",
     "forced_run",
 )
 

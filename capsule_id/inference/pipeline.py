@@ -177,7 +177,8 @@ def make_result(
 
 def provenance(rig: Rig, seed: int, experiments: Choice, friction: str) -> Provenance:
     """Return the provenance of a fit of ``rig`` with ``seed`` and these ``experiments``."""
-    return Provenance(seed, experiments, friction, package_versions(PACKAGES), dict(rig.files))
+    rejected = {table.label: table.rejected for table in rig.tables if table.rejected}
+    return Provenance(seed, experiments, friction, package_versions(PACKAGES), dict(rig.files), rejected)
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """Frozen results of inference; the report renders them without further computation."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
@@ -109,13 +109,17 @@ class Pointwise:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Inputs of a result: the seed, the chosen experiments, the friction law, versions of packages, SHA-256 of the files."""
+    """Inputs of a result: the seed, the chosen experiments, the friction law, versions of packages, SHA-256 of the files.
+
+    ``rejected``: number of rows that the rule ``reject`` dropped, by label of the experiment.
+    """
 
     seed: int
     experiments: Choice
     friction: str
     versions: Mapping[str, str]
     files: Mapping[str, str]
+    rejected: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

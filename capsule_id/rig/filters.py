@@ -19,6 +19,7 @@ Record = Num[np.ndarray, " n"]
 
 TIMING_TOLERANCE = 0.01  # largest distance from an even grid, in sampling steps, of evenly spaced samples
 SMALLEST_GAIN = 0.99  # smallest gain of `choose_window` at the dominant frequency
+_HAMPEL_BLOCK = 2_000_000  # readings that are sorted at a time
 _ZERO_PADDING = 8  # the frequency grid of the spectrum is 8 times finer than 1 / duration
 
 
@@ -196,3 +197,28 @@ def _check_window(samples: int, order: int, available: int) -> None:
     if samples > available:
         value = f"{samples} samples of {available}"
         raise InputError("the window must fit into the record", value, "shorten the window")
+
+
+def hampel_outliers(values: Record, samples: int, n_sd: float) -> np.ndarray:
+    """Whether each reading lies further than ``n_sd`` robust sds from the median of the window around it, (n,).
+
+    The sd of a window is 1.4826 times the median distance of its readings from its median, and at least the smallest
+    such distance in the record: a window at a steady level may hold one value only.
+    Source: F. R. Hampel, J. Am. Stat. Assoc. 69, 383 (1974).
+
+    Parameters
+    ----------
+    values : (n,)
+    samples : length of the window, odd; at the ends the window is filled with the first or last reading
+    """
+    padded = np.pad(np.asarray(values, float), samples // 2, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, samples)
+    distance, sd = np.empty(len(values)), np.empty(len(values))
+    rows = max(1, _HAMPEL_BLOCK // samples)
+    for first in range(0, len(values), rows):
+        part = slice(first, first + rows)
+        median = np.median(windows[part], axis=1)
+        distance[part] = np.abs(values[part] - median)
+        sd[part] = 1.4826 * np.median(np.abs(windows[part] - median[:, None]), axis=1)
+    rounding = 1e-12 * np.max(np.abs(values), initial=0.0)
+    return distance > n_sd * np.maximum(sd, np.min(distance[distance > rounding], initial=np.inf))

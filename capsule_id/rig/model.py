@@ -101,6 +101,7 @@ class Table(Generic[S]):
         files put one below the other: 1-based number of the row
     bench : its kind is a bench test; else a forced run
     missing, other : rows of the files that a column map drops: for a missing cell, and outside ``where``
+    rejected : rows dropped as outliers, by the rule ``reject``
     """
 
     kind: str
@@ -112,6 +113,7 @@ class Table(Generic[S]):
     bench: bool = True
     missing: int = 0
     other: int = 0
+    rejected: int = 0
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""

@@ -192,16 +192,17 @@ def _read_experiment(
         raise document.error((*path, "kind"), "unknown kind", shown(word), f"write one of {' '.join(kinds)}")
     kind = kinds[word]
     errors = [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
-    refuse_unknown_keys(document, path, entry, ("kind", "file", "label", *MAP_KEYS, *kind.setting_rules, *errors))
+    refuse_unknown_keys(
+        document, path, entry, ("kind", "file", "label", "reject", *MAP_KEYS, *kind.setting_rules, *errors)
+    )
     settings = _read_settings(document, path, entry, kind)
     file = read_experiment_files(document, path, entry, kind)
     name = next(iter(file.sha256))
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
     columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
     _refuse_reading_errors_without_column(document, path, entry, errors, file)
-    table = Table(
-        word, label, name, MappingProxyType(columns), settings, file.raw.rows, kind.bench, file.missing, file.other
-    )
+    dropped = file.missing, file.other, file.rejected
+    table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows, kind.bench, *dropped)
     for rule in kind.rules:
         rule(Entry(table, document, path, file))
     return table, file.sha256

@@ -17,7 +17,9 @@ from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.maps.declared import ColumnMap, read_map
 from capsule_id.rig.maps.mapped import apply_map
+from capsule_id.rig.maps.plateaus import Plateaus, read_plateaus, readings_of_plateaus
 from capsule_id.rig.maps.proposal import proposal
+from capsule_id.rig.maps.rejection import Rejection, outlying_rows, read_rejection
 from capsule_id.rig.model import Column
 from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
@@ -36,6 +38,7 @@ class TableFile:
     columns : by name, still without reading errors
     file_of : (row index or None for the header, column index) -> the file, for error lines
     missing, other : rows that a column map drops: for a missing cell, and outside ``where``
+    rejected : rows dropped as outliers
     """
 
     sha256: Mapping[str, str]
@@ -44,6 +47,7 @@ class TableFile:
     file_of: Callable[[int | None, int], Path]
     missing: int = 0
     other: int = 0
+    rejected: int = 0
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""
@@ -101,15 +105,21 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
             value = f"{shown(name)} ({error.strerror})"
             raise document.error(place, "file must be readable", value, "check its permissions") from None
     first = places[0][1]
+    rejection, plateaus = read_rejection(document, path, entry), read_plateaus(document, path, entry, kind)
     column_map = read_map(document, path, entry, kind, partial(_proposal, contents[first], files[first], kind))
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     if column_map is None:
         table = _read_plain(document, places[0][0], files[first], contents[first], hashes, kind)
     else:
-        _check_map_names(document, path, column_map, kind)
+        _check_map_names(document, path, column_map, kind, plateaus)
         read = [EXPORTS[suffix_of(file)](contents[name], file, column_map.layout) for name, file in files.items()]
         mapped = apply_map(document, path, read, column_map)
         table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other)
+    if rejection is not None:
+        table = _without_outliers(document, path, table, rejection)
+    if plateaus is not None:
+        raw, starts = readings_of_plateaus(document, path, table.raw, _times(table), plateaus)
+        table = _with_rows(table, raw, starts)
     table.raw.rows.flags.writeable = False
     columns = {column: _to_si(table, index, kind.columns[column]) for index, column in enumerate(table.raw.names)}
     return replace(table, columns=columns)
@@ -158,15 +168,52 @@ def _proposal(content: bytes, file: Path, kind: KindRule, layout: Layout) -> str
     return proposal(kind, export)
 
 
-def _check_map_names(document: TomlDocument, path: KeyPath, column_map: ColumnMap, kind: KindRule) -> None:
-    """Refuse a map without the columns that the kind needs."""
+def _times(table: TableFile) -> np.ndarray:
+    """The times of a record, (n,) s, increasing."""
+    return _to_si(table, table.raw.names.index("time"), ColumnRule("s", increasing=True)).values
+
+
+def _without_outliers(document: TomlDocument, path: KeyPath, table: TableFile, rejection: Rejection) -> TableFile:
+    """The table without its outliers."""
+    if "time" not in table.raw.names:
+        value, remedy = " ".join(table.raw.names), "remove reject, and correct or delete the rows"
+        raise document.error((*path, "reject"), "reject needs a record with times", value, remedy, of_key=True)
+    keep = np.flatnonzero(~outlying_rows(table.raw, _times(table), rejection))
+    raw = table.raw
+    kept = RawTable(
+        raw.names,
+        raw.units,
+        raw.values[keep],
+        raw.rows[keep],
+        lambda row, column: raw.place(None if row is None else int(keep[row]), column),
+    )
+    return replace(_with_rows(table, kept, keep), rejected=len(raw.values) - len(keep))
+
+
+def _with_rows(table: TableFile, raw: RawTable, origin: np.ndarray) -> TableFile:
+    """The table with other rows; ``origin`` (k,) are their rows in the former one."""
+    columns = len(table.raw.names) - 1
+    return replace(
+        table,
+        raw=raw,
+        file_of=lambda row, column: table.file_of(None if row is None else int(origin[row]), min(column, columns)),
+    )
+
+
+def _check_map_names(
+    document: TomlDocument, path: KeyPath, column_map: ColumnMap, kind: KindRule, plateaus: Plateaus | None
+) -> None:
+    """Refuse a map without the columns that the kind needs; plateaus replace the time by the column of their levels."""
     place = (*path, "columns")
 
     def error(name: str, rule: str, value: str, remedy: str) -> InputError:
         del name
         return document.error(place, rule, value, remedy)
 
-    _check_names(tuple(column_map.sources), kind, error)
+    names = tuple(column_map.sources)
+    if plateaus is not None:
+        names = (*(name for name in names if name != "time"), plateaus.name)
+    _check_names(names, kind, error)
 
 
 def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str, str, str], InputError]) -> None:

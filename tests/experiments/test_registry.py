@@ -62,6 +62,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "length": (QuantityRule("m", has_sd=True), None),
         "sd_ratio": (QuantityRule("N/m"), None),
     },
+    "transducer": {"sd_ratio": (QuantityRule("1/N"), None)},
     "forced_run": {
         "drive": (ChoiceRule(("harmonic", "base")), "harmonic"),
         "spring": (NameRule(), None),

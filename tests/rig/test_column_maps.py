@@ -112,25 +112,6 @@ def test_layouts(tmp_path: Path, layout: str, ending: str) -> None:
     assert_read(rig_of(tmp_path, {"t.txt": text.replace("\n", ending)}, f'file = "t.txt"\n{lines}'))
 
 
-def test_a_decimal_comma_in_a_single_column_must_be_stated(tmp_path: Path) -> None:
-    text = rows("", ",", (DISP,))
-    assert "," in text
-    rate = 'time = { rate = { value = 100, unit = "Hz" } }'
-    lines = f'file = "x.txt"\ncolumns = {{ {rate}, x_rel = {{ from = 1, unit = "mm" }} }}'
-    fault = fault_of(tmp_path, {"x.txt": text}, lines)
-    assert (fault.file, fault.line) == (str(tmp_path / "x.txt"), 1)
-    assert "comma between digits" in fault.rule
-    stated = re.search(r'decimal = ","', fault.remedy)
-    assert stated is not None
-    for head in ("", "Disp\n"):
-        assert_read(rig_of(tmp_path, {"x.txt": head + text}, f"{lines}\n{stated[0]}"))
-    whole = "".join(f"{i},{i * i}\n" for i in range(12))  # two columns of whole numbers
-    lines = 'file = "x.txt"\ncolumns = { time = { from = 1, unit = "s" }, x_rel = { from = 2, unit = "mm" } }'
-    assert "comma between digits" in fault_of(tmp_path, {"x.txt": whole}, lines).rule
-    (table,) = rig_of(tmp_path, {}, f'{lines}\ndecimal = "."').tables
-    np.testing.assert_allclose(table["x_rel"], 1e-3 * np.arange(12.0) ** 2)
-
-
 def test_combined_columns_and_a_stated_rate(tmp_path: Path) -> None:
     text = "A,B\n" + rows(",", columns=(DISP, EXTRA))
     source = '{ from = "A", minus = "B", unit = "mm", scale = -2, offset = 0.2 }'

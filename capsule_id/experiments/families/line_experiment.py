@@ -9,7 +9,9 @@ intercept is integrated out under a wide normal prior.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import ModuleType
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -141,6 +143,8 @@ class Line(Experiment):
     y_name: str = eqx.field(static=True)
     errors_known: bool = eqx.field(static=True)
 
+    #: SI unit of y.
+    unit_of_y: ClassVar[str] = "N"
     estimates_may_be_negative = True
     checks = (check_linearity, check_replicates, check_scatter)
     tables = (line_table,)
@@ -159,7 +163,8 @@ class Line(Experiment):
         self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
         self.y_sd = max(self.y_sd, self.step / np.sqrt(12.0))
         factor = SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
-        scatter = parameter("scatter", table.label, Prior("lognormal", SCATTER_MEDIAN * size, factor))
+        row = parameter("scatter", table.label, Prior("lognormal", SCATTER_MEDIAN * size, factor))
+        scatter = replace(row, unit=self.unit_of_y)
         self.about = About(table, rig, (slope,) if self.errors_known else (slope, scatter))
 
     @property

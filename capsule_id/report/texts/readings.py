@@ -29,6 +29,13 @@ DATA_MESSAGES: Mapping[str, Message] = {
             "the reading."
         ),
     ),
+    "readings.rejected": Message(
+        "outliers",
+        warn=(
+            "{file}: {rows} rows are dropped as outliers by the rule reject, {used} are used. Check with --figures that no "
+            "impact or step is among them."
+        ),
+    ),
     "readings.errors": Message(
         "reading errors", warn="no reading error is stated for {names}. Add {first}_sd to the experiment."
     ),

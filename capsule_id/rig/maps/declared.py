@@ -20,7 +20,7 @@ from capsule_id.rig.toml_values import (
 )
 
 #: Keys of an experiment that go with ``columns``.
-MAP_KEYS = ("columns", "files", "data_from_line", "missing", "decimal", "where")
+MAP_KEYS = ("columns", "files", "data_from_line", "missing", "decimal", "where", "plateaus")
 _EXAMPLE = '{ from = "...", unit = "..." }'
 Header = str | int  #: a header, or a column's number counted from 1
 
@@ -84,8 +84,10 @@ def read_map(
     stated = read_table(document, place, entry["columns"], propose(layout))
     if not stated:
         raise document.error(place, "a column map must have columns", "none", f"write {propose(layout)}")
-    refuse_unknown_keys(document, place, stated, tuple(kind.columns))
-    sources = {name: _source(document, (*place, name), stated[name], kind.columns[name]) for name in stated}
+    # Plateaus are readings of a time trace, whatever the columns of the kind.
+    rules = {**({"time": ColumnRule("s")} if "plateaus" in entry else {}), **kind.columns}
+    refuse_unknown_keys(document, place, stated, tuple(rules))
+    sources = {name: _source(document, (*place, name), stated[name], rules[name]) for name in stated}
     return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(_where(document, path, entry)))
 
 

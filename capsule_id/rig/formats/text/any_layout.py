@@ -5,6 +5,7 @@ comments; above the numbers they may hold the headers.
 """
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_
 from capsule_id.rig.formats.text.decode import decode
 
 _COMMENTS = ("#", "%")
-_COMMA_BETWEEN_DIGITS = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
+_MANY_ROWS = 50  # whose whole parts do not increase by chance
+_COMMA_BETWEEN_DIGITS = re.compile(r"\s*([+-]?[0-9]+),[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 
 def read_text(content: bytes, path: Path, layout: Layout) -> Export:
@@ -131,11 +133,19 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
 
 
 def _refuse_ambiguous_comma(rows: list[str], delimiter: str | None, layout: Layout, path: Path, line: int) -> None:
-    """Refuse rows such as ``1,25``: two whole numbers, or one number with a decimal comma."""
-    if delimiter == "," and layout.decimal is None and all(_COMMA_BETWEEN_DIGITS.fullmatch(row) for row in rows):
-        rule = "a comma between digits must be stated as a separator or a decimal mark"
-        remedy = 'state decimal = "," for one column of numbers, decimal = "." for two'
-        raise InputError(rule, shown_cell(rows[0].strip()), remedy, path, line, 1)
+    """Refuse rows such as ``1,25``: two whole numbers, or one number with a decimal comma.
+
+    Many rows whose whole parts increase from row to row are times and a reading.
+    """
+    if delimiter != "," or layout.decimal is not None:
+        return
+    found = [_COMMA_BETWEEN_DIGITS.fullmatch(row) for row in rows]
+    whole = [int(match[1][:18]) for match in found if match is not None]
+    if len(whole) < len(rows) or (len(rows) >= _MANY_ROWS and all(a < b for a, b in pairwise(whole))):
+        return
+    rule = "a comma between digits must be stated as a separator or a decimal mark"
+    remedy = 'state decimal = "," for one column of numbers, decimal = "." for two'
+    raise InputError(rule, shown_cell(rows[0].strip()), remedy, path, line, 1)
 
 
 def _is_comment(line: str) -> bool:

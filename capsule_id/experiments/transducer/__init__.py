@@ -1,0 +1,1 @@
+"""Reading of a force transducer against a known force, which determines its sensitivity."""
