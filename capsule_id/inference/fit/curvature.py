@@ -54,11 +54,12 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vect
     return matrix + np.triu(matrix, 1).T
 
 
-def gradient(function: Callable[[np.ndarray], np.ndarray], v: Vector) -> Vector:
-    """(d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates with unit standard deviation."""
+def value_and_gradient(function: Callable[[np.ndarray], np.ndarray], v: Vector) -> tuple[float, Vector]:
+    """Value and (d,) gradient of ``function`` ((m, d) -> (m,)) at v (d,), in coordinates with unit standard deviation."""
     offsets = GRADIENT_STEP * np.eye(len(v))
-    plus, minus = np.split(function(np.concatenate([v + offsets, v - offsets])), 2)
-    return (plus - minus) / (2.0 * GRADIENT_STEP)
+    values = function(np.concatenate([v[None], v + offsets, v - offsets]))
+    plus, minus = np.split(values[1:], 2)
+    return float(values[0]), (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
 def root_of_inverse(hessian: Matrix) -> Matrix:

@@ -14,7 +14,14 @@ import numpy as np
 from scipy import optimize
 
 from capsule_id.inference.fit.covariance import covariance
-from capsule_id.inference.fit.curvature import BATCH, gradient, hessian, in_batches, jacobian, root_of_inverse
+from capsule_id.inference.fit.curvature import (
+    BATCH,
+    hessian,
+    in_batches,
+    jacobian,
+    root_of_inverse,
+    value_and_gradient,
+)
 from capsule_id.inference.fit.least_squares import Solver, least_squares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
@@ -110,9 +117,9 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
 
     stop_if_interrupted()
     solution = optimize.minimize(
-        lambda v: float(negative(v[None])[0]),
+        lambda v: value_and_gradient(negative, v),  # one batch for both, up to 15 parameters
         np.zeros(len(end)),
-        jac=lambda v: gradient(negative, v),
+        jac=True,
         method="BFGS",
         options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
     )
