@@ -1,6 +1,7 @@
 """Free vibration: columns, settings, rules, template, lint and the paper's estimates."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,14 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
 from capsule_id.experiments.free_vibration.lint import lint_decay
-from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings, cut_at_release, decay_window
+from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, channel_of
+from capsule_id.experiments.free_vibration.settings import (
+    DAMPING,
+    DecayModel,
+    DecaySettings,
+    cut_at_release,
+    decay_window,
+)
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.kind import Kind, Values, made_by
 from capsule_id.parameters import Parameter, Prior, nuisance, scatter
@@ -27,7 +35,7 @@ if TYPE_CHECKING:
 #: Fewest passages of the rest position, and smallest distance from it that counts, relative to the record's range.
 FEWEST_SWINGS, SMALLEST_SWING = 2, 0.05
 
-NOISE_SD = scatter("noise_sd", "m", "noise of a record", r"\sigma")
+NOISE_SD = CHANNELS["x_rel"].noise
 TIME_SD = scatter("time_sd", "s", "noise of the times of turning points", r"\sigma_t")
 AMPLITUDE = nuisance("amplitude", "m", "first turning point of a decay", "a_0")
 NOISE_TIME = Parameter("noise_time", "s", "correlation time of a record's noise", r"\tau", physical=False)
@@ -80,6 +88,18 @@ def _check_forward(entry: Entry[DecaySettings]) -> None:
         raise entry.error("forward", rule, model.name, remedy)
 
 
+def _check_channels(entry: Entry[DecaySettings]) -> None:
+    """Require x_rel alone for turning points and for the capsule model."""
+    settings, names = entry.table.settings, set(CHANNELS).intersection(entry.table.columns)
+    for key, value, needs in (
+        ("samples", settings.samples, "turning_points"),
+        ("forward", settings.forward, "capsule"),
+    ):
+        if value == needs and names != {"x_rel"}:
+            found = " ".join(sorted(names))
+            raise entry.error(key, f'{key} = "{needs}" needs x_rel and no other channel', found, "map x_rel only")
+
+
 def _check_turning_points(entry: Entry[DecaySettings]) -> None:
     """Refuse drift, coloured noise and thinning of turning points."""
     settings = entry.table.settings
@@ -106,7 +126,7 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         sides = np.sign(size[np.abs(size) > SMALLEST_SWING])
         swings = int(np.count_nonzero(np.diff(sides)))
         if table.settings.samples == "record" and swings < FEWEST_SWINGS:
-            rule = f"x_rel must pass its rest position at least {FEWEST_SWINGS} times"
+            rule = f"{channel_of(table)} must pass its rest position at least {FEWEST_SWINGS} times"
             remedy = (
                 "record a period or more, with at least 10 samples per period; where each row is a turning point, state "
                 'samples = "turning_points"'
@@ -116,12 +136,23 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
 
 def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":
     """Make the experiment of the class that the settings demand; its record begins with the release."""
-    points = made_by("capsule_id.experiments.free_vibration.turning_points:TurningPoints")
-    record = made_by(
+    make = made_by(
         "capsule_id.experiments.free_vibration.experiment:FreeVibration",
         capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
     )
-    return (record if table.settings.samples == "record" else points)(cut_at_release(table), rig, friction)
+    if table.settings.samples == "turning_points":
+        make = made_by("capsule_id.experiments.free_vibration.turning_points:TurningPoints")
+    return tuple(e for one in _channel_tables(cut_at_release(table)) for e in make(one, rig, friction))
+
+
+def _channel_tables(table: Table[DecaySettings]) -> list[Table[DecaySettings]]:
+    """Return a table for each channel; its fit has initial conditions of its own, which loses little."""
+    first, *others = [name for name in CHANNELS if name in table.columns]
+    tables = [replace(table, columns={name: table.columns[name] for name in ("time", first)})]
+    for name in others:
+        columns = {own: table.columns[own] for own in ("time", name)}
+        tables.append(replace(table, columns=columns, label=f"{table.label}_{name}"))
+    return tables
 
 
 def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
@@ -149,8 +180,8 @@ def _rough(experiments: Sequence["FreeVibration"], rig: Rig) -> Values:
 
 
 TEMPLATE = """\
-#: Free vibration of the rod on its spring: k1 and c. Columns: time [s], x_rel [mm] (positive towards the support
-#: spring).
+#: Free vibration of the rod on its spring: k1 and c. Columns: time [s], and x_rel [mm] (positive towards the support
+#: spring), velocity [m/s] or acceleration [m/s^2] (g_n: standard gravity) of the rod, or several of them.
 # [[experiment]]
 # kind = "free_vibration"
 # file = "free_vibration_1.csv"
@@ -191,6 +222,19 @@ def _second_fit(facts: Facts) -> str:
     )
 
 
+def _halves(facts: Facts) -> str:
+    """The parameter whose halves disagree most, the effect that this indicates, and remedies."""
+    damping = facts["name"] in ("c", *DAMPING.values())
+    effect = "The damping" if damping else "The stiffness"
+    key = "damping" if damping else "stiffness"
+    values = f"the first half gives {facts['first']:.4g}, the second {facts['second']:.4g} {facts['unit']}"
+    return (
+        f"{facts['label']}: expected the same {facts['name']} in both halves of the record; {values} ({facts['z']:.1f} joint "
+        f"sd apart). {effect} depends on the amplitude or on the time in a way that the fitted model lacks ({facts['model']}). "
+        f"Leave {key} open, or state start and stop for the amplitudes of interest."
+    )
+
+
 MESSAGES = {
     **LINT_MESSAGES,
     "decays.stiffness": Message(
@@ -224,6 +268,12 @@ MESSAGES = {
             "noise."
         ),
     ),
+    "decays.halves": Message(
+        "halves of a decay",
+        ok="{labels}: the estimates of both halves of each record agree within 3 joint sd",
+        warn=_halves,
+        fail=_halves,
+    ),
     "decays.damping": Message(
         "Damping parameters",
         caption=(
@@ -251,12 +301,27 @@ MESSAGES = {
 
 KIND = Kind(
     name="free_vibration",
-    columns={"time": ColumnRule("s", increasing=True), "x_rel": ColumnRule("m", varies=True)},
-    sets=(("time", "x_rel"),),
+    columns={
+        "time": ColumnRule("s", increasing=True),
+        "x_rel": ColumnRule("m", varies=True),
+        "velocity": ColumnRule("m/s", varies=True),
+        "acceleration": ColumnRule("m/s^2", varies=True),
+    },
+    sets=(("time",),),
+    channels=tuple(CHANNELS),
     settings=DecaySettings,
-    rules=(Entry.check_spring_with_gap, _check_window, _check_forward, _check_turning_points),
+    rules=(Entry.check_spring_with_gap, _check_channels, _check_window, _check_forward, _check_turning_points),
     masses=_masses,
-    parameters=(NOISE_SD, TIME_SD, AMPLITUDE, TURNING_TIME, NOISE_TIME, WHITE_RATIO, DRIFT_RATIO, DRIFT_TIME),
+    parameters=(
+        *(channel.noise for channel in CHANNELS.values()),
+        TIME_SD,
+        AMPLITUDE,
+        TURNING_TIME,
+        NOISE_TIME,
+        WHITE_RATIO,
+        DRIFT_RATIO,
+        DRIFT_TIME,
+    ),
     make=_make,
     check=_check_swings,
     template=TEMPLATE,

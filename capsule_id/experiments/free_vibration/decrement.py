@@ -6,9 +6,11 @@ the decrement, and dry friction increases it. A drift of the frequency indicates
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 
 from capsule_id.records.noise import noise_level
 from capsule_id.views import Facts
@@ -46,6 +48,14 @@ class Decrement:
     delta: float
     k1: float
     c: float
+
+    @property
+    def first_ratio(self) -> float:
+        """Ratio of the first two amplitudes, at least 1; the mean of neighbouring peaks cancels the error of the rest."""
+        if len(self.peaks) < 3:
+            return float(np.exp(0.5 * max(self.delta, 0.0)))
+        first, second, third = np.abs(self.peaks[:3])
+        return max(1.0, float((first + second) / (second + third)))
 
 
 def equilibrium(values: np.ndarray) -> float:
@@ -110,6 +120,47 @@ def logarithmic_decrement(
     delta = float(-2.0 * np.polyfit(index, np.log(np.abs(peaks)), 1)[0])
     k1 = m1 * Omega_o**2
     return Decrement(times, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * m1)))
+
+
+def crossing_decrement(time: np.ndarray, values: np.ndarray, m1: float) -> Decrement:
+    """Rough estimate from the first zero crossings, where there are too few peaks; a typical damping stands in."""
+    x = values - equilibrium(values)
+    # The noise of a rod at rest crosses zero too, so only swings beyond it count.
+    swings = np.flatnonzero(np.abs(x) > max(PEAK_NOISE_RATIO * noise_level(values), 0.1 * np.ptp(x)))
+    crossings = swings[1:][np.diff(np.signbit(x[swings]))]
+    spacing = np.median(np.diff(time[crossings])) if len(crossings) > 1 else 0.5 * time[-1]
+    omega = float(np.pi / spacing)
+    k1 = m1 * omega**2
+    return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * m1)))
+
+
+def damping_of_peaks(decrement: Decrement, m1: float, deflection: float, symbols: Sequence[str]) -> dict[str, float]:
+    """Rough c, and those of F_dry and c_q in ``symbols``, from what the peaks lose; SI, none negative.
+
+    In a half cycle of amplitude a viscous damping takes pi c a/(2 m1 omega), dry friction 2 F_dry/k1 and quadratic
+    damping 4 c_q a^2/(3 m1). {} with too few peaks.
+
+    Parameters
+    ----------
+    m1 : mass of the rod, kg
+    deflection : x_rel, m, over the unit of the peaks
+    """
+    height = deflection * np.abs(decrement.peaks)
+    # Neighbouring peaks lie on opposite sides of the equilibrium, so their mean cancels its error.
+    size = 0.5 * (height[1:] + height[:-1])
+    middle = 0.5 * (size[1:] + size[:-1])
+    if len(middle) < len(symbols) + 1:
+        return {}
+    losses = {
+        "c": 0.5 * np.pi / (m1 * decrement.Omega_o) * middle,
+        "F_dry": np.full(len(middle), 2.0 / decrement.k1),
+        "c_q": 4.0 / (3.0 * m1) * middle**2,
+    }
+    chosen = [name for name in losses if name == "c" or name in symbols]
+    design = np.stack([losses[name] for name in chosen], axis=1)
+    scale = np.linalg.norm(design, axis=0)
+    parts = nnls(design / scale, -np.diff(size))[0] / scale
+    return dict(zip(chosen, (float(part) for part in parts), strict=True))
 
 
 def _drift(values: np.ndarray) -> tuple[float, float, bool]:

@@ -12,7 +12,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label, band
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
-from capsule_id.experiments.free_vibration.checks import check_free_decay, check_stiffness
+from capsule_id.experiments.free_vibration.checks import check_free_decay, check_halves, check_stiffness
 from capsule_id.experiments.free_vibration.decay_models import (
     decay,
     decay_moments,
@@ -21,15 +21,17 @@ from capsule_id.experiments.free_vibration.decay_models import (
     uniform_step,
     viscous_basis,
 )
-from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TURNING_TIME
+from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import (
-    PEAK_NOISE_RATIO,
     Decrement,
+    crossing_decrement,
+    damping_of_peaks,
     equilibrium,
     logarithmic_decrement,
     trend,
 )
 from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, default_block_size, is_even
+from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Channel, channel_of
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.starts import decay_starts
@@ -69,7 +71,7 @@ def stated_model(table: Table) -> DecayModel:
 
 
 class FreeVibration(SurfaceExperiment):
-    """x_rel(t) of one raw record; all records share k1, c and the parameters of further forces.
+    """One channel of one raw record; all records share k1, c and the parameters of further forces.
 
     For viscous damping and a linear spring the two solutions enter linearly and are integrated out. Any other decay
     starts at its last turning point before the record, which is sampled. Offset and linear drift are integrated out.
@@ -93,9 +95,11 @@ class FreeVibration(SurfaceExperiment):
     model: DecayModel = eqx.field(static=True)
     half_cycles: int = eqx.field(static=True)
     uniform: bool = eqx.field(static=True)
+    #: Order of the time derivative of x_rel that the readings are.
+    order: int = eqx.field(static=True)
 
     time_series = True
-    checks = (check_stiffness, check_free_decay)
+    checks = (check_stiffness, check_free_decay, check_halves)
     tables = (decay_table, damping_table, second_fit_table)
 
     def __init__(
@@ -109,13 +113,14 @@ class FreeVibration(SurfaceExperiment):
         """Make one record; ``model`` None: as stated in the settings; ``screened`` gives starts."""
         self.friction = friction
         self.model = model or stated_model(table)
+        self.order = CHANNELS[channel_of(table)].order
         time, values = decay_window(table)
-        blocks = block_means(time - float(time[0]), values, self.model.thin)
+        blocks = block_means(time - float(time[0]), values, self.model.thin, by_sample=channel_of(table) != "x_rel")
         self.time, self.values, self.nodes, self.weights = blocks.time, blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)
         self.relative_sd = np.squeeze(1.0 / np.sqrt(self.times.count))
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
-        self.reading_sd = table.columns["x_rel"].reading_sd
+        self.reading_sd = table.columns[channel_of(table)].reading_sd
         step = uniform_step(self.time)
         self.uniform = (
             step is not None and self.model == DecayModel(thin=self.model.thin) and self.relative_sd.ndim == 0
@@ -127,7 +132,7 @@ class FreeVibration(SurfaceExperiment):
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side, self.half_cycles = 1.0, 0
         self.about = DecayAbout(table, rig, (), screened)
-        rows = [parameter("k1"), parameter("c"), NOISE_SD.named(table.label, self.noise_prior())]
+        rows = [parameter("k1"), parameter("c"), self.channel.noise.named(table.label, self.noise_prior())]
         if self.model.whitened:
             period = 2.0 * np.pi / self.rough_decrement().Omega_o
             rows += noise_parameters(self.model, self.time, period, table.label)
@@ -139,7 +144,9 @@ class FreeVibration(SurfaceExperiment):
             hardening = Prior("normal", 0.0, rough.k1 / self.largest_deflection**2)
             rows += [parameter(s, prior=hardening if s == "k_cubic" else None) for s in self.model.symbols]
             rows += [
-                AMPLITUDE.named(table.label, Prior("lognormal", float(np.ptp(self.values)), NUISANCE_WIDTH)),
+                AMPLITUDE.named(
+                    table.label, Prior("lognormal", self.deflection * float(np.ptp(self.values)), NUISANCE_WIDTH)
+                ),
                 TURNING_TIME.named(table.label, Prior("normal", 0.0, float(self.time[-1]))),
             ]
         self.about = DecayAbout(table, rig, tuple(rows), screened)
@@ -177,7 +184,7 @@ class FreeVibration(SurfaceExperiment):
 
     @property
     def scatters(self) -> tuple[str]:
-        return ("noise_sd",)
+        return (self.channel.noise.symbol,)
 
     @property
     def masses(self) -> tuple[str, ...]:
@@ -185,7 +192,17 @@ class FreeVibration(SurfaceExperiment):
 
     @property
     def column(self) -> Column:
-        return self.table.columns["x_rel"]
+        return self.table.columns[channel_of(self.table)]
+
+    @property
+    def channel(self) -> Channel:
+        """The recorded quantity."""
+        return tuple(CHANNELS.values())[self.order]
+
+    @property
+    def deflection(self) -> float:
+        """x_rel over the magnitude of the channel, at the rough frequency; SI."""
+        return 1.0 if self.order == 0 else abs(self.channel.deflection(self.rough_decrement().Omega_o))
 
     @property
     def observed(self) -> np.ndarray:
@@ -208,7 +225,7 @@ class FreeVibration(SurfaceExperiment):
             return self.values, xp.concatenate([basis, trend], axis=1)
         forces = {symbol: theta[symbol] for symbol in ("k1", "c", "m1", *self.model.symbols)}
         motion = decay(nodes, forces, theta["amplitude"], theta["turning_time"], self.half_cycles)
-        return self.values - self.side * block_mean(xp.asarray(motion.x_rel), self.weights, xp), trend
+        return self.values - self.side * block_mean(xp.asarray(motion[self.order]), self.weights, xp), trend
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         raw, design = self.unwhitened(theta, xp)
@@ -230,7 +247,7 @@ class FreeVibration(SurfaceExperiment):
 
     @property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
-        """Time, s from the first sample, and x_rel, m, of every sample, thinned or not."""
+        """Time, s from the first sample, and the channel, SI, of every sample, thinned or not."""
         time, values = decay_window(self.table)
         return time - time[0], values
 
@@ -268,14 +285,12 @@ class FreeVibration(SurfaceExperiment):
         decrement = self.decrement()
         if decrement is not None and decrement.delta > 0.0:
             return decrement
-        x = self.values - equilibrium(self.values)
-        # The noise of a rod at rest crosses zero too, so only swings beyond it count.
-        swings = np.flatnonzero(np.abs(x) > max(PEAK_NOISE_RATIO * noise_level(self.values), 0.1 * np.ptp(x)))
-        crossings = swings[1:][np.diff(np.signbit(x[swings]))]
-        spacing = np.median(np.diff(self.time[crossings])) if len(crossings) > 1 else 0.5 * self.time[-1]
-        omega = float(np.pi / spacing)
-        k1 = self.mass * omega**2
-        return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * self.mass)))
+        return crossing_decrement(self.time, self.values, self.mass)
+
+    def rough_damping(self, symbols: Sequence[str]) -> dict[str, float]:
+        """Rough c, and those of F_dry and c_q in ``symbols``, SI, from the peaks; {} with too few of them."""
+        decrement = self.decrement()
+        return {} if decrement is None else damping_of_peaks(decrement, self.mass, self.deflection, symbols)
 
     def starts(self) -> dict[str, Start]:
         return decay_starts(self)
@@ -284,24 +299,30 @@ class FreeVibration(SurfaceExperiment):
         """Rough time, s, and signed x_rel, m, of the last turning point before the record, or at its first samples."""
         rough = self.rough_decrement()
         half_period = np.pi / rough.Omega_o
-        back = int(np.ceil(rough.times[0] / half_period - LATEST_TURNING_POINT))
-        growth = float(np.exp(0.5 * max(rough.delta, 0.0) * back))
-        return float(rough.times[0] - back * half_period), float(rough.peaks[0] * (-1.0) ** back * growth)
+        # A velocity peaks a quarter of a period before the turning point.
+        first = float(rough.times[0]) + (0.5 * half_period if self.order == 1 else 0.0)
+        back = int(np.ceil(first / half_period - LATEST_TURNING_POINT))
+        growth = rough.first_ratio**back
+        peak = self.channel.deflection(rough.Omega_o) * float(rough.peaks[0])
+        return first - back * half_period, peak * (-1.0) ** back * growth
 
     # -- interface to the report and the checks ---------------------------------------------------------------------
 
     @property
     def largest_deflection(self) -> float:
         """Largest distance of a sample from the rest position, m."""
-        return float(np.max(np.abs(self.values - equilibrium(self.values))))
+        return self.deflection * float(np.max(np.abs(self.values - equilibrium(self.values))))
 
     def damping_trend(self) -> Facts:
         """Drift of damping and frequency of the peaks with amplitude, see ``trend``; empty without drift."""
         decrement = self.decrement()
-        return {} if decrement is None else trend(decrement, noise_level(self.values))
+        facts = {} if decrement is None else trend(decrement, noise_level(self.values))
+        return facts and {**facts, "amplitude": tuple(self.deflection * size for size in facts["amplitude"])}
 
     def largest_force(self, theta: ValuesBySymbol) -> float:
         """Largest |f| over the record, N; f = k1 x_rel + c d(x_rel)/dt."""
+        if self.order > 0:
+            return float(theta["k1"]) * self.largest_deflection
         x = self.smoothed() - equilibrium(self.values)
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.whole[0]))))
 

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from capsule_id.experiments.free_vibration.readings.channels import channel_of
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.model import Quantity, Settings, Table
@@ -121,9 +122,9 @@ def rows_in_window(table: Table) -> np.ndarray:
 
 
 def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
-    """Return (time, x_rel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
+    """Return (time, channel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
     inside = rows_in_window(table)
-    return table["time"][inside], table["x_rel"][inside]
+    return table["time"][inside], table[channel_of(table)][inside]
 
 
 def release_time(decay: FreeDecay) -> float:

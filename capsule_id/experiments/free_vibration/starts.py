@@ -22,7 +22,7 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
     starts = {
         "k1": Start(rough.k1, spread),
         "c": Start(rough.c, 0.3),
-        f"noise_sd[{e.label}]": Start(noise, 0.2),
+        e.channel.noise.named(e.label).name: Start(noise, 0.2),
     }
     if not e.closed:
         time, peak = e.first_turning_point()
@@ -32,7 +32,12 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
             "c_q": Start(0.5 * rough.c / (rough.Omega_o * size), 0.3),
             "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
         }
+        rough_damping = e.rough_damping(e.model.symbols)
+        forces |= {
+            name: Start(max(rough_damping.get(name, 0.0), 0.2 * forces[name].centre), 0.2) for name in ("F_dry", "c_q")
+        }
         starts |= {symbol: forces[symbol] for symbol in e.model.symbols}
+        starts["c"] = Start(max(rough_damping.get("c", rough.c), 0.1 * rough.c), 0.2)
         starts[f"amplitude[{e.label}]"] = Start(size, 0.05)
         starts[f"turning_time[{e.label}]"] = Start(time, 0.05 / rough.Omega_o)
     known = {} if e.about.screened is None else e.about.screened.values

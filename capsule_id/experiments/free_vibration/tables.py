@@ -73,7 +73,7 @@ def second_fit_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Re
                 "fit": role,
                 "model": model.name,
                 "parameters": ", ".join(f"{name} = {mean:.5g} ± {sd:.2g}" for name, (mean, sd) in means.items()),
-                "noise, m": float(np.mean([one.noise for one in fits])),
+                "noise, SI": float(np.mean([one.noise for one in fits])),
                 "BIC": sum(one.bic for one in fits),
                 "residuals white": "yes" if white else "no",
             }

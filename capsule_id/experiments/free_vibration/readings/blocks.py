@@ -42,13 +42,15 @@ class Blocks:
     weights: np.ndarray
 
 
-def block_means(time: np.ndarray, values: np.ndarray, size: int) -> Blocks:
+def block_means(time: np.ndarray, values: np.ndarray, size: int, by_sample: bool = False) -> Blocks:
     """Divide a record into blocks of ``size`` samples; 1 leaves it as it is.
 
     Parameters
     ----------
     time, values : (n,) s, increasing, and readings. The last samples of an even record may not fill a block; they are
         left out
+    by_sample : take every sample as a node. A velocity with dry friction has kinks and an acceleration jumps, so two
+        nodes do not suffice
     """
     if size == 1:
         one = np.ones((len(time), 1))
@@ -74,9 +76,15 @@ def block_means(time: np.ndarray, values: np.ndarray, size: int) -> Blocks:
     sides = 0.5 * np.stack([skew + root, skew - root], axis=1)
     weights = np.stack([-sides[:, 1], sides[:, 0]], axis=1) / root[:, None]
     sides[lone] = 0.0
+    nodes = middle[:, None] + sides
     edges = np.flatnonzero(np.diff(number, prepend=-1, append=number[-1] + 1))
     first, last = time[edges[:-1]], time[edges[1:] - 1]
-    return Blocks(middle, mean(values), first, last, count, middle[:, None] + sides, weights)
+    if by_sample:
+        place = np.arange(int(np.max(count)))[None]
+        inside = place < count[:, None]
+        nodes = time[np.where(inside, edges[:-1, None] + place, edges[:-1, None])]
+        weights = inside / count[:, None]
+    return Blocks(middle, mean(values), first, last, count, nodes, weights)
 
 
 def is_even(time: np.ndarray) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from capsule_id.experiments.free_vibration.decay_models import HalfCycles, half_cycles, interpolate
 from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 #: Largest number of evaluations in a fit, and relative step of its difference quotients.
 EVALUATIONS, STEP = 40, 1e-5
+#: Replaces the effect of an unknown that the record does not depend on.
+UNKNOWN = 1e-12
+#: Starts of a fit with dry friction: rounds of one batch each, standard deviations of their scaled unknowns (F_dry:
+#: logarithm) after the first round, and number of starts that are fitted.
+DRY_ROUNDS, DRY_FITS = 8, 3
+DRY_SPREADS: Mapping[str, float] = {"F_dry": 0.15, "c": 0.3, "k1": 0.01, "amplitude": 0.04}
 #: White over correlated noise that stands for white noise.
 WHITE = 1e3
 #: Unknowns of a fit, and bounds of their scaled values. Masses, forces and times are logarithms, or fractions of the
@@ -76,10 +82,10 @@ def _paths(thetas: Mapping[str, Any], number: int) -> HalfCycles:
     return jax.vmap(partial(half_cycles, number=number))(forces, thetas["amplitude"], thetas["turning_time"])
 
 
-@jax.jit
-def _positions(paths: HalfCycles, nodes: Any, weights: Any) -> Any:
-    """(batch, n) block means of x_rel, m."""
-    return jax.vmap(lambda path: block_mean(interpolate(path, nodes.ravel()).x_rel, weights, jnp))(paths)
+@partial(jax.jit, static_argnames="order")
+def _readings(paths: HalfCycles, nodes: Any, weights: Any, order: int) -> Any:
+    """(batch, n) block means of x_rel or of its derivative of this order, SI."""
+    return jax.vmap(lambda path: block_mean(interpolate(path, nodes.ravel())[order], weights, jnp))(paths)
 
 
 @jax.jit
@@ -110,12 +116,17 @@ class Screening:
         self.side, self.size = float(np.sign(peak)), abs(peak)
         self.m1, self.k1, self.c, self.omega = record.mass, rough.k1, rough.c, rough.Omega_o
         period, length = 2.0 * np.pi / self.omega, float(record.time[-1])
-        blocks = block_means(*record.whole, thin or record.model.thin)
+        self.order = record.order
+        blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
         self.values, self.nodes, self.weights = blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)
         # The margin allows for a frequency 1.25 times the rough estimate.
         self.number = int(2.5 * length / period) + 5
         self.noise_time, self.drift_time = 0.1 * period, period
+        self.rough_damping, self.mean_peak = (
+            record.rough_damping,
+            record.deflection * float(np.mean(np.abs(rough.peaks))),
+        )
 
     def theta(self, z: np.ndarray) -> dict[str, Any]:
         """Values by symbol, SI, of scaled unknowns (..., names)."""
@@ -136,9 +147,21 @@ class Screening:
             "drift_time": self.drift_time * np.exp(own["drift_time"]),
         }
 
+    def scaled(self, values: Mapping[str, float]) -> np.ndarray:
+        """(names,) scaled unknowns at values by symbol, SI, of another fit; amplitude and time of this record's own."""
+        z = np.zeros(len(NAMES))
+        units = {"F_dry": self.k1 * self.size, "c_q": self.m1 / self.size, "k_cubic": self.k1 / self.size**2}
+        logarithms = {"k1": self.k1, "c": self.c, "noise_time": self.noise_time, "drift_time": self.drift_time}
+        for name, unit in units.items():
+            z[NAMES.index(name)] = values.get(name, 0.0) / unit
+        for name, unit in {**logarithms, "white_ratio": 1.0, "drift_ratio": 1.0}.items():
+            if values.get(name, 0.0) > 0.0:
+                z[NAMES.index(name)] = np.log(values[name] / unit)
+        return z
+
     def start(self, model: DecayModel, near: np.ndarray | None) -> np.ndarray:
         """(names,) scaled starting values; absent terms are switched off."""
-        z = np.zeros(len(NAMES)) if near is None else near.copy()
+        z = self.scaled(self.rough_damping(model.symbols)) if near is None else near.copy()
         free = free_symbols(model)
         for name, value in (("F_dry", 0.02), ("c_q", 0.05), ("k_cubic", 0.0), ("drift_time", 1.0)):
             i = NAMES.index(name)
@@ -153,45 +176,91 @@ class Screening:
             z[i] = (z[i] if inside and near is not None else value) if name in free else absent
         return z
 
+    def dry_starts(self, start: np.ndarray) -> np.ndarray:
+        """(starts, names) starts of different dry friction, where the peaks lose about as much in all of them.
+
+        The rod sticks after a whole number of half cycles, so the likelihood of dry friction has many maxima.
+        """
+        i, j = NAMES.index("F_dry"), NAMES.index("c")
+        found = self.theta(start)
+        known = "F_dry" in self.rough_damping(("F_dry",))
+        grid = found["F_dry"] * np.geomspace(0.5, 2.0, len(NAMES) + 1)
+        if not known:
+            grid = self.k1 * self.size * np.geomspace(0.003, 0.45, len(NAMES) + 1)
+        lost = (found["F_dry"] if known else 0.0) - grid
+        c = np.maximum(found["c"] + lost * 4.0 / (np.pi * self.omega * self.mean_peak), 0.02 * self.c)
+        starts = np.tile(start, (len(grid), 1))
+        starts[:, i], starts[:, j] = grid / (self.k1 * self.size), np.log(c / self.c)
+        moved = np.repeat(starts[None], DRY_ROUNDS, axis=0)
+        rng = np.random.default_rng(0)
+        for name, spread in DRY_SPREADS.items():
+            z = spread * rng.standard_normal(moved.shape[:2])
+            place = NAMES.index(name)
+            moved[1:, :, place] = (
+                (moved[1:, :, place] * np.exp(z[1:])) if name == "F_dry" else moved[1:, :, place] + z[1:]
+            )
+        return moved.reshape(-1, len(NAMES))
+
     def fit(self, model: DecayModel, near: np.ndarray | None = None) -> tuple[Screened, np.ndarray]:
         """Fit ``model`` from the scaled values ``near``; return also the scaled values found."""
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
         sloped = float(model.drift == "linear")
 
         jacobians: dict[bytes, np.ndarray] = {}
+        unit = float(np.std(self.values))
+
+        def whitened(whole: np.ndarray) -> np.ndarray:
+            """(names + 1, n) residuals at as many scaled unknowns."""
+            thetas = {name: jnp.asarray(value) for name, value in self.theta(whole).items()}
+            paths = _paths(thetas, self.number)
+            raw = self.values[None] - self.side * _readings(paths, self.nodes, self.weights, self.order)
+            return np.asarray(_whitened(self.times, raw, thetas, sloped)) / unit
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
             sign = np.where(z > high - 2.0 * STEP, -1.0, 1.0)
             whole = np.tile(start, (len(NAMES) + 1, 1))
             whole[: len(free) + 1, free] = np.concatenate([z[None], z + STEP * np.diag(sign)])
-            thetas = {name: jnp.asarray(value) for name, value in self.theta(whole).items()}
-            raw = self.values[None] - self.side * _positions(_paths(thetas, self.number), self.nodes, self.weights)
-            points = np.asarray(_whitened(self.times, raw, thetas, sloped))[: len(free) + 1] / unit
+            points = whitened(whole)[: len(free) + 1]
             jacobians[z.tobytes()] = (points[1:] - points[:1]).T / (STEP * sign)
             return points[0]
 
         low, high = np.array([BOUNDS[NAMES[i]] for i in free]).T
-        first = np.clip(start[free], low + 1e-3, high - 1e-3)
-        unit = float(np.std(self.values))
-        found = least_squares(
-            residuals,
-            first,
-            jac=lambda z: jacobians[z.tobytes()],  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
-            bounds=(low, high),
-            x_scale="jac",
-            max_nfev=EVALUATIONS,
-        )
-        z = start.copy()
-        z[free] = found.x
-        n, unknowns = len(self.values), len(free) + 2 + int(sloped)
+        starts = [start]
+        if near is None and "dry" in model.damping:
+            offered = self.dry_starts(start)
+            parts = offered.reshape(-1, len(NAMES) + 1, len(NAMES))
+            costs = np.concatenate([np.sum(whitened(part) ** 2, axis=1) for part in parts])
+            starts = list(offered[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:DRY_FITS]])
+        ends = [
+            least_squares(
+                residuals,
+                np.clip(one[free], low + 1e-3, high - 1e-3),
+                jac=lambda z: jacobians[z.tobytes()],  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+                bounds=(low, high),
+                x_scale="jac",
+                max_nfev=EVALUATIONS,
+            )
+            for one in starts
+        ]
+        found = min(ends, key=lambda end: end.cost)
+        start[free] = found.x
+        return self._summary(model, start, found, unit), start
+
+    def _summary(self, model: DecayModel, z: np.ndarray, found: OptimizeResult, unit: float) -> Screened:
+        """Estimates at the end ``found`` of a fit, at the scaled unknowns ``z`` (names,); ``unit`` of its residuals."""
+        free = free_symbols(model)
+        n, unknowns = len(self.values), len(free) + 2 + int(model.drift == "linear")
         deviance = n * (np.log(2.0 * found.cost * unit**2 / n) + 1.0 + LOG_2PI)
         values = {name: float(value) for name, value in self.theta(z).items()}
-        variances = np.maximum(np.diag(np.linalg.pinv(found.jac.T @ found.jac, hermitian=True)), 0.0)
+        norms = np.linalg.norm(found.jac, axis=0)
+        norms = np.where(norms > 0.0, norms, UNKNOWN)
+        scaled = found.jac / norms
+        variances = np.maximum(np.diag(np.linalg.pinv(scaled.T @ scaled, hermitian=True)), UNKNOWN) / norms**2
         sd = np.sqrt(variances * 2.0 * found.cost / max(n - unknowns, 1))
-        moved = {name: self.theta(z + STEP * np.eye(len(NAMES))[NAMES.index(name)]) for name in free_symbols(model)}
+        moved = {name: self.theta(z + STEP * np.eye(len(NAMES))[NAMES.index(name)]) for name in free}
         errors = {
             name: float(abs(moved[name][name] - values[name]) / STEP * own) for name, own in zip(moved, sd, strict=True)
         }
         noise = float(np.sqrt(2.0 * found.cost / n)) * unit
-        return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun), z
+        return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun)

@@ -16,7 +16,7 @@ from scipy.signal import lsim
 
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
-from capsule_id.experiments.free_vibration.decay_models import viscous_basis
+from capsule_id.experiments.free_vibration.decay_models import rates
 from capsule_id.experiments.free_vibration.readings.blocks import block_size
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
 from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
@@ -66,7 +66,7 @@ def demands_another(record: "FreeVibration", level: float) -> bool:
     noise = max(noise_level(record.values), 1e-6 * float(np.ptp(record.values)))
     # Steps of the fit must not start from an overdamped decay.
     c = min(rough.c, float(np.sqrt(rough.k1 * record.mass)))
-    theta = {"m1": record.mass, "k1": rough.k1, "c": c, "noise_sd": noise}
+    theta = {"m1": record.mass, "k1": rough.k1, "c": c, record.scatters[0]: noise}
     theta |= {symbol: value for symbol, (value, _) in refit(record, theta, []).items()}
     residuals = np.asarray(record.residuals(theta, np))[: record.n]
     return ljung_box(residuals)[1] < level or response_p(record, theta) < level
@@ -80,11 +80,17 @@ def response_p(record: "FreeVibration", theta: Mapping[str, float]) -> float:
     length = float(record.time[-1])
     points = max(200, int(RESPONSE_POINTS * length * np.sqrt(k1 / m1) / (2.0 * np.pi)))
     grid = np.linspace(0.0, length, points)
-    x = viscous_basis(grid, k1, c, m1, np) @ parts[:2]
-    rate = np.gradient(x, grid[1])
+    gamma, omega = rates(k1, c, m1, np)
+    rate_of = complex(-gamma, omega)
+    # The readings are the real part of A exp(rate t); x_rel is that of A exp(rate t) / rate^order.
+    curve = complex(parts[0], -parts[1]) / rate_of**record.order * np.exp(rate_of * grid)
+    x, rate = curve.real, (rate_of * curve).real
     system = ([1.0 / m1], [1.0, c / m1, k1 / m1])
     forces = [force / np.max(np.abs(force)) for force in (np.sign(rate), rate * np.abs(rate), x**3)]
-    columns = [np.interp(record.time, grid, lsim(system, force, grid)[1]) for force in forces]
+    responses = [lsim(system, force, grid)[1] for force in forces]
+    for _ in range(record.order):
+        responses = [np.gradient(response, grid[1]) for response in responses]
+    columns = [np.interp(record.time, grid, response) for response in responses]
     relative = record.time / length - 0.5
     extra = np.column_stack([*columns, relative, relative**2])
     moved = [record.unwhitened({**theta, name: 1.001 * theta[name]}, np)[1] @ parts for name in ("k1", "c")]
