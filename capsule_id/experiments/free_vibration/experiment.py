@@ -34,7 +34,7 @@ from capsule_id.experiments.free_vibration.readings.blocks import block_mean, bl
 from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Channel, channel_of
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
-from capsule_id.experiments.free_vibration.starts import decay_starts
+from capsule_id.experiments.free_vibration.starts import decay_starts, first_turning_point
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_table, second_fit_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -49,8 +49,6 @@ if TYPE_CHECKING:
 
 #: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
-#: Latest first turning point after the first sample, in half periods.
-LATEST_TURNING_POINT = 0.1
 #: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
 SMOOTHING_ORDER = 3
 
@@ -137,7 +135,7 @@ class FreeVibration(SurfaceExperiment):
             period = 2.0 * np.pi / self.rough_decrement().Omega_o
             rows += noise_parameters(self.model, self.time, period, table.label)
         if not self.closed:
-            rough, turning = self.rough_decrement(), self.first_turning_point()
+            rough, turning = self.rough_decrement(), first_turning_point(self)
             self.side = float(np.sign(turning[1]))
             # The margin allows for a frequency 1.25 times the rough estimate.
             self.half_cycles = int(1.25 * rough.Omega_o * float(self.time[-1]) / np.pi) + 5
@@ -294,17 +292,6 @@ class FreeVibration(SurfaceExperiment):
 
     def starts(self) -> dict[str, Start]:
         return decay_starts(self)
-
-    def first_turning_point(self) -> tuple[float, float]:
-        """Rough time, s, and signed x_rel, m, of the last turning point before the record, or at its first samples."""
-        rough = self.rough_decrement()
-        half_period = np.pi / rough.Omega_o
-        # A velocity peaks a quarter of a period before the turning point.
-        first = float(rough.times[0]) + (0.5 * half_period if self.order == 1 else 0.0)
-        back = int(np.ceil(first / half_period - LATEST_TURNING_POINT))
-        growth = rough.first_ratio**back
-        peak = self.channel.deflection(rough.Omega_o) * float(rough.peaks[0])
-        return first - back * half_period, peak * (-1.0) ** back * growth
 
     # -- interface to the report and the checks ---------------------------------------------------------------------
 

@@ -8,6 +8,9 @@ from capsule_id.experiments.base import Start
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium
 from capsule_id.records.noise import noise_level
 
+#: Latest first turning point after the first sample, in half periods.
+LATEST_TURNING_POINT = 0.1
+
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
 
@@ -25,7 +28,7 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
         e.channel.noise.named(e.label).name: Start(noise, 0.2),
     }
     if not e.closed:
-        time, peak = e.first_turning_point()
+        time, peak = first_turning_point(e)
         size = abs(peak)
         forces = {
             "F_dry": Start(0.02 * rough.k1 * size, 0.3),
@@ -49,6 +52,18 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
             floor = 1e-3 * near.centre if row.positive else -np.inf
             starts[row.name] = Start(max(value, floor), 0.3 * near.spread)
     return starts
+
+
+def first_turning_point(e: "FreeVibration") -> tuple[float, float]:
+    """Rough time, s, and signed x_rel, m, of the last turning point before the record, or at its first samples."""
+    rough = e.rough_decrement()
+    half_period = np.pi / rough.Omega_o
+    # A velocity peaks a quarter of a period before the turning point.
+    first = float(rough.times[0]) + (0.5 * half_period if e.order == 1 else 0.0)
+    back = int(np.ceil(first / half_period - LATEST_TURNING_POINT))
+    growth = rough.first_ratio**back
+    peak = e.channel.deflection(rough.Omega_o) * float(rough.peaks[0])
+    return first - back * half_period, peak * (-1.0) ** back * growth
 
 
 def starts_of_motion(e: "FreeVibration", rough: Decrement) -> dict[str, Start]:

@@ -14,6 +14,7 @@ from capsule_id.experiments.free_vibration.decay_models import HalfCycles, half_
 from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, whiten_by_shape
 from capsule_id.experiments.free_vibration.settings import DecayModel
+from capsule_id.experiments.free_vibration.starts import first_turning_point
 from capsule_id.experiments.linear import LOG_2PI
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ class Screening:
 
     def __init__(self, record: "FreeVibration", thin: int | None = None) -> None:
         rough = record.rough_decrement()
-        self.turning_time, peak = record.first_turning_point()
+        self.turning_time, peak = first_turning_point(record)
         self.side, self.size = float(np.sign(peak)), abs(peak)
         self.m1, self.k1, self.c, self.omega = record.mass, rough.k1, rough.c, rough.Omega_o
         period, length = 2.0 * np.pi / self.omega, float(record.time[-1])
