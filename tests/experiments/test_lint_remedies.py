@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import capsule_id as cid
+from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import default_registry
 from capsule_id.report.texts.messages import finding_text, messages_of
@@ -149,3 +150,16 @@ def test_decays_of_one_rig_have_one_frequency() -> None:
     (finding,) = found(bench.rig(recorded("a", 1.0), recorded("b", 60.0)), "decays.frequency")
     assert (finding.level, finding.experiment) == ("fail", "b")
     assert "The ratio is near 60 (min and s)." in text(finding)
+
+
+def test_a_rod_that_friction_holds_after_one_swing_needs_a_larger_release() -> None:
+    """F_dry is 0.35 of the spring's force at the first release, and 0.07 of it at the second."""
+    time = np.arange(250) / 500.0
+    forces = {"k1": bench.K1, "c": 1.0, "m1": bench.M1, "F_dry": 0.35 * bench.K1 * 2e-3}
+    one, larger = (
+        bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)])
+        for x in (np.asarray(rubbed(time, forces, release, 0.0, 30).x_rel) for release in (2e-3, 1e-2))
+    )
+    with pytest.raises(cid.InputError, match="release it from a larger deflection"):
+        KINDS["free_vibration"].check([one])
+    KINDS["free_vibration"].check([larger])

@@ -68,6 +68,9 @@ def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str
     (second,), (finding,) = second_models([record(disturbance, extra)])
     assert second.model == expected
     assert (finding.code, finding.level, finding.experiment) == ("decays.second_fit", "warn", "decay")
+    assert ("The zero drifts by" in MESSAGES["decays.second_fit"].text("warn", finding.facts)) == (
+        expected.drift != "none"
+    )
 
 
 def test_a_record_with_two_excitations_keeps_its_model(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,10 +125,13 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         size = (values - equilibrium(values)) / np.ptp(values)
         sides = np.sign(size[np.abs(size) > SMALLEST_SWING])
         swings = int(np.count_nonzero(np.diff(sides)))
+        stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SMALLEST_SWING
         if table.settings.samples == "record" and swings < FEWEST_SWINGS:
             rule = f"{channel_of(table)} must pass its rest position at least {FEWEST_SWINGS} times"
             remedy = (
-                "record a period or more, with at least 10 samples per period; where each row is a turning point, state "
+                "friction holds the rod after one swing: release it from a larger deflection, or reduce the friction"
+                if stuck
+                else "record a period or more, with at least 10 samples per period; where each row is a turning point, state "
                 'samples = "turning_points"'
             )
             raise InputError(rule, f"{swings} in {len(values)} samples", remedy, Path(table.file), int(table.rows[0]))
@@ -218,7 +221,8 @@ def _second_fit(facts: Facts) -> str:
     """The records that contradict the stated model, the quoted model and the lines that state it."""
     return (
         f"{', '.join(facts['labels'])}: the record contradicts the first model ({facts['first']}). The quoted values are those "
-        f"of a second fit: {facts['second']}. To state it, write {facts['lines']}. To keep the first model, state its words."
+        f"of a second fit: {facts['second']}.{facts['drift']} To state it, write {facts['lines']}. To keep the first model, "
+        f"state its words."
     )
 
 

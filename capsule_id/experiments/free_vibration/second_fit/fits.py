@@ -248,6 +248,19 @@ class Screening:
         start[free] = found.x
         return self._summary(model, start, found, unit), start
 
+    def drift(self, z: np.ndarray) -> float:
+        """Range of the mean over one period of measured minus predicted readings, SI, at scaled unknowns (names,)."""
+        thetas = {name: jnp.asarray(value) for name, value in self.theta(np.tile(z, (len(NAMES) + 1, 1))).items()}
+        paths = _paths(thetas, self.number)
+        raw = self.values - self.side * np.asarray(_readings(paths, self.nodes, self.weights, self.order))[0]
+        time = self.times.time
+        window = 2.0 * np.pi / self.omega
+        first, last = np.searchsorted(time, time - 0.5 * window), np.searchsorted(time, time + 0.5 * window)
+        total = np.concatenate([[0.0], np.cumsum(raw)])
+        means = (total[last] - total[first]) / (last - first)
+        whole = means[(time > 0.5 * window) & (time < time[-1] - 0.5 * window)]
+        return float(np.ptp(whole)) if len(whole) else 0.0
+
     def _summary(self, model: DecayModel, z: np.ndarray, found: OptimizeResult, unit: float) -> Screened:
         """Estimates at the end ``found`` of a fit, at the scaled unknowns ``z`` (names,); ``unit`` of its residuals."""
         free = free_symbols(model)

@@ -197,7 +197,19 @@ def second_models(
         model = ranking.model
         if model != own[0].model:
             facts = {"labels": contradicting, "first": own[0].model.name, "second": model.name, "lines": model.lines}
+            facts["drift"] = _drift_text(own, ranking)
             findings.append(Finding("decays.second_fit", "warn", facts, contradicting[0]))
             for i, (screened, _) in zip(members, ranking.fits, strict=True):
                 chosen[i] = records[i].with_model(model, screened)
     return chosen, findings
+
+
+def _drift_text(records: Sequence["FreeVibration"], ranking: Ranking) -> str:
+    """A sentence on the size of the drift in every record; "" without a drift."""
+    if ranking.model.drift == "none":
+        return ""
+    sizes = []
+    for record, (_, z) in zip(records, ranking.fits, strict=True):
+        size = Screening(record, ranking.model.thin).drift(z) * record.column.to_display
+        sizes.append(f"{size:.2g} {record.column.unit} in {record.label}")
+    return f" The zero drifts by {', '.join(sizes)}."
