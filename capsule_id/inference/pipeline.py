@@ -30,6 +30,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
+from capsule_id.inference.checks.run_widening import run_widenings
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.checks.widening import widenings
@@ -135,7 +136,7 @@ def check_fit(sampled: Setting, before: Sequence[Finding] = ()) -> Setting:
     checked = run_checks(sampled)
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
     checked = replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
-    widened = widenings(checked)
+    widened = {**widenings(checked), **run_widenings(checked)}
     if not widened:
         return checked
     facts = {"factors": [(name, one.factor, one.parts) for name, one in widened.items()]}

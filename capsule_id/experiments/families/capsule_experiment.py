@@ -27,6 +27,11 @@ class CapsuleForward(SurfaceExperiment):
     event_driven = True
 
     @property
+    def excitation_period(self) -> float | None:
+        """s; None where nothing excites the capsule periodically."""
+        return None
+
+    @property
     def masses(self) -> tuple[str, ...]:
         return ("m1", "m2")
 

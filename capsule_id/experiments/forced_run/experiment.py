@@ -177,6 +177,10 @@ class ForcedRun(CapsuleForward):
         return np.array([sd or 0.0 for sd in sds]), tuple(sd is not None for sd in sds)
 
     @property
+    def excitation_period(self) -> float | None:
+        return 2.0 * np.pi / self.Omega
+
+    @property
     def rough(self) -> RunStart:
         return self.about.rough
 

@@ -43,6 +43,11 @@ class Widening:
     quantile: float
     parts: int
 
+    @property
+    def stretch(self) -> float:
+        """Factor of the half-length of the 95 % interval."""
+        return self.factor * self.quantile
+
 
 def widenings(s: Setting) -> dict[str, Widening]:
     """Error of the model of every physical parameter that a failed check of its bench test concerns, by name."""

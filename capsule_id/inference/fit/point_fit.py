@@ -152,7 +152,7 @@ def _steps(target: LogPosterior) -> np.ndarray:
 
 def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """(d,) approximate diagonal information: squared residual Jacobian, and 2n for the scatter of n readings."""
-    jacobian = _residual_jacobian(target, u)
+    jacobian = residual_jacobian(target, u)
     count = np.zeros(target.dimension)
     for experiment in target.experiments:
         for row in experiment.parameters:
@@ -161,7 +161,7 @@ def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     return np.maximum(np.where(target.scatter, count, np.sum(jacobian**2, axis=0)), 1e-2)
 
 
-def _residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+def residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """(n, d) Jacobian of the standardised residuals, scatters in the denominator included."""
     return jacobian(target.plain_residuals, u, _steps(target))
 
@@ -172,7 +172,7 @@ def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> 
     The error of a parameter sampled through its logarithm is its relative error times its value.
     """
     located = ~target.scatter
-    at_fit = _residual_jacobian(target, u)[:, located]
+    at_fit = residual_jacobian(target, u)[:, located]
     errors = np.full(len(u), np.nan)
     matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
     errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]

@@ -76,7 +76,7 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
     }
     for end in ("lower", "upper"):
         if end in entry:
-            value, limit, stretch = entry["value"], entry[end], widening.factor * widening.quantile
+            value, limit, stretch = entry["value"], entry[end], widening.stretch
             moved = value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
             found |= {end: moved, f"{end}_unwidened": limit}
     return found

@@ -1,0 +1,106 @@
+"""Error of the model in runs, from the scores of parts of their records.
+
+residuals and Jacobian at the fit -> derivative with respect to one parameter, the others refitted
+    -> step of that parameter from every part -> chi-square between the parts (``widening``)
+
+A run determines some parameters only as a whole, so its parts are not fitted. Each part gives a Gauss-Newton step of
+one parameter and its sd. A record is divided into successive whole excitation periods, and by phase of the excitation.
+A misfit that repeats with every period shows between phases only. The widest interval counts.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from capsule_id.experiments.families.capsule_experiment import CapsuleForward
+from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.widening import FEWEST_PARTS, LARGEST_RELATIVE_SD, MOST_PARTS, Widening, widening
+from capsule_id.inference.fit.point_fit import residual_jacobian
+
+#: Parts of an excitation period. They are long beside most waves of a misfit, so that their steps are independent.
+PHASES = 6
+#: Numbers of the parts of the n samples of a record; None where it cannot be divided in this way.
+Division = Callable[[CapsuleForward], Int[np.ndarray, " n"] | None]
+
+
+def run_widenings(s: Setting) -> dict[str, Widening]:
+    """Error of the model of every physical parameter of a run with a failed check, by name."""
+    failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
+    runs = [e for e in s.experiments if isinstance(e, CapsuleForward) and {e.label, e.table.label} & failed]
+    if not runs:
+        return {}
+    located = s.target.located
+    jacobian, residuals = residual_jacobian(s.target, s.fit.u)[:, located], s.target.plain_residuals(s.fit.u)
+    informed = {row.name for e in runs for row in e.parameters if row.physical}
+    found = {}
+    for division in (by_time, by_phase):
+        part = parts_of_residuals(s, runs, division)
+        for k, i in enumerate(located.tolist()):
+            name, largest_sd = s.target.names[i], LARGEST_RELATIVE_SD
+            if name not in informed:
+                continue
+            largest_sd *= 1.0 if s.target.positive[i] else abs(s.fit.u[i])
+            pairs = [pair for pair in steps_of_parts(jacobian, residuals, k, part) if pair[1] < largest_sd]
+            one = widening(pairs) if len(pairs) >= FEWEST_PARTS else None
+            if one and one.factor > 1.0 and (name not in found or one.stretch > found[name].stretch):
+                found[name] = one
+    return found
+
+
+def by_time(run: CapsuleForward) -> Int[np.ndarray, " n"] | None:
+    """Successive parts of whole excitation periods, about equally long."""
+    period = run.excitation_period
+    if period is None:
+        return None
+    time = run.table["time"]
+    cycle = ((time - time[0]) / period).astype(int)
+    number = int(cycle[-1]) + 1
+    return cycle * min(number, MOST_PARTS) // number
+
+
+def by_phase(run: CapsuleForward) -> Int[np.ndarray, " n"] | None:
+    """The same parts of every excitation period."""
+    period = run.excitation_period
+    if period is None:
+        return None
+    return (run.table["time"] / period % 1.0 * PHASES).astype(int) % PHASES
+
+
+def parts_of_residuals(s: Setting, runs: Sequence[CapsuleForward], division: Division) -> Int[np.ndarray, " m"]:
+    """Part of each of ``LogPosterior.plain_residuals``; -1, one more part, where no record of ``runs`` gives it."""
+    parts, used = [], 0
+    for e in s.experiments:
+        own = np.full(len(e.residuals(e.local(s.values), np)), -1)
+        numbers = next((division(run) for run in runs if run is e), None)
+        if numbers is not None:
+            channels = e.n // len(numbers)
+            own[: channels * len(numbers)] = used + np.tile(numbers, channels)
+            used += int(np.max(numbers)) + 1
+        parts.append(own)
+    return np.concatenate([*parts, np.full(s.target.dimension, -1)])
+
+
+def steps_of_parts(
+    jacobian: Float[np.ndarray, "m d"], residuals: Float[np.ndarray, " m"], k: int, part: Int[np.ndarray, " m"]
+) -> list[tuple[float, float]]:
+    """Gauss-Newton step of parameter k and its sd from every part that informs it.
+
+    A part meets the other parameters as the rest of the data gives them: the fit to all of the data has adapted them
+    to the misfit of the part itself. A part without which the fit has no solution gives no step.
+    """
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    jacobian = jacobian / scale
+    others = np.linalg.qr(np.delete(jacobian, k, axis=1))[0]
+    own = jacobian[:, k] - others @ (others.T @ jacobian[:, k])
+    pairs = []
+    for number in np.unique(part):
+        rows, rest = part == number, part != number
+        information = float(np.sum(own[rows] ** 2))
+        if information == 0.0 or np.linalg.matrix_rank(jacobian[rest]) < jacobian.shape[1]:
+            continue
+        step = np.linalg.lstsq(jacobian[rest], -residuals[rest], rcond=None)[0]
+        beyond = residuals[rows] + jacobian[rows] @ step
+        value = step[k] - float(own[rows] @ beyond) / information
+        pairs.append((value / scale[k], information**-0.5 / scale[k]))
+    return pairs

@@ -1,0 +1,108 @@
+"""Error of the model in runs: intervals that cover under a misfit that repeats with every excitation period."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.experiments.forced_run.base_run import BaseRun
+from capsule_id.inference.checks.run_widening import (
+    by_phase,
+    by_time,
+    parts_of_residuals,
+    run_widenings,
+    steps_of_parts,
+)
+from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.widening import FEWEST_PARTS, widening
+from capsule_id.inference.fit.point_fit import residual_jacobian
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.views import Finding
+from tests.experiments import test_base_run as shaken
+
+NO_ARRAY = np.zeros(0)
+
+
+@cache
+def setting(folder: Path) -> Setting:
+    """The shaken capsule of the tests of base runs at its true values, with a failed check."""
+    rig = shaken.rig(folder)
+    run = BaseRun(rig.tables[0], rig)
+    target = LogPosterior(rig, [run])
+    truth = {**shaken.TRUTH, "x_start[shaken]": float(shaken.base(0.0)), "noise_x_capsule[shaken]": shaken.NOISE}
+    u = target.unconstrain(np.array([truth[name] for name in target.names]))
+    fit = PointFit(target.names, u, truth, NO_ARRAY, {}, NO_ARRAY, NO_ARRAY, NO_ARRAY, NO_ARRAY, NO_ARRAY)
+    finding = Finding("residuals.white", "fail", {}, "shaken")
+    return Setting(target, fit, None, {**target.fixed, **truth}, findings=(finding,))
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Setting:
+    return setting(tmp_path_factory.mktemp("shaken"))
+
+
+def pulls(s: Setting, misfit: float, divisions: tuple = (by_time, by_phase)) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of k1 over its sd, and over 1.96 times the widened sd and t quantile, of 300 linearised fits.
+
+    misfit : amplitude of each of six random harmonics of the excitation in x_capsule, units of the noise
+    """
+    rng, located = np.random.default_rng(0), s.target.located
+    run, k = s.experiments[0], [s.target.names[i] for i in located].index("k1")
+    jacobian = residual_jacobian(s.target, s.fit.u)[:, located]
+    parts = [parts_of_residuals(s, [run], division) for division in divisions]  # type: ignore[list-item]
+    inverse = np.linalg.pinv(jacobian)
+    sd = float(np.linalg.norm(inverse[k]))
+    angle = np.multiply.outer(run.table["time"], np.arange(1, 7)) * 4.0 * np.pi
+    plain, widened = [], []
+    for _ in range(300):
+        residuals = np.zeros(len(jacobian))
+        waves = [wave(angle) @ rng.standard_normal(6) for wave in (np.cos, np.sin)]
+        residuals[: run.n] = rng.standard_normal(run.n) + misfit * np.sum(waves, axis=0)
+        step = inverse @ residuals
+        found = [widening(steps_of_parts(jacobian, residuals - jacobian @ step, k, part)) for part in parts]
+        one = max(found, key=lambda w: w.stretch)
+        plain.append(step[k] / sd)
+        widened.append(step[k] / (sd * one.stretch) / 1.96)
+    return np.abs(plain), np.abs(widened)
+
+
+def test_intervals_cover_under_a_misfit_that_repeats(known: Setting) -> None:
+    plain, widened = pulls(known, 5.0)
+    assert np.mean(plain < 1.96) < 0.5
+    assert np.mean(widened < 1.0) >= 0.9
+    # Negative control: successive parts of the record do not show a misfit that they share.
+    assert np.mean(pulls(known, 5.0, (by_time,))[1] < 1.0) < 0.7
+
+
+def test_noise_alone_widens_little(known: Setting) -> None:
+    plain, widened = pulls(known, 0.0)
+    assert np.mean(plain < 1.96) == pytest.approx(0.95, abs=0.04)
+    assert np.median(plain / widened) / 1.96 < 1.8  # t quantile of 4 to 8 parts included
+
+
+def test_a_failed_check_widens_the_parameters_of_its_run(known: Setting) -> None:
+    assert run_widenings(replace(known, findings=())) == {}
+    quiet = run_widenings(known)
+    assert all(one.factor < 2.0 for one in quiet.values())
+    # The rod's spring is 10 % stiffer than the record shows.
+    u = known.fit.u + np.where(np.array(known.target.names) == "k1", 0.1, 0.0)
+    values = {**known.values, "k1": 1.1 * known.values["k1"]}
+    wide = run_widenings(replace(known, fit=replace(known.fit, u=u), values=values))
+    assert wide["k1"].factor > 5.0
+    assert wide["k1"].parts >= FEWEST_PARTS
+    assert set(wide) <= set(shaken.TRUTH)
+
+
+def test_parts_are_whole_periods_and_phases(known: Setting) -> None:
+    run = known.experiments[0]
+    assert isinstance(run, BaseRun)
+    time, phase = by_time(run), by_phase(run)
+    assert time is not None
+    assert phase is not None
+    assert np.array_equal(np.unique(time), np.arange(4))  # 2 s at 2 Hz
+    assert np.array_equal(np.bincount(time), [50, 50, 50, 50])
+    assert np.mean(phase[:50] == phase[50:100]) > 0.95  # a sample on an edge
+    assert np.all(np.abs(np.bincount(phase) - 200 / 6) < 4)
