@@ -1,7 +1,10 @@
 """What an error of the initial state becomes over a record, with a negative control."""
 
 import numpy as np
+import pytest
+from scipy.linalg import expm
 
+from capsule_id.experiments.forced_run import predictability
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.predictability import LARGEST_GROWTH, check_predictable, growth
 from capsule_id.inference.checks.setting import Setting
@@ -9,13 +12,44 @@ from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from tests.forced_runs import make, theta
 
+#: The chaotic motion of tests/motions/test_lyapunov.py.
+WILD = {"m2": 0.3, "k2": 56410.0, "c": 0.5, "mu": 0.2, "G": 0.5e-3, "I_d": 4.0}
+
+
+def test_an_oscillator_in_a_heavy_capsule_has_its_closed_form() -> None:
+    """Without contacts and sliding: the matrix exponential of m1 x'' + c x' + k1 x = drive. Y2 decays at once."""
+    run = make(1, samples=400)
+    values = theta(1) | {"m2": 1e4, "G": 1.0, "c": 0.1}
+    matrix = np.array([[0.0, 1.0], [-values["k1"] / values["m1"], -values["c"] / values["m1"]]])
+    end = expm(matrix * (run.time[-1] - run.time[0]))
+    scale = np.array([1.0, run.Omega])
+    # An error of Y2 is one of the rod's speed as well, and the capsule stops.
+    known = np.linalg.norm((end * scale / scale[:, None])[:, [0, 1, 1]], 2)
+    assert growth(run, values) == pytest.approx(known, rel=1e-3)
+    assert growth(run, values | {"c": 1.0}) < 0.9 * known
+
+
+@pytest.mark.parametrize(
+    ("number", "samples", "exact"), [(0, 600, 8837.3123), (2, 2000, 6407218.9), (3, 2000, 85943570.0)]
+)
+def test_differences_agree_with_forward_derivatives(number: int, samples: int, exact: float) -> None:
+    """Chaotic motions; ``exact`` comes from the derivatives of the engine in forward mode."""
+    assert growth(make(number, samples=samples), theta(number) | WILD) == pytest.approx(exact, rel=0.01)
+
+
+def test_a_factor_beyond_differences_is_extrapolated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the first instant above 1e4 of a record that reaches 8.6e7."""
+    monkeypatch.setattr(predictability, "MEASURABLE", 1e4)
+    found = growth(make(3, samples=2000), theta(3) | WILD)
+    assert np.log(found) == pytest.approx(np.log(85943570.0), rel=0.5)
+    assert found != pytest.approx(85943570.0, rel=0.1)
+
 
 def test_a_motion_that_forgets_its_start_is_predictable_and_a_chaotic_one_is_not() -> None:
     run = make(0, samples=2000)
     assert growth(run, theta(0)) < 1.0
     assert check_predictable([run], fitted(run, theta(0)))[0].level == "ok"
-    # The chaotic motion of tests/capsule/test_lyapunov.py.
-    wild = theta(0) | {"m2": 0.3, "k2": 56410.0, "c": 0.5, "mu": 0.2, "G": 0.5e-3, "I_d": 4.0}
+    wild = theta(0) | WILD
     assert growth(run, wild) > LARGEST_GROWTH
     found = check_predictable([run], fitted(run, wild))
     assert found[0].level == "fail"
