@@ -112,7 +112,8 @@ class Parameter:
     @property
     def prior_can_be_stated(self) -> bool:
         """Whether ``[prior]`` in rig.toml may override the default prior."""
-        return self.prior is not None and self.prior.kind in ("lognormal", "halfnormal")
+        kind = None if self.prior is None else self.prior.kind
+        return kind in ("lognormal", "halfnormal") or (kind == "normal" and self.physical)
 
     @property
     def optional(self) -> bool:
@@ -196,10 +197,11 @@ TABLE: Mapping[str, Parameter] = {
         ),
         Parameter(
             "k_cubic", "N/m^3", "cubic stiffness between rod and capsule", r"k_\mathrm{cubic}",
-            leaf="capsule", sign="any", default=0.0,
+            Prior("normal", 0.0, 1e7), leaf="capsule", sign="any", default=0.0,
         ),
         Parameter(
-            "c2", "N s/m", "damping of the closed contact", "c_2", leaf="capsule", sign="not negative", default=0.0
+            "c2", "N s/m", "damping of the closed contact", "c_2", _lognormal(1.0, 100.0),
+            leaf="capsule", sign="not negative", default=0.0,
         ),
         Parameter(
             "k2_back", "N/m", "stiffness of the back spring", r"k_{2,-}",
@@ -233,7 +235,10 @@ TABLE: Mapping[str, Parameter] = {
             "duty", "1", "share of the period in which the pulse is on", r"\delta",
             leaf="drive", sign="any", sampled=False,
         ),
-        Parameter("lag", "s", "lag of the force of pulses", r"\tau", leaf="drive", sign="not negative", default=0.0),
+        Parameter(
+            "lag", "s", "lag of the force of pulses", r"\tau", _lognormal(0.01, 10.0),
+            leaf="drive", sign="not negative", default=0.0,
+        ),
         Parameter("K", "N/A", "force per motor current", "K", _lognormal(2.0, 1000.0), table_1=2.0),
         Parameter("F_dry", "N", "dry friction between rod and capsule", r"F_\mathrm{dry}", _lognormal(0.1, 1000.0)),
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),

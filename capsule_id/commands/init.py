@@ -41,13 +41,16 @@ name = "@NAME@"
 
 #: Choices of the model. friction: "stribeck" (eq. (1)) or "constant" (the same at every speed, no v_s).
 #: free: optional parameters that the fit samples: @OPTIONAL@.
+#: reaction: "ground", or "capsule" where the drive pushes the capsule back, as a coil inside it does.
 # [model]
 # friction = "stribeck"
 # free = ["ratio"]
+# reaction = "ground"
 
 #: Priors: knowledge from before the measurement. Default priors are broad.
 #: Log-normal, 95 % within median/factor to median*factor: @LOGNORMAL@.
 #: Half-normal, by scale: @HALFNORMAL@.
+#: Normal, by mean and sd: @NORMAL@.
 # [prior]
 # k1 = { median = 1500, factor = 3, unit = "N/m" }
 # tilt_sd = { scale = 1, unit = "deg" }
@@ -57,9 +60,11 @@ name = "@NAME@"
 def template(kinds: Registry, name: str, entries: Sequence[str] | None = None) -> str:
     """The commented ``rig.toml`` of a rig called ``name``, with ``entries``, or a commented one for each of ``kinds``."""
     stated = [row for row in kinds.parameters.values() if row.prior_can_be_stated]
-    lognormal = ['"k2[<spring>]"' if row.symbol == "k2" else row.symbol for row in stated if not row.scatter]
-    head = HEAD.replace("@NAME@", name).replace("@LOGNORMAL@", " ".join(lognormal))
-    head = head.replace("@HALFNORMAL@", " ".join(row.symbol for row in stated if row.scatter))
+    head = HEAD.replace("@NAME@", name)
+    for kind in ("lognormal", "halfnormal", "normal"):
+        rows = [row for row in stated if row.prior is not None and row.prior.kind == kind]
+        words = ['"k2[<spring>]"' if row.symbol == "k2" else row.symbol for row in rows]
+        head = head.replace(f"@{kind.upper()}@", " ".join(words))
     head = head.replace("@OPTIONAL@", " ".join(row.symbol for row in kinds.parameters.values() if row.optional))
     return "\n".join([head, *(entries or [kind.template for kind in kinds.values()])])
 

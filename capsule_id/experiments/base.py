@@ -9,7 +9,7 @@ fields are strings and flags. ``About`` holds all other data.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -145,6 +145,16 @@ class Experiment(eqx.Module):
         return (None,)
 
     @property
+    def has_joint_scatters(self) -> bool:
+        """Whether readings have several scatters at once; then a point fit takes them from ``profile`` together."""
+        return False
+
+    @property
+    def mirrored(self) -> tuple[str, ...]:
+        """Names of the parameters whose sign is unknown: the point fit tries both."""
+        return ()
+
+    @property
     def masses(self) -> tuple[str, ...]:
         """Symbols of the masses that the likelihood reads."""
         return ()
@@ -262,6 +272,10 @@ class Experiment(eqx.Module):
         Return the new experiment and the values, SI, by name, from which a fit continues. None: no contradiction.
         """
         del theta
+
+    def profile(self, theta: ValuesBySymbol) -> Callable[[ValuesBySymbol], float]:
+        """The log-likelihood as a function of its scatters by symbol, all other values held at ``theta``."""
+        return lambda scatters: float(self.log_likelihood({**theta, **scatters}, np))
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
         """Largest ratio of a noise level of ``theta`` to its estimate from the record alone; 0 without an estimate."""

@@ -12,6 +12,8 @@ import numpy as np
 
 #: sd of the normal prior of a linear nuisance relative to the range of its record, dimensionless; wide but proper.
 NUISANCE_WIDTH = 10.0
+#: From this number of nuisances on their matrix is factorised in a library, not eliminated step by step.
+MANY_NUISANCES = 8
 #: log(2 pi), from the normalisation of a normal density.
 LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -28,6 +30,11 @@ def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp
     aa : (..., p, p) A'A
     n : length of y
     """
+    if aa.shape[-1] > MANY_NUISANCES:
+        root = xp.linalg.cholesky(xp.eye(aa.shape[-1]) + aa)
+        half = xp.linalg.solve(root, ay[..., None])[..., 0]
+        log_det = 2.0 * xp.sum(xp.log(xp.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
+        return -0.5 * (n * LOG_2PI + log_det + yy - xp.sum(half**2, axis=-1))
     rest, rows, log_det = yy, xp.broadcast_to(xp.eye(aa.shape[-1]), aa.shape) + aa, 0.0
     while rows.shape[-1]:
         pivot, first = rows[..., 0, 0], rows[..., 0, 1:]

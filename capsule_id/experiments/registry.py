@@ -29,6 +29,7 @@ BUILT_IN = (
     "support_spring",
     "transducer",
     "forced_run",
+    "progression",
 )
 
 Declared = TypeVar("Declared")

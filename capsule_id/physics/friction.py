@@ -4,7 +4,7 @@ A friction law is a class with the methods of ``FrictionLaw``. ``simulate(p, e, 
 law, in both engines; nothing else has to be changed. Forces in N, velocities in m/s, masses in kg.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import jax
@@ -128,6 +128,32 @@ def friction_law(p: "CapsuleParameters", friction: FrictionLaw | None = None) ->
         return friction
     own = {row.symbol: getattr(p, row.symbol) for row in CoulombStribeck.parameters if row.symbol != "N"}
     return CoulombStribeck(N=normal_force(p.m1, p.m2, p.g, p.slope, p.N0), **own)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scaled:
+    """Any law with its resistance multiplied by ``factor``, 1."""
+
+    law: FrictionLaw
+    factor: Any
+
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+
+    def forward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards positive X2, N."""
+        return self.factor * self.law.forward(speed)
+
+    def backward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards negative X2, N."""
+        return self.factor * self.law.backward(speed)
+
+
+def scaled(law: FrictionLaw, factor: Any) -> FrictionLaw:
+    """``law`` with its resistance multiplied by ``factor``; eq. (1) keeps its own Taylor recursion."""
+    if isinstance(law, CoulombStribeck):
+        return replace(law, N=law.N * factor, viscous=law.viscous * factor)
+    return Scaled(law, factor)
 
 
 def sliding_friction(law: FrictionLaw, sigma: Any, v: Any) -> jax.Array:

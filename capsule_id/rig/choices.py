@@ -22,10 +22,12 @@ def read_model(document: TomlDocument) -> ModelChoices:
         If a key or word is unknown or repeated, or a free parameter has no effect in the chosen law.
     """
     head = read_table(document, ("model",), document.data.get("model", {}), "[model]")
-    refuse_unknown_keys(document, ("model",), head, ("friction", "free"))
-    words = get_args(get_type_hints(ModelChoices)["friction"])
-    friction = read_choice(document, ("model", "friction"), head.get("friction", words[0]), words)
-    constant = friction == "constant"
+    refuse_unknown_keys(document, ("model",), head, ("friction", "free", "reaction"))
+    choices: dict[str, str] = {}
+    for key in ("friction", "reaction"):
+        words = get_args(get_type_hints(ModelChoices)[key])
+        choices[key] = read_choice(document, ("model", key), head.get(key, words[0]), words)
+    constant = choices["friction"] == "constant"
     free = head.get("free", [])
     path = ("model", "free")
     if not isinstance(free, list):
@@ -40,7 +42,8 @@ def read_model(document: TomlDocument) -> ModelChoices:
     if constant and "ratio" in free:
         remedy = 'remove "ratio" from free, or remove friction = "constant"'
         raise document.error(path, "constant friction has no ratio", shown("ratio"), remedy)
-    return ModelChoices("constant" if constant else "stribeck", tuple(symbol for symbol in OPTIONAL if symbol in free))
+    in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
+    return ModelChoices(free=in_order, **choices)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 
 
 def check_masses_of_free(

@@ -21,17 +21,21 @@ class Quantity:
 @dataclass(frozen=True)
 class PriorOverride:
     """One line of ``[prior]``, SI: log-normal by ``median`` and ``factor`` (95 % within median/factor..median*factor),
-    or, for scatters, half-normal by ``scale``."""
+    for scatters half-normal by ``scale``, and for parameters of either sign normal by ``mean`` and ``sd``."""
 
     median: float | None = None
     factor: float | None = None
     scale: float | None = None
+    mean: float | None = None
+    sd: float | None = None
 
     @property
     def prior(self) -> Prior:
         """The stated density."""
         if self.scale is not None:
             return Prior("halfnormal", 0.0, self.scale)
+        if self.mean is not None and self.sd is not None:
+            return Prior("normal", self.mean, self.sd)
         assert self.median is not None, "the schema requires median and factor"
         assert self.factor is not None, "the schema requires median and factor"
         return Prior("lognormal", self.median, self.factor)
@@ -45,10 +49,17 @@ class ModelChoices:
     ----------
     friction : "stribeck": eq. (1); "constant": the same friction at every speed, ratio = 1 and no v_s
     free : symbols of the optional parameters that a fit samples
+    reaction : what takes up the reaction of the drive: "ground", as in the paper, or "capsule", as for a coil inside it
     """
 
     friction: Literal["stribeck", "constant"] = "stribeck"
     free: tuple[str, ...] = ()
+    reaction: Literal["ground", "capsule"] = "ground"
+
+    @property
+    def share_of_reaction(self) -> float:
+        """Share of the drive's force that pushes the capsule back, 1."""
+        return 1.0 if self.reaction == "capsule" else 0.0
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,8 @@ def _read_priors(
         elif key not in known:
             refuse_unknown_keys(document, ("prior",), {key: value}, known)
         row = rows["k2" if spring else key]
-        priors[key] = read_prior(document, path, value, row.unit, row.scatter)
+        assert row.prior is not None, "its prior can be stated"
+        priors[key] = read_prior(document, path, value, row.unit, row.prior.kind)
     return priors
 
 

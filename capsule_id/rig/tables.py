@@ -125,6 +125,26 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
     return replace(table, columns=columns)
 
 
+def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:
+    """Columns of a file with the settings of new experiments: those of ``kind`` without the reading ``without``.
+
+    Raises
+    ------
+    InputError
+        At a place in the file.
+    """
+    if not path.is_file() or path.suffix.lower() not in READERS:
+        remedy = f"name a file of {' '.join(READERS)}"
+        raise InputError("the settings must be a table", "no such table", remedy, path)
+    columns = {name: rule for name, rule in kind.columns.items() if name != without}
+    sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
+    raw = READERS[path.suffix.lower()](path.read_bytes(), path)
+    table = TableFile({}, raw, {}, lambda row, column: path)
+    asked = replace(kind, columns=columns, sets=sets)
+    _check_names(raw.names, asked, lambda name, *text: table.error(None, name, *text))
+    return {name: _to_si(table, index, columns[name]) for index, name in enumerate(raw.names)}
+
+
 def _file_places(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> list[tuple[KeyPath, str]]:
     """The files of an experiment, each with its place in ``rig.toml``."""
     if "files" not in entry:

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from math import isfinite
 from typing import Any
 
-from capsule_id.rig.domains import ABOVE_ONE, LARGEST, NOT_NEGATIVE, POSITIVE, SMALLEST, Domain, is_plausible
+from capsule_id.rig.domains import ABOVE_ONE, ANY, LARGEST, NOT_NEGATIVE, POSITIVE, SMALLEST, Domain, is_plausible
 from capsule_id.rig.model import PriorOverride, Quantity
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.units import UnitError, factor_to_si, scale
@@ -95,15 +95,21 @@ def read_choice(document: TomlDocument, path: KeyPath, value: object, choices: S
     return word
 
 
-def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, is_scatter: bool) -> PriorOverride:
-    """``{ median, factor, unit }``, or ``{ scale, unit }`` for a scatter; a unit of 1 is optional."""
-    keys = ("scale", "unit") if is_scatter else ("median", "factor", "unit")
+def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, kind: str) -> PriorOverride:
+    """``{ median, factor, unit }``, ``{ scale, unit }`` or ``{ mean, sd, unit }`` by the kind of the default prior.
+
+    A unit of 1 is optional.
+    """
+    keys = {"halfnormal": ("scale", "unit"), "normal": ("mean", "sd", "unit")}.get(kind, ("median", "factor", "unit"))
     example = "{ " + ", ".join(f"{key} = ..." for key in keys[:-1]) + f', unit = "{si}" }}'
     entry = read_table(document, path, value, example)
     refuse_unknown_keys(document, path, entry, keys)
     factor = 1.0 if si == "1" and "unit" not in entry else read_unit(document, path, entry, si)
-    if is_scatter:
+    if kind == "halfnormal":
         return PriorOverride(scale=_read_scaled(document, path, entry, "scale", factor, POSITIVE))
+    if kind == "normal":
+        mean = _read_scaled(document, path, entry, "mean", factor, ANY)
+        return PriorOverride(mean=mean, sd=_read_scaled(document, path, entry, "sd", factor, POSITIVE))
     return PriorOverride(
         median=_read_scaled(document, path, entry, "median", factor, POSITIVE),
         factor=_read_scaled(document, path, entry, "factor", 1.0, ABOVE_ONE),

@@ -52,9 +52,10 @@ _DEFINITIONS = {
     "g_n": "9.80665 * m / s ** 2",
     "lbf": "4.4482216152605 * N",
     "Ns": "N * s",
+    "percent": "0.01",
 }
 # Other ways to write the same symbol.
-_SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "⋅": "·"})
+_SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "⋅": "·", "%": "percent"})
 _FACTOR = r"(?:(?:g_n|[A-Za-z]+)(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
 _GRAMMAR = re.compile(rf"{_FACTOR}(?:(?: ?[*/·] ?| ){_FACTOR})*")
 _LONGEST = 40  # characters of a unit

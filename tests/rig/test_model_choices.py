@@ -31,7 +31,12 @@ def write(folder: Path, model: str, head: str = HEAD) -> Path:
         ('free = ‸"ratio"', "free must be a list of words", 'free = ["ratio"]'),
         ('free = ‸["ratoi"]', "free must name optional parameters, 'ratoi', write ratio", 'free = ["ratio"]'),
         ('free = ‸["ratio", "ratio"]', "must name each parameter once", 'free = ["ratio"]'),
-        ("free = ‸[7]", "free must name optional parameters, 7, write some of mu_back ratio viscous", "free = []"),
+        (
+            "free = ‸[7]",
+            "free must name optional parameters, 7, write some of mu_back ratio viscous k_cubic",
+            "free = []",
+        ),
+        ('reaction = ‸"floor"', "reaction must be", 'reaction = "capsule"'),
         ('friction = ‸"coulomb"', "friction must be", 'friction = "constant"'),
         ('friction = "constant"\nfree = ‸["ratio"]', "constant friction has no ratio", 'friction = "constant"'),
         ('free = ‸["viscous"]', "free viscous needs m1, because slide", "free = []"),
@@ -45,7 +50,7 @@ def test_a_fault_has_its_place_and_its_remedy_works(tmp_path: Path, model: str, 
 
 
 def test_choices_select_the_sampled_parameters(tmp_path: Path) -> None:
-    assert OPTIONAL == ("mu_back", "ratio", "viscous")
+    assert OPTIONAL == ("mu_back", "ratio", "viscous", "k_cubic", "c2", "lag")
     assert all(TABLE[symbol].prior_can_be_stated for symbol in OPTIONAL)
     expected = {
         "": ["mu", "v_s"],

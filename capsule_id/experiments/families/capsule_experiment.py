@@ -51,6 +51,8 @@ class CapsuleForward(SurfaceExperiment):
             v_s=theta.get("v_s", 1.0),
             G=gap,
             g=theta["g"],
+            k_cubic=theta.get("k_cubic", 0.0),
+            c2=theta.get("c2", 0.0),
         )
 
     def simulated(

@@ -221,9 +221,11 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel
     InputError
         If both ``law`` and ``[model]`` choose the friction, or ``law`` cannot be fitted.
     """
+    own = {row.symbol for row in CoulombStribeck.parameters}
+    free = tuple(symbol for symbol in rig.model.free if symbol in own)
     if law is None:
-        return FrictionModel(free=rig.model.free, constant=rig.model.friction == "constant")
-    if rig.model != ModelChoices():
+        return FrictionModel(free=free, constant=rig.model.friction == "constant")
+    if free or rig.model.friction != ModelChoices().friction:
         rule, remedy = "a friction law of its own replaces [model]", "remove friction and free from [model]"
         raise InputError(rule, f"both {law.__name__} and [model]", remedy, rig.folder / "rig.toml")
     return FrictionModel(law)

@@ -66,6 +66,7 @@ class ForcedRun(CapsuleForward):
     reading_variance : (channels,) stated, SI
     moves : factor of ``capsule_start``, 0 or 1, so that one program computes runs of both kinds
     normal_force : stated, N; 0 where it is the weight
+    reaction : share of the drive's force that pushes the capsule back, 1
     """
 
     about: AboutRun = eqx.field(static=True)
@@ -90,6 +91,7 @@ class ForcedRun(CapsuleForward):
     has_delay: tuple[bool, ...] = eqx.field(static=True)
     coloured: bool = eqx.field(static=True)
     second_reading: bool = eqx.field(static=True)
+    reaction: float = eqx.field(static=True)
 
     #: Whether the record prescribes the motion of the rod.
     prescribed: ClassVar[bool] = False
@@ -117,6 +119,7 @@ class ForcedRun(CapsuleForward):
         """
         settings, gap = table.settings, stated_gap(table)
         self.friction, self.smoothing = friction, None
+        self.reaction = rig.model.share_of_reaction
         self.channels = tuple(name for name in NOISE if name in table.columns)
         self.time = table["time"]
         self.values = np.stack([table[name] for name in self.channels])
@@ -215,7 +218,7 @@ class ForcedRun(CapsuleForward):
         """Return parameters and drive of this run; leaves as in ``theta``."""
         stated: Any = self.drive if self.drive_known else theta.get("P_d")
         force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
-        return self.with_spring(theta), Excitation(force, self.Omega, theta["phase"])
+        return self.with_spring(theta), Excitation(force, self.Omega, theta["phase"], self.reaction)
 
     def with_spring(self, theta: ValuesBySymbol) -> CapsuleParameters:
         """Parameters at ``theta`` with the support spring of this run; k2 = 0 where there is none."""

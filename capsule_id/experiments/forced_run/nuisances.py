@@ -24,6 +24,8 @@ def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...
     """Return the parameters sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
     of, whole, settings = run.label, run.about.record, run.table.settings
     rows = [parameter("k1"), parameter("c"), *run.friction.parameters]
+    free = ("k_cubic",) if run.spring is None else ("k_cubic", "c2")
+    rows += [parameter(symbol) for symbol in free if symbol in run.rig.model.free]
     if run.spring is not None:
         rows.append(parameter("k2", run.spring))
     if not run.gap_known:

@@ -15,10 +15,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.inference.fit import difference_descent
 from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares
@@ -31,6 +32,8 @@ from capsule_id.interruption import stop_if_interrupted
 SOLVER = Solver(tolerance=1e-7, max_steps=80, normal_equations=True, heavy=True)
 #: Largest number of rounds of least squares and scatters. Convergence tolerance of a round, in standard deviations.
 ROUNDS, SMALL_MOVE_IN_SD = 8, 0.01
+#: Largest number of rounds where residuals have kinks: small moves go on there without an end.
+ROUNDS_WITH_KINKS = 3
 #: Single-parameter steps after a descent, in standard deviations. A point whose log-posterior is higher by more than
 #: ``LEAST_INCREASE`` starts another descent, at most ``MAX_RESTARTS`` times.
 MOVES_IN_SD, LEAST_INCREASE, MAX_RESTARTS = 2.0 ** np.arange(8), 1.0, 4
@@ -46,6 +49,8 @@ COST_RATIO_TO_ABANDON = 3.0
 NOISE_RATIO_OF_A_GOOD_FIT = 1.2
 #: Search range of a scatter's conditional maximum about its value, natural logarithm.
 SCATTER_SEARCH = 6.0
+#: Settings of the search over scatters that act together, natural logarithm.
+JOINT_SEARCH = {"xatol": 1e-3, "fatol": 1e-4, "maxiter": 2000}
 
 
 @dataclass(frozen=True)
@@ -161,10 +166,13 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
     """Descend from one start (d,); stop where the cost exceeds ``limit`` or a number is not finite."""
     located = target.located
     u, still, fit = start.copy(), False, None
-    for _ in range(ROUNDS):
+    kinked = any(e.has_joint_scatters for e in target.experiments)
+    for _ in range(ROUNDS_WITH_KINKS if kinked else ROUNDS):
         stop_if_interrupted()
-        residual = HeldResiduals(target, jnp.asarray(u))
-        fit = least_squares(residual, u[located][None], SOLVER)
+        if kinked:
+            fit = difference_descent.descend(target, u)
+        else:
+            fit = least_squares(HeldResiduals(target, jnp.asarray(u)), u[located][None], SOLVER)
         if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
             return _End(u, fit, False, -np.inf)
         sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))
@@ -195,29 +203,56 @@ def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
         bounds = (u[i] - SCATTER_SEARCH, u[i] + SCATTER_SEARCH)
         found: Any = minimize_scalar(lambda t, terms=terms: -terms(t), bounds=bounds, options={"xatol": 1e-5})
         modes[i] = float(found.x)
+    members, together = _joint_scatters(target, u)
+    if len(members):
+        at = minimize(lambda t: -together(t), u[members], method="Nelder-Mead", options=JOINT_SEARCH).x
+        modes |= dict(zip(members.tolist(), at.tolist(), strict=True))
     return modes
 
 
 def _scatter_variances(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """Inverse curvature of every scatter's conditional density at u (d,), in the order of the scatters."""
-    h, variances = 0.05, []
+    h, variances = 0.05, {}
+    members, together = _joint_scatters(target, u)
     terms = _scatter_terms(target, u)
-    for i in np.flatnonzero(target.scatter).tolist():
-        bend = (2.0 * terms[i](u[i]) - terms[i](u[i] + h) - terms[i](u[i] - h)) / h**2
-        variances.append(1.0 / max(bend, 0.1))
-    return np.array(variances)
+    for place, i in enumerate(members.tolist()):
+        unit = np.eye(len(members))[place]
+        terms[i] = lambda t, unit=unit, i=i: together(u[members] + (t - u[i]) * unit)
+    for i, own in terms.items():
+        bend = (2.0 * own(u[i]) - own(u[i] + h) - own(u[i] - h)) / h**2
+        variances[i] = 1.0 / max(bend, 0.1)
+    return np.array([variances[i] for i in np.flatnonzero(target.scatter).tolist()])
+
+
+def _joint_scatters(target: LogPosterior, u: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], float]]:
+    """Indices of the scatters that only act together, and their log-density in u, up to a constant."""
+    own = [e for e in target.experiments if e.has_joint_scatters]
+    values = target.mapping(target.theta(u))
+    names = dict.fromkeys(row.name for e in own for row in e.parameters if row.scatter)
+    members = np.array([target.names.index(name) for name in names], dtype=int)
+    profiles = [(e.profile(e.local(values)), {r.symbol: r.name for r in e.parameters if r.scatter}) for e in own]
+    priors = target.priors.at(members, np)
+
+    def together(t: np.ndarray) -> float:
+        sizes = dict(zip(names, np.exp(t), strict=True))
+        total = sum(profile({s: sizes[name] for s, name in rows.items()}) for profile, rows in profiles)
+        return float(total + np.sum(priors.terms(t, np.exp(t), np)))
+
+    return members, together
 
 
 def _scatter_terms(target: LogPosterior, u: np.ndarray) -> dict[int, Callable[[float], float]]:
-    """log-density of every scatter's u given the located entries of u (d,), up to a constant, by index."""
+    """log-density of each scatter that acts alone, given the located entries of u (d,), up to a constant, by index."""
     values = target.mapping(target.theta(u))
-    parts: dict[int, list[Misfit | Moments]] = {int(i): [] for i in np.flatnonzero(target.scatter)}
-    priors = {i: target.priors.at(i, np) for i in parts}
+    parts: dict[int, list[Misfit | Moments]] = {}
     for experiment in target.experiments:
+        if experiment.has_joint_scatters:
+            continue
         names = {row.symbol: row.name for row in experiment.parameters}
         for part, symbol in zip(experiment.summaries(experiment.local(values), np), experiment.scatters, strict=True):
             if symbol is not None:
-                parts[target.names.index(names[symbol])].append(part)
+                parts.setdefault(target.names.index(names[symbol]), []).append(part)
+    priors = {i: target.priors.at(i, np) for i in parts}
 
     def terms(i: int, t: float) -> float:
         own = sum(part.log_density(np.exp(t), np) for part in parts[i])

@@ -11,6 +11,7 @@ import numpy as np
 
 from capsule_id.inference.fit.point_fit import dispersed_starts
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.batches import pool
 
 #: Number of starting points that are always tried (the bench estimate included), and the largest number.
 STARTS, MAX_STARTS = 3, 8
@@ -38,6 +39,8 @@ def choose_starts(
     width = np.exp(rng.uniform(np.log(SMALLEST_LOG_SD), np.log(LARGEST_LOG_SD), candidates.shape)) * open_
     moved = np.where(has, width * rng.standard_normal(candidates.shape), candidates - candidates[0]) + centre
     candidates = np.where((rng.random(candidates.shape) < PROBABILITY_TO_PERTURB) & ~target.scatter, moved, centre)
+    mirrored = np.isin(target.names, [name for e in target.experiments for name in e.mirrored])
+    candidates = np.where(mirrored & (rng.random((len(candidates), 1)) < 0.5), -candidates, candidates)
     candidates[0] = centre
     value = weigh(target, candidates)
     ranked = 1 + np.argsort(-value[1:])[: MAX_STARTS - 1]
@@ -49,5 +52,8 @@ def choose_starts(
 def weigh(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """(n,) log-posterior of u (n, d), one compiled batch for any n; -inf where it is not finite."""
     rows = np.concatenate([u, np.repeat(u[-1:], -len(u) % ROWS_OF_A_BATCH, axis=0)])
-    value = np.concatenate([target.batch(part) for part in np.split(rows, len(rows) // ROWS_OF_A_BATCH)])[: len(u)]
+    first, *rest = np.split(rows, len(rows) // ROWS_OF_A_BATCH)
+    # The first batch compiles the program that all threads then call.
+    parts = [np.asarray(target.batch(first)), *pool().map(lambda part: np.asarray(target.batch(part)), rest)]
+    value = np.concatenate(parts)[: len(u)]
     return np.where(np.isfinite(value), value, -np.inf)

@@ -117,6 +117,12 @@ class LogPosterior(eqx.Module):
         return np.array(self.are_scatters, dtype=bool)
 
     @property
+    def integrated(self) -> np.ndarray:
+        """(d,) whether each parameter is the one scatter of some readings, which the sampler integrates out."""
+        alone = {row.name for e in self.experiments for row in e.parameters if row.scatter and row.symbol in e.scatters}
+        return np.array([name in alone for name in self.names])
+
+    @property
     def located(self) -> np.ndarray:
         """Indices of the parameters that change a prediction."""
         return np.flatnonzero(~self.scatter)

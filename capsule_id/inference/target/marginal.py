@@ -160,11 +160,11 @@ def compile_ahead(target: LogPosterior) -> None:
 def _layout(target: LogPosterior) -> Layout:
     """Layout with a number of nodes that suffices for most rigs."""
     # A block of scatters alone has no located parameter, so it follows the other blocks.
-    blocks = sorted(target.blocks, key=lambda block: bool(np.all(target.scatter[block])))
+    blocks = sorted(target.blocks, key=lambda block: bool(np.all(target.integrated[block])))
     label = np.zeros(target.dimension, dtype=int)
     for i, block in enumerate(blocks):
         label[block] = i
-    scatter, located = np.flatnonzero(target.scatter), target.located
+    scatter, located = np.flatnonzero(target.integrated), np.flatnonzero(~target.integrated)
     return Layout(tuple(scatter.tolist()), tuple(located.tolist()), tuple(label.tolist()), NODES[0])
 
 

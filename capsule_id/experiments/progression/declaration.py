@@ -1,0 +1,137 @@
+"""Progressions: columns, settings, rules, template and texts."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from capsule_id.experiments.kind import Kind, made_by
+from capsule_id.parameters import Prior, scatter
+from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Quantity, Rig, Settings, Table
+from capsule_id.rig.schema import ColumnRule, QuantityRule
+from capsule_id.views import Finding, Message
+
+SESSION_SD = scatter(
+    "session_sd", "1", "relative scatter of the friction from session to session", r"\sigma_\mathrm{ses}",
+    Prior("halfnormal", 0.0, 0.1),
+)  # fmt: skip
+TRIAL_SCATTER = scatter(
+    "trial_scatter", "1", "relative scatter of the displacement of a trial", r"s_\mathrm{trial}",
+    Prior("halfnormal", 0.0, 0.1),
+)  # fmt: skip
+#: These two have priors from the readings.
+TRIAL_SD = scatter("trial_sd", "m", "absolute scatter of the displacement of a trial", r"\sigma_\mathrm{trial}")
+DISCREPANCY = scatter("discrepancy", "m/s", "error of the model's mean velocity at a setting", r"\delta_v")
+
+#: Amplitude column of each drive; ``current`` times K is another amplitude of both.
+AMPLITUDE = {"pulses": "P_on", "harmonic": "P_d"}
+#: Fewest settings of a table that show more than their own scatter.
+FEWEST_SETTINGS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressionSettings(Settings):
+    """Settings of a progression, SI. ``P_on``, ``P_d`` and ``lag`` are priors where they have an sd."""
+
+    drive: Literal["pulses", "harmonic"] = "pulses"
+    P_on: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
+    P_d: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
+    lag: Annotated[Quantity | None, QuantityRule("s", NOT_NEGATIVE, has_sd=True)] = None
+
+
+def _check_drive(entry: Entry[ProgressionSettings]) -> None:
+    """Require one amplitude that belongs to the drive, and a duty with pulses."""
+    settings, columns = entry.table.settings, entry.table.columns
+    own = AMPLITUDE[settings.drive]
+    other = next(name for name in AMPLITUDE.values() if name != own)
+    if getattr(settings, other) is not None or other in columns:
+        rule = f'drive = "{settings.drive}" has the amplitude {own}'
+        raise entry.error("drive", rule, other, f"rename {other} to {own}, or correct the drive")
+    if (settings.drive == "pulses") != ("duty" in columns):
+        rule = "pulses need a column duty, and a harmonic drive has none"
+        remedy = "add the column duty" if settings.drive == "pulses" else "remove the column duty"
+        raise entry.error("drive", rule, f"columns {' '.join(columns)}", remedy)
+    if settings.drive == "harmonic" and settings.lag is not None:
+        raise entry.error("lag", "only pulses have a lag", "lag", "remove lag", of_key=True)
+    stated = [name for name in (own, "current") if name in columns]
+    stated += [f"the setting {own}"] if getattr(settings, own) is not None else []
+    if len(stated) != 1:
+        rule = f"a progression must have one amplitude: a column {own} or current, or the setting {own}"
+        remedy = f'state {own} = {{ value = ..., sd = ..., unit = "N" }} and nothing else'
+        raise entry.error("", rule, " and ".join(stated) or "none", remedy)
+
+
+def _check_periods(entry: Entry[ProgressionSettings]) -> None:
+    """Require whole numbers of periods."""
+    periods = entry.table["periods"]
+    wrong = np.flatnonzero(periods != np.round(periods))
+    if len(wrong):
+        row = int(wrong[0])
+        value = f"{periods[row]:g}"
+        raise entry.file.error(row, "periods", "periods must be a whole number", value, "count whole periods")
+
+
+def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
+    """Warn where a table has few settings."""
+    del rig
+    drive = [name for name in ("period", "f", "duty", "P_on", "P_d", "current") if name in table.columns]
+    settings = len(np.unique(np.stack([table[name] for name in drive], axis=1), axis=0))
+    if settings < FEWEST_SETTINGS:
+        facts = {"settings": settings, "wanted": FEWEST_SETTINGS}
+        yield Finding("progression.settings", "warn", facts, table.label)
+
+
+TEMPLATE = """\
+#: Progression, a row per trial: the displacement of the capsule after a number of drive periods from rest. Columns:
+#: period [ms] or f [Hz]; periods [1]; distance [cm]; duty [%] with pulses; session [1] optional. The amplitude is a
+#: column P_on [N] (harmonic: P_d [N]) or current [A], or a setting with its prior. It may be negative. lag too.
+#: Without a column session every block of consecutive rows with equal settings is a session.
+# [[experiment]]
+# kind = "progression"
+# file = "progression.csv"
+# drive = "pulses"                                    # or "harmonic"
+# P_on = { value = 1.25, sd = 0.5, unit = "N" }
+# lag = { value = 5, sd = 2, unit = "ms" }
+# distance_sd = { value = 1, unit = "mm" }
+"""
+
+MESSAGES = {
+    "progression.settings": Message(
+        "settings",
+        warn="{settings} settings of the drive, and {wanted} or more are wanted to test the model: vary period or duty",
+    ),
+}
+
+KIND = Kind(
+    name="progression",
+    columns={
+        "period": ColumnRule("s", POSITIVE),
+        "f": ColumnRule("Hz", POSITIVE),
+        "duty": ColumnRule("1"),
+        "P_on": ColumnRule("N"),
+        "P_d": ColumnRule("N"),
+        "current": ColumnRule("A"),
+        "periods": ColumnRule("1", POSITIVE, usual=(1.0, 1e4)),
+        "distance": ColumnRule("m"),
+        "session": ColumnRule("1", usual=(1.0, 1e9)),
+    },
+    sets=(("period", "periods", "distance"), ("f", "periods", "distance")),
+    optional=("duty", "P_on", "P_d", "current", "session"),
+    settings=ProgressionSettings,
+    rules=(_check_drive, _check_periods),
+    masses=lambda table: ("m1", "m2"),
+    parameters=(SESSION_SD, TRIAL_SCATTER, TRIAL_SD, DISCREPANCY),
+    bench=False,
+    make=made_by("capsule_id.experiments.progression.experiment:Progression"),
+    template=TEMPLATE,
+    informs="k1, c, mu, P_on, lag",
+    captions={
+        "progression": "Mean velocity of the capsule at each setting: trials, the fit, and the 95 % band of a new trial "
+        "in a new session."
+    },
+    messages=MESSAGES,
+    lint=(_lint_settings,),
+)

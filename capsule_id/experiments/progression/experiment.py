@@ -1,0 +1,291 @@
+"""Likelihood of progressions: displacement of the capsule after a number of drive periods, from rest.
+
+    distance_i = X2(setting, friction exp(s_j)) (1 + trial scatter) + discrepancy_b v t_b + trial sd + reading error
+
+Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2). X2 at s = ± session_sd gives the mean over
+sessions and the response to s_j, so that s_j enters linearly and is integrated out. So is the discrepancy, an error of
+the model's mean velocity at setting b that all trials of the setting share.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from capsule_id.experiments.base import About, Start, ValuesBySymbol
+from capsule_id.experiments.families.capsule_experiment import CapsuleForward
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.progression.declaration import (
+    AMPLITUDE,
+    DISCREPANCY,
+    SESSION_SD,
+    TRIAL_SCATTER,
+    TRIAL_SD,
+)
+from capsule_id.experiments.progression.panels import progression_panels
+from capsule_id.experiments.progression.trials import sessions_of, settings_of
+from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.batches import pool
+from capsule_id.physics.displacement import Progress, displacement
+from capsule_id.physics.drive import Drive, Excitation
+from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.friction import scaled
+from capsule_id.physics.model import CapsuleParameters
+from capsule_id.rig.model import Rig, Table
+from capsule_id.views import Comparison
+
+#: Scales of the half-normal priors of trial_sd and discrepancy, relative to the largest reading.
+TRIAL_PRIOR, DISCREPANCY_PRIOR = 0.05, 0.1
+#: Draws of one compiled batch.
+DRAWS_OF_A_BATCH = 16
+#: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
+DAMPING_RATIO, FRICTION = 0.1, 0.3
+
+
+class Progression(CapsuleForward):
+    """Trials of one table.
+
+    Attributes
+    ----------
+    distance : (n,) m
+    settings : (settings, 4) period, s, number of periods, duty, amplitude, N or A; see ``settings_of``
+    setting, session : (n, settings), (n, sessions) 1 where a row belongs to it
+    time : (settings,) duration of a trial, s
+    reading_variance : m^2
+    force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
+    has_lag : whether the lag is a parameter
+    """
+
+    distance: np.ndarray
+    settings: np.ndarray
+    setting: np.ndarray
+    session: np.ndarray
+    time: np.ndarray
+    reading_variance: float
+    force: float
+    lag: float
+    drive: str = eqx.field(static=True)
+    amplitude_from: str = eqx.field(static=True)
+    has_lag: bool = eqx.field(static=True)
+    reaction: float = eqx.field(static=True)
+
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        self.friction, self.smoothing = friction, None
+        self.drive, self.reaction = table.settings.drive, rig.model.share_of_reaction
+        self.distance = table["distance"]
+        self.reading_variance = table.columns["distance"].reading_sd ** 2
+        rows, self.amplitude_from = settings_of(
+            {name: column.values for name, column in table.columns.items()}, table.settings
+        )
+        self.settings, index = np.unique(rows, axis=0, return_inverse=True)
+        self.setting, self.time = np.eye(len(self.settings))[index], self.settings[:, 0] * self.settings[:, 1]
+        self.session = sessions_of(table, rows)
+        stated = {name: getattr(table.settings, name) for name in (AMPLITUDE[self.drive], "lag")}
+        exact = {name: q.value if q is not None and q.sd == 0.0 else 0.0 for name, q in stated.items()}
+        self.force, self.lag = exact[AMPLITUDE[self.drive]], exact["lag"]
+        stated_lag = stated["lag"]
+        free = "lag" in rig.model.free and self.drive == "pulses"
+        self.has_lag = free if stated_lag is None else stated_lag.sd > 0.0
+        self.about = About(table, rig, ())
+        self.about = replace(self.about, parameters=self._sampled())
+
+    def _sampled(self) -> tuple[Parameter, ...]:
+        settings, free = self.table.settings, self.rig.model.free
+        rows = [parameter("k1"), parameter("c"), *self.friction.parameters]
+        rows += [parameter("k_cubic")] if "k_cubic" in free else []
+        if self.amplitude_from == "current":
+            rows.append(parameter("K"))
+        elif self.amplitude_from == "prior":
+            name = AMPLITUDE[self.drive]
+            stated = getattr(settings, name)
+            rows.append(parameter(name, prior=Prior("normal", stated.value, stated.sd)))
+        if self.has_lag:
+            lag = settings.lag
+            rows.append(parameter("lag", prior=lag and Prior("positive_normal", lag.value, lag.sd)))
+        largest = float(np.max(np.abs(self.distance)))
+        speed = float(np.max(np.abs(self.distance / (self.setting @ self.time))))
+        floor = np.sqrt(self.reading_variance) + 1e-9
+        return (
+            *rows,
+            SESSION_SD,
+            TRIAL_SCATTER,
+            TRIAL_SD.named(self.label, Prior("halfnormal", 0.0, max(TRIAL_PRIOR * largest, floor))),
+            DISCREPANCY.named(self.label, Prior("halfnormal", 0.0, max(DISCREPANCY_PRIOR * speed, 1e-9))),
+        )
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.distance
+
+    @property
+    def scatters(self) -> tuple[str]:
+        # The other scatters enter with the parameters, because they change the design.
+        return ("trial_sd",)
+
+    @property
+    def has_joint_scatters(self) -> bool:
+        return True
+
+    @property
+    def mirrored(self) -> tuple[str, ...]:
+        return (AMPLITUDE[self.drive],) if self.amplitude_from == "prior" else ()
+
+    def with_smoothing(self, widths: Any) -> "Progression":
+        """Return the experiment itself: it has the exact model only."""
+        del widths
+        return self
+
+    # -- the forward model --------------------------------------------------------------------------------------------
+
+    def capsule(self, theta: ValuesBySymbol, settings: Any) -> tuple[CapsuleParameters, Drive]:
+        """Parameters and drive at rows of ``settings`` (rows, 4), leaves () or (rows,)."""
+        period, _, duty, amplitude = settings.T
+        force = {
+            "column": amplitude,
+            "current": theta.get("K", 0.0) * amplitude,
+            "prior": theta.get(AMPLITUDE[self.drive], 0.0) + 0.0 * period,
+            "exact": self.force + 0.0 * period,
+        }[self.amplitude_from]
+        p = self.parameters_of(theta, 0.0, np.inf)
+        if self.drive == "harmonic":
+            return p, Excitation(force, 2.0 * np.pi / period, 0.0, self.reaction)
+        return p, Pulses(force, period, duty, lag=theta["lag"] if self.has_lag else self.lag, reaction=self.reaction)
+
+    def responses(self, theta: ValuesBySymbol) -> tuple[Any, Any]:
+        """(settings,) mean of X2 over sessions, m, and its change per standard deviation of a session, m."""
+        sd, settings = theta["session_sd"], jnp.concatenate([self.settings, self.settings])
+        sign = np.repeat([1.0, -1.0], len(self.settings))
+        upper, lower = jnp.split(self.displacements(theta, sd * sign, settings), 2)
+        return 0.5 * (upper + lower), 0.5 * (upper - lower)
+
+    def displacements(self, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
+        """X2, m, at rows of ``settings`` (rows, 4) with friction multiplied by exp(s), s (rows,)."""
+        return _displacements(self, theta, s, settings).X2
+
+    def displacements_of_draws(
+        self, draws: Sequence[ValuesBySymbol], s: np.ndarray, settings: np.ndarray
+    ) -> np.ndarray:
+        """(draws, rows) X2, m, at each draw with friction multiplied by exp(s), s (draws, rows)."""
+        return _batched(_displacements_at, self, draws, s, settings)
+
+    def responses_of_draws(self, draws: Sequence[ValuesBySymbol]) -> tuple[np.ndarray, np.ndarray]:
+        """``responses`` at each draw, (draws, settings) each."""
+        found = _batched(_responses_at, self, draws, np.zeros((len(draws), 0)), self.settings)
+        mean, per_sd = np.split(found, 2, axis=1)
+        return mean, per_sd
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        return (self.misfit_of(theta, *self.responses(theta), xp),)
+
+    def misfit_of(self, theta: ValuesBySymbol, mean: Any, per_sd: Any, xp: ModuleType = jnp) -> Misfit:
+        """The misfit at the responses ``mean`` and ``per_sd`` of ``responses``."""
+        mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
+        expected = self.setting @ mean
+        design = xp.concatenate(
+            [(self.setting @ per_sd)[:, None] * self.session, theta["discrepancy"] * self.setting * self.time], axis=1
+        )
+        variance = self.reading_variance + (theta["trial_scatter"] * expected) ** 2
+        return Misfit(self.distance - expected, variance, xp.ones(len(self.distance)), design)
+
+    def profile(self, theta: ValuesBySymbol) -> Any:
+        """The log-likelihood as a function of values of the scatters by symbol, the motions held at ``theta``."""
+        mean, per_sd = (np.asarray(x) for x in self.responses(theta))
+
+        def log_likelihood(scatters: ValuesBySymbol) -> float:
+            own = {**theta, **scatters}
+            scale = own["session_sd"] / theta["session_sd"]
+            return float(self.misfit_of(own, mean, scale * per_sd, np).log_density(own["trial_sd"], np))
+
+        return log_likelihood
+
+    # -- starting points and the report -------------------------------------------------------------------------------
+
+    def starts(self) -> dict[str, Start]:
+        m1, m2 = self.rig.mass("m1"), self.rig.mass("m2")
+        k1 = m1 * (2.0 * np.pi / float(np.median(self.settings[:, 0]))) ** 2
+        largest = float(np.max(np.abs(self.distance)))
+        priors = {row.symbol: row.prior for row in self.parameters}
+        starts = {
+            "k1": Start(k1, 0.7),
+            "c": Start(2.0 * DAMPING_RATIO * float(np.sqrt(k1 * m1)), 1.0),
+            "mu": Start(FRICTION, 0.5),
+            "mu_back": Start(FRICTION, 0.5),
+            "v_s": Start(0.3, 1.0),
+            "ratio": Start(0.7, 0.3),
+            "lag": Start(0.05 * float(np.median(self.settings[:, 0])), 1.0),
+            "session_sd": Start(0.05, 0.3),
+            "trial_scatter": Start(0.05, 0.3),
+            f"trial_sd[{self.label}]": Start(max(0.01 * largest, float(np.sqrt(self.reading_variance))), 0.3),
+            f"discrepancy[{self.label}]": Start(0.5 * _scale(priors["discrepancy"]), 0.3),
+        }
+        for name in self.mirrored:
+            prior = priors[name]
+            assert prior is not None, "the amplitude has the stated prior"
+            friction = FRICTION * (m1 + m2) * self.rig.g.value
+            starts[name] = Start(prior.location if abs(prior.location) > prior.spread else friction, 0.5 * prior.spread)
+        known = {row.name for row in self.parameters}
+        return {name: start for name, start in starts.items() if name in known}
+
+    def excess_noise(self, theta: ValuesBySymbol) -> float:
+        """Total error of a trial relative to its scatter, at the median setting."""
+        size = float(np.median(np.abs(self.distance)))
+        scatter = np.hypot(theta["trial_sd"], theta["trial_scatter"] * size) + np.sqrt(self.reading_variance)
+        return float(np.hypot(scatter, theta["discrepancy"] * np.median(self.time)) / scatter)
+
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+        return self.comparisons(theta, draws)[0]
+
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
+        return progression_panels(self, theta, draws)
+
+
+def _batched(
+    function: Callable[..., Any],
+    e: Progression,
+    draws: Sequence[ValuesBySymbol],
+    s: np.ndarray,
+    settings: np.ndarray,
+) -> np.ndarray:
+    """``function(e, theta, s, settings)`` at every draw and row of ``s``, in batches of one size, on all cores."""
+    symbols = tuple(name for name in draws[0] if np.ndim(draws[0][name]) == 0)
+    rows = np.concatenate([np.array([[draw[name] for name in symbols] for draw in draws]), s], axis=1)
+    padded = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % DRAWS_OF_A_BATCH, axis=0)])
+    parts = np.split(padded, len(padded) // DRAWS_OF_A_BATCH)
+    found = pool().map(lambda part: np.asarray(_of_rows(function, e, symbols, part, settings)), parts)
+    return np.concatenate(list(found))[: len(rows)]
+
+
+@eqx.filter_jit
+def _of_rows(function: Callable[..., Any], e: Progression, symbols: tuple[str, ...], rows: Any, settings: Any) -> Any:
+    def one(row: Any) -> Any:
+        theta = dict(zip(symbols, row[: len(symbols)], strict=True))
+        return function(e, theta, row[len(symbols) :], settings)
+
+    return jax.vmap(one)(rows)
+
+
+def _displacements_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
+    return e.displacements(theta, s, settings)
+
+
+def _responses_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
+    del s, settings
+    return jnp.concatenate(e.responses(theta))
+
+
+@eqx.filter_jit
+def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Progress:
+    p, drive = e.capsule(theta, settings)
+    law = scaled(e.law(theta), jnp.exp(s))
+    return displacement(p, drive, law, settings[:, 0], settings[:, 1])
+
+
+def _scale(prior: Prior | None) -> float:
+    assert prior is not None, "the experiment states its prior"
+    return prior.spread

@@ -1,0 +1,72 @@
+"""Predictions of progressions and their panels: mean velocity against period, for every duty and amplitude."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from capsule_id.experiments.base import ValuesBySymbol, band
+from capsule_id.views import Comparison, Curve, Points
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.progression.experiment import Progression
+
+#: Symbols of the scatters.
+SCATTERS = ("session_sd", "trial_scatter", "trial_sd", "discrepancy")
+#: Draws of a band.
+BAND_DRAWS = 200
+#: Seed of the sessions and trials of a band.
+BAND_SEED = 0
+
+
+def new_trials(
+    e: "Progression", draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """(draws, rows) displacement, m, of a new trial in a new session at each row of ``settings`` (rows, 4).
+
+    Each row has a session, a discrepancy and a trial of its own.
+    """
+    time = settings[:, 0] * settings[:, 1]
+    z = rng.standard_normal((3, len(draws), len(settings)))
+    own = {name: np.array([draw[name] for draw in draws])[:, None] for name in SCATTERS}
+    X2 = e.displacements_of_draws(draws, own["session_sd"] * z[0], settings)
+    variance = e.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
+    return X2 + own["discrepancy"] * time * z[1] + np.sqrt(variance) * z[2]
+
+
+def progression_panels(e: "Progression", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
+    """One panel per duty and amplitude: trials, the point fit, and the band of a new trial in a new session."""
+    settings = e.settings
+    speed = 1e3 / e.time
+    centre = np.asarray(e.displacements(theta, np.zeros(len(settings)), settings)) * speed
+    chosen = draws[:: max(1, len(draws) // BAND_DRAWS)]
+    trials = new_trials(e, chosen, settings, np.random.default_rng(BAND_SEED)) if chosen else np.empty((0, 0))
+    lower, upper = band(trials * speed if chosen else trials)
+    residuals = np.asarray(e.residuals(theta, np))[: e.n]
+    panels = []
+    for group in np.unique(settings[:, 2:], axis=0):
+        own = np.flatnonzero(np.all(settings[:, 2:] == group, axis=1))
+        rows = np.flatnonzero(e.setting[:, own].any(axis=1))
+        name = f"{e.label}, duty {100.0 * group[0]:g} %" if e.drive == "pulses" else e.label
+        x = 1e3 * settings[:, 0]
+        curve = Curve(
+            "this fit, 95 % band of a new trial",
+            x[own],
+            centre[own],
+            None if lower is None else lower[own],
+            None if upper is None else upper[own],
+        )
+        panels.append(
+            Comparison(
+                "progression",
+                e.label,
+                f"{name}: mean velocity",
+                "period [ms]",
+                "mean velocity [mm/s]",
+                (Points(e.label, (e.setting @ x)[rows], (e.distance * (e.setting @ speed))[rows]),),
+                (curve,),
+                (e.setting @ x)[rows],
+                residuals[rows],
+            )
+        )
+    return tuple(panels)

@@ -1,0 +1,119 @@
+"""Displacement of the capsule after many periods of a drive, as a progression test measures it.
+
+A lane runs in blocks of periods. Once the motion repeats from period to period, the remaining periods add the same
+displacement each. Lanes are sorted by period and run in chunks, because lanes of one setting need as many steps.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.lax import stop_gradient
+
+from capsule_id.physics.batches import CHUNK
+from capsule_id.physics.drive import Drive
+from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.model import CapsuleParameters, Status, simulate, without_absent
+
+#: Periods of a block.
+BLOCK = 6
+#: The motion repeats where the state changes by less than this part of itself over one period, dimensionless.
+REPEATS = 1e-5
+
+
+class Progress(NamedTuple):
+    """Displacement X2 after the periods, m, NaN where the run failed, and a ``Status`` code; (L,) each."""
+
+    X2: Any
+    status: Any
+
+
+class _Lane(NamedTuple):
+    """A run in progress: periods done, state (X1, Y1, X2, Y2) then, whether it goes on, its status; (L,) each."""
+
+    done: Any
+    state: tuple[Any, ...]
+    active: Any
+    status: Any
+
+
+def displacement(p: CapsuleParameters, e: Drive, law: FrictionLaw, period: Any, count: Any, r0: Any = 0.0) -> Progress:
+    """X2 after ``count`` periods of ``e`` from rest at x_rel = ``r0``, by the exact engine.
+
+    Parameters
+    ----------
+    p, e, law : leaves () or (L,)
+    period, count : (L,) period of the drive, s, and number of periods
+    r0 : () or (L,), m
+
+    Works under ``jit`` and ``vmap``, and is differentiable in forward mode.
+    """
+    p, e = without_absent(p, e)
+    lanes = jnp.shape(period)[0]
+    tree = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (lanes,)), (p, e, law, r0))
+    leaves, structure = jax.tree.flatten((*tree, jnp.asarray(period, float), jnp.asarray(count, float)))
+    return _folding(structure)(*leaves)
+
+
+@cache
+def _folding(structure: Any) -> Callable[..., Progress]:
+    """The run of leaves (L,); the axis of a ``jax.vmap`` joins the lanes."""
+
+    @custom_vmap
+    def run(*leaves: Any) -> Progress:
+        return _in_chunks(structure, leaves)
+
+    @run.def_vmap
+    def _fold(size: int, batched: list[bool], *leaves: Any) -> tuple[Progress, Progress]:
+        if not any(batched):
+            return _in_chunks(structure, leaves), Progress(False, False)
+        full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)]
+        out = run(*(x.reshape(-1) for x in full))
+        return Progress(*(x.reshape(size, -1) for x in out)), Progress(True, True)
+
+    return run
+
+
+def _in_chunks(structure: Any, leaves: tuple[Any, ...]) -> Progress:
+    """Run lanes (L,) in chunks of ``CHUNK``, sorted by period."""
+    lanes = leaves[0].shape[0]
+    order = jnp.argsort(stop_gradient(jax.tree.unflatten(structure, leaves)[-2]))
+    index = jnp.concatenate([order, jnp.repeat(order[-1:], -lanes % CHUNK)])
+    chunks = [leaf[index].reshape(-1, CHUNK) for leaf in leaves]
+    out = jax.lax.map(lambda one: _run(*jax.tree.unflatten(structure, one)), chunks)
+    back = jnp.argsort(order)
+    return Progress(*(x.reshape(-1)[:lanes][back] for x in out))
+
+
+def _run(p: CapsuleParameters, e: Drive, law: FrictionLaw, r0: Any, period: Any, count: Any) -> Progress:
+    """One chunk of lanes."""
+    omega = 2.0 * np.pi / period
+
+    def block(lane: _Lane) -> _Lane:
+        ahead = jnp.where(lane.active, jnp.minimum(float(BLOCK), count - lane.done), 0.0)
+        begin, end = lane.done * period, (lane.done + ahead) * period
+        t = simulate(
+            p, e, jnp.stack([begin, end - jnp.where(ahead > 1.0, period, 0.0), end], 1), lane.state, friction=law
+        )
+        ends = [(x[:, 1], x[:, 2]) for x in (t.X1, t.Y1, t.X2, t.Y2)]
+        before, after = (
+            jnp.stack([X1 - X2, (Y1 - Y2) / omega, Y2 / omega]) for X1, Y1, X2, Y2 in zip(*ends, strict=True)
+        )
+        change, size = (jnp.sum(stop_gradient(x) ** 2, axis=0) for x in (after - before, after))
+        repeats = (ahead > 1.0) & (change <= REPEATS**2 * size)
+        done = lane.done + ahead
+        left = jnp.where(repeats, count - done, 0.0) * (ends[2][1] - ends[2][0])
+        new = (ends[0][1] + left, ends[1][1], ends[2][1] + left, ends[3][1])
+        state = tuple(jnp.where(lane.active, x, y) for x, y in zip(new, lane.state, strict=True))
+        status = jnp.where(lane.active, jnp.maximum(lane.status, t.status), lane.status)
+        usable = status <= Status.GRAZING
+        return _Lane(done, state, lane.active & usable & ~repeats & (done < count), status)
+
+    zero = jnp.zeros_like(period)
+    first = _Lane(zero, (r0 + zero, zero, zero, zero), count > 0.0, jnp.zeros(period.shape, jnp.int32))
+    last = jax.lax.while_loop(lambda lane: jnp.any(lane.active), block, first)
+    return Progress(jnp.where(last.status <= Status.GRAZING, last.state[2], jnp.nan), last.status)

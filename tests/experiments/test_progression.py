@@ -1,0 +1,121 @@
+"""Progressions: the likelihood against SciPy, sessions, the start on its own, faults of a folder with their remedies."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from capsule_id.api import read_rig
+from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.experiments.progression.twin import ROBOT, Design, write_robot
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.model import CapsuleParameters, simulate
+from tests.rig.faults import fault_of
+
+PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
+SMALL = Design(PERIODS, np.full(3, 0.3), sessions=2)
+#: Values that are no parameter of the twin.
+SCATTERS = {"session_sd": 0.05, "trial_scatter": 0.04, "trial_sd": 1e-3, "discrepancy": 2e-4}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("robot") / "rig"
+    write_robot(path, 1, SMALL)
+    return path
+
+
+def progression(folder: Path) -> Progression:
+    (experiment,) = make_experiments(read_rig(folder))
+    assert isinstance(experiment, Progression)
+    return experiment
+
+
+THETA = {**ROBOT, "g": 9.81, **SCATTERS}
+
+
+def plain_displacement(s: float, period: float, count: float) -> float:
+    """X2 by a plain run, friction multiplied by exp(s)."""
+    own = {name: ROBOT[name] for name in ("m1", "m2", "k1", "c", "v_s", "ratio")}
+    p = CapsuleParameters(**own, mu=ROBOT["mu"] * np.exp(s), k2=0.0, G=np.inf)
+    drive = Pulses(ROBOT["P_on"], period, 0.3, lag=ROBOT["lag"], reaction=1.0)
+    return float(simulate(p, drive, np.array([0.0, period * count])).X2[-1])
+
+
+def test_the_likelihood_is_that_of_correlated_normal_readings(folder: Path) -> None:
+    e = progression(folder)
+    table = e.table
+    sd = SCATTERS["session_sd"]
+    ends = np.array(
+        [
+            [plain_displacement(s, *row) for s in (sd, -sd)]
+            for row in zip(table["period"], table["periods"], strict=True)
+        ]
+    )
+    mean, slope = ends.mean(axis=1), 0.5 * (ends[:, 0] - ends[:, 1])
+    same_session = table["session"][:, None] == table["session"]
+    same_setting = table["period"][:, None] == table["period"]
+    time = table["period"] * table["periods"]
+    noise = 5e-4**2 + SCATTERS["trial_sd"] ** 2 + (SCATTERS["trial_scatter"] * mean) ** 2
+    covariance = np.diag(noise) + same_session * np.outer(slope, slope)
+    covariance += same_setting * SCATTERS["discrepancy"] ** 2 * np.outer(time, time)
+    expected = multivariate_normal(mean, covariance).logpdf(table["distance"])
+    assert float(e.log_likelihood(THETA)) == pytest.approx(expected, abs=0.02)
+    assert e.profile(THETA)(SCATTERS) == pytest.approx(float(e.log_likelihood(THETA)), abs=1e-6)
+    other = {**SCATTERS, "discrepancy": 1e-3}
+    assert e.profile(THETA)(other) == pytest.approx(float(e.log_likelihood({**THETA, **other})), abs=1e-6)
+
+
+def test_without_a_column_a_session_is_a_block_of_equal_settings(folder: Path, tmp_path: Path) -> None:
+    e = progression(folder)
+    np.testing.assert_array_equal(np.argmax(e.session, axis=1), e.table["session"] - 1.0)
+    (tmp_path / "rig.toml").write_text((folder / "rig.toml").read_text())
+    lines = (folder / "progression.csv").read_text().splitlines()
+    repeated = [*lines, lines[1]]
+    (tmp_path / "progression.csv").write_text("\n".join(line.rsplit(",", 1)[0] for line in repeated) + "\n")
+    blocks = progression(tmp_path)
+    np.testing.assert_array_equal(np.argmax(blocks.session, axis=1), [0, 0, 0, 1, 1, 1, 2, 2, 2, 3])
+    assert blocks.setting.shape == (10, 3)
+
+
+def test_the_sampler_integrates_the_absolute_scatter_alone(folder: Path) -> None:
+    target = LogPosterior(read_rig(folder), [progression(folder)])
+    assert [name for name, one in zip(target.names, target.integrated, strict=True) if one] == ["trial_sd[progression]"]
+    assert {"P_on", "lag", "ratio", "session_sd"} <= set(target.names)
+    assert not target.positive[target.names.index("P_on")]
+
+
+@pytest.mark.parametrize(
+    ("setting", "rule", "instead"),
+    [
+        ("", "must have one amplitude", 'P_on = { value = 1, unit = "N" }'),
+        ('drive = "harmonic"\nP_d = { value = 1, unit = "N" }', "a harmonic drive has", 'P_on = { value = 1, unit = "N" }'),
+        ('P_d = { value = 1, unit = "N" }', "has the amplitude P_on", 'P_on = { value = 1, unit = "N" }'),
+        ('P_on = { value = 1, unit = "N" }\nlag = { value = -1, unit = "s" }', "lag must be 0 or greater",
+         'P_on = { value = 1, unit = "N" }\nlag = { value = 1, unit = "ms" }'),
+    ],
+)  # fmt: skip
+def test_a_fault_is_named_and_its_remedy_works(
+    folder: Path, tmp_path: Path, setting: str, rule: str, instead: str
+) -> None:
+    text = (folder / "rig.toml").read_text()
+    head = text[: text.index('drive = "pulses"')]
+    (tmp_path / "progression.csv").write_text((folder / "progression.csv").read_text())
+    (tmp_path / "rig.toml").write_text(head + setting + "\n")
+    assert rule in str(fault_of(tmp_path))
+    (tmp_path / "rig.toml").write_text(head + instead + "\n")
+    read_rig(tmp_path)
+
+
+def test_parts_of_periods_are_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text((folder / "rig.toml").read_text())
+    lines = (folder / "progression.csv").read_text().splitlines()
+    cells = lines[1].split(",")
+    lines[1] = ",".join([*cells[:2], "66.5", *cells[3:]])
+    (tmp_path / "progression.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError, match=r"progression.csv:2:.*periods must be a whole number, 66.5"):
+        read_rig(tmp_path)
