@@ -8,8 +8,9 @@ from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_o
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments import CHOICES, make_experiments
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress
+from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 
 DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 4000
@@ -40,6 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"stop at this bulk and tail effective sample size of every parameter (default {DEFAULT_ESS})",
     )
     parser.add_argument("--json", action="store_true", help="print parameters.json instead of the table")
+    parser.add_argument(
+        "--compare",
+        metavar="WORDS",
+        help="compare models instead of a fit: some of friction,reaction,lag,cubic; needs a progression",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     add_cache_argument(parser)
 
@@ -60,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--ess must be positive", str(args.ess), "give 1 or more")
     kinds = default_registry()
     rig = read_rig(args.data, kinds)
+    if args.compare is not None:
+        return _compare(args, rig, kinds)
     directory = args.out if args.out is not None else Path("results") / rig.name
     check_directory(directory)
     if args.no_sample and (directory / "posterior.nc").exists():
@@ -103,3 +111,16 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
     return 3
+
+
+def _compare(args: argparse.Namespace, rig: Rig, kinds: Registry) -> int:
+    """Print the comparison of models; 0."""
+    set_loop_option()
+    if not args.no_cache:
+        keep_programs()
+    from capsule_id.inference.choice.compare import compare_models
+
+    with Progress(not args.quiet) as progress:
+        choice = compare_models(rig, args.compare.split(","), kinds, args.seed, progress)
+    say(f"{choice.table.round(2).to_string()}\n{choice.line}")
+    return 0

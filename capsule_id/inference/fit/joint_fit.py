@@ -64,7 +64,11 @@ class _End:
 
 
 def joint_fit(
-    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float] | None = None
+    target: LogPosterior,
+    known: Mapping[str, float],
+    seed: int,
+    first: Mapping[str, float] | None = None,
+    starts: np.ndarray | None = None,
 ) -> PointFit:
     """Fit ``target``, whose experiments include forced runs.
 
@@ -73,8 +77,9 @@ def joint_fit(
     known : previous estimates by name: a fit of the bench tests, or the paper's estimates
     seed : seed of the candidates
     first : values by name that replace those of ``known`` in the first starting point
+    starts : (s, d) u of the starting points, instead of the best candidates
     """
-    starts = choose_starts(target, known, seed, first or {})
+    starts = choose_starts(target, known, seed, first or {}) if starts is None else starts
     ends: list[_End] = []
     for start in starts:
         if len(ends) >= STARTS and sum(not _has_excess_noise(target, end.u) for end in ends) > 1:

@@ -1,0 +1,79 @@
+"""Displacement of a capsule robot at new settings, from a fit with progressions."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.experiments.progression.panels import new_trials
+from capsule_id.experiments.progression.trials import settings_of
+from capsule_id.inference.result import Result
+from capsule_id.rig.model import Column, Table
+from capsule_id.rig.tables import read_settings
+
+#: Draws of the posterior; the ends of the 95 % interval then have a standard error of a tenth of its sd.
+DRAWS = 1000
+#: The kind that is predicted, and its reading.
+KIND, READING = "progression", "distance"
+
+
+def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
+    """Predict a new trial in a new session at each row of a table of settings.
+
+    Parameters
+    ----------
+    result : of a fit with a progression, sampled; the first one gives reading error and drive
+    settings : a file with the columns of that progression, without ``distance``
+    draws : draws of the posterior, at most those of the sample
+    seed : of the choice of draws, and of sessions and trials
+
+    Returns
+    -------
+    DataFrame with a row per row of ``settings``: ``distance [mm]`` (median), ``distance_lower [mm]`` and
+    ``distance_upper [mm]`` (central 95 %, all scatter included), ``mean_velocity [mm/s]`` (of the median).
+
+    Raises
+    ------
+    InputError
+        If nothing was sampled, no progression was fitted, ``draws`` is out of range, or the settings break a rule.
+    """
+    tables = [table for table in result.rig.tables if table.kind == KIND and table.label in result.observed]
+    if not tables:
+        raise InputError("a prediction needs a fit with a progression", "none", "add one to the rig and fit again")
+    if result.posterior is None:
+        raise InputError("a prediction needs a sample", "the point fit alone", "fit without --no-sample (budget=None)")
+    flat = result.posterior.draws.reshape(-1, len(result.posterior.names))
+    if not 1 <= draws <= len(flat):
+        raise InputError("draws must lie between 1 and the sample's", str(draws), f"give at most {len(flat)}")
+    columns = read_settings(Path(settings), result.registry[KIND], READING)
+    _check_settings(tables[0], columns, Path(settings))
+    rng = np.random.default_rng(seed)
+    chosen = flat[rng.choice(len(flat), draws, replace=False)]
+    experiment = next(e for e in make_experiments(result.rig, "all", result.registry) if isinstance(e, Progression))
+    constants = {**result.fixed, "g": result.rig.g.value}
+    values = [
+        experiment.local({**constants, **dict(zip(result.posterior.names, theta, strict=True))}) for theta in chosen
+    ]
+    rows = settings_of({name: column.values for name, column in columns.items()}, tables[0].settings)[0]
+    trials = 1e3 * new_trials(experiment, values, rows, rng)
+    lower, median, upper = np.quantile(trials, [0.025, 0.5, 0.975], axis=0)
+    return pd.DataFrame(
+        {
+            "distance [mm]": median,
+            "distance_lower [mm]": lower,
+            "distance_upper [mm]": upper,
+            "mean_velocity [mm/s]": median / (rows[:, 0] * rows[:, 1]),
+        }
+    )
+
+
+def _check_settings(fitted: Table, columns: dict[str, Column], path: Path) -> None:
+    """Require the drive columns of the fitted progression."""
+    drive = {"duty", "P_on", "P_d", "current"}
+    wanted, given = drive & set(fitted.columns), drive & set(columns)
+    if wanted != given:
+        rule = f"the settings must have the drive columns of {fitted.label}: {' '.join(sorted(wanted)) or 'none'}"
+        raise InputError(rule, " ".join(sorted(given)) or "none", "add or remove columns", path, 1, 1)
