@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from capsule_id.experiments.linear import MANY_NUISANCES
 from capsule_id.experiments.misfit import Misfit, Moments
 
 RNG = np.random.default_rng(5)
@@ -15,6 +16,7 @@ CASES = {
     "one variance": ONE_VARIANCE,
     "no nuisance": Misfit(RAW, 0.0, 1.0, np.zeros((7, 0))),
     "unequal": Misfit(RAW, np.linspace(0.1, 2.0, 7), np.linspace(1.0, 3.0, 7), DESIGN),
+    "many nuisances": Misfit(RAW, 0.3, np.linspace(1.0, 3.0, 7), RNG.standard_normal((7, MANY_NUISANCES + 2))),
     "unequal, no nuisance": Misfit(RAW, 0.2, np.linspace(1.0, 3.0, 7), np.zeros((7, 0))),
 }
 

@@ -63,7 +63,7 @@ def test_faults_of_the_settings_are_named(result: Result, tmp_path: Path, text: 
     path = tmp_path / "settings.csv"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
-        predict(result, path)
+        predict(result, path, draws=16)
     assert rule in str(caught.value)
     assert caught.value.file == str(path)
     path.write_text(SETTINGS)

@@ -160,5 +160,5 @@ def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices])
         }
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("variant")
     close = table[table["difference"] >= -STANDARD_ERRORS * table["se"]]
-    recommended = str(close.sort_values(["parameters", "elpd"], ascending=[True, False]).index[0])
+    recommended = min(close.index, key=lambda name: (fitted[name].parameters, -float(np.sum(fitted[name].density))))
     return Choice(table, recommended, dict(choices))

@@ -6,7 +6,7 @@ integrated out. Draws come from the Laplace approximation at the maximum, widene
 Statistics and Computing 27, 2017, 1413.)
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -64,7 +64,7 @@ def leave_settings_out(target: LogPosterior, e: Progression, draws: WeightedDraw
     return LeftOut(np.asarray(logsumexp(smoothed + own.T, axis=1)), shape)
 
 
-def conditional_densities(e: Progression, draws: list[Mapping[str, Any]]) -> np.ndarray:
+def conditional_densities(e: Progression, draws: Sequence[Mapping[str, Any]]) -> np.ndarray:
     """(draws, settings) log-density of the readings of each setting, given the parameters and all other readings."""
     means, per_sd = e.responses_of_draws(draws)
     rows = [np.flatnonzero(column) for column in e.setting.T]
