@@ -15,6 +15,7 @@ from scipy import stats
 
 from capsule_id.errors import InputError
 from capsule_id.inference.checks.trust import MASSES
+from capsule_id.inference.prediction import DRAWS, predict
 from capsule_id.inference.result import Result
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.physics.drive import Drive
@@ -141,6 +142,10 @@ class Fit(Result):
             raise InputError("draws must lie between 1 and the sample's", str(number), f"give at most {len(flat)}")
         chosen = np.random.default_rng(seed).choice(len(flat), number, replace=False)
         return dict(zip(self.posterior.names, flat[chosen].T, strict=True))
+
+    def predict(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
+        """Predict a new trial in a new session at each row of a table; see ``capsule_id.inference.prediction``."""
+        return predict(self, settings, draws, seed)
 
     def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""

@@ -98,7 +98,26 @@ TEMPLATE = """\
 # distance_sd = { value = 1, unit = "mm" }
 """
 
+_SIZES = (
+    "the discrepancy of the mean velocity is {size:.2g} mm/s, the scatter of a trial {scatter:.2g} mm/s, "
+    "the rms {rms:.2g} mm/s"
+)
+
 MESSAGES = {
+    "progression.discrepancy": Message(
+        "discrepancy of the model",
+        ok=_SIZES,
+        warn=(
+            _SIZES
+            + ": the model leaves more than the trials scatter. The intervals and predictions include it; compare other models "
+            "with --compare friction,reaction,lag,cubic."
+        ),
+        fail=(
+            _SIZES
+            + ". Expected a model that explains most of the motion; its parameters have no meaning here. Check reaction, the "
+            "sign and size of the amplitude and the units, or compare models with --compare friction,reaction,lag,cubic."
+        ),
+    ),
     "progression.settings": Message(
         "settings",
         warn="{settings} settings of the drive, and {wanted} or more are wanted to test the model: vary period or duty",

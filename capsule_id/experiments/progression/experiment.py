@@ -21,6 +21,7 @@ from capsule_id.experiments.base import About, Start, ValuesBySymbol
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import (
     AMPLITUDE,
     DISCREPANCY,
@@ -73,6 +74,8 @@ class Progression(CapsuleForward):
     drive: str = eqx.field(static=True)
     amplitude_from: str = eqx.field(static=True)
     has_lag: bool = eqx.field(static=True)
+
+    checks = (check_discrepancy,)
     reaction: float = eqx.field(static=True)
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
