@@ -75,7 +75,7 @@ def _folding(structure: Any) -> Callable[..., Progress]:
         out = run(*(x.reshape(-1) for x in full))
         return Progress(*(x.reshape(size, -1) for x in out)), Progress(True, True)
 
-    return run
+    return jax.jit(run)
 
 
 def _in_chunks(structure: Any, leaves: tuple[Any, ...]) -> Progress:

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from capsule_id.errors import InputError
+from capsule_id.experiments.forced_run.drives.rules import check_base, check_drive
 from capsule_id.experiments.forced_run.lint import MESSAGES as LINT_MESSAGES
 from capsule_id.experiments.forced_run.lint import lint_run
 from capsule_id.experiments.kind import Estimate, Kind, Twin, Values, made_by
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.run_description import describe_run
-from capsule_id.rig.domains import NOT_NEGATIVE
+from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
@@ -47,16 +46,28 @@ Delay = Annotated[float | None, QuantityRule("s")]
 RUN_SPRINGS = {"hard": 59410.0}
 
 
+#: Module and class of the runs of each drive.
+RUNS_OF_DRIVES = {
+    "harmonic": "experiment:ForcedRun",
+    "base": "base_run:BaseRun",
+    "pulses": "drives.runs:PulseRun",
+    "recorded": "drives.runs:RecordedRun",
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(Settings):
     """Settings of a forced run, SI; ``<channel>_gain_sd`` and ``<channel>_delay_sd`` are sds of gain and delay."""
 
-    drive: Literal["harmonic", "base"] = "harmonic"
+    drive: Literal["harmonic", "base", "pulses", "recorded"] = "harmonic"
     spring: Annotated[str | None, NameRule()] = None
     gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
     Omega: Annotated[float | None, QuantityRule("rad/s")] = None
     f: Annotated[float | None, QuantityRule("Hz")] = None
     P_d: Annotated[Quantity | None, QuantityRule("N", has_sd=True)] = None
+    duty: Annotated[float | None, QuantityRule("1")] = None
+    P_on: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
+    lag: Annotated[Quantity | None, QuantityRule("s", NOT_NEGATIVE, has_sd=True)] = None
     normal_force: Annotated[float | None, QuantityRule("N")] = None
     start: Literal["auto", "stuck", "moving", "settled"] = "auto"
     noise: Literal["white", "ar1"] = "white"
@@ -79,60 +90,13 @@ class RunSettings(Settings):
         return 2.0 * np.pi * self.f
 
 
-def _check_base(entry: Entry[RunSettings]) -> None:
-    """Require x_base with drive = "base" and only there, and nothing that belongs to a force on the rod."""
-    settings, columns = entry.table.settings, entry.table.columns
-    if settings.drive == "harmonic":
-        if "x_base" in columns:
-            rule, remedy = "x_base prescribes the motion of the rod", 'add drive = "base", or remove the column'
-            raise entry.error("", rule, "a harmonic force", remedy)
-        return
-    if "x_base" not in columns:
-        raise entry.error("drive", 'drive = "base" needs a column x_base', f"columns {' '.join(columns)}", "add it")
-    present = [name for name in ("acceleration_rod", "current") if name in columns]
-    if present:
-        rule = "a run with a prescribed rod has x_capsule, x_rel or both, and no other channel"
-        raise entry.error("drive", rule, f"columns {' '.join(columns)}", f"remove {' and '.join(present)}")
-    if settings.P_d is not None:
-        raise entry.error("P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True)
-    if settings.start == "settled":
-        rule, remedy = 'start = "settled" needs a harmonic force', 'write start = "auto"'
-        raise entry.error("start", rule, 'drive = "base"', remedy)
-    if settings.Omega is None and settings.f is None:
-        try:
-            sampling_step(entry.table["time"])
-        except InputError as error:
-            rule = "the frequency of a base sampled unevenly must be stated"
-            raise entry.error("", rule, error.value, 'add f = { value = ..., unit = "Hz" }') from None
-
-
-def _check_drive(entry: Entry[RunSettings]) -> None:
-    """Require one frequency, and an amplitude from P_d or from the recorded current."""
-    settings, columns = entry.table.settings, entry.table.columns
-    stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
-    if settings.drive == "base" and not stated:
-        return
-    if len(stated) != 1:
-        rule = "forced_run must have Omega (rad/s) or f (Hz), not both"
-        raise entry.error("f" if stated else "", rule, " and ".join(stated) or "none", "state one of them")
-    if settings.drive == "base":
-        return
-    if settings.P_d is None and "current" not in columns:
-        rule = "forced_run must have P_d where current is not recorded"
-        remedy = 'add P_d = { value = ..., sd = ..., unit = "N" }'
-        raise entry.error("", rule, f"columns {' '.join(columns)}", remedy)
-    if "current" in columns and settings.P_d is not None and settings.P_d.sd == 0.0:
-        rule = "P_d beside a recorded current is a second reading of the same amplitude and must have an sd"
-        raise entry.error("P_d", rule, "none", "add sd = ... to it, or leave P_d out")
-
-
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
     from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE
     from capsule_id.experiments.forced_run.feasibility import feasibility
 
     settings = table.settings
-    if settings.drive == "base":
+    if settings.drive != "harmonic":
         return []
     names = {symbol: symbol for symbol in ("k1", "c", "mu", "K")}
     if settings.spring is not None:
@@ -159,7 +123,7 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
 
 
 def _make(table: Table[RunSettings], rig: Rig, friction: "FrictionModel") -> tuple["Experiment", ...]:
-    reference = "base_run:BaseRun" if table.settings.drive == "base" else "experiment:ForcedRun"
+    reference = RUNS_OF_DRIVES[table.settings.drive]
     return made_by(f"capsule_id.experiments.forced_run.{reference}")(table, rig, friction)
 
 
@@ -180,6 +144,8 @@ TEMPLATE = """\
 # P_d = { value = 4.0, sd = 0.1, unit = "N" }
 #: "harmonic" (default): P_d cos(Omega t + phase); "base": a column x_base [mm] prescribes the motion of the rod. Then
 #: x_capsule or x_rel is needed, P_d and m1 are not, and the frequency is that of x_base. spring and gap: optional
+#: "pulses": duty = { value = 30, unit = "%" }, P_on = { value = 1.2, sd = 0.3, unit = "N" } and optionally lag;
+#: "recorded": K times the column current is the force, whatever its form
 # drive = "harmonic"
 #: normal force on the ground where it is not (m1 + m2) g
 # normal_force = { value = 6.28, unit = "N" }
@@ -289,7 +255,7 @@ KIND = Kind(
     optional=("x_base",),
     channels=tuple(NOISE),
     settings=RunSettings,
-    rules=(Entry.check_spring_with_gap, Entry.check_length, _check_base, _check_drive),
+    rules=(Entry.check_spring_with_gap, Entry.check_length, check_base, check_drive),
     masses=_masses,
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
     make=_make,

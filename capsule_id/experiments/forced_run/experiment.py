@@ -95,6 +95,9 @@ class ForcedRun(CapsuleForward):
 
     #: Whether the record prescribes the motion of the rod.
     prescribed: ClassVar[bool] = False
+    #: Whether the phase of the drive is a parameter, and channels that are inputs, not readings.
+    has_phase: ClassVar[bool] = True
+    inputs: ClassVar[tuple[str, ...]] = ()
     time_series = True
     checks = (check_feasible, check_predictable)
     tables = (predicted_motion, scaled_groups)
@@ -120,7 +123,7 @@ class ForcedRun(CapsuleForward):
         settings, gap = table.settings, stated_gap(table)
         self.friction, self.smoothing = friction, None
         self.reaction = rig.model.share_of_reaction
-        self.channels = tuple(name for name in NOISE if name in table.columns)
+        self.channels = tuple(name for name in NOISE if name in table.columns and name not in self.inputs)
         self.time = table["time"]
         self.values = np.stack([table[name] for name in self.channels])
         self.Omega = stated_Omega(table)
@@ -242,12 +245,9 @@ class ForcedRun(CapsuleForward):
 
         Concrete values in ``theta`` may have a batch axis (draws,); the result is then (draws, n).
         """
-        p, e = self.capsule(theta)
         run = self.motion(theta, xp)
         x_rel, rate = xp.asarray(run.X1 - run.X2), xp.asarray(run.Y1 - run.Y2)
 
-        # A batch axis of the leaves precedes the axis of the samples.
-        p, e, I_d = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], (p, e, theta.get("I_d", 0.0)))
         seen: list[Any] = []
         for name in self.channels:
             if name == "x_rel":
@@ -255,11 +255,18 @@ class ForcedRun(CapsuleForward):
             elif name == "x_capsule":
                 seen.append(xp.asarray(run.X2))
             elif name == "acceleration_rod":
-                seen.append(rod_acceleration(p, e, self.time, x_rel, rate))
+                seen.append(self.acceleration(theta, x_rel, rate, xp))
             else:
+                # A batch axis of the leaves precedes the axis of the samples.
+                e, I_d = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], (self.capsule(theta)[1], theta["I_d"]))
                 assert isinstance(e, Excitation), "a current belongs to a harmonic drive"
                 seen.append(I_d * e.cosine(self.time))
         return seen
+
+    def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
+        """Acceleration of the rod at the samples, m/s^2, from x_rel (..., n), m, and its rate."""
+        p, e = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.capsule(theta))
+        return rod_acceleration(p, e, self.time, x_rel, rate)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
         parts = []

@@ -35,7 +35,15 @@ def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...
         rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
     elif not run.drive_known:
         rows.append(parameter("P_d", whole, Prior("positive_normal", run.drive, run.drive_sd)))
-    if not run.prescribed:
+    if "current" in run.inputs:
+        rows.append(parameter("K"))
+    if settings.P_on is not None and settings.P_on.sd > 0.0:
+        rows.append(parameter("P_on", prior=Prior("normal", settings.P_on.value, settings.P_on.sd)))
+    if settings.lag is not None and settings.lag.sd > 0.0:
+        rows.append(parameter("lag", prior=Prior("positive_normal", settings.lag.value, settings.lag.sd)))
+    elif settings.drive == "pulses" and settings.lag is None and "lag" in run.rig.model.free:
+        rows.append(parameter("lag"))
+    if run.has_phase and not run.prescribed:
         rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
     length = NUISANCE_WIDTH * run.rough.length
     if not run.settled:

@@ -1,0 +1,119 @@
+"""Runs with a drive that is not harmonic: pulses, or K times the recorded current."""
+
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.checks.context import RunRecord
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.predictability import check_predictable
+from capsule_id.experiments.forced_run.tables import predicted_motion
+from capsule_id.physics.drive import Drive
+from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drives.recorded import RecordedDrive
+from capsule_id.physics.forces import rod_on_capsule
+from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.rig.model import Rig, Table
+
+#: Periods before the first sample from which pulses act: a lag forgets its start in a few periods.
+EARLIER_PERIODS = 50.0
+
+
+class RecordedRun(ForcedRun):
+    """One record whose drive is K times the recorded current, linear between the samples.
+
+    The current is taken as recorded: its noise and the phase shift of its filter act as a force on the rod. Noise of
+    standard deviation s at n samples per period changes the amplitude of a tone by about s sqrt(2/n), which the noise
+    levels of the other channels absorb. An offset of the current is a constant force.
+
+    Attributes
+    ----------
+    current : (n,) A
+    """
+
+    current: np.ndarray
+
+    has_phase = False
+    inputs = ("current",)
+    checks = (check_predictable,)
+    tables = (predicted_motion,)
+
+    def __init__(
+        self,
+        table: Table,
+        rig: Rig,
+        friction: FrictionModel = EQUATION_1,
+        part_of: str | None = None,
+        leads: bool = True,
+        capsule_rate: float | None = None,
+    ) -> None:
+        """Make one record, or a part of one; arguments as for ``ForcedRun``."""
+        self.current = table["current"]
+        super().__init__(table, rig, friction, part_of, leads, capsule_rate)
+
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
+        force = jnp.multiply.outer(jnp.asarray(theta["K"]), self.current)
+        return self.with_spring(theta), RecordedDrive(self.time, force, self.reaction)
+
+    def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
+        p = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.with_spring(theta))
+        force = xp.asarray(theta["K"])[..., None] * self.current
+        return (force - rod_on_capsule(p, x_rel, rate)) / p.m1
+
+    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
+        # The figures of the paper show a harmonic force.
+        return None
+
+
+class PulseRun(ForcedRun):
+    """One record driven by pulses of stated period and duty, which act since long before the first sample.
+
+    Attributes
+    ----------
+    duty, P_on, lag : 1, N, s; stated, the last two where they are exact
+    """
+
+    duty: float
+    P_on: float
+    lag: float
+
+    checks = (check_predictable,)
+    tables = (predicted_motion,)
+
+    def __init__(
+        self,
+        table: Table,
+        rig: Rig,
+        friction: FrictionModel = EQUATION_1,
+        part_of: str | None = None,
+        leads: bool = True,
+        capsule_rate: float | None = None,
+    ) -> None:
+        """Make one record, or a part of one; arguments as for ``ForcedRun``."""
+        settings = table.settings
+        self.duty, self.P_on = settings.duty, settings.P_on.value
+        self.lag = 0.0 if settings.lag is None else settings.lag.value
+        super().__init__(table, rig, friction, part_of, leads, capsule_rate)
+
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
+        force, lag = theta.get("P_on", self.P_on), theta.get("lag", self.lag)
+        period = 2.0 * np.pi / self.Omega
+        return self.with_spring(theta), Pulses(
+            force, period, self.duty, phase=theta["phase"], lag=lag, reaction=self.reaction
+        )
+
+    def simulated(
+        self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
+    ) -> Trajectory:
+        earlier = EARLIER_PERIODS * 2.0 * np.pi / self.Omega
+        return super().simulated(theta, p, e, jnp.asarray(times) - self.time[0] + earlier, initial)
+
+    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
+        # The figures of the paper show a harmonic force.
+        return None

@@ -1,0 +1,98 @@
+"""Runs driven by pulses or by the recorded current: white residuals at the truth, and faults with their remedies."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id.api import read_rig
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.forced_run.drives.runs import PulseRun, RecordedRun
+from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.physics.drive import Drive
+from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drives.recorded import RecordedDrive
+from capsule_id.physics.model import CapsuleParameters, simulate
+from tests.rig.faults import fault_of
+
+TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.3, "v_s": 0.3, "g": 9.81}
+P = CapsuleParameters(**TRUTH, k2=0.0, G=np.inf)
+PERIOD, DUTY, LAG, PHASE, K = 0.09, 0.4, 0.006, 1.1, 2.0
+TIME = np.arange(600) / 1000.0
+NOISE = 1e-5
+HEAD = '[rig]\nname = "run"\nm1 = { value = 110, unit = "g" }\nm2 = { value = 530, unit = "g" }\n'
+RUN = (
+    '\n[[experiment]]\nkind = "forced_run"\nfile = "run.csv"\nf = { value = 11.111111, unit = "Hz" }\nstart = "stuck"\n'
+)
+PULSES = (
+    'drive = "pulses"\nduty = { value = 40, unit = "%" }\nP_on = { value = 6, sd = 3, unit = "N" }\n'
+    'lag = { value = 6, sd = 2, unit = "ms" }\n'
+)
+
+
+def write(folder: Path, drive: Drive, shift: float, current: np.ndarray | None, settings: str) -> None:
+    """A record of x_rel and x_capsule from rest, with noise, and its rig."""
+    rng = np.random.default_rng(1)
+    t = simulate(P, drive, shift + TIME)
+    columns = {"time [s]": TIME, "x_rel [m]": np.asarray(t.x_rel), "x_capsule [m]": np.asarray(t.X2)}
+    noisy = {
+        name: x if name.startswith("time") else x + NOISE * rng.standard_normal(x.size) for name, x in columns.items()
+    }
+    if current is not None:
+        noisy["current [A]"] = current
+    rows = zip(*noisy.values(), strict=True)
+    (folder / "run.csv").write_text("\n".join([",".join(noisy), *(",".join(f"{x:.9g}" for x in row) for row in rows)]))
+    (folder / "rig.toml").write_text(HEAD + RUN + settings)
+
+
+def run_of(folder: Path) -> ForcedRun:
+    (run,) = make_experiments(read_rig(folder))
+    assert isinstance(run, ForcedRun)
+    return run
+
+
+def largest_residual(run: ForcedRun, own: dict[str, float]) -> float:
+    """Largest rms residual of a channel at the truth with ``own``, in units of the noise."""
+    start = {"x_start": 0.0, "y_start": 0.0, "noise_x_rel": NOISE, "noise_x_capsule": NOISE}
+    records = run.records({**TRUTH, **start, **own})
+    return max(float(np.sqrt(np.mean(residuals**2))) for _, residuals in records)
+
+
+def test_pulses_explain_a_record_of_pulses(tmp_path: Path) -> None:
+    shift = 50 * PERIOD
+    write(tmp_path, Pulses(6.0, PERIOD, DUTY, phase=PHASE, lag=LAG), shift, None, PULSES)
+    # A record that starts from rest within the pulses: the drive acts since long before the first sample.
+    run = run_of(tmp_path)
+    assert isinstance(run, PulseRun)
+    assert {"P_on", "lag", "phase[run]"} <= {row.name for row in run.parameters}
+    own = {"P_on": 6.0, "lag": LAG, "phase": PHASE}
+    assert largest_residual(run, own) < 1.15
+    assert largest_residual(run, {**own, "lag": 2.0 * LAG}) > 3.0
+
+
+def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    current = np.interp(TIME, np.arange(0.0, 0.7, 0.05), 2.0 * rng.standard_normal(14))
+    write(tmp_path, RecordedDrive(TIME, K * current), 0.0, current, 'drive = "recorded"\n')
+    run = run_of(tmp_path)
+    assert isinstance(run, RecordedRun)
+    assert "current" not in run.channels
+    assert not {"phase[run]", "I_d[run]"} & {row.name for row in run.parameters}
+    assert largest_residual(run, {"K": K}) < 1.15
+    assert largest_residual(run, {"K": 1.1 * K}) > 3.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "rule", "instead"),
+    [
+        ('drive = "recorded"\n', 'drive = "recorded" needs the column current', PULSES),
+        ('drive = "pulses"\nP_on = { value = 6, unit = "N" }\n', 'drive = "pulses" needs duty', PULSES),
+        (PULSES.replace('drive = "pulses"\n', ""), 'only drive = "pulses" has duty', PULSES),
+        (PULSES + 'P_d = { value = 1, unit = "N" }\n', 'drive = "pulses" has no amplitude P_d', PULSES),
+    ],
+)  # fmt: skip
+def test_a_fault_is_named_and_its_remedy_works(tmp_path: Path, settings: str, rule: str, instead: str) -> None:
+    write(tmp_path, Pulses(6.0, PERIOD, DUTY), 0.0, None, settings)
+    assert rule in str(fault_of(tmp_path))
+    (tmp_path / "rig.toml").write_text(HEAD + RUN + instead)
+    read_rig(tmp_path)
