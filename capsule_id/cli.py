@@ -56,7 +56,7 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands import bifurcate, check, import_file, init, report, simulate, synthesize
+    from capsule_id.commands import bifurcate, check, import_file, init, predict, report, simulate, synthesize
 
     parser = _parser(program, "Make, check, simulate and report; fit-params fits.")
     parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)
@@ -68,6 +68,7 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
         ("synthesize", synthesize, "a rig folder with known truth"),
         ("simulate", simulate, "the capsule model: time histories and phase plane"),
         ("bifurcate", bifurcate, "the settled motions over one quantity or two: bifurcation diagrams and maps"),
+        ("predict", predict, "displacements of a capsule robot at new settings, from a result"),
         ("report", report, "the parameter table and findings of a result"),
     ):
         sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
