@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from capsule_id.api import load as load
     from capsule_id.api import read_rig as read_rig
     from capsule_id.errors import InputError as InputError
+    from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign
+    from capsule_id.experiments.progression.twin import synthesize_robot as synthesize_robot
     from capsule_id.motions.response import Response as Response
     from capsule_id.motions.response import Settling as Settling
     from capsule_id.motions.response import response as response
@@ -88,6 +90,7 @@ _MODULE_OF = {
     "RecordedDrive": "capsule_id.physics.drives.recorded",
     "Response": "capsule_id.motions.response",
     "response": "capsule_id.motions.response",
+    "RobotDesign": "capsule_id.experiments.progression.twin",
     "RodMotion": "capsule_id.physics.drives.recorded",
     "Settling": "capsule_id.motions.response",
     "simulate": "capsule_id.physics.model",
@@ -95,6 +98,7 @@ _MODULE_OF = {
     "Status": "capsule_id.physics.model",
     "status_message": "capsule_id.physics.model",
     "synthesize": "capsule_id.synthetic",
+    "synthesize_robot": "capsule_id.experiments.progression.twin",
     "Trajectory": "capsule_id.physics.model",
 }
 

@@ -12,6 +12,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directory", metavar="DIR", type=Path, help="new or empty folder")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the reading errors (default 0)")
     parser.add_argument("--name", help="name of the rig (default: the folder's)")
+    parser.add_argument(
+        "--robot", action="store_true", help="a capsule robot with a progression instead of a bench rig"
+    )
     parser.add_argument("--runs", action="store_true", help="add forced runs, computed with the exact model")
     parser.add_argument(
         "--set", nargs="+", default=[], metavar="NAME=VALUE", help="true values, SI: k1=1500 'k2[soft]=2500'"
@@ -28,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.seed < 0:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
+    if args.robot:
+        return _robot(args)
     from capsule_id.experiments.registry import default_registry
     from capsule_id.synthetic import Truth, synthesize
 
@@ -40,6 +45,18 @@ def run(args: argparse.Namespace) -> int:
     say(
         f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and {args.directory.resolve().name}.truth.json beside it"
     )
+    return 0
+
+
+def _robot(args: argparse.Namespace) -> int:
+    """Write the folder of a capsule robot; 0."""
+    from capsule_id.experiments.progression.twin import ROBOT, synthesize_robot
+
+    values = dict(_assignment(text) for text in args.set)
+    if unknown := sorted(set(values) - set(ROBOT)):
+        raise InputError("--set takes a parameter of the robot", unknown[0], f"choose from {', '.join(ROBOT)}")
+    synthesize_robot(args.directory, args.seed, None, values)
+    say(f"wrote {args.directory} (SYNTHETIC, seed {args.seed})")
     return 0
 
 

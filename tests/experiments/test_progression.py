@@ -10,14 +10,14 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.twin import ROBOT, Design, write_robot
+from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.model import CapsuleParameters, simulate
 from tests.rig.faults import fault_of
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
-SMALL = Design(PERIODS, np.full(3, 0.3), sessions=2)
+SMALL = RobotDesign(PERIODS, np.full(3, 0.3), sessions=2)
 #: Values that are no parameter of the twin.
 SCATTERS = {"session_sd": 0.05, "trial_scatter": 0.04, "trial_sd": 1e-3, "discrepancy": 2e-4}
 
@@ -25,7 +25,7 @@ SCATTERS = {"session_sd": 0.05, "trial_scatter": 0.04, "trial_sd": 1e-3, "discre
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("robot") / "rig"
-    write_robot(path, 1, SMALL)
+    synthesize_robot(path, 1, SMALL)
     return path
 
 

@@ -8,7 +8,7 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.twin import ROBOT, Design, write_robot
+from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.choice.compare import _choose, _Variant
 from capsule_id.inference.choice.leave_out import conditional_densities
 from capsule_id.inference.choice.variants import variants_of
@@ -21,7 +21,7 @@ THETA = {**ROBOT, "g": 9.81, "session_sd": 0.05, "trial_scatter": 0.04, "trial_s
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     folder = tmp_path_factory.mktemp("robot") / "rig"
-    write_robot(folder, 1, Design(PERIODS, np.full(3, 0.3), sessions=2))
+    synthesize_robot(folder, 1, RobotDesign(PERIODS, np.full(3, 0.3), sessions=2))
     return read_rig(folder)
 
 

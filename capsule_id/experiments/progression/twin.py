@@ -28,7 +28,7 @@ DURATION = 4.0
 
 
 @dataclass(frozen=True)
-class Design:
+class RobotDesign:
     """Settings and errors of a synthetic progression.
 
     Attributes
@@ -47,7 +47,7 @@ class Design:
     reading_sd: float = 5e-4
 
 
-def robot_progression(seed: int, design: Design, values: Mapping[str, float] = ROBOT) -> dict[str, np.ndarray]:
+def robot_progression(seed: int, design: RobotDesign, values: Mapping[str, float] = ROBOT) -> dict[str, np.ndarray]:
     """Columns of a table by header cell; ``TRIALS`` rows per setting, sessions one after the other.
 
     Raises
@@ -80,15 +80,19 @@ def robot_progression(seed: int, design: Design, values: Mapping[str, float] = R
     }
 
 
-def write_robot(
-    folder: Path, seed: int, design: Design | None = None, values: Mapping[str, float] | None = None, model: str = ""
+def synthesize_robot(
+    folder: Path,
+    seed: int,
+    design: RobotDesign | None = None,
+    values: Mapping[str, float] | None = None,
+    model: str = "",
 ) -> None:
     """Write the rig folder of a synthetic robot and, beside it, ``<folder>.truth.json``.
 
     Parameters
     ----------
     folder : new or empty
-    design, values : default ``Design()`` and ``ROBOT``; a partial mapping changes the values that it names
+    design, values : default ``RobotDesign()`` and ``ROBOT``; a partial mapping changes the values that it names
     model : lines of ``[model]``; default: reaction on the capsule, free ratio and lag
 
     Raises
@@ -96,7 +100,7 @@ def write_robot(
     InputError
         If ``folder`` is not empty, or the model cannot complete a trial.
     """
-    design, truth = design or Design(), {**ROBOT, **(values or {})}
+    design, truth = design or RobotDesign(), {**ROBOT, **(values or {})}
     if values and "mu" in values and "mu_back" not in values:
         truth["mu_back"] = truth["mu"]
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
