@@ -58,12 +58,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the input is bad; then nothing is written.
     """
-    if args.seed < 0:
-        raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
-    if args.max_steps < 1:
-        raise InputError("--max-steps must be positive", str(args.max_steps), "give 1 or more")
-    if args.ess < 1:
-        raise InputError("--ess must be positive", str(args.ess), "give 1 or more")
+    _check_numbers(args)
     kinds = default_registry()
     rig = read_rig(args.data, kinds)
     if args.compare is not None:
@@ -111,6 +106,16 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
     return 3
+
+
+def _check_numbers(args: argparse.Namespace) -> None:
+    """Refuse numbers that no fit has."""
+    if args.seed < 0:
+        raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
+    if args.max_steps < 1:
+        raise InputError("--max-steps must be positive", str(args.max_steps), "give 1 or more")
+    if args.ess < 1:
+        raise InputError("--ess must be positive", str(args.ess), "give 1 or more")
 
 
 def _compare(args: argparse.Namespace, rig: Rig, kinds: Registry) -> int:

@@ -16,8 +16,8 @@ from capsule_id.rig.tables import read_settings
 
 #: Draws of the posterior; the ends of the 95 % interval then have a standard error of a tenth of its sd.
 DRAWS = 1000
-#: The kind that is predicted, and its reading.
-KIND, READING = "progression", "distance"
+#: The reading that is predicted.
+READING = "distance"
 
 
 def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
@@ -40,24 +40,24 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
     InputError
         If nothing was sampled, no progression was fitted, ``draws`` is out of range, or the settings break a rule.
     """
-    tables = [table for table in result.rig.tables if table.kind == KIND and table.label in result.observed]
-    if not tables:
+    made = make_experiments(result.rig, "all", result.registry)
+    experiment = next((e for e in made if isinstance(e, Progression) and e.label in result.observed), None)
+    if experiment is None:
         raise InputError("a prediction needs a fit with a progression", "none", "add one to the rig and fit again")
     if result.posterior is None:
         raise InputError("a prediction needs a sample", "the point fit alone", "fit without --no-sample (budget=None)")
     flat = result.posterior.draws.reshape(-1, len(result.posterior.names))
     if not 1 <= draws <= len(flat):
         raise InputError("draws must lie between 1 and the sample's", str(draws), f"give at most {len(flat)}")
-    columns = read_settings(Path(settings), result.registry[KIND], READING)
-    _check_settings(tables[0], columns, Path(settings))
+    columns = read_settings(Path(settings), result.registry[experiment.kind], READING)
+    _check_settings(experiment.table, columns, Path(settings))
     rng = np.random.default_rng(seed)
     chosen = flat[rng.choice(len(flat), draws, replace=False)]
-    experiment = next(e for e in make_experiments(result.rig, "all", result.registry) if isinstance(e, Progression))
     constants = {**result.fixed, "g": result.rig.g.value}
     values = [
         experiment.local({**constants, **dict(zip(result.posterior.names, theta, strict=True))}) for theta in chosen
     ]
-    rows = settings_of({name: column.values for name, column in columns.items()}, tables[0].settings)[0]
+    rows = settings_of({name: column.values for name, column in columns.items()}, experiment.table.settings)[0]
     trials = 1e3 * new_trials(experiment, values, rows, rng)
     lower, median, upper = np.quantile(trials, [0.025, 0.5, 0.975], axis=0)
     return pd.DataFrame(

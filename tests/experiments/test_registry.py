@@ -32,6 +32,8 @@ KINDS = default_registry()
 _CHANNELS = ("x_rel", "x_capsule", "acceleration_rod", "current")
 _DIRECTION = (ChoiceRule(("forward", "backward")), "forward")
 _FORWARD = (ChoiceRule(("closed", "capsule")), "closed")
+_FORCE = QuantityRule("N", ANY, has_sd=True)
+_LAG = QuantityRule("s", NOT_NEGATIVE, has_sd=True)
 _GAP = QuantityRule("m", NOT_NEGATIVE, has_sd=True)
 SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
     "free_vibration": {
@@ -64,18 +66,27 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
     },
     "transducer": {"sd_ratio": (QuantityRule("1/N"), None)},
     "forced_run": {
-        "drive": (ChoiceRule(("harmonic", "base")), "harmonic"),
+        "drive": (ChoiceRule(("harmonic", "base", "pulses", "recorded")), "harmonic"),
         "spring": (NameRule(), None),
         "gap": (_GAP, None),
         "Omega": (QuantityRule("rad/s"), None),
         "f": (QuantityRule("Hz"), None),
         "P_d": (QuantityRule("N", has_sd=True), None),
+        "duty": (QuantityRule("1"), None),
+        "P_on": (_FORCE, None),
+        "lag": (_LAG, None),
         "normal_force": (QuantityRule("N"), None),
         "start": (ChoiceRule(("auto", "stuck", "moving", "settled")), "auto"),
         "noise": (ChoiceRule(("white", "ar1")), "white"),
         "segment": (QuantityRule("s"), None),
         **{f"{name}_gain_sd": (QuantityRule("1"), None) for name in _CHANNELS},
         **{f"{name}_delay_sd": (QuantityRule("s"), None) for name in _CHANNELS},
+    },
+    "progression": {
+        "drive": (ChoiceRule(("pulses", "harmonic")), "pulses"),
+        "P_on": (_FORCE, None),
+        "P_d": (_FORCE, None),
+        "lag": (_LAG, None),
     },
 }
 
@@ -91,7 +102,7 @@ def test_the_settings_are_those_of_the_interface(name: str) -> None:
 
 def test_the_registry_has_every_built_in_kind_in_order() -> None:
     assert tuple(KINDS)[: len(BUILT_IN)] == BUILT_IN == tuple(SETTINGS)
-    assert [name for name, kind in KINDS.items() if not kind.bench] == ["forced_run"]
+    assert [name for name, kind in KINDS.items() if not kind.bench] == ["forced_run", "progression"]
     own = {row.symbol for kind in KINDS.values() for row in kind.parameters}
     assert own.isdisjoint(TABLE)
     assert set(KINDS.parameters) == own | set(TABLE)
@@ -151,11 +162,11 @@ class ProgressionSettings(Settings):
     drive: Annotated[tuple[str, ...], WordsRule()] = ("harmonic",)
 
 
-def progression() -> Kind:
+def hop() -> Kind:
     """A kind that another issue adds: optional columns, a setting by a rule of its own, masses by its table."""
     return replace(
         KINDS["dynamic_friction"],
-        name="progression",
+        name="hop",
         columns={
             "period": ColumnRule("s", POSITIVE),
             "f": ColumnRule("Hz", POSITIVE),
@@ -176,43 +187,43 @@ def test_a_new_kind_joins_the_synthetic_rig(tmp_path: Path) -> None:
     def measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
         del rng
         columns = {"f [Hz]": np.array([4.0, 5.0]), "distance [cm]": values["stride"] * np.array([1.0, seed])}
-        return Twin((TwinTable("progression.csv", columns, ('drive = "base"',)),))
+        return Twin((TwinTable("hop.csv", columns, ('drive = "base"',)),))
 
-    kind = replace(progression(), twin=measure, truth={"stride": 2.0})
+    kind = replace(hop(), twin=measure, truth={"stride": 2.0})
     kinds = Registry((*KINDS.kinds, kind))
     truth = Truth().with_kinds(kinds.values()).with_values({"stride": 3.0, "k2[soft]": 2000.0})
     synthesize(tmp_path / "with", 7, truth, registry=kinds)
     synthesize(tmp_path / "without", 7, Truth().with_values({"k2[soft]": 2000.0}))
     table = read_rig(tmp_path / "with", kinds).tables[-1]
-    assert (table.kind, table.settings.drive) == ("progression", ("base",))
+    assert (table.kind, table.settings.drive) == ("hop", ("base",))
     np.testing.assert_allclose(table["distance"], [0.03, 0.21])
     known = json.loads((tmp_path / "with.truth.json").read_text(encoding="utf-8"))["parameters"]
     assert (known["stride"], known["k2[soft]"], known["k1"]) == (3.0, 2000.0, 1420.0)
     for file in (tmp_path / "without").glob("*.csv"):
         assert file.read_bytes() == (tmp_path / "with" / file.name).read_bytes()
     files, before = ({file.name for file in (tmp_path / name).iterdir()} for name in ("with", "without"))
-    assert files - before == {"progression.csv"}
+    assert files - before == {"hop.csv"}
     with pytest.raises(InputError, match="--set takes a parameter of the twin, stride"):
         Truth().with_values({"stride": 3.0})
 
 
-def write_progression(folder: Path, columns: str, *settings: str) -> Path:
-    entry = "\n".join(['[rig]\nname = "a"\n[[experiment]]\nkind = "progression"\nfile = "p.csv"', *settings])
+def write_hop(folder: Path, columns: str, *settings: str) -> Path:
+    entry = "\n".join(['[rig]\nname = "a"\n[[experiment]]\nkind = "hop"\nfile = "p.csv"', *settings])
     return write_folder(folder, entry, {"p.csv": f"{columns}\n{','.join('1' for _ in columns.split(','))}\n"})
 
 
 def test_a_new_kind_needs_no_change_of_the_reader(tmp_path: Path) -> None:
-    kinds = Registry((*KINDS.kinds, progression()))
-    (table,) = read_rig(write_progression(tmp_path / "a", "period [ms],distance [cm]"), kinds).tables
+    kinds = Registry((*KINDS.kinds, hop()))
+    (table,) = read_rig(write_hop(tmp_path / "a", "period [ms],distance [cm]"), kinds).tables
     assert (table.settings.drive, table["period"][0], table["distance"][0]) == (("harmonic",), 1e-3, 1e-2)
-    several = write_progression(tmp_path / "b", "f [Hz],distance [cm]", 'drive = ["pulses", "base"]')
+    several = write_hop(tmp_path / "b", "f [Hz],distance [cm]", 'drive = ["pulses", "base"]')
     assert read_rig(several, kinds).tables[0].settings.drive == ("pulses", "base")
     for columns, settings, place, rule in (
         ("f [Hz],distance [cm]", ["drive = 3"], "rig.toml:6:9", "drive must be words"),
-        ("f [Hz],distance [cm],duty [1]", [], "rig.toml:4:8", "progression needs m2"),
+        ("f [Hz],distance [cm],duty [1]", [], "rig.toml:4:8", "hop needs m2"),
         ("f [Hz],duty [1]", [], "p.csv:1:1", "must have the columns period and distance, or f and distance"),
     ):
-        folder = write_progression(tmp_path / "c", columns, *settings)
+        folder = write_hop(tmp_path / "c", columns, *settings)
         with pytest.raises(InputError, match=rule) as caught:
             read_rig(folder, kinds)
         assert str(caught.value).startswith(f"{folder}/{place}: ")
@@ -220,8 +231,8 @@ def test_a_new_kind_needs_no_change_of_the_reader(tmp_path: Path) -> None:
 
 def test_a_kind_outside_of_the_registry_is_unknown(tmp_path: Path) -> None:
     """The negative control: the same folder without the kind."""
-    folder = write_progression(tmp_path / "a", "period [ms],distance [cm]")
-    with pytest.raises(InputError, match=r"rig\.toml:4:8: unknown kind, 'progression', write one of free_vibration"):
+    folder = write_hop(tmp_path / "a", "period [ms],distance [cm]")
+    with pytest.raises(InputError, match=r"rig\.toml:4:8: unknown kind, 'hop', write one of free_vibration"):
         read_rig(folder)
 
 

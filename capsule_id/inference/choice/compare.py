@@ -86,7 +86,7 @@ def compare_models(
         If a word is unknown, or the rig has no progression.
     """
     choices = variants_of(rig, words)
-    if not any(table.kind == "progression" for table in rig.tables):
+    if not any(isinstance(e, Progression) for e in make_experiments(rig, "all", registry)):
         remedy = "compare friction laws of bench tests in the report of fit-params"
         raise InputError("--compare needs a progression, whose settings are left out", "none", remedy)
     fitted = {}
