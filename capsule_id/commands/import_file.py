@@ -6,12 +6,16 @@ from pathlib import Path
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import default_registry
-from capsule_id.importing.report import import_report
+from capsule_id.importing.report import clock_line, import_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add FILE."""
+    """Add FILE, and the options of its clock."""
     parser.add_argument("file", metavar="FILE", type=Path, help="table as a logger or a program exports it")
+    parser.add_argument(
+        "--clock-of", type=Path, metavar="OTHER", help="estimate the clock of FILE against that of OTHER"
+    )
+    parser.add_argument("--common", metavar="HEADER", help="signal that both files hold, for --clock-of")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -22,6 +26,13 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If the file cannot be read.
     """
+    if (args.clock_of is None) != (args.common is None):
+        rule, remedy = "--clock-of and --common must stand together", "name the other file and the common signal"
+        raise InputError(rule, "one of them", remedy, args.file)
+    if args.clock_of is not None:
+        files = {path: read_file(path) for path in (args.clock_of, args.file)}
+        say(clock_line(files, args.common, default_registry()))
+        return 0
     say("\n".join(import_report(read_file(args.file), args.file, default_registry())))
     return 0
 

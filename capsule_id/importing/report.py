@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
 from capsule_id.importing.entry import dimensions_of, entry_of
 from capsule_id.importing.guess import TIME, guess
 from capsule_id.importing.headers import name_and_unit, unit_of
 from capsule_id.importing.layout import FoundLayout, find_layout
+from capsule_id.records.clocks import estimate_clock
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples
@@ -46,6 +48,37 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     lines += _rows(found, rows)
     text, _ = entry_of(content, path, path.name, kinds)
     return [*lines, "", text.rstrip()]
+
+
+def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:
+    """The line ``clock = ...`` that puts the second of two files on the clock of the first one, with its sds.
+
+    Parameters
+    ----------
+    files : two files with their bytes
+    common : header of the signal that both hold
+
+    Raises
+    ------
+    InputError
+        If a file has no times or no such header, or the signals are not the same.
+    """
+    records = []
+    for path, content in files.items():
+        found = find_layout(content, path, dimensions_of(kinds))
+        guessed = guess(found, kinds)
+        if guessed is None or TIME not in guessed.columns:
+            raise InputError("a file must hold times with their unit", "none", "head them `time [s]`", path)
+        index = next((index for index in found.columns if found.names[index] == common), None)
+        if index is None:
+            known = ", ".join(found.names[index] for index in found.columns)
+            raise InputError(f"a file must have the column {common}", known, "name a column of both files", path)
+        column = guessed.columns[TIME]
+        records += [scale(found.columns[column.index], factor_to_si(column.unit, "s")), found.columns[index]]
+    clock = estimate_clock(*records)
+    line = f'clock = {{ offset = {{ value = {clock.offset:.9g}, unit = "s" }}, '
+    line += f'drift = {{ value = {1e6 * clock.drift:.6g}, unit = "ppm" }} }}'
+    return f"{line}  # sd {clock.offset_sd:.2g} s and {1e6 * clock.drift_sd:.2g} ppm; {clock.explained:.1%} explained"
 
 
 def _sampling(time: np.ndarray) -> Iterable[str]:

@@ -194,7 +194,7 @@ def _read_experiment(
     kind = kinds[word]
     errors = [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
     refuse_unknown_keys(
-        document, path, entry, ("kind", "file", "label", "reject", *MAP_KEYS, *kind.setting_rules, *errors)
+        document, path, entry, ("kind", "file", "label", "reject", "clock", *MAP_KEYS, *kind.setting_rules, *errors)
     )
     settings = _read_settings(document, path, entry, kind)
     file = read_experiment_files(document, path, entry, kind)

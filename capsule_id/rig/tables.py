@@ -15,6 +15,7 @@ from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.maps.clock import on_reference, read_clock
 from capsule_id.rig.maps.declared import ColumnMap, read_map
 from capsule_id.rig.maps.mapped import apply_map
 from capsule_id.rig.maps.plateaus import Plateaus, read_plateaus, readings_of_plateaus
@@ -115,6 +116,8 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
         read = [EXPORTS[suffix_of(file)](contents[name], file, column_map.layout) for name, file in files.items()]
         mapped = apply_map(document, path, read, column_map)
         table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other)
+    if (clock := read_clock(document, path, entry)) is not None:
+        table = replace(table, raw=on_reference(document, path, table.raw, clock))
     if rejection is not None:
         table = _without_outliers(document, path, table, rejection)
     if plateaus is not None:

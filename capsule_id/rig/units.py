@@ -53,6 +53,7 @@ _DEFINITIONS = {
     "lbf": "4.4482216152605 * N",
     "Ns": "N * s",
     "percent": "0.01",
+    "ppm": "1e-6",
 }
 # Other ways to write the same symbol.
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "⋅": "·", "%": "percent"})

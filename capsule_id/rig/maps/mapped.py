@@ -130,7 +130,7 @@ class _Part:
         for each in found:
             if each.values.size != self.rows:
                 rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {each.values.size}"
-                remedy = "export the columns with one sampling rate, or map columns of equal length"
+                remedy = "map columns of equal length, or make an experiment of each file, with a clock"
                 raise self.document.error(place, rule, value, remedy)
             scale = float(np.nanmax(np.abs(first.values), initial=0.0))
             if not np.allclose(each.values, first.values, rtol=0.0, atol=ROUNDING * scale, equal_nan=True):

@@ -1,0 +1,63 @@
+"""Puts the times of a record on the clock of another logger: ``clock = { offset = {...}, drift = {...} }``.
+
+Only times change; no reading is interpolated. Channels of two loggers are two experiments, each with its own times.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from capsule_id.rig.domains import ANY
+from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.rig.toml_values import read_quantity, read_table, refuse_unknown_keys, shown
+from capsule_id.rig.units import UnitError, factor_to_si
+
+_EXAMPLE = '{ offset = { value = 0.3, unit = "ms" }, drift = { value = 20, unit = "ppm" } }'
+LARGEST_DRIFT = 0.1
+
+
+def read_clock(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Offset, s, and drift of the experiment at ``path``, None where it states no clock.
+
+    Raises
+    ------
+    InputError
+        At the key or value that is wrong.
+    """
+    if "clock" not in entry:
+        return None
+    place = (*path, "clock")
+    stated = read_table(document, place, entry["clock"], _EXAMPLE)
+    refuse_unknown_keys(document, place, stated, ("offset", "drift"))
+    if not stated:
+        raise document.error(place, "a clock must have an offset or a drift", "none", f"write {_EXAMPLE}")
+    offset, drift = (
+        read_quantity(document, (*place, key), stated[key], si, ANY).value if key in stated else 0.0
+        for key, si in (("offset", "s"), ("drift", "1"))
+    )
+    if abs(drift) > LARGEST_DRIFT:
+        rule, remedy = f"drift must lie between -{LARGEST_DRIFT:g} and {LARGEST_DRIFT:g}", 'write it in "ppm"'
+        raise document.error((*place, "drift"), rule, shown(stated["drift"]), remedy)
+    return offset, drift
+
+
+def on_reference(document: TomlDocument, path: KeyPath, raw: RawTable, clock: tuple[float, float]) -> RawTable:
+    """The table with its times t' replaced by offset + (1 + drift) t'.
+
+    Raises
+    ------
+    InputError
+        If the table has no times.
+    """
+    if "time" not in raw.names:
+        value = " ".join(raw.names)
+        raise document.error((*path, "clock"), "clock needs a record with times", value, "remove clock", of_key=True)
+    offset, drift = clock
+    index, values = raw.names.index("time"), raw.values.copy()
+    try:
+        factor = factor_to_si(raw.units[index], "s")
+    except UnitError:  # reported at its place, where the column is converted
+        return raw
+    values[:, index] = offset / factor + (1.0 + drift) * values[:, index]
+    return replace(raw, values=values)
