@@ -8,6 +8,7 @@ import numpy as np
 
 from capsule_id.experiments.forced_run.declaration import RunSettings
 from capsule_id.experiments.forced_run.twin import GAP_SD, NOISE_SD, RunSetup, SyntheticRun, make_runs
+from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.records.label import MeasuredMotion, measured_motion
 from capsule_id.rig.model import Column, Quantity, Table
 from tests.capsule_cases import read_cases
@@ -26,6 +27,24 @@ LONGER = {
     (56410.0, 0.697, 1.023e-3, 1.12, 65.79): "aperiodic",
     (56410.0, 0.646, 1.145e-3, 5.69, 118.14): "aperiodic",
     (18960.0, 0.262, 0.808e-3, 4.888, 113.74): "aperiodic",
+}
+
+#: (m1, m2, k1, k2, c, mu, G, P_d, Omega) with v_s = 0.3 m/s and the period of the model (``response``), 0: aperiodic.
+#: Drawn at random after the settings of ``find_period`` were fixed.
+FRESH = {
+    (0.1885, 0.3013, 2809.0, 10700.0, 1.948, 0.4032, 1.465e-3, 1.411, 188.2): 1,
+    (0.09933, 0.4282, 1184.0, 88960.0, 2.098, 0.6784, 0.95e-3, 1.766, 98.38): 1,
+    (0.1075, 0.664, 1572.0, 98180.0, 1.582, 0.6421, 0.832e-3, 2.88, 51.65): 2,
+    (0.1629, 0.8475, 815.0, 77790.0, 1.209, 0.4532, 0.3322e-3, 4.162, 85.47): 2,
+    (0.1364, 0.4148, 964.2, 89770.0, 0.483, 0.3928, 1.945e-3, 1.496, 51.58): 3,
+    (0.1293, 0.6084, 1384.0, 98780.0, 0.4685, 0.2333, 0.5152e-3, 3.603, 59.98): 3,
+    (0.1735, 0.7072, 1040.0, 41160.0, 1.474, 0.5633, 0.7197e-3, 6.439, 84.29): 4,
+    (0.1364, 0.447, 2050.0, 27230.0, 1.681, 0.6066, 1.846e-3, 7.129, 46.78): 4,
+    (0.1275, 0.7567, 1364.0, 38610.0, 0.9807, 0.4618, 0.8471e-3, 4.086, 36.37): 6,
+    (0.1066, 0.3045, 1539.0, 16380.0, 0.8254, 0.2647, 0.5522e-3, 1.518, 59.74): 6,
+    (0.1733, 0.495, 2567.0, 51210.0, 0.4841, 0.6629, 1.557e-3, 1.228, 106.1): 0,
+    (0.1432, 0.6281, 1016.0, 16570.0, 0.5399, 0.5469, 0.2677e-3, 7.05, 36.71): 0,
+    (0.1857, 0.7636, 1316.0, 42940.0, 0.8235, 0.553, 0.3951e-3, 4.94, 30.8): 0,
 }
 
 
@@ -81,6 +100,34 @@ def table_of(
     columns = {name: Column(name, "", 1.0, values[:samples]) for name, values in channels.items()}
     stated = RunSettings(**(dict(record["settings"]) | settings))  # type: ignore[call-overload]
     return Table("forced_run", "run", "run.csv", columns, stated, np.arange(len(columns["time"].values)) + 2, False)
+
+
+@cache
+def settled() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time and x_rel (motions, samples) of ``FRESH`` at rates and lengths of their own, and excitation periods; exact."""
+    rng, n = np.random.default_rng(0), len(FRESH)
+    m1, m2, k1, k2, c, mu, G, P_d, Omega = np.array(list(FRESH)).T
+    T = 2.0 * np.pi / Omega
+    time = np.arange(1500) * (T / rng.uniform(25.0, 75.0, n))[:, None]
+    start = (300.0 + rng.uniform(size=n))[:, None] * T[:, None]
+    p = CapsuleParameters(m1=m1, m2=m2, k1=k1, k2=k2, c=c, mu=mu, v_s=np.full(n, 0.3), G=G)
+    t = simulate(p, Excitation(P_d, Omega), np.concatenate([np.zeros((n, 1)), start + time], axis=1))
+    return time, np.asarray(t.X1 - t.X2)[:, 1:], T
+
+
+def fresh(seed: int) -> list[tuple[np.ndarray, np.ndarray, float, int]]:
+    """Time, x_rel, excitation period and true period of ``FRESH``.
+
+    Each record has a scatter of 0.3 to 1.5 %, a drift of up to 3 %, and 10 um of noise.
+    """
+    rng, found = np.random.default_rng(seed), []
+    for time, x, T, period in zip(*settled(), FRESH.values(), strict=True):
+        z = rng.standard_normal(63)
+        size = 1.0 + rng.uniform(0.003, 0.015) * np.interp(time / T, np.arange(63) - 0.5, z)
+        size += rng.uniform(0.0, 0.03) * (time / time[-1] - 0.5)
+        seen = np.mean(x) + size * (x - np.mean(x)) + 1e-5 * rng.standard_normal(len(x))
+        found.append((time, seen, float(T), period))
+    return found
 
 
 @cache
