@@ -12,6 +12,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, TwinTable
 from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.parameters import TABLE_1
+from capsule_id.rig.model import Rig
 from capsule_id.rig.toml_values import NAME_PATTERN
 
 
@@ -120,10 +121,25 @@ def synthesize(
     for table in (table for _, twin in twins for table in twin.tables):
         _write_csv(folder / table.file, table.columns)
     (folder / "rig.toml").write_text(_rig_toml(name, seed, truth.g, masses, priors, entries), encoding="utf-8")
-    beside = folder.resolve().with_name(folder.resolve().name + ".truth.json")
+    beside = _truth_file(folder)
     known = {"seed": seed, "parameters": values, **({"runs": behind} if behind else {})}
     beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
     return truth
+
+
+def truth_beside(rig: Rig) -> dict[str, float]:
+    """True values of a synthetic rig by parameter name, SI, from the file that ``synthesize`` wrote; {} without one."""
+    if not rig.synthetic:
+        return {}
+    try:
+        known = json.loads(_truth_file(rig.folder).read_text(encoding="utf-8"))["parameters"]
+        return {str(name): float(value) for name, value in known.items() if np.isfinite(value)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _truth_file(folder: Path) -> Path:
+    return folder.resolve().with_name(folder.resolve().name + ".truth.json")
 
 
 def _entry(kind: Kind, table: TwinTable) -> str:

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.fitted import Fit, compare
+from capsule_id.synthetic import truth_beside
 from tests.cli_tools import DATA, listing, small_rig
 
 TABLES = ("free_vibration_1", "static_friction", "dynamic_friction", "support_spring_soft")
@@ -231,6 +232,15 @@ def test_replicates_scatter_as_the_readings(capsule: Fit) -> None:
     low, high = np.quantile(capsule.pointwise.replicates["free_vibration_1"], [0.025, 0.975], axis=(0, 1))
     y = capsule.observed["free_vibration_1"]
     assert np.mean((low <= y) & (y <= high)) == pytest.approx(0.95, abs=0.025)
+
+
+def test_the_truth_lies_beside_a_synthetic_rig(tmp_path: Path) -> None:
+    truth = cid.synthesize(tmp_path / "rig", seed=1)
+    rig = cid.read_rig(tmp_path / "rig")
+    assert truth_beside(rig)["k1"] == truth.k1
+    assert truth_beside(dataclasses.replace(rig, synthetic=False)) == {}
+    (tmp_path / "rig.truth.json").write_text("[]", encoding="utf-8")
+    assert truth_beside(rig) == {}
 
 
 def test_help_lists_the_public_names() -> None:

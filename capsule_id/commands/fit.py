@@ -1,7 +1,9 @@
 """``fit-params DATA``: from a rig folder to parameters, posterior and report."""
 
 import argparse
+import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
@@ -92,6 +94,8 @@ def run(args: argparse.Namespace) -> int:
     }
     with work_in_progress(directory, fingerprint, args.resume) as partial, Progress(not args.quiet) as progress:
         result = fit(rig, args.seed, args.experiments, budget, partial / CHAINS, progress, kinds, ess=args.ess)
+        made = result.provenance.made[0], shlex.join(["fit-params", *sys.argv[1:]])
+        result = replace(result, provenance=replace(result.provenance, made=made))
         progress(0, 1, "report")
         write_result(result, partial)
         publish(partial, directory)

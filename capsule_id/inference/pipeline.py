@@ -18,6 +18,7 @@
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -44,6 +45,7 @@ from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.rig.model import Rig
+from capsule_id.synthetic import truth_beside
 from capsule_id.views import Comparison, Finding
 
 #: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
@@ -173,13 +175,15 @@ def make_result(
         prior=target.sample_prior(rng, PRIOR_DRAWS),
         pointwise=None if posterior is None else _pointwise(target, posterior, rng),
         provenance=replace(made_from, versions={**made_from.versions, **registry.packages}),
+        truth=truth_beside(target.rig),
     )
 
 
 def provenance(rig: Rig, seed: int, experiments: Choice, friction: str) -> Provenance:
-    """Return the provenance of a fit of ``rig`` with ``seed`` and these ``experiments``."""
+    """Return the provenance of a fit of ``rig`` with ``seed`` and these ``experiments``, made now by ``capsule_id.fit``."""
     rejected = {table.label: table.rejected for table in rig.tables if table.rejected}
-    return Provenance(seed, experiments, friction, package_versions(PACKAGES), dict(rig.files), rejected)
+    made = datetime.now(UTC).isoformat(timespec="seconds"), "capsule_id.fit"
+    return Provenance(seed, experiments, friction, package_versions(PACKAGES), dict(rig.files), rejected, made)
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:

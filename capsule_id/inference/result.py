@@ -112,6 +112,7 @@ class Provenance:
     """Inputs of a result: the seed, the chosen experiments, the friction law, versions of packages, SHA-256 of the files.
 
     ``rejected``: number of rows that the rule ``reject`` dropped, by label of the experiment.
+    ``made``: date (ISO, UTC) and command of the fit; results that differ in them only are equal.
     """
 
     seed: int
@@ -120,6 +121,7 @@ class Provenance:
     versions: Mapping[str, str]
     files: Mapping[str, str]
     rejected: Mapping[str, int] = field(default_factory=dict)
+    made: tuple[str, str] = field(default=("", ""), compare=False)
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,7 @@ class Result:
     observed : (n,) readings that enter the likelihood, SI, by label
     prior : (draws,) prior draws by parameter name, SI
     pointwise : None without a sample
+    truth : of a synthetic rig by parameter name, SI, where its file lies beside the folder
     """
 
     rig: Rig
@@ -155,6 +158,7 @@ class Result:
     prior: Mapping[str, np.ndarray]
     pointwise: Pointwise | None
     provenance: Provenance
+    truth: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def clean(self) -> bool:

@@ -5,16 +5,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from capsule_id.inference.result import Result, RunRecord
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.records.label import UNDECIDED
 from capsule_id.report.figures import comparisons as figures
+from capsule_id.report.figures.comparisons import TWO_SIDED_95
 from capsule_id.report.figures.corner import corner
 from capsule_id.report.figures.runs import force_on_rod, run_overview
 from capsule_id.report.figures.style import figure_of, mark, png
 from capsule_id.report.figures.traces import traces
+from capsule_id.report.sampled_parameters import sampled_parameters
 from capsule_id.views import Comparison
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
@@ -31,6 +34,8 @@ class Picture:
     name : file name without suffix, safe and unique within the result
     section : "measured", "sample" or "point_fit"
     title, caption : plain text
+    alt : what is seen, for readers who do not see it
+    group : label of the experiment, "" for figures of the whole fit
     width, height : of the page's picture, CSS pixels
     png : the file
     """
@@ -42,6 +47,8 @@ class Picture:
     width: int
     height: int
     png: bytes
+    alt: str = ""
+    group: str = ""
 
     @property
     def wide(self) -> bool:
@@ -53,14 +60,14 @@ def pictures(result: Result) -> tuple[Picture, ...]:
     """Draw every figure of the result; synthetic data are marked on each of them."""
     names = _unique(_comparison_name(item) for item in result.comparisons)
     drawn = [
-        _picture(
-            result,
+        Drawing(
             name,
             "measured",
             item.title,
             comparison_caption(item, result.registry.captions),
-            figures.comparison_figure(item),
-        )
+            comparison_alt(item),
+            _group(result, item.label),
+        ).on(result, figures.comparison_figure(item))
         for name, item in zip(names, result.comparisons, strict=True)
     ]
     labels = _unique(_UNSAFE.sub("_", record.name) for record in result.records)
@@ -68,15 +75,24 @@ def pictures(result: Result) -> tuple[Picture, ...]:
         drawn += _record_pictures(result, label, record)
     if result.posterior is not None:
         corner_caption = "Posterior of the physical parameters: histograms, and contours of every pair."
-        trace_caption = (
-            f"A few walkers of each ensemble, one colour per ensemble ({len(result.posterior.draws)} ensembles)."
-        )
-        drawn.append(_picture(result, "corner", "sample", "Corner plot", corner_caption, figure_of(corner(result))))
-        drawn.append(_picture(result, "traces", "sample", "Traces", trace_caption, figure_of(traces(result))))
-    starts = figure_of(figures.point_fit_starts(result.point_fit))
+        ensembles = len(result.posterior.draws)
+        trace_caption = f"A few walkers of each ensemble, one colour per ensemble ({ensembles} ensembles)."
+        drawing = Drawing("corner", "sample", "Corner plot", corner_caption, _corner_alt(result))
+        drawn.append(drawing.on(result, figure_of(corner(result))))
+        worst = f"{ensembles} ensembles; the largest split R-hat is {max(result.posterior.rhat):.4f}."
+        drawing = Drawing("traces", "sample", "Traces", trace_caption, f"Traces of every physical parameter, {worst}")
+        drawn.append(drawing.on(result, figure_of(traces(result))))
+    fit = result.point_fit
     starts_caption = "Where each start began and where it ended, in standard deviations of the Laplace approximation."
-    drawn.append(_picture(result, "point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts))
-    return tuple(drawn)
+    starts_alt = f"{len(fit.starts)} starts; {int(fit.at_other_maximum.sum())} ended at another maximum than the best."
+    drawing = Drawing("point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts_alt)
+    return (*drawn, drawing.on(result, figure_of(figures.point_fit_starts(fit))))
+
+
+def _group(result: Result, label: str) -> str:
+    """The table that a panel belongs to, by the longest label that begins it; the panel's own label for shared ones."""
+    own = [table.label for table in result.rig.tables if label == table.label or label.startswith(f"{table.label}_")]
+    return max(own, key=len, default=label)
 
 
 def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Picture]:
@@ -90,15 +106,52 @@ def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Pict
         f"period. The filter ({view.samples} samples) leaves {left}."
     )
     word = view.label if view.label == UNDECIDED else f"{view.label} (probability {view.probability:.2g})"
-    title = f"{record.name}: the record, {word}"
-    drawn = [_picture(result, f"record_{label}", "measured", title, caption, figure_of(run_overview(view)))]
+    title, group = f"{record.name}: the record, {word}", _group(result, record.name)
+    alt = (
+        f"{len(view.time)} samples of {', '.join(view.channels)} over {view.time[-1] - view.time[0]:.3g} s; x_rel from "
+        f"{1e3 * view.x_rel.min():.3g} to {1e3 * view.x_rel.max():.3g} mm; {len(view.section_x_rel)} points, one a period."
+    )
+    drawing = Drawing(f"record_{label}", "measured", title, caption, alt, group)
+    drawn = [drawing.on(result, figure_of(run_overview(view)))]
     if view.force is not None:
         figure = figure_of(force_on_rod(view, model=(view.time, record.force)))
         text = (
             "Force on the rod (the paper's Fig. 4d): K times the recorded current, and the drive of the fitted model."
         )
-        drawn.append(_picture(result, f"force_{label}", "measured", f"{record.name}: force on the rod", text, figure))
+        misses = float(np.std(view.force - record.force))
+        alt = f"Force between {view.force.min():.3g} and {view.force.max():.3g} N; the model differs by {misses:.2g} N (rms)."
+        drawing = Drawing(f"force_{label}", "measured", f"{record.name}: force on the rod", text, alt, group)
+        drawn.append(drawing.on(result, figure))
     return drawn
+
+
+def comparison_alt(item: Comparison) -> str:
+    """What the panel shows, in numbers: how many readings over which range, and how far the model misses them."""
+    readings = [points for points in item.points if points.x.size]
+    parts = [f"{item.y_label} against {item.x_label}"]
+    if readings:
+        x = np.concatenate([points.x for points in readings])
+        parts.append(f"{x.size} readings from {np.nanmin(x):.3g} to {np.nanmax(x):.3g}")
+    parts.append(f"curves: {', '.join(curve.label for curve in item.curves)}" if item.curves else "no curve")
+    if item.residuals is not None and item.residuals.size:
+        size = np.abs(item.residuals)
+        inside = np.mean(size <= TWO_SIDED_95)
+        parts.append(f"{inside:.0%} of the residuals within ±1.96 sd, the largest {np.max(size):.2g} sd")
+    flagged = sum(int(points.flagged.sum()) for points in item.points if points.flagged is not None)
+    parts += [f"{flagged} rows flagged by a check"] if flagged else []
+    return "; ".join(parts) + "."
+
+
+def _corner_alt(result: Result) -> str:
+    """Number of parameters and the strongest correlation."""
+    columns = sampled_parameters(result)
+    names, flat = columns.names, columns.draws.reshape(-1, len(columns.names))
+    if len(names) < 2 or not np.all(np.std(flat, axis=0) > 0.0):
+        return f"Histograms of {len(names)} parameters."
+    correlation = np.corrcoef(flat.T) - np.eye(len(names))
+    i, j = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
+    strongest = f"strongest correlation {correlation[i, j]:.2f}, of {names[i]} with {names[j]}"
+    return f"Histograms of {len(names)} parameters and contours of their pairs; {strongest}."
 
 
 def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
@@ -113,19 +166,26 @@ def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
     return " ".join(parts)
 
 
-def _picture(
-    result: Result,
-    name: str,
-    section: Literal["measured", "sample", "point_fit"],
-    title: str,
-    caption: str,
-    figure: Figure,
-) -> Picture:
-    stop_if_interrupted()
-    if result.rig.synthetic:
-        mark(figure, "synthetic data")
-    width, height = (round(96 * inches) for inches in figure.get_size_inches())
-    return Picture(name, section, title, caption, width, height, png(figure))
+@dataclass(frozen=True)
+class Drawing:
+    """The words of a picture; see ``Picture``."""
+
+    name: str
+    section: Literal["measured", "sample", "point_fit"]
+    title: str
+    caption: str
+    alt: str
+    group: str = ""
+
+    def on(self, result: Result, figure: Figure) -> Picture:
+        """The picture of ``figure``, with the mark of a synthetic rig."""
+        stop_if_interrupted()
+        if result.rig.synthetic:
+            mark(figure, "synthetic data")
+        width, height = (round(96 * inches) for inches in figure.get_size_inches())
+        return Picture(
+            self.name, self.section, self.title, self.caption, width, height, png(figure), self.alt, self.group
+        )
 
 
 def _comparison_name(item: Comparison) -> str:

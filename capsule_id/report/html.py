@@ -1,4 +1,4 @@
-"""The page: one self-contained HTML file, figures embedded, no script, nothing loaded from elsewhere."""
+"""The page: one self-contained HTML file, figures embedded, one small script, nothing loaded from elsewhere."""
 
 import base64
 import math
@@ -13,12 +13,16 @@ from capsule_id.inference.result import Result
 from capsule_id.report.columns import Output, columns_of, table_rows
 from capsule_id.report.console_table import verdict_text
 from capsule_id.report.gallery import Picture
+from capsule_id.report.texts.advice import next_steps
+from capsule_id.report.texts.citation import AUTHORS, TITLE, bibtex, latex_table, methods_paragraph
 from capsule_id.report.texts.messages import caption_of, finding_text, messages_of, title_of
-from capsule_id.report.typography import MISSING, symbol_parts
+from capsule_id.report.typography import MISSING, fixed, symbol_parts
 from capsule_id.views import Finding, Level, Message, ResultTable
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
+#: Largest number of figures of experiments that are open at first; those of the sample and the point fit add 3.
+MOST_OPEN = 9
 _WORDS: Mapping[Level, str] = {"ok": "✓ ok", "warn": "! warning", "fail": "✗ failed"}
 
 
@@ -32,7 +36,10 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         .get_template("report.html.j2")
         .render(
             result=result,
-            sections={name: _section(pictures, name) for name in ("measured", "sample", "point_fit")},
+            answers=_answers(result),
+            steps=next_steps(result),
+            experiments=_experiments(result, pictures),
+            sections={name: _section(pictures, name) for name in ("sample", "point_fit")},
             parameters=_parameters(result.summary),
             nuisances=_parameters(result.nuisances),
             checks=_checks(result.findings, titles),
@@ -42,8 +49,57 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             starts=_starts(result),
             notes=[_note(note, messages) for note in result.notes],
             missing=MISSING,
+            authors=AUTHORS,
+            title=TITLE,
+            copies=(
+                ("methods", "Methods paragraph", methods_paragraph(result)),
+                ("bibtex", "BibTeX", bibtex(result)),
+                ("latex", "LaTeX table", latex_table(result)),
+            ),
         )
     )
+
+
+def _answers(result: Result) -> list[dict[str, str]]:
+    """The rows of the first screen: name, value ± sd with its unit, interval, trust, truth; weighed masses last."""
+    rows = sorted(table_rows(result.summary), key=lambda row: row.name in ("m1", "m2"))
+    columns = {column.key: column for column in columns_of("html", result.summary)}
+    answers = []
+    for row in rows:
+        unit = "" if row.unit == "1" else f" {row.unit}"
+        truth, sd = result.truth.get(row.name), float(row.values["sd"])
+        known = MISSING if truth is None else fixed(truth * row.scale, row.decimals)
+        if truth is not None and sd > 0.0:
+            known += f" ({(float(row.values['value']) - truth) / sd:+.1f} sd)".replace("-", "−")
+        answers.append(
+            {
+                "name": row.name,
+                "meaning": str(row.values["meaning"]),
+                "value": row.plus_minus("value", "sd", row.decimals) + unit,
+                "interval": columns["ci95"].text(row) if "ci95" in columns else MISSING,
+                "trust": str(row.values["trust"]),
+                "truth": known,
+            }
+        )
+    return answers
+
+
+def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, object]]:
+    """One entry per experiment: label, worst level of its findings, pictures, whether it is open at first.
+
+    Experiments with a failure or a warning are open, as long as fewer than ``MOST_OPEN`` figures are.
+    """
+    measured = [picture for picture in pictures if picture.section == "measured"]
+    named = {finding.experiment: finding.level for finding in result.findings if finding.level == "warn"}
+    named |= {finding.experiment: finding.level for finding in result.findings if finding.level == "fail"}
+    entries, shown = [], 0
+    for group in dict.fromkeys(picture.group for picture in measured):
+        own = sorted((picture for picture in measured if picture.group == group), key=lambda picture: picture.wide)
+        level: Level = named.get(group, "ok")
+        is_open = level != "ok" and shown + len(own) <= MOST_OPEN
+        shown += len(own) if is_open else 0
+        entries.append({"label": group, "level": level, "pictures": own, "open": is_open})
+    return entries
 
 
 def summary_html(result: Result) -> str:

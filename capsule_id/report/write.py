@@ -6,6 +6,7 @@ import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,6 +45,7 @@ def write_result(result: Result, directory: Path) -> None:
 
 def parameters_json(result: Result) -> dict[str, object]:
     """The content of parameters.json, ready for strict JSON: what is missing or not finite is None."""
+    provenance: Any = _plain(asdict(result.provenance))
     messages, columns = messages_of(result.registry), columns_of("json")
     return {
         "rig": result.rig.name,
@@ -71,7 +73,8 @@ def parameters_json(result: Result) -> dict[str, object]:
             record.name: {"label": record.view.label, "probability": _plain(record.view.probability)}
             for record in result.records
         },
-        "provenance": _plain(asdict(result.provenance)),
+        # Without date and command: the same seed gives the same file.
+        "provenance": {key: value for key, value in provenance.items() if key != "made"},
     }
 
 

@@ -12,10 +12,12 @@ import pytest
 
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.result import Provenance, Result
+from capsule_id.report.columns import table_rows
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
 from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.views import Finding, Message, ResultTable, Text
+from tests.report.conftest import OUTLIER
 
 EMPTY = {"meta", "img", "br"}
 
@@ -58,8 +60,11 @@ def page(result: Result, drawn: tuple[Picture, ...]) -> str:
 def test_self_contained(page: str, drawn: tuple[Picture, ...]) -> None:
     parsed = Page(page)
     assert not re.search(r"https?:|url\(|@import|//[a-z]", re.sub(r"base64,[A-Za-z0-9+/=]+", "", page))
-    assert not {"script", "link", "iframe", "object", "embed", "form"} & set(parsed.tags)
-    sources = [value for key, value in parsed.attributes if key in ("src", "href")]
+    assert not {"link", "iframe", "object", "embed", "form"} & set(parsed.tags)
+    assert page.count("<script") == page.count("<script>\n") == 1  # inline, so that tables can be sorted
+    anchors = [value[1:] for key, value in parsed.attributes if key == "href"]
+    assert set(anchors) <= {value for key, value in parsed.attributes if key == "id"}
+    sources = [value for key, value in parsed.attributes if key == "src"]
     assert len(sources) == len(drawn)
     assert all(source.startswith("data:image/png;base64,iVBORw0KGgo") for source in sources)
     assert not [key for key, _ in parsed.attributes if key.startswith("on")]
@@ -112,16 +117,73 @@ def test_every_finding_is_there_in_full_worst_first(unclean: Result) -> None:
     assert max(places[-2:]) < min(places[:-2])
 
 
-def test_unclean_says_so_at_the_table(unclean: Result, page: str) -> None:
-    said = "A check failed: the numbers in this table that read “not trusted” must not be quoted"
+def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean: Result, page: str) -> None:
+    """Before the contents list: the verdict, a row per parameter, what to do."""
     text = render(unclean, ())
-    assert said in Page(text).text
+    first = Page(text.partition("<nav")[0] + "</body></html>").text
+    assert "Verdict: not trusted. Failed: chains converged, residuals white." in first
     assert 'class="untrusted"' in text
-    assert "Verdict: not trusted. Failed: chains converged, residuals white." in Page(text).text
-    assert "Verdict: trusted. No check failed." in Page(page).text
-    assert text.index("<h2>Parameters") < text.index("A check failed") < text.index("<table")
-    assert said not in Page(page).text
+    for row in table_rows(unclean.summary):
+        assert row.plus_minus("value", "sd", row.decimals) in first
+    assert "What would improve it Correct the whole fit. expected " in first
+    assert "Correct free_vibration_2." in first
+    clean = Page(page.partition("<nav")[0] + "</body></html>").text
+    assert "Verdict: trusted. No check failed." in clean
+    assert "Narrow v_s. v_s has the largest relative sd, 11 %." in clean
     assert 'class="untrusted"' not in page
+
+
+def test_a_number_that_must_not_be_quoted_is_named_in_the_verdict(unclean: Result) -> None:
+    summary = unclean.summary.copy()
+    summary.loc["c", "trust"] = "not trusted"
+    text = Page(render(replace(unclean, summary=summary), ())).text
+    assert "Do not quote c; the other numbers stand as marked." in text
+    assert "Do not quote" not in Page(render(unclean, ())).text
+
+
+def test_the_truth_of_a_synthetic_rig_stands_beside_the_estimate(result: Result) -> None:
+    value, sd = (float(result.summary.at["k1", column]) for column in ("value", "sd"))
+    text = Page(render(replace(result, truth={"k1": value + 2.0 * sd}), ())).text
+    assert f"{value + 2.0 * sd:.1f} (−2.0 sd)" in text
+    assert "truth" not in Page(render(result, ())).text
+
+
+def test_few_figures_are_open_at_first(result: Result, drawn: tuple[Picture, ...]) -> None:
+    """Experiments with a failure or a warning are open, up to 9 figures; with the sample's at most 12."""
+    bad = tuple(Finding("outliers", "warn", OUTLIER, item.label) for item in result.comparisons)
+    for findings in ((), bad):
+        page = render(replace(result, findings=findings), (*drawn, *drawn))
+        opened = [part for part in re.split(r"(?=<details)", page) if part.startswith("<details") and " open>" in part]
+        assert sum(part.partition("</details>")[0].count("<img") for part in opened) <= 12
+        assert page.count("<img") == 2 * len(drawn)
+    assert 'details id="experiment-1" open' in page
+
+
+def test_alternative_texts_say_what_is_seen(drawn: tuple[Picture, ...]) -> None:
+    alts = {picture.name: picture.alt for picture in drawn}
+    assert re.search(
+        r"8 readings from 0\.1 to 2; curves: this fit; \d+% of the residuals within", alts["motor_current"]
+    )
+    assert "strongest correlation" in alts["corner"]
+    assert all(len(alt) > 30 for alt in alts.values())
+
+
+def test_texts_to_copy_hold_the_numbers(result: Result, page: str) -> None:
+    text = html.unescape(page)
+    row = next(row for row in table_rows(result.summary) if row.name == "k2[soft]")
+    number = row.plus_minus("value", "sd", row.decimals).replace("±", r"\pm")
+    assert rf"$k_2$ (soft) & N/m & ${number}$ & trusted \\" in text
+    assert "title = {Experimental verification of the vibro-impact capsule model}" in text
+    assert "author = {Liu, Yang and Pavlovskaia, Ekaterina and Wiercigroch, Marian}" in text
+    assert "4 independent ensembles of 8 walkers" in text
+    for equation in ("F_s = μ/2", "m₁ X₁″ = P_d cos(Ω t) − f"):
+        assert equation in text
+
+
+def test_date_and_command_are_shown_where_they_are_known(result: Result) -> None:
+    made = ("2020-02-20T20:20:20+00:00", "fit-params data/")
+    text = Page(render(replace(result, provenance=replace(result.provenance, made=made)), ())).text
+    assert "date 2020-02-20T20:20:20+00:00 command fit-params data/" in text
 
 
 def test_synthetic_is_said_loudly_and_only_when_true(page: str, unclean: Result) -> None:
@@ -219,7 +281,7 @@ def test_faulty_words_give_the_facts(result: Result, words: Text, error: str) ->
     said = [
         " ".join(text.split()) for text in re.findall(r"the words of own are [^<]*", html.unescape(render(faulty, ())))
     ]
-    assert len(said) == 2  # the finding and the caption
+    assert len(said) == 3  # the next step, the finding and the caption
     for text in said:
         assert f"faulty ({error}" in text
         assert "the facts: number = 3, pair = (1, 2), nought = 0" in text

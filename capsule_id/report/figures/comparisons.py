@@ -30,7 +30,7 @@ from capsule_id.views import Comparison, Curve, Points
 
 # Beyond this many points a record is a cloud of dots, not single readings with bars.
 _MANY = 100
-_TWO_SIDED_95 = 1.96
+TWO_SIDED_95 = 1.96
 
 _POINT_STYLES: dict[str, dict[str, Any]] = {
     "static": {"marker": "o", "mfc": "none", "color": BLACK},
@@ -74,7 +74,7 @@ def residuals(item: Comparison, ax: Axes | None = None) -> Axes:
     if item.residuals is None or item.residual_x is None:
         raise ValueError(f"{item.label} has no residuals")
     ax = own_axes(ax, height=2.2)
-    ax.axhspan(-_TWO_SIDED_95, _TWO_SIDED_95, color=BLUE, alpha=0.13, lw=0)
+    ax.axhspan(-TWO_SIDED_95, TWO_SIDED_95, color=BLUE, alpha=0.13, lw=0)
     ax.axhline(0.0, color=GREY, lw=0.8)
     many = item.residuals.size > _MANY
     ax.plot(item.residual_x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)

@@ -1,0 +1,25 @@
+// Sorts a table by the column of the pressed button, opens all parts before printing, copies a text.
+for (const button of document.querySelectorAll("th button")) {
+  button.addEventListener("click", () => {
+    const cell = button.parentElement, table = cell.closest("table"), body = table.tBodies[0];
+    const column = [...cell.parentElement.children].indexOf(cell);
+    const down = cell.getAttribute("aria-sort") === "ascending";
+    for (const other of cell.parentElement.children) other.removeAttribute("aria-sort");
+    cell.setAttribute("aria-sort", down ? "descending" : "ascending");
+    const key = row => row.children[column].textContent.trim().replaceAll("\u2212", "-");
+    const order = (a, b) => {
+      const [x, y] = [parseFloat(key(a)), parseFloat(key(b))];
+      return isNaN(x) || isNaN(y) ? key(a).localeCompare(key(b)) : x - y;
+    };
+    const rows = [...body.rows].sort((a, b) => down ? order(b, a) : order(a, b));
+    body.append(...rows);
+  });
+}
+addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(part => { part.open = true; }));
+for (const button of document.querySelectorAll("button.copy")) {
+  button.addEventListener("click", () => {
+    getSelection().selectAllChildren(document.getElementById(button.value));
+    document.execCommand("copy");
+  });
+}
+addEventListener("hashchange", () => document.getElementById(location.hash.slice(1))?.closest("details")?.setAttribute("open", ""));

@@ -1,0 +1,86 @@
+"""The page in a browser: no message, no request, sortable, as narrow as a phone, dark, and whole when printed."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from capsule_id.inference.result import Result
+from capsule_id.report.gallery import Picture
+from capsule_id.report.html import render
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+#: Runs in the page: sorts the first sortable table twice, then says what it sees in the title.
+PROBE = """<script>
+const button = [...document.querySelectorAll("th button")].find(item => item.textContent === "value ± sd");
+const table = button.closest("table");
+const place = [...button.closest("tr").children].indexOf(button.closest("th"));
+const numbers = () => [...table.tBodies[0].rows].map(row => parseFloat(row.children[place].textContent));
+button.click();
+const up = numbers();
+button.click();
+const down = numbers();
+const rows = JSON.stringify([up, down, document.documentElement.scrollWidth, innerWidth,
+  getComputedStyle(document.body).backgroundColor]);
+const paper = new Event("beforeprint");
+dispatchEvent(paper);
+document.title = rows + "|" + document.querySelectorAll("details:not([open])").length;
+</script>"""
+
+
+def browse(file: Path, *flags: str) -> tuple[str, list[str]]:
+    """The document after its scripts, and the messages of its console."""
+    assert BROWSER is not None
+    words = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom", *flags]
+    words += [f"--user-data-dir={file.parent / 'profile'}", "--allow-file-access-from-files", file.as_uri()]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+
+
+def seen(document: str) -> tuple[list[float], list[float], int, int, str, int]:
+    """What ``PROBE`` has written into the title."""
+    import html
+    import json
+
+    (title,) = re.findall(r"<title>(.*?)</title>", document)
+    values, closed = html.unescape(title).split("|")
+    return (*json.loads(values), int(closed))
+
+
+def test_it_opens_without_a_message_and_sorts(result: Result, drawn: tuple[Picture, ...], tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    file.write_text(render(result, drawn).replace("</body>", PROBE + "</body>"), encoding="utf-8")
+    document, messages = browse(file, "--blink-settings=preferredColorScheme=0")
+    assert messages == []
+    up, down, *_, background, closed = seen(document)
+    assert up == sorted(up)
+    assert down == up[::-1]
+    assert len(up) == len(result.summary)
+    assert background == "rgb(23, 24, 26)"  # the dark scheme
+    assert closed == 0  # all parts are open for the printer
+
+
+def test_it_fits_a_phone(unclean: Result, drawn: tuple[Picture, ...], tmp_path: Path) -> None:
+    """A frame of 390 px: nothing makes the page wider."""
+    text = render(unclean, drawn).replace("</body>", PROBE + "</body>")
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    (tmp_path / "report.html").write_text(
+        '<title>none</title><iframe src="page.html" style="width: 390px; height: 800px; border: 0" '
+        'onload="document.title = this.contentDocument.title"></iframe>',
+        encoding="utf-8",
+    )
+    document, messages = browse(tmp_path / "report.html")
+    assert messages == []
+    _, _, width, window, background, _ = seen(document)
+    assert (window, background) == (390, "rgb(255, 255, 255)")
+    assert width <= window
+
+
+def test_a_message_would_be_noticed(tmp_path: Path) -> None:
+    """Negative control: an error of a script and a missing picture are messages."""
+    file = tmp_path / "bad.html"
+    file.write_text("<title>x</title><script>undefinedFunction()</script>", encoding="utf-8")
+    assert len(browse(file)[1]) == 1
