@@ -148,7 +148,7 @@ def _corner_alt(result: Result) -> str:
     names, flat = columns.names, columns.draws.reshape(-1, len(columns.names))
     if len(names) < 2 or not np.all(np.std(flat, axis=0) > 0.0):
         return f"Histograms of {len(names)} parameters."
-    correlation = np.corrcoef(flat.T) - np.eye(len(names))
+    correlation = np.triu(np.corrcoef(flat.T), 1)
     i, j = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
     strongest = f"strongest correlation {correlation[i, j]:.2f}, of {names[i]} with {names[j]}"
     return f"Histograms of {len(names)} parameters and contours of their pairs; {strongest}."

@@ -90,12 +90,13 @@ def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, 
     Experiments with a failure or a warning are open, as long as fewer than ``MOST_OPEN`` figures are.
     """
     measured = [picture for picture in pictures if picture.section == "measured"]
-    named = {finding.experiment: finding.level for finding in result.findings if finding.level == "warn"}
-    named |= {finding.experiment: finding.level for finding in result.findings if finding.level == "fail"}
+    named: dict[str, Level] = {}
+    for level in reversed(_WORST_FIRST):
+        named |= {finding.experiment: level for finding in result.findings if finding.level == level}
     entries, shown = [], 0
     for group in dict.fromkeys(picture.group for picture in measured):
         own = sorted((picture for picture in measured if picture.group == group), key=lambda picture: picture.wide)
-        level: Level = named.get(group, "ok")
+        level = named.get(group, "ok")
         is_open = level != "ok" and shown + len(own) <= MOST_OPEN
         shown += len(own) if is_open else 0
         entries.append({"label": group, "level": level, "pictures": own, "open": is_open})
