@@ -4,7 +4,6 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
-import pandas as pd
 
 from capsule_id.inference.result import Result
 from capsule_id.parameters import symbol_of
@@ -42,8 +41,8 @@ def _missing(result: Result) -> Iterator[tuple[str, str]]:
         return
     names = [str(name) for name in result.summary.index if name not in _WEIGHED]
     for name in names:
-        informed = result.summary["informed"].to_dict()[name]
-        if not pd.isna(informed) and not informed:
+        # NaN for an exact constant: nothing is to be measured.
+        if str(result.summary.at[name, "informed"]) == "False":
             kinds = " or ".join(_kinds(result, name)) or "another test"
             yield f"Measure {name}", f"The data hardly narrow the prior of {name}. Add a table of {kinds}."
 
