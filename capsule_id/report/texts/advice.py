@@ -42,7 +42,7 @@ def _missing(result: Result) -> Iterator[tuple[str, str]]:
     names = [str(name) for name in result.summary.index if name not in _WEIGHED]
     for name in names:
         # NaN for an exact constant: nothing is to be measured.
-        if str(result.summary.at[name, "informed"]) == "False":
+        if f"{result.summary.at[name, 'informed']}" == "False":
             kinds = " or ".join(_kinds(result, name)) or "another test"
             yield f"Measure {name}", f"The data hardly narrow the prior of {name}. Add a table of {kinds}."
 
@@ -51,14 +51,15 @@ def _widest(result: Result) -> Iterator[tuple[str, str]]:
     """The parameter with the largest relative sd and the tests that it rests on."""
     rows = result.summary.drop(index=[name for name in _WEIGHED if name in result.summary.index])
     relative = (rows["sd"].astype(float) / rows["value"].astype(float).abs()).replace([np.inf], np.nan).dropna()
-    if relative.empty or relative.max() <= 0.0:
+    largest = float(np.max(relative.to_numpy(float), initial=0.0))
+    if largest == 0.0:
         return
     name = str(relative.idxmax())
     readings = [
         f"{table.label} ({len(table.rows)} rows)" for table in result.rig.tables if table.kind in _kinds(result, name)
     ]
     source = f" It rests on {', '.join(readings)}." if readings else ""
-    sentence = f"{name} has the largest relative sd, {100.0 * relative.max():.2g} %.{source}"
+    sentence = f"{name} has the largest relative sd, {100.0 * largest:.2g} %.{source}"
     yield f"Narrow {name}", f"{sentence} Four times as many independent readings halve the sd."
 
 
