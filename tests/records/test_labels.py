@@ -206,7 +206,7 @@ def test_the_stored_labels_are_those_of_the_model() -> None:
     assert list(response(p, Excitation(P_d, Omega)).label) == list(LONGER.values())
     m1, m2, k1, k2, c, mu, G, P_d, Omega = np.array(list(FRESH)).T
     p = CapsuleParameters(m1=m1, m2=m2, k1=k1, k2=k2, c=c, mu=mu, v_s=0.3, G=G)
-    assert list(response(p, Excitation(P_d, Omega)).period) == list(FRESH.values())
+    assert np.array_equal(response(p, Excitation(P_d, Omega)).period, list(FRESH.values()))
 
 
 def test_the_noise_of_the_gap_is_what_the_rig_states() -> None:
