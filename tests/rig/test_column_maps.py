@@ -239,7 +239,7 @@ FAULTS = [
     ('unit = "mm"', 'unit = "mm", offset = ‸inf', "finite number", "without quotes", 'unit = "mm", offset = 0'),
     ('unit = "mm"', 'unit = "mm", ‸sd = 1', "unknown key", "remove it", 'unit = "mm"'),
     (X, 'x_rel = { ‸rate = { value = 1, unit = "Hz" } }', "for times", 'write { from = "...", unit = "..." }', X),
-    (MAP, f"columns = ‸{MAP[10:].replace(', ' + X, '')}", "must have the columns time and x_rel", "add", MAP),
+    (MAP, f"columns = ‸{MAP[10:].replace(', ' + X, '')}", "must have a channel beside time", "add one of x_rel", MAP),
     (X, f"‸xx{X[5:]}", "unknown key", "known: time x_rel", X),
     (MAP, "‸missing = []", "needs a column map", MAP, f"missing = []\n{MAP}"),
     (MAP, "columns = ‸{}", "must have columns", f"write {MAP}", MAP),

@@ -12,7 +12,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.export import Export, Layout
-from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_column, shown_cell
+from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_column, read_plain_rows, shown_cell
 from capsule_id.rig.formats.text.decode import decode
 
 _COMMENTS = ("#", "%")
@@ -41,11 +41,12 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         raise InputError("a table must have rows of numbers", "none", "export the readings", path, len(lines), 1)
     delimiter = delimiter_of(lines[numbers[0]], layout)
     _refuse_ambiguous_comma([lines[i] for i in numbers], delimiter, layout, path, numbers[0] + 1)
-    rows = [lines[i].split(delimiter) for i in numbers]
+    table = _plain_table([lines[i] for i in numbers], delimiter, layout)
+    rows = [lines[i].split(delimiter) for i in (numbers if table is None else numbers[:1])]
     if len(rows[0]) > 1 and not any(row[-1].strip(BLANKS) for row in rows):  # a separator at the end of every line
         rows = [row[:-1] for row in rows]
     width = len(rows[0])
-    for i, row in zip(numbers, rows, strict=True):
+    for i, row in zip(numbers, rows, strict=False):
         if len(row) != width:
             rule = f"a row must have {width} cells, as line {numbers[0] + 1} has"
             remedy = f"correct the row, or state data_from_line = {i + 1} if the readings begin here"
@@ -53,6 +54,8 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     found = [(i, names) for i in range(first - 1, -1, -1) if (names := _headers(lines[i], delimiter, width, layout))]
 
     def values(column: int) -> np.ndarray:
+        if table is not None:
+            return table[:, column]
         texts = [_bare(row[column]) for row in rows]
         decimal = "." if delimiter == "," else layout.decimal
         return read_column(texts, decimal, layout.missing, lambda k: (path, *place(k, column)))
@@ -63,6 +66,16 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
         return line + 1, cells[column][1] if column < len(cells) else 1
 
     return Export(path, tuple(names for _, names in found), width, np.asarray(numbers) + 1, values, place)
+
+
+def _plain_table(rows: list[str], delimiter: str | None, layout: Layout) -> np.ndarray | None:
+    """All numbers of a file without missing, empty or other cells; None for any other file."""
+    decimal = layout.decimal or "."
+    if delimiter == ",":
+        decimal = "."
+    elif layout.decimal is None and "," in rows[0]:
+        decimal = ","
+    return read_plain_rows(rows, delimiter, decimal)
 
 
 def _first_row(lines: list[str], layout: Layout, path: Path) -> int:

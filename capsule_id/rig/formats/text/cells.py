@@ -14,6 +14,7 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
+_PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
 _LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
 
@@ -59,6 +60,20 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
         remedy = "write a smaller number: float64 ends at 1.8e308"
         raise InputError("a cell must be a finite number", shown_cell(cell), remedy, path, line, column)
     return value
+
+
+def read_plain_rows(lines: Sequence[str], delimiter: str | None, decimal: str) -> np.ndarray | None:
+    """The (rows, columns) numbers of lines that hold numbers alone, by NumPy's C reader; None for any other lines."""
+    allowed = f"{_PLAIN}{delimiter or ''}{decimal}".encode()
+    if "".join(lines).encode("utf-8", "replace").translate(None, allowed):
+        return None
+    if decimal == ",":
+        lines = [line.replace(",", ".") for line in lines]
+    try:
+        values = np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, dtype=np.float64)
+    except ValueError:
+        return None
+    return values if len(values) == len(lines) and np.isfinite(values).all() else None
 
 
 def read_column(

@@ -5,7 +5,6 @@ NumPy's C reader reads the whole body. If it fails, the cells are read one by on
 1-based: the line of the file, and the character of that line at which the cell begins.
 """
 
-import io
 import re
 from pathlib import Path
 
@@ -13,11 +12,10 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.formats.text.cells import cells_of, read_number, shown_cell
+from capsule_id.rig.formats.text.cells import cells_of, read_number, read_plain_rows, shown_cell
 from capsule_id.rig.formats.text.decode import decode
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
-_NUMBER_CHARACTERS = frozenset("0123456789+-eE \t\n")  # plus the decimal mark
 
 
 def read_csv(content: bytes, path: Path) -> RawTable:
@@ -38,10 +36,11 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     names, units = _header(lines[0], delimiter, path)
     if len(lines) == 1:
         raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
-    body = "\n".join(lines[1:])
-    first_mark = re.search("[.,]", body) if delimiter != "," else None
-    decimal = first_mark[0] if first_mark else "."
-    values = _read_fast(body, delimiter, decimal, len(names), len(lines) - 1)
+    marks = (re.search("[.,]", line) for line in lines[1:]) if delimiter != "," else iter(())
+    decimal = next((mark[0] for mark in marks if mark), ".")
+    values = read_plain_rows(lines[1:], delimiter, decimal)
+    if values is not None and values.shape[1] != len(names):
+        values = None
     if values is None:
         values = _read_cells(lines, delimiter, decimal, len(names), path)
 
@@ -86,19 +85,6 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
             )
         units[found[1]] = found[2].strip()
     return tuple(units), tuple(units.values())
-
-
-def _read_fast(body: str, delimiter: str, decimal: str, columns: int, rows: int) -> np.ndarray | None:
-    """The (rows, columns) numbers, or None if a cell or row is faulty."""
-    if not frozenset(body) <= _NUMBER_CHARACTERS | {delimiter, decimal}:
-        return None
-    if decimal == ",":
-        body = body.replace(",", ".")
-    try:
-        values = np.loadtxt(io.StringIO(body), delimiter=delimiter, comments=None, ndmin=2, dtype=np.float64)
-    except ValueError:
-        return None
-    return values if values.shape == (rows, columns) and np.isfinite(values).all() else None
 
 
 def _read_cells(lines: list[str], delimiter: str, decimal: str, columns: int, path: Path) -> np.ndarray:
