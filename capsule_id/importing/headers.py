@@ -23,6 +23,10 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "distance": ("distance", "travel", "slide", "strecke", "weg", "x", "d", "displacement"),
     "deflection": ("deflection", "displacement", "disp", "compression", "extension", "verformung", "weg", "x"),
     "coefficient": ("coefficient", "mu", "reibwert"),
+    "period": ("period", "t", "periode"),
+    "duty": ("duty", "tau"),
+    "periods": ("periods", "n", "cycles"),
+    "session": ("session", "day"),
     "reading": ("reading", "counts", "adc", "raw", "cell"),
 }
 #: Units of headers that state none: names that programs give to their columns.

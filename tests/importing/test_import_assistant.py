@@ -9,6 +9,7 @@ import pytest
 import capsule_id
 from capsule_id import cli
 from tests.importing.spoiled_exports import Spoiled, spoiled_exports
+from tests.measured.sources import measured_file
 
 EXPORTS = spoiled_exports()
 #: Least share of exports read correctly, and largest share of unsure guesses.
@@ -114,3 +115,25 @@ def test_files_that_cannot_be_read_are_refused_and_nothing_is_written(
             assert part in err
             assert err.count("\n") == 1
     assert not (tmp_path / "rig").exists()
+
+
+#: Periods of a pulsed drive, duty, number of periods, distance, and its mean velocity, as a capsule robot's table has them.
+PROGRESSION = "T;tau;n;x;V\nms;%;;cm;m/s\n" + "".join(
+    f"{t};30;100;{x};{x * 0.1 / t:.4f}\n".replace(".", ",")
+    for t, x in zip(range(30, 80, 5), np.arange(10) - 2.5, strict=True)
+)
+
+
+@pytest.mark.parametrize("source", ["synthetic", "measured"])
+def test_a_table_of_progressions_is_no_table_of_pushes(tmp_path: Path, source: str) -> None:
+    """Speed and distance are columns of pushes too; the period, the duty and the periods decide."""
+    text = PROGRESSION.encode()
+    if source == "measured":
+        text = measured_file("capsubot_pulse/exp_data_tau30.csv").read_bytes()
+    lines = written(tmp_path / "a", Spoiled("trials.csv", text, "progression", {})).split("\n")
+    (kind,) = (line for line in lines if line.startswith("kind = "))
+    assert kind.startswith('kind = "progression"  # sure')
+    found = {line.split(" = ")[0]: line for line in lines if "{ from = " in line and not line.startswith("#")}
+    units = {name: line.split('unit = "')[1].split('"')[0] for name, line in found.items()}
+    assert units == {"period": "ms", "periods": "1", "distance": "cm", "duty": "%"}
+    assert 'distance = { from = "x"' in found["distance"]
