@@ -10,7 +10,13 @@ from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.declaration import MESSAGES
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
-from capsule_id.experiments.free_vibration.second_fit.screening import demands_another, second_models
+from capsule_id.experiments.free_vibration.second_fit.screening import (
+    BIC_MARGIN,
+    Ranking,
+    demands_another,
+    second_models,
+    simplest,
+)
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from tests.experiments import bench
 
@@ -95,6 +101,16 @@ def test_a_record_with_two_excitations_keeps_its_model(monkeypatch: pytest.Monke
     record_cut = FreeVibration(cut, bench.rig(cut))
     ((other,), _) = second_models([record_cut], list(lint_decay(cut, record_cut.rig)))
     assert other.model == DecayModel(("dry",))
+
+
+def test_the_fewest_forces_are_chosen_among_models_that_differ_little() -> None:
+    best, near = (
+        Ranking(DecayModel(("dry", "quadratic")), 100.0, ()),
+        Ranking(DecayModel(("dry",)), 100.0 + BIC_MARGIN, ()),
+    )
+    far = Ranking(DecayModel(), 100.1 + BIC_MARGIN, ())
+    assert simplest([best, near, far]) is near
+    assert simplest([best, far]) is best
 
 
 def test_coloured_noise_is_found() -> None:

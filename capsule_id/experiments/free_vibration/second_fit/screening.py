@@ -32,6 +32,8 @@ READINGS_PER_PERIOD, RESPONSE_POINTS = 16, 60
 FEWEST_PER_PERIOD = 8
 #: Largest number of samples of a record that is no free decay.
 LONGEST_UNCUT = 1000
+#: Of forces whose BIC differs by less, the fewest are chosen: with seven alternatives, noise alone often gains this much.
+BIC_MARGIN = 4.0
 #: Shorter records, in samples, keep their model.
 SHORTEST = 40
 #: Residuals with a larger p-value of the Ljung–Box test count as white here; the check after the fit is more lenient.
@@ -135,6 +137,12 @@ def rank(screenings: Sequence[Screening], models: Iterable[DecayModel], near: Ra
     return sorted(found, key=lambda one: one.bic)
 
 
+def simplest(ranked: Sequence[Ranking]) -> Ranking:
+    """Return the model with the fewest forces whose BIC is within ``BIC_MARGIN`` of the best one, the first."""
+    near = [one for one in ranked if one.bic <= ranked[0].bic + BIC_MARGIN]
+    return min(near, key=lambda one: len(one.model.symbols))
+
+
 def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
     """Return the model with the lowest BIC of all ``records`` together, thinned until its residuals are white.
 
@@ -145,7 +153,7 @@ def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
     forces, others = open_models(records[0])
     coarse = thinning(records[0], READINGS_PER_PERIOD)
     thinned = [Screening(record, coarse) for record in records]
-    best = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])[0]
+    best = simplest(rank(thinned, [replace(model, noise=others[-1].noise) for model in forces]))
     others = [replace(model, damping=best.model.damping, cubic=best.model.cubic) for model in others]
     ranked = rank(thinned, others, best)
     best = ranked[0]
