@@ -14,6 +14,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.experiment_checks import check_outliers, check_stated_errors, check_whiteness
 from capsule_id.inference.checks.modes import check_maximum, check_starts
 from capsule_id.inference.checks.order import check_order
+from capsule_id.inference.checks.predictive import check_statistics
 from capsule_id.inference.checks.priors import check_priors
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.result import PointFit, Posterior
@@ -40,6 +41,7 @@ def run_checks(setting: Setting) -> Setting:
         *outliers,
         *check_stated_errors(setting),
         *check_order(setting),
+        *check_statistics(setting),
         *_declared_findings(setting, bench=True),
         *_informed(setting),
         *check_priors(setting),

@@ -164,6 +164,14 @@ FIT_MESSAGES: Mapping[str, Message] = {
             "Repeat the trials in random order, with the test set up anew between them."
         ),
     ),
+    "residuals.statistics": Message(
+        "residuals like noise",
+        ok="runs of signs, largest residual and trend of {number} bench tests are those of noise",
+        warn=(
+            "expected residuals like those of noise through the same fit; their {statistic} is too large (p = {p:.1g}). A "
+            "fitted scatter cannot absorb this. Look at the residuals: a bend, a wrong model or a wrong reading."
+        ),
+    ),
     "model.error": Message(
         "model error",
         warn=lambda facts: (

@@ -1,0 +1,80 @@
+"""Runs of signs, largest residual and trend: calibrated on clean twins, large where the model or a reading is wrong."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.registry import default_registry
+from capsule_id.inference.checks.predictive import STATISTICS, experiment_p_values, p_values
+from tests.experiments import bench
+from tests.scipy_decay import scipy_decay
+
+KINDS = default_registry()
+LINE_SD, DECAY_SD = 0.05, 2e-5  # N, m
+Twin = tuple[Experiment, dict[str, float]]
+
+
+def line(seed: int, bend: float = 0.0, outlier: float = 0.0) -> Twin:
+    """A support spring of 11 readings; ``bend`` in N/m^2, ``outlier`` in sds, at a random reading."""
+    rng = np.random.default_rng(seed)
+    x = np.linspace(0.0, 1e-3, 11)
+    y = 18960.0 * x + LINE_SD * rng.standard_normal(11) + bend * (x - np.mean(x)) ** 2
+    y[rng.integers(11)] += outlier * LINE_SD * rng.choice([-1, 1])
+    table = bench.table("support_spring", [bench.column("deflection", x), bench.column("force", y)], spring="soft")
+    (e,) = make_experiments(bench.rig(table), "bench", KINDS)
+    return e, {"k2": 18960.0, "scatter": LINE_SD}
+
+
+def decay(seed: int, F_dry: float = 0.0, outlier: float = 0.0) -> Twin:
+    """A decay of 300 samples; ``F_dry`` in N is dry friction that the viscous model lacks."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(300) * 1e-3
+    forces = {"k1": bench.K1, "c": bench.C, "m1": bench.M1, "F_dry": F_dry}
+    x = scipy_decay(t, forces, 2e-3, 0.0)[0] if F_dry else bench.released(t, 2e-3)
+    x = x + DECAY_SD * rng.standard_normal(300)
+    x[rng.integers(300)] += outlier * DECAY_SD * rng.choice([-1, 1])
+    table = bench.table("free_vibration", [bench.column("time", t), bench.column("x_rel", x)])
+    (e,) = make_experiments(bench.rig(table), "bench", KINDS)
+    return e, {"k1": bench.K1, "c": bench.C, "noise_sd": DECAY_SD, "m1": bench.M1, "m2": bench.M2, "g": bench.G}
+
+
+def shares(make: Callable[[int], Twin], number: int) -> dict[str, float]:
+    """Share of twins with p < 0.05, by statistic."""
+    found = [experiment_p_values(*make(seed)) for seed in range(number)]
+    return {name: float(np.mean([p[name] < 0.05 for p in found])) for name in STATISTICS}
+
+
+@pytest.mark.parametrize("make", [line, decay])
+def test_clean_twins_have_small_p_values_as_often_as_they_should(make: Callable[[int], Twin]) -> None:
+    """20 twins: at most 20 %. The study of 200 is slow."""
+    assert max(shares(make, 20).values()) <= 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [line, decay])
+def test_of_200_clean_twins_2_to_9_percent_have_a_small_p_value(make: Callable[[int], Twin]) -> None:
+    assert all(0.02 <= share <= 0.09 for share in shares(make, 200).values())
+
+
+@pytest.mark.parametrize(
+    ("make", "statistic"),
+    [
+        (partial(line, bend=1.2e6), "trend"),  # leaves the line by 0.3 N at both ends, 6 sd
+        (partial(decay, outlier=6.0), "largest"),
+        (partial(decay, F_dry=0.02), "sign runs"),  # 2 % of the first spring force is 0.06 N
+    ],
+)
+def test_what_the_scatter_cannot_absorb_is_found(make: Callable[[int], Twin], statistic: str) -> None:
+    assert shares(make, 8)[statistic] >= 0.87
+
+
+def test_the_noise_level_does_not_matter() -> None:
+    """The p-values of residuals and of ten times the residuals are equal: a fitted scatter changes nothing."""
+    rng = np.random.default_rng(0)
+    r, columns = rng.standard_normal(40), rng.standard_normal((40, 3))
+    assert p_values(r, columns) == pytest.approx(p_values(10.0 * r, columns))
+    assert p_values(r, columns) == pytest.approx(p_values(r + columns @ [5.0, -2.0, 1.0], columns))
