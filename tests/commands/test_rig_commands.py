@@ -33,6 +33,7 @@ FILES = {
     "free_vibration_1.csv": "time [s],x_rel [mm]\n" + "".join(f"{i / 100},{2 * (-0.8) ** i}\n" for i in range(51)),
     "support_spring_L60.csv": TABLES["support_spring_L60.csv"],
     "run_01.csv": TABLES["run_01.csv"],
+    "progression.csv": "period [ms],duty [%],periods [1],distance [cm]\n60,30,100,4.5\n80,30,50,-2.1\n",
     # Five levels of 15 s each, read at 2 Hz.
     "load_cell.csv": "".join(f"{k / 2} {224 * (0, 10, 20, 10, 0)[k // 30] + k % 3}\n" for k in range(150)),
     **{f"{kind}.csv": TABLES[f"{kind}.csv"] for kind in ("static_friction", "dynamic_friction", "motor_current")},
