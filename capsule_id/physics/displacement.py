@@ -23,6 +23,8 @@ from capsule_id.physics.model import CapsuleParameters, Status, simulate, withou
 BLOCK = 6
 #: The motion repeats where the state changes by less than this part of itself over one period, dimensionless.
 REPEATS = 1e-5
+#: Bound on the steps of a block. A usual one needs 200; a motion that needs far more keeps its whole chunk waiting.
+BLOCK_STEPS = 3000
 
 
 class Progress(NamedTuple):
@@ -96,9 +98,8 @@ def _run(p: CapsuleParameters, e: Drive, law: FrictionLaw, r0: Any, period: Any,
     def block(lane: _Lane) -> _Lane:
         ahead = jnp.where(lane.active, jnp.minimum(float(BLOCK), count - lane.done), 0.0)
         begin, end = lane.done * period, (lane.done + ahead) * period
-        t = simulate(
-            p, e, jnp.stack([begin, end - jnp.where(ahead > 1.0, period, 0.0), end], 1), lane.state, friction=law
-        )
+        times = jnp.stack([begin, end - jnp.where(ahead > 1.0, period, 0.0), end], 1)
+        t = simulate(p, e, times, lane.state, friction=law, max_steps=BLOCK_STEPS)
         ends = [(x[:, 1], x[:, 2]) for x in (t.X1, t.Y1, t.X2, t.Y2)]
         before, after = (
             jnp.stack([X1 - X2, (Y1 - Y2) / omega, Y2 / omega]) for X1, Y1, X2, Y2 in zip(*ends, strict=True)

@@ -65,6 +65,17 @@ gap = { value = 1.0, sd = 0.02, unit = "mm" }
 Omega = { value = 34.56, unit = "rad/s" }
 P_d = { value = 4.0, sd = 0.1, unit = "N" }
 file = "run_01.csv"
+
+[[experiment]]
+kind = "transducer"
+file = "load_cell.csv"
+
+[[experiment]]
+kind = "progression"
+file = "progression.csv"
+drive = "pulses"
+P_on = { value = -1.25, sd = 0.5, unit = "N" }
+lag = { value = 5, sd = 2, unit = "ms" }
 """
 
 TABLES = {
@@ -76,6 +87,8 @@ TABLES = {
     "sliding_friction.csv": "speed [m/s],coefficient [1]\n0.1,0.56\n0.3,0.45\n",
     "motor_current.csv": "force [N],current [A]\n0.5,0.26\n1,0.51\n1.5,0.74\n",
     "support_spring_L60.csv": "deflection [mm],force [N]\n0,0.01\n0.5,9.4\n1,19\n",
+    "load_cell.csv": "reading [1],force [N]\n3,0\n227,1\n452,2\n",
+    "progression.csv": "period [ms],duty [%],periods [1],distance [cm]\n60,30,100,4.5\n80,30,50,-2.1\n",
     "run_01.csv": "time [s],x_rel [mm],acceleration_rod [m/s^2]\n"
     + "".join(f"{i / 100},{i % 3},{i % 5}\n" for i in range(9)),
 }

@@ -43,9 +43,11 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "motor_current",
         "support_spring",
         "forced_run",
+        "transducer",
+        "progression",
     ]
     assert {table.kind for table in rig.tables} == set(default_registry())
-    decay, tilts, boards, pushes, _, motor, spring, run = rig.tables
+    decay, tilts, boards, pushes, _, motor, spring, run, *_ = rig.tables
     np.testing.assert_array_equal(decay["time"], np.arange(10) / 1000)
     np.testing.assert_array_equal(decay["x_rel"][:3], [0.002, 0.0015, 0.0005])
     assert decay.columns["x_rel"].reading_sd == pytest.approx(math.hypot(2e-5, 1e-6 / math.sqrt(12.0)), rel=1e-15)
