@@ -1,0 +1,99 @@
+"""No text of a figure leaves the picture or lies on another one: boxes measured by matplotlib's renderer."""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from capsule_id.inference.result import Result
+from capsule_id.report.figures import comparisons
+from capsule_id.report.figures.corner import corner
+from capsule_id.report.figures.style import figure_of
+from capsule_id.report.figures.traces import traces
+
+#: Boxes may share this much, pixels: a renderer rounds.
+SLACK = 1.0
+
+
+def drawn_texts(figure: Figure) -> list[Text]:
+    """The texts that a drawing shows: those of ticks outside an axis are not drawn."""
+    FigureCanvasAgg(figure).draw()
+    hidden: set[Text] = set()
+    for axis in (axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)):
+        shown = axis._update_ticks() if axis.axes.axison else []  # pyright: ignore[reportAttributeAccessIssue]
+        hidden |= {
+            label
+            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks())
+            if tick not in shown
+            for label in (tick.label1, tick.label2)
+        }
+    texts: list[Text] = figure.findobj(Text)  # type: ignore[assignment]  # pyright: ignore[reportAssignmentType]
+    return [text for text in texts if text.get_visible() and text.get_text().strip() and text not in hidden]
+
+
+def faults(figure: Figure) -> list[str]:
+    """Texts that leave the figure, and pairs of texts that overlap."""
+    texts = drawn_texts(figure)
+    found, boxes = [], []
+    for text in texts:
+        box = text.get_window_extent()
+        if box.x0 < -SLACK or box.y0 < -SLACK or box.x1 > figure.bbox.x1 + SLACK or box.y1 > figure.bbox.y1 + SLACK:
+            found.append(f"{text.get_text()!r} leaves the figure")
+        if text.get_rotation() % 90.0 == 0.0:
+            boxes.append((text.get_text(), box))
+    for (one, a), (other, b) in itertools.combinations(boxes, 2):
+        if min(a.x1, b.x1) - max(a.x0, b.x0) > SLACK and min(a.y1, b.y1) - max(a.y0, b.y0) > SLACK:
+            found.append(f"{one!r} lies on {other!r}")
+    return found + rotated_faults([text for text in texts if text.get_rotation() % 90.0])
+
+
+def rotated_faults(texts: list[Text]) -> list[str]:
+    """Pairs of parallel texts on one line whose distance across their direction is less than their height."""
+    found = []
+    for one, other in itertools.combinations(texts, 2):
+        (x0, y0), (x1, y1) = (text.get_transform().transform(text.get_position()) for text in (one, other))
+        angle = np.deg2rad(one.get_rotation())
+        height = one.get_fontsize() * figure_dpi(one) / 72.0
+        if abs(y0 - y1) < 1.0 and abs(x1 - x0) * np.sin(angle) < 0.9 * height:
+            found.append(f"{one.get_text()!r} lies on {other.get_text()!r}")
+    return found
+
+
+def figure_dpi(text: Text) -> float:
+    figure = text.get_figure(root=True)
+    assert figure is not None
+    return figure.dpi
+
+
+FIGURES: dict[str, Callable[[Result], Figure]] = {
+    "corner": lambda result: figure_of(corner(result)),
+    "traces": lambda result: figure_of(traces(result)),
+    "starts": lambda result: figure_of(comparisons.point_fit_starts(result.point_fit)),
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_texts_of_the_sample_are_apart(result: Result, name: str) -> None:
+    assert faults(FIGURES[name](result)) == []
+
+
+def test_texts_of_panels_are_apart(result: Result) -> None:
+    found = {item.label: faults(comparisons.comparison_figure(item)) for item in result.comparisons}
+    assert {label: fault for label, fault in found.items() if fault} == {}
+
+
+def test_overlaps_and_clipped_texts_would_be_found() -> None:
+    """Negative control: long ticks side by side, a label below the edge, two parallel texts."""
+    figure = Figure(figsize=(3.0, 2.0))
+    ax = figure.subplots()
+    ax.set_xticks([0.5, 0.51], ["a long label", "another label"])
+    ax.set_xlabel("time", labelpad=40)
+    ax.text(0.2, 0.5, "one", rotation=40)
+    ax.text(0.21, 0.5, "two", rotation=40)
+    found = " ".join(faults(figure))
+    for fault in ("'a long label' lies on 'another label'", "'time' leaves the figure", "'one' lies on 'two'"):
+        assert fault in found
