@@ -73,14 +73,14 @@ def _probabilities(advance: float, sd: float, largest: float) -> dict[str, float
     moving = np.geomspace(STANDING_ADVANCE, max(largest, 2.0 * STANDING_ADVANCE, 2.0 * abs(advance)), _ADVANCES)
     standing = np.linspace(-STANDING_ADVANCE, STANDING_ADVANCE, _ADVANCES)
     logs = {
-        word: logsumexp(norm.logpdf(advance, values, np.maximum(sd, spacing)))
+        word: float(np.asarray(logsumexp(norm.logpdf(advance, values, np.maximum(sd, spacing)))))
         for word, values, spacing in (
             ("F", moving, np.gradient(moving)),
             ("B", -moving, np.gradient(moving)),
             ("S", standing, np.gradient(standing)),
         )
     }
-    total = logsumexp(list(logs.values()))
+    total = float(np.asarray(logsumexp(list(logs.values()))))
     return {word: float(np.exp(value - total)) for word, value in logs.items()}
 
 

@@ -77,8 +77,8 @@ def test_one_unit_for_all_rows_of_a_symbol(result: Result) -> None:
     """Gaps of 0.99926 mm and 1.50037 mm: before, the first was in µm and the second in m."""
     gaps = result.summary.loc[["k1", "k1"]].set_axis(["G[run_1]", "G[run_2]"])
     gaps = gaps.assign(unit="m", value=[9.9926e-4, 1.50037e-3], map=[9.9926e-4, 1.50037e-3], sd=5e-6)
-    assert [row.unit for row in table_rows(gaps)] == ["m", "m"]
-    assert [row.number("value") for row in table_rows(gaps)] == ["0.0009993", "0.0015004"]
+    assert [row.unit for row in table_rows(gaps)] == ["mm", "mm"]
+    assert [row.number("value") for row in table_rows(gaps)] == ["0.9993", "1.5004"]
 
 
 @pytest.mark.parametrize(
