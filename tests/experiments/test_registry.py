@@ -248,11 +248,12 @@ def test_an_unknown_choice_of_experiments_is_refused(tmp_path: Path, word: str) 
 def test_the_choices_of_experiments(tmp_path: Path) -> None:
     rig = read_rig(write_folder(tmp_path / "rig"))
     chosen = {choice: [table.label for table in select_tables(rig, choice)] for choice in CHOICES}
-    assert chosen["runs"] == ["run_01"]
-    assert chosen["all"] == [*chosen["bench"], *chosen["runs"]]
-    assert len(chosen["bench"]) == len(TABLES) - 1
+    assert chosen["runs"] == ["run_01", "progression"]
+    assert sorted(chosen["all"]) == sorted([*chosen["bench"], *chosen["runs"]])
+    assert len(chosen["bench"]) == len(TABLES) - 2
     assert rig.has_runs
-    assert not replace(rig, tables=rig.tables[:-1]).has_runs
+    bench = tuple(table for table in rig.tables if table.label in chosen["bench"])
+    assert not replace(rig, tables=bench).has_runs
 
 
 def test_a_bracket_in_a_symbol_is_refused() -> None:
