@@ -96,7 +96,7 @@ def test_init_takes_an_empty_folder_and_no_other(tmp_path: Path) -> None:
 def test_check_prints_a_line_per_experiment(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert call(check, str(write_folder(tmp_path / "rig"))) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "twin: 8 experiments, SYNTHETIC data"
+    assert lines[0] == "twin: 10 experiments, SYNTHETIC data"
     assert lines[1] == "free_vibration free_vibration_1: 10 rows of time [ms], x_rel [mm], 1000 Hz"
     assert lines[3] == "static_friction lifted: 2 rows of height [mm], length [mm]"
     assert lines[8] == "forced_run run_01: 9 rows of time [s], x_rel [mm], acceleration_rod [m/s^2], 100 Hz"
