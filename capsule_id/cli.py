@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from capsule_id import console
-from capsule_id.compilation import discard_damaged
+from capsule_id.commands.compilation import discard_damaged
 from capsule_id.errors import InputError
 from capsule_id.interruption import INTERRUPTED, interruptible
 
@@ -56,7 +56,8 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands import bifurcate, check, import_file, init, predict, report, simulate, synthesize
+    from capsule_id.commands import check, import_file, init, predict, report, simulate, synthesize
+    from capsule_id.commands.maps import bifurcate
 
     parser = _parser(program, "Make, check, simulate and report; fit-params fits.")
     parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)

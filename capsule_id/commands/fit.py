@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments import CHOICES, make_experiments

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.console import say
 from capsule_id.errors import InputError
 

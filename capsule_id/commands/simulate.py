@@ -13,7 +13,7 @@ from capsule_id.commands.capsule_options import (
     capsule_values,
     number,
 )
-from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.errors import InputError
 
 if TYPE_CHECKING:

@@ -31,10 +31,10 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
-from capsule_id.inference.checks.run_widening import run_widenings
+from capsule_id.inference.checks.model_error.run_widening import run_widenings
+from capsule_id.inference.checks.model_error.widening import widenings
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.verdict import run_checks
-from capsule_id.inference.checks.widening import widenings
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import PointStage
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result

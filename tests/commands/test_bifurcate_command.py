@@ -12,7 +12,7 @@ import xarray as xr
 from PIL import Image
 
 from capsule_id.cli import capsule_id
-from capsule_id.commands import bifurcate as command
+from capsule_id.commands.maps import bifurcate as command
 from capsule_id.console import Progress
 from capsule_id.motions import sweep
 from capsule_id.motions.response import Settling, response

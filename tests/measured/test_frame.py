@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments.families.friction_model import FrictionModel
 from capsule_id.experiments.forced_run.base_run import BaseRun
-from capsule_id.inference.checks.run_widening import run_widenings
+from capsule_id.inference.checks.model_error.run_widening import run_widenings
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.fit.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit

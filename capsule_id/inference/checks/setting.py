@@ -16,7 +16,7 @@ from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 
 if TYPE_CHECKING:
-    from capsule_id.inference.checks.widening import Widening
+    from capsule_id.inference.checks.model_error.widening import Widening
 
 
 @dataclass(frozen=True)

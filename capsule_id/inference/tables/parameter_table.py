@@ -8,10 +8,10 @@ import pandas as pd
 
 from capsule_id.experiments import paper_estimates
 from capsule_id.experiments.registry import Registry
+from capsule_id.inference.checks.model_error.widening import Widening
 from capsule_id.inference.checks.setting import Setting
 from capsule_id.inference.checks.trust import trust_words
 from capsule_id.inference.checks.verdict import informed
-from capsule_id.inference.checks.widening import Widening
 from capsule_id.inference.result import Posterior
 from capsule_id.parameters import Parameter, parameter
 

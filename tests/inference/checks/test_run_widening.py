@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments.forced_run.base_run import BaseRun
-from capsule_id.inference.checks.run_widening import (
+from capsule_id.inference.checks.model_error.run_widening import (
     by_phase,
     by_time,
     parts_of_residuals,
     run_widenings,
     steps_of_parts,
 )
+from capsule_id.inference.checks.model_error.widening import FEWEST_PARTS, widening
 from capsule_id.inference.checks.setting import Setting
-from capsule_id.inference.checks.widening import FEWEST_PARTS, widening
 from capsule_id.inference.fit.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior

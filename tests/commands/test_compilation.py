@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from capsule_id import compilation
+from capsule_id.commands import compilation
 from tests.cli_tools import environment, run
 
 MOTION = ("simulate", "--k2", "18960", "--P_d", "4", "--Omega", "34.56", "--G", "1e-3", "--periods", "1")

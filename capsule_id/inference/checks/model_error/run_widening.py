@@ -14,8 +14,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
+from capsule_id.inference.checks.model_error.widening import (
+    FEWEST_PARTS,
+    LARGEST_RELATIVE_SD,
+    MOST_PARTS,
+    Widening,
+    widening,
+)
 from capsule_id.inference.checks.setting import Setting
-from capsule_id.inference.checks.widening import FEWEST_PARTS, LARGEST_RELATIVE_SD, MOST_PARTS, Widening, widening
 from capsule_id.inference.fit.point_fit import residual_jacobian
 
 #: Parts of an excitation period. They are long beside most waves of a misfit, so that their steps are independent.

@@ -16,8 +16,8 @@ from capsule_id.commands.capsule_options import (
     fitted_values,
     number,
 )
-from capsule_id.commands.sweep_output import prepare_store, publish_pair, remove_store
-from capsule_id.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.maps.sweep_output import prepare_store, publish_pair, remove_store
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import default_registry
@@ -195,7 +195,7 @@ def _measured_points(
     args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
 ) -> "tuple[MeasuredPoint, ...]":
     """The forced runs with the settings of a diagram. Standard error lists the omitted runs."""
-    from capsule_id.commands.measured_runs import Span, overlay
+    from capsule_id.commands.maps.measured_runs import Span, overlay
 
     diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
     if not diagram or not rig.has_runs:

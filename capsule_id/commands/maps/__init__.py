@@ -1,0 +1,1 @@
+"""Maps of motions: the command ``bifurcate``, its stores, and measured runs on its figures."""
