@@ -92,7 +92,7 @@ def test_another_seed_is_another_result(fitted: Fit, tmp_path: Path) -> None:
 
 
 def test_what_is_no_result_is_refused(fitted: Fit, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="run fit-params again"):
+    with pytest.raises(InputError, match=r"it has no data\.npz, run fit-params again"):
         cid.load(tmp_path)
     fitted.write(tmp_path / "one")
     saved = tmp_path / "one" / "figures" / "data.npz"

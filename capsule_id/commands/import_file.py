@@ -47,7 +47,8 @@ def read_file(path: Path) -> bytes:
     """
     try:
         if not path.is_file():
-            raise InputError("FILE must be a regular file", "no such file", "correct the name", path)
+            found = "a directory" if path.is_dir() else "no such file"
+            raise InputError("FILE must be a regular file", found, "correct the name", path)
         return path.read_bytes()
     except OSError as error:
         raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None

@@ -9,7 +9,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
-from capsule_id.importing.guess import TIME, ColumnGuess, Guess, free_part, guess
+from capsule_id.importing.guess import TIME, ColumnGuess, Guess, disordered_times, free_part, guess
 from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
@@ -43,8 +43,17 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
     if guessed is None:
         words = " ".join(kinds)
         headers = ", ".join(name for name in found.names if name) or "none"
+        times = disordered_times(found)
         lines = [
             f"#: {file}: unsure. No kind fits its headers: {headers}.",
+            *(
+                [
+                    f"#: Times must increase; {times[0]!r} does not at line {times[1]}. "
+                    "Export times with more digits, or correct the headers."
+                ]
+                if times
+                else []
+            ),
             f"#: Write one of {words}, and the columns of that kind.",
             "# [[experiment]]",
             '# kind = "..."',

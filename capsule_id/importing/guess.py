@@ -177,15 +177,43 @@ def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | Non
     if rows < FEWEST_SAMPLES or len(times) > 1 or len(channels) != 1:
         return None
     reason = "no header names the column"
+    dimensions = sorted({rule.si for kind in kinds.values() for rule in kind.columns.values()})
     candidates = []
-    for kind in kinds.values():
-        name = next((name for name in (*kind.sets[0], *kind.channels) if name != TIME), None)
-        if TIME in kind.columns and name is not None:
-            wanted = {name: channels[0]} | dict.fromkeys([TIME] * len(times), times[0] if times else 0)
-            columns = {n: ColumnGuess(i, kind.columns[n].si, "unsure", reason) for n, i in wanted.items()}
+    for kind in (kind for kind in kinds.values() if TIME in kind.columns):
+        names = [name for name in (*kind.sets[0], *kind.channels) if name != TIME]
+        wanted = [(channels[0], names), *((index, [TIME]) for index in times)]
+        units = [_first_with_unit(found, index, names, kind, dimensions) for index, names in wanted]
+        columns = {
+            pair[0]: ColumnGuess(index, pair[1], "unsure", reason)
+            for (index, _), pair in zip(wanted, units, strict=True)
+            if pair is not None
+        }
+        if len(columns) == len(wanted):
             candidates.append(_Candidate(kind, columns, 0.0))
     by_motion = _by_motion(found, candidates)
     return None if by_motion is None else _guess(found, by_motion[0], "unsure", f"{reason}; {by_motion[2]}")
+
+
+def _first_with_unit(
+    found: FoundLayout, index: int, names: list[str], kind: Kind, dimensions: list[str]
+) -> tuple[str, str] | None:
+    """The first of the ``names`` that the unit in the file allows, and that unit (SI where the file has none)."""
+    text = name_and_unit(found.names[index], dimensions)[1] or found.units[index]
+    if unit_of(text, dimensions) is None:
+        return next(((name, kind.columns[name].si) for name in names), None)
+    units = ((name, unit_of(text, [kind.columns[name].si])) for name in names)
+    return next(((name, unit) for name, unit in units if unit is not None), None)
+
+
+def disordered_times(found: FoundLayout) -> tuple[str, int] | None:
+    """Header of a column of times that do not increase, and the first line where they do not; None without one."""
+    for index, values in found.columns.items():
+        name, text = name_and_unit(found.names[index], ["s"])
+        if fits_name(name, TIME) and unit_of(text or found.units[index], ["s"]) is not None:
+            rows = np.flatnonzero(np.diff(values) <= 0.0)
+            if len(rows):
+                return found.names[index], int(found.export.lines[rows[0] + 1])
+    return None
 
 
 def _is_even(values: np.ndarray) -> bool:

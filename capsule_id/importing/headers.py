@@ -60,7 +60,7 @@ def unit_of(text: str, dimensions: Sequence[str]) -> str | None:
 def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | None]:
     """Name and text of the unit of a header; None where it states none.
 
-    ``dimensions`` are the SI units that columns may have. A suffix such as ``_mm`` counts only if it is such a unit.
+    ``dimensions`` are the SI units that columns may have. A suffix such as ``_mm`` or ``/mm`` counts only if it is such a unit.
     """
     if header in UNITS_OF_NAMES:
         return header, UNITS_OF_NAMES[header]
@@ -68,11 +68,14 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
         found = pattern.fullmatch(header)
         if found:
             return found[1], next(group for group in found.groups()[1:] if group is not None).strip()
-    parts = header.split("_")
-    for k in range(1, len(parts)):
-        suffix = "_".join(parts[k:])
-        if unit_of(suffix, dimensions) is not None:
-            return "_".join(parts[:k]), suffix
+    if unit_of(header, dimensions) is not None:
+        return header, None
+    for mark in ("_", "/"):
+        parts = header.split(mark)
+        for k in range(1, len(parts)):
+            suffix = mark.join(parts[k:])
+            if unit_of(suffix, dimensions) is not None:
+                return mark.join(parts[:k]), suffix
     return header, None
 
 

@@ -116,6 +116,9 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
                 first = first or error
                 continue
             columns, _ = _readings(export)
+            if columns and len(export.lines) == 1:
+                rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
+                first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
             if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
                 return layout
     assert first is not None, "every layout was refused"

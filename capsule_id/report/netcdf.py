@@ -39,7 +39,7 @@ def data_tree(result: Result) -> xr.DataTree:
         If nothing was sampled, or a name is used both alone and as a family.
     """
     if result.posterior is None:
-        raise ValueError("nothing was sampled (point fit only): there is no posterior")
+        raise ValueError("nothing was sampled (point fit only): fit without --no-sample (budget=None)")
     # Exact masses and g need no row in the tables of the result.
     units = {symbol: row.unit for symbol, row in TABLE.items()}
     for frame in (result.summary, result.nuisances):

@@ -38,7 +38,7 @@ def sampled_parameters(result: Result) -> SampledParameters:
         If nothing was sampled.
     """
     if result.posterior is None:
-        raise ValueError("nothing was sampled (point fit only): there is no sample to show")
+        raise ValueError("nothing was sampled (point fit only): fit without --no-sample (budget=None)")
     place = {name: i for i, name in enumerate(result.posterior.names)}
     summary = result.summary.loc[[name in place for name in result.summary.index]]
     names = tuple(str(name) for name in summary.index)

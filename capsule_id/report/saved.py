@@ -53,7 +53,9 @@ def load(directory: Path, registry: Registry) -> dict[str, Any]:
             kept |= {"posterior": posterior, "prior": prior, "pointwise": pointwise}
     except READ_ERRORS as error:
         rule = "a result must be a directory that this version of fit-params wrote"
-        raise InputError(rule, f"{type(error).__name__}: {error}", "run fit-params again", directory) from error
+        absent = isinstance(error, FileNotFoundError | NotADirectoryError)
+        value = f"it has no {Path(str(error.filename)).name}" if absent else f"{type(error).__name__}: {error}"
+        raise InputError(rule, value, "run fit-params again", directory) from error
     return {**kept, "registry": registry}
 
 

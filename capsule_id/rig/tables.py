@@ -201,7 +201,7 @@ def _without_outliers(document: TomlDocument, path: KeyPath, table: TableFile, r
     if "time" not in table.raw.names:
         value, remedy = " ".join(table.raw.names), "remove reject, and correct or delete the rows"
         raise document.error((*path, "reject"), "reject needs a record with times", value, remedy, of_key=True)
-    keep = np.flatnonzero(~outlying_rows(table.raw, _times(table), rejection))
+    keep = np.flatnonzero(~outlying_rows(document, path, table.raw, _times(table), rejection))
     raw = table.raw
     kept = RawTable(
         raw.names,

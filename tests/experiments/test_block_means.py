@@ -1,10 +1,14 @@
 """Block means of long records: their covariance and prediction, and the same posterior as the whole record's."""
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import capsule_id
+from capsule_id.errors import InputError
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.decay_models import half_cycles, interpolate
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -154,3 +158,28 @@ def test_long_records_are_thinned_and_the_finding_says_so() -> None:
     assert FreeVibration(whole, bench.rig(whole)).model == DecayModel()
     assert [f for f in lint_decay(whole, bench.rig(whole)) if f.code == "decays.thinned"] == []
     assert default_block_size(TIME[:2000], columns[1].values[:2000]) == 1
+
+
+def test_blocks_that_lose_the_oscillation_are_refused(tmp_path: Path) -> None:
+    """The remedy is applied: the largest block that it names is accepted, one more is not."""
+    time = np.arange(600) * 5e-4
+    values = 2.5 * np.exp(-12.0 * time) * np.cos(113.0 * time)
+    rows = "".join(f"{t:.4f},{x:.4f}\n" for t, x in zip(time, values, strict=True))
+    (tmp_path / "decay.csv").write_text(f"time [s],x_rel [mm]\n{rows}", encoding="utf-8")
+
+    def read(thin: int) -> None:
+        entry = '[[experiment]]\nkind = "free_vibration"\nfile = "decay.csv"\n'
+        text = f'[rig]\nname = "thin"\nm1 = {{ value = 110, sd = 1, unit = "g" }}\n{entry}thin = {thin}\n'
+        (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+        capsule_id.read_rig(tmp_path)
+
+    for thin in (100_000, 300):
+        with pytest.raises(InputError, match="means of the record and 4 means in a period") as caught:
+            read(thin)
+    found = re.search(r"write thin = (\d+) or less", str(caught.value))
+    assert found is not None
+    most = int(found[1])
+    assert abs(most - 2.0 * np.pi / 113.0 / 5e-4 / 4.0) < 2.0
+    read(most)
+    with pytest.raises(InputError, match="4 means in a period"):
+        read(most + 1)

@@ -53,6 +53,7 @@ def test_the_estimated_line_puts_the_times_on_one_clock(tmp_path: Path, capsys: 
     [
         ("{}", "must have an offset or a drift"),
         ('{ drift = { value = 20, unit = "1" } }', "drift must lie between"),
+        ('{ offset = { value = 1e20, unit = "s" } }', "offset must lie between"),
         ('{ offset = { value = 20, unit = "ppm" } }', "dimension of s"),
         ('{ shift = { value = 20, unit = "s" } }', "unknown key"),
     ],
@@ -69,6 +70,7 @@ def test_files_without_a_common_signal_are_refused(tmp_path: Path, capsys: pytes
     for words, part in (
         (["--clock-of", str(a), "--common", "trigger"], "must have the column trigger"),
         (["--clock-of", str(a)], "must stand together"),
+        (["--clock-of", str(b), "--common", "x_rel [mm]"], "must name another file"),
     ):
         assert cli.capsule_id(["import", str(b), *words]) == 2
         assert part in capsys.readouterr().err

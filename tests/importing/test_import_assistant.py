@@ -1,5 +1,6 @@
 """The import assistant on thirty spoiled exports: kind, columns and units, judged by the readings in SI."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,3 +138,38 @@ def test_a_table_of_progressions_is_no_table_of_pushes(tmp_path: Path, source: s
     units = {name: line.split('unit = "')[1].split('"')[0] for name, line in found.items()}
     assert units == {"period": "ms", "periods": "1", "distance": "cm", "duty": "%"}
     assert 'distance = { from = "x"' in found["distance"]
+
+
+def decay_rows(separator: str = ",", digits: int = 4) -> str:
+    time = np.arange(400) * 5e-4
+    values = 2.5 * np.exp(-12.0 * time) * np.cos(113.0 * time)
+    return "".join(f"{t:.{digits}f}{separator}{x:.3f}\n" for t, x in zip(time, values, strict=True))
+
+
+@pytest.mark.parametrize("header", ["Time,CH1\ns,mm\n", "Time (s),LVDT [mm]\n", "t/s,LVDT/mm\n"])
+def test_the_unit_of_a_column_without_known_name_is_kept(
+    tmp_path: Path, header: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "decay.csv"
+    file.write_text(header + decay_rows(), encoding="utf-8")
+    assert cli.capsule_id(["import", str(file)]) == 0
+    out = capsys.readouterr().out
+    assert 'kind = "free_vibration"  # unsure' in out
+    (line,) = [line for line in out.splitlines() if line.startswith("x_rel = ")]
+    assert re.search(r'unit = "mm".*# unsure', line)
+
+
+def test_times_that_do_not_increase_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "decay.csv"
+    for digits, named in ((2, True), (4, False)):
+        file.write_text("time [s],x_rel [mm]\n" + decay_rows(digits=digits), encoding="utf-8")
+        assert cli.capsule_id(["import", str(file)]) == 0
+        assert ("Times must increase; 'time [s]' does not at line 3." in capsys.readouterr().out) == named
+
+
+def test_an_export_of_one_row_is_refused_with_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "one.csv").write_text("time [s],x_rel [mm]\n0,2.5\n", encoding="utf-8")
+    assert cli.capsule_id(["import", str(tmp_path / "one.csv")]) == 2
+    assert "one.csv:2: an export must have two rows of numbers or more, one row" in capsys.readouterr().err
+    assert cli.capsule_id(["import", str(tmp_path)]) == 2
+    assert "a directory" in capsys.readouterr().err

@@ -166,3 +166,22 @@ def test_measured_load_cells(tmp_path: Path, cell: int, expected: float) -> None
     assert rig.tables[0].rejected >= np.sum(load_cells()[1][:, cell] < -8e6) > 0
     value, _ = slope(rig)
     assert abs(value * LBF - expected) < 1.0
+
+
+@pytest.mark.parametrize("levels", [[0.0, 10.0, 20.0, 30.0], [0.0, 10.0]])
+def test_fewer_levels_than_plateaus_are_refused(tmp_path: Path, levels: list[float]) -> None:
+    """Eight plateaus with half as many levels, or a quarter: the slope would be wrong by a factor."""
+    rng = np.random.default_rng(2)
+    reading = np.repeat(np.arange(8.0), 60) * 1000.0 + rng.normal(0.0, 20.0, 480)
+    text = "".join(f"{100 * k},{value:.0f}\n" for k, value in enumerate(reading))
+    every = [10.0 * k for k in range(8)]
+    assert len(rig_of(tmp_path, text, COLUMNS, PLATEAUS.replace(str(LEVELS), str(every))).tables[0].rows) == 8
+    with pytest.raises(InputError, match="must be constant on each plateau"):
+        rig_of(tmp_path, text, COLUMNS, PLATEAUS.replace(str(LEVELS), str(levels)))
+
+
+@pytest.mark.parametrize("window", ["1e9 s", "1 us", "-5 ms"])
+def test_a_window_that_no_record_has_is_refused(tmp_path: Path, window: str) -> None:
+    text, _ = trace(1)
+    with pytest.raises(InputError, match=r"window must (hold two sampling steps|be greater than 0)"):
+        rig_of(tmp_path, text, COLUMNS, PLATEAUS, REJECT.replace("1 s", window))

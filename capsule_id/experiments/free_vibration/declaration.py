@@ -10,7 +10,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
-from capsule_id.experiments.free_vibration.lint import lint_decay
+from capsule_id.experiments.free_vibration.lint import check_thin, lint_decay
 from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, channel_of
 from capsule_id.experiments.free_vibration.settings import (
     DAMPING,
@@ -314,7 +314,14 @@ KIND = Kind(
     sets=(("time",),),
     channels=tuple(CHANNELS),
     settings=DecaySettings,
-    rules=(Entry.check_spring_with_gap, _check_channels, _check_window, _check_forward, _check_turning_points),
+    rules=(
+        Entry.check_spring_with_gap,
+        _check_channels,
+        _check_window,
+        _check_forward,
+        _check_turning_points,
+        check_thin,
+    ),
     masses=_masses,
     parameters=(
         *(channel.noise for channel in CHANNELS.values()),

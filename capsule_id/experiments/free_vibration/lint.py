@@ -6,21 +6,25 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.readings.blocks import default_block_size
-from capsule_id.experiments.free_vibration.settings import release_time, rows_in_window
+from capsule_id.experiments.free_vibration.readings.blocks import block_size, default_block_size
+from capsule_id.experiments.free_vibration.settings import DecaySettings, decay_window, release_time, rows_in_window
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import TABLE
 from capsule_id.records.faults.aliasing import aliases
 from capsule_id.records.faults.magnitudes import USUAL, unit_meant
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
+from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, sampling_step
 from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.views import Finding, Message
 
 #: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
 #: Smallest number of periods; with fewer, one peak determines the damping.
 FEWEST_PERIODS = 2
+#: Fewest block means in a period.
+FEWEST_MEANS = 4
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
@@ -119,6 +123,25 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
         digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
         facts = {"file": table.file, "stop": round(stop, digits), "found": stop}
         yield Finding("decays.second", "fail", facts, table.label)
+
+
+def check_thin(entry: Entry[DecaySettings]) -> None:
+    """Require block means that leave a record, and that follow its oscillation.
+
+    Raises
+    ------
+    InputError
+        At ``thin``.
+    """
+    thin = entry.table.settings.thin
+    if thin is None or thin == 1:
+        return
+    time, values = decay_window(entry.table)
+    most = min(len(time) // SHORTEST_RECORD, max(block_size(time, values, FEWEST_MEANS), 2))
+    if thin > most:
+        rule = f"thin must leave {SHORTEST_RECORD} means of the record and {FEWEST_MEANS} means in a period"
+        remedy = f"write thin = {most} or less" if most > 1 else "remove thin"
+        raise entry.error("thin", rule, f"{thin} of {len(time)} samples", remedy)
 
 
 def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:

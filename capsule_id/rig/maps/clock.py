@@ -10,11 +10,12 @@ from typing import Any
 from capsule_id.rig.domains import ANY
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
-from capsule_id.rig.toml_values import read_quantity, read_table, refuse_unknown_keys, shown
+from capsule_id.rig.toml_values import read_quantity, read_table, refuse_unknown_keys
 from capsule_id.rig.units import UnitError, factor_to_si
 
 _EXAMPLE = '{ offset = { value = 0.3, unit = "ms" }, drift = { value = 20, unit = "ppm" } }'
-LARGEST_DRIFT = 0.1
+#: Largest offset, s, and drift. A time in s has a resolution of 2 us at this offset; times since 1970 are smaller.
+LARGEST_OFFSET, LARGEST_DRIFT = 1e10, 0.1
 
 
 def read_clock(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -36,9 +37,13 @@ def read_clock(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) 
         read_quantity(document, (*place, key), stated[key], si, ANY).value if key in stated else 0.0
         for key, si in (("offset", "s"), ("drift", "1"))
     )
-    if abs(drift) > LARGEST_DRIFT:
-        rule, remedy = f"drift must lie between -{LARGEST_DRIFT:g} and {LARGEST_DRIFT:g}", 'write it in "ppm"'
-        raise document.error((*place, "drift"), rule, shown(stated["drift"]), remedy)
+    for key, value, largest, unit, remedy in (
+        ("offset", offset, LARGEST_OFFSET, " s", "check number and unit"),
+        ("drift", drift, LARGEST_DRIFT, "", 'check number and unit; 20 ppm is { value = 20, unit = "ppm" }'),
+    ):
+        if abs(value) > largest:
+            rule = f"{key} must lie between -{largest:g}{unit} and {largest:g}{unit}"
+            raise document.error((*place, key), rule, f"{value:g}{unit}", remedy)
     return offset, drift
 
 

@@ -24,6 +24,9 @@ MOST_BLOCKS = 1500
 SMALLEST_CORRELATION = 0.9
 #: Fewest samples of a plateau.
 FEWEST_SAMPLES = 3
+#: Largest step inside a plateau relative to the median step between plateaus, where both sides of it hold at least this
+#: share of the samples of the plateau.
+LARGEST_INNER_STEP, LEAST_SHARE = 0.3, 0.1
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ def readings_of_plateaus(
         rule = f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)"
         value = f"{correlation:.2g}; means {' '.join(f'{mean:.4g}' for mean in means[:, 0])}"
         raise document.error((*place, "levels"), rule, value, "state a level for each plateau, in the order of time")
+    _check_constant(document, place, trace, parts, means)
     starts = np.array([part[0] for part in parts])
     names = (*(raw.names[index] for index in channels), plateaus.name)
     units = (*(raw.units[index] for index in channels), plateaus.unit)
@@ -117,6 +121,33 @@ def readings_of_plateaus(
         return raw.place(None if row is None else int(starts[row]), channels[min(column, len(channels) - 1)])
 
     return RawTable(names, units, np.column_stack([means, plateaus.levels]), raw.rows[starts], cell), starts
+
+
+def _check_constant(
+    document: TomlDocument, place: KeyPath, trace: np.ndarray, parts: list[np.ndarray], means: np.ndarray
+) -> None:
+    """Refuse a part with a step inside: the trace then has more plateaus than levels.
+
+    Parameters
+    ----------
+    trace : (n, channels)
+    parts, means : samples of each part, and their means (k, channels)
+
+    Raises
+    ------
+    InputError
+        At the list of levels.
+    """
+    step = np.median(np.abs(np.diff(means[:, 0])))
+    for part in parts:
+        middle = find_steps(trace[part], 2)[0][1]
+        one, other = trace[part[:middle], 0], trace[part[middle:], 0]
+        if min(len(one), len(other)) < LEAST_SHARE * len(part):
+            continue
+        if abs(one.mean() - other.mean()) > LARGEST_INNER_STEP * step:
+            rule = "the trace must be constant on each plateau"
+            value = f"{one.mean():.4g} and {other.mean():.4g} on one of {len(parts)} plateaus"
+            raise document.error((*place, "levels"), rule, value, "state a level for each plateau of the trace")
 
 
 def find_steps(trace: np.ndarray, count: int) -> tuple[np.ndarray, int]:

@@ -14,7 +14,7 @@ from capsule_id.rig.toml_values import read_choice, read_string, read_table, ref
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 _EXAMPLE = '{ rule = "hampel", window = "50 ms", n_sd = 5 }'
-_DURATION = re.compile(r"\s*([0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?)\s*([^\s0-9]+)\s*")
+_DURATION = re.compile(r"\s*([+-]?[0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?)\s*([^\s0-9]+)\s*")
 
 
 @dataclass(frozen=True)
@@ -70,16 +70,30 @@ def read_rejection(document: TomlDocument, path: KeyPath, entry: Mapping[str, An
     return Rejection(read_duration(document, (*place, "window"), stated["window"]), float(number))
 
 
-def outlying_rows(raw: RawTable, time: np.ndarray, rejection: Rejection) -> np.ndarray:
+def outlying_rows(
+    document: TomlDocument, path: KeyPath, raw: RawTable, time: np.ndarray, rejection: Rejection
+) -> np.ndarray:
     """Whether a reading of each row is an outlier, (n,) bool.
 
     Parameters
     ----------
+    path : of the experiment, for the error line
     raw : the table; its column ``time`` is not judged
     time : (n,) s, increasing
+
+    Raises
+    ------
+    InputError
+        If the window holds less than two sampling steps, or does not fit into the record.
     """
     step = float(np.median(np.diff(time))) if len(time) > 1 else np.inf
-    samples = 2 * max(1, round(rejection.window / step / 2.0)) + 1
+    half = rejection.window / step / 2.0
+    if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
+        rule = "the window must hold two sampling steps or more, and fit into the record"
+        value = f"{rejection.window:g} s; the record has {len(time)} samples, a step is {step:.4g} s"
+        remedy = "write a window of about 10 steps"
+        raise document.error((*path, "reject", "window"), rule, value, remedy)
+    samples = 2 * round(half) + 1
     found = np.zeros(len(time), bool)
     for index, name in enumerate(raw.names):
         if name != "time":
