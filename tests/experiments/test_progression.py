@@ -119,3 +119,13 @@ def test_parts_of_periods_are_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "progression.csv").write_text("\n".join(lines) + "\n")
     with pytest.raises(InputError, match=r"progression.csv:2:.*periods must be a whole number, 66.5"):
         read_rig(tmp_path)
+
+
+def test_a_duty_in_per_cent_under_a_header_without_unit_is_refused(folder: Path, tmp_path: Path) -> None:
+    """A duty of 30 would count as 1: the drive limits it to a share."""
+    (tmp_path / "rig.toml").write_text((folder / "rig.toml").read_text())
+    text = (folder / "progression.csv").read_text()
+    assert "duty [%]" in text
+    (tmp_path / "progression.csv").write_text(text.replace("duty [%]", "duty [1]"))
+    with pytest.raises(InputError, match=r"progression.csv:2:.*duty must lie between 0 and 100 %"):
+        read_rig(tmp_path)

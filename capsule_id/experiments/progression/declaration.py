@@ -8,7 +8,7 @@ import numpy as np
 
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, scatter
-from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
+from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE, SHARE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, QuantityRule
@@ -129,7 +129,7 @@ KIND = Kind(
     columns={
         "period": ColumnRule("s", POSITIVE),
         "f": ColumnRule("Hz", POSITIVE),
-        "duty": ColumnRule("1"),
+        "duty": ColumnRule("1", SHARE),
         "P_on": ColumnRule("N"),
         "P_d": ColumnRule("N"),
         "current": ColumnRule("A"),
