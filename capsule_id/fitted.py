@@ -217,7 +217,16 @@ def compare(a: Result, b: Result) -> pd.DataFrame:
     DataFrame with a row per common parameter (index ``name``), SI: unit, value and sd of both, ``difference`` (b - a),
     its ``sd``, ``sds`` (their ratio) and ``differs``: |sds| beyond the normal quantile that two equal rigs exceed in
     any parameter in 1 of 20 cases.
+
+    Raises
+    ------
+    InputError
+        If ``a`` or ``b`` is something else than a result.
     """
+    for one in (a, b):
+        if not isinstance(one, Result):
+            rule, remedy = "compare takes two results", "give results of fit, or load(DIR)"
+            raise InputError(rule, f"{type(one).__name__} {str(one)[:60]!r}", remedy)
     names = [name for name in a.summary.index if name in b.summary.index]
     one, other = a.summary.loc[names], b.summary.loc[names]
     frame = pd.DataFrame({"unit": one["unit"]}, index=pd.Index(names, name="name"))

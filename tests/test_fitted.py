@@ -193,6 +193,11 @@ def test_compare_counts_sds_and_names_what_differs(fitted: Fit) -> None:
     assert moved.at["K", "sd"] == pytest.approx(np.sqrt(2.0) * sd)
 
 
+def test_compare_names_what_it_takes(fitted: Fit) -> None:
+    with pytest.raises(InputError, match=r"compare takes two results, str 'results/a', give results of fit, or load"):
+        compare(fitted, "results/a")  # type: ignore[arg-type]
+
+
 def test_compare_finds_two_equal_rigs_equal(fitted: Fit) -> None:
     """1 pair in 20 of results of equal rigs shows a difference; with sds half as large, far more do."""
     rng = np.random.default_rng(0)

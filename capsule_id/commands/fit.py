@@ -124,6 +124,10 @@ def _check_numbers(args: argparse.Namespace) -> None:
 
 def _compare(args: argparse.Namespace, rig: Rig, kinds: Registry) -> int:
     """Print the comparison of models; 0."""
+    ignored = [f"--{name}" for name in ("out", "json", "no_sample", "resume") if getattr(args, name)]
+    if ignored:
+        names = ", ".join(ignored).replace("_", "-")
+        raise InputError("--compare prints a table and writes nothing", names, f"remove {names}")
     set_loop_option()
     if not args.no_cache:
         keep_programs()

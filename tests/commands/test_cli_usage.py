@@ -52,6 +52,7 @@ def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ..
         (("a", "--seed", ""), "--seed"),
         (("a", "--max-steps", "0"), "--max-steps"),
         (("a", "--ess", "0"), "--ess"),
+        ((str(DATA), "--compare", "lag", "--no-sample", "--out", "x"), "remove --out, --no-sample"),
         (("a", "--experiments", "some"), "bench"),
         (("a", "--out"), "--out"),
         (("a", "two\nlines"), "two lines"),
