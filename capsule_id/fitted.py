@@ -120,7 +120,17 @@ class Fit(Result):
         """
         chosen = self._draws(draws, seed)
         stated = {name: self.rig.mass(name) for name in MASSES if getattr(self.rig, name) is not None}
-        values = {**stated, **self.fixed, "g": self.rig.g.value, "k2": 0.0, "G": gap, **chosen, **(given or {})}
+        ground = {name: q.value for name, q in (("slope", self.rig.slope), ("N0", self.rig.N0)) if q is not None}
+        values = {
+            **stated,
+            **self.fixed,
+            **ground,
+            "g": self.rig.g.value,
+            "k2": 0.0,
+            "G": gap,
+            **chosen,
+            **(given or {}),
+        }
         if spring is not None:
             if f"k2[{spring}]" not in chosen:
                 known = ", ".join(name[3:-1] for name in chosen if name.startswith("k2["))

@@ -11,6 +11,9 @@ from capsule_id.physics.batches import array_module
 from capsule_id.physics.contacts import support
 from capsule_id.physics.drive import Drive
 
+#: Newton steps from the linear to the cubic equilibrium; a cubic share of one half needs five.
+NEWTON_STEPS = 8
+
 
 def spring_and_damper(p: Any, r: Any, w: Any) -> Any:
     """k1 r + k_cubic r^3 + c w, N: what acts without contact; r = X1 - X2, w = Y1 - Y2."""
@@ -33,6 +36,17 @@ def rod_on_capsule(p: Any, r: Any, w: Any) -> Any:
 def downhill(p: Any, mass: Any) -> Any:
     """Weight of a mass along the slope, N, towards -X; NumPy and JAX."""
     return mass * p.g * array_module(p.slope).sin(p.slope) if p.slope is not None else 0.0
+
+
+def equilibrium(p: Any) -> Any:
+    """x_rel, m, of the rod at rest with the drive off and no contact: k1 r + k_cubic r^3 = -m1 g sin(slope)."""
+    load = -downhill(p, p.m1)
+    r = load / p.k1
+    if p.k_cubic is None:
+        return r
+    for _ in range(NEWTON_STEPS):
+        r = r - (p.k1 * r + p.k_cubic * r**3 - load) / (p.k1 + 3.0 * p.k_cubic * r**2)
+    return r
 
 
 def rod_acceleration(p: Any, drive: Drive, t: Any, r: Any, w: Any) -> Any:

@@ -1,12 +1,13 @@
-"""Reads ``[model]`` of ``rig.toml``: the friction law and the optional parameters that a fit samples."""
+"""Reads ``[model]`` of ``rig.toml``, and checks choices of [rig] and of an experiment that depend on each other."""
 
 from collections.abc import Mapping, Sequence
-from typing import get_args, get_type_hints
+from math import cos
+from typing import Any, get_args, get_type_hints
 
 from capsule_id.parameters import TABLE
 from capsule_id.rig.model import ModelChoices, Table
-from capsule_id.rig.schema import KindRule
-from capsule_id.rig.toml_document import TomlDocument
+from capsule_id.rig.schema import GroundSettings, KindRule
+from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_choice, read_table, refuse_unknown_keys, shown
 
 #: Words that ``free`` may hold.
@@ -67,3 +68,29 @@ def check_masses_of_free(
                     rule = f"free {symbol} needs {mass}, because {table.label} gives friction without the weight"
                     remedy = f'add {mass} = {{ value = ..., sd = ..., unit = "kg" }} to [rig], or remove "{symbol}"'
                     raise document.error(("model", "free"), rule, f"no {mass} in [rig]", remedy)
+
+
+def place_of(document: TomlDocument, path: KeyPath, key: str) -> KeyPath:
+    """The key path where ``key`` of the entry at ``path`` is stated: the entry itself, or [rig]."""
+    return (*path, key) if (*path, key) in document.keys else ("rig", key)
+
+
+def check_normal_forces(
+    document: TomlDocument, tables: Sequence[Table[Any]], masses: Mapping[str, float], g: float
+) -> None:
+    """Refuse a pressing force that lifts the capsule off the ground.
+
+    Raises
+    ------
+    InputError
+        At the first N0 with (m1 + m2) g cos(slope) + N0 <= 0; ``masses``, kg, are those stated.
+    """
+    for index, table in enumerate(tables):
+        settings = table.settings
+        if not isinstance(settings, GroundSettings) or not settings.N0 or "m2" not in masses:
+            continue
+        N = sum(masses.values()) * g * cos(settings.slope or 0.0) + settings.N0
+        if N <= 0.0:
+            rule = f"the normal force (m1 + m2) g cos(slope) + N0 of {table.label} must be positive"
+            place = place_of(document, ("experiment", index), "N0")
+            raise document.error(place, rule, f"{N:.3g} N", "raise N0; N0 > 0 presses the capsule down")

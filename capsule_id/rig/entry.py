@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Generic
 
 from capsule_id.errors import InputError
+from capsule_id.rig.choices import place_of
 from capsule_id.rig.model import S, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.rig.tables import TableFile
@@ -30,6 +31,20 @@ class Entry(Generic[S]):
         """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
         path = (*self.path, key) if key else self.path
         return self.document.error(path, rule, value, remedy, of_key)
+
+    def refuse_ground(self, key: str, rule: str) -> None:
+        """Refuse a slope or N0 that this experiment cannot have, its own or that of [rig].
+
+        Raises
+        ------
+        InputError
+            Where ``key``, "slope" or "N0", is stated.
+        """
+        settings: Any = self.table.settings
+        if value := getattr(settings, key):
+            unit = "deg" if key == "slope" else "N"
+            remedy = f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it'
+            raise self.document.error(place_of(self.document, self.path, key), rule, f"{value:.3g} in SI units", remedy)
 
     def check_spring_with_gap(self) -> None:
         """Require a gap where a spring is within reach.

@@ -143,6 +143,7 @@ class Rig:
     tables : in the order of ``rig.toml``
     files : sha256 of every file read, by relative path
     model : the choices of ``[model]``
+    slope, N0 : slope of the track, rad, and pressing force, N, of experiments that state no other (None: not stated)
     """
 
     name: str
@@ -155,6 +156,8 @@ class Rig:
     files: Mapping[str, str]
     folder: Path
     model: ModelChoices = ModelChoices()
+    slope: Quantity | None = None
+    N0: Quantity | None = None
 
     def mass(self, symbol: Literal["m1", "m2"]) -> float:
         """Stated mass, kg, for a kind whose ``masses`` contain ``symbol``.

@@ -12,7 +12,7 @@ import numpy as np
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
-from capsule_id.rig.choices import check_masses_of_free, read_model
+from capsule_id.rig.choices import check_masses_of_free, check_normal_forces, read_model
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.formats.text.decode import decode
 from capsule_id.rig.maps.declared import MAP_KEYS
@@ -76,22 +76,29 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         if key in head:
             with collecting(faults):
                 stated[key] = read_quantity(document, ("rig", key), head[key], rule.si, rule.domain, rule.has_sd)
-    tables, files = _read_experiments(document, kinds, faults)
+    ground = {key: stated[key].value for key in ("slope", "N0") if key in stated}
+    tables, files = _read_experiments(document, kinds, ground, faults)
     raise_all(faults)
     model = read_model(document)
     _check_masses(document, tables, kinds, set(stated))
     check_masses_of_free(document, model, tables, kinds, set(stated))
+    g = stated.get("g", Quantity(STANDARD_GRAVITY))
+    check_normal_forces(
+        document, tables, {name: stated[name].value for name in ("m1", "m2") if name in stated}, g.value
+    )
     return Rig(
         name=name,
         synthetic=synthetic,
         m1=stated.get("m1"),
         m2=stated.get("m2"),
-        g=stated.get("g", Quantity(STANDARD_GRAVITY)),
+        g=g,
         priors=MappingProxyType(_read_priors(document, tables, [*parameter_rows(kinds).values(), *parameters])),
         tables=tables,
         files=MappingProxyType({"rig.toml": sha256, **files}),
         folder=folder,
         model=model,
+        slope=stated.get("slope"),
+        N0=stated.get("N0"),
     )
 
 
@@ -157,7 +164,7 @@ def _check_prior_of_spring(document: TomlDocument, path: KeyPath, spring: str, t
 
 
 def _read_experiments(
-    document: TomlDocument, kinds: Mapping[str, KindRule], faults: list[InputError]
+    document: TomlDocument, kinds: Mapping[str, KindRule], ground: Mapping[str, float], faults: list[InputError]
 ) -> tuple[tuple[Table, ...], dict[str, str]]:
     """Every ``[[experiment]]``, and the sha256 of every file read; the first error of each is appended to ``faults``."""
     entries = document.data.get("experiment", [])
@@ -171,7 +178,7 @@ def _read_experiments(
         path: KeyPath = ("experiment", index)
         with collecting(faults):
             read_table(document, path, entry, "[[experiment]]")
-            table, sha256 = _read_experiment(document, path, entry, kinds)
+            table, sha256 = _read_experiment(document, path, entry, kinds, ground)
             for other in tables:
                 if other.label == table.label:
                     place = next(key for key in ("label", "file", "files") if key in entry)
@@ -183,7 +190,11 @@ def _read_experiments(
 
 
 def _read_experiment(
-    document: TomlDocument, path: KeyPath, entry: dict[str, Any], kinds: Mapping[str, KindRule]
+    document: TomlDocument,
+    path: KeyPath,
+    entry: dict[str, Any],
+    kinds: Mapping[str, KindRule],
+    ground: Mapping[str, float],
 ) -> tuple[Table, Mapping[str, str]]:
     """One entry with its table, and the sha256 of its files."""
     if "kind" not in entry:
@@ -196,7 +207,7 @@ def _read_experiment(
     refuse_unknown_keys(
         document, path, entry, ("kind", "file", "label", "reject", "clock", *MAP_KEYS, *kind.setting_rules, *errors)
     )
-    settings = _read_settings(document, path, entry, kind)
+    settings = _read_settings(document, path, entry, kind, ground)
     file = read_experiment_files(document, path, entry, kind)
     name = next(iter(file.sha256))
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
@@ -209,14 +220,17 @@ def _read_experiment(
     return table, file.sha256
 
 
-def _read_settings(document: TomlDocument, path: KeyPath, entry: dict[str, Any], kind: KindRule) -> Settings:
-    """The entry's settings, defaults filled in."""
+def _read_settings(
+    document: TomlDocument, path: KeyPath, entry: dict[str, Any], kind: KindRule, ground: Mapping[str, float]
+) -> Settings:
+    """The entry's settings, defaults filled in; ``ground`` are those of [rig]."""
     rules = kind.setting_rules
     stated = {key: rule.read(document, (*path, key), entry[key]) for key, rule in rules.items() if key in entry}
     for key in kind.required:
         if key not in stated:
             raise document.error(path, f"{kind.name} must have a {key}", "none", f"add {key} = ...")
-    return kind.settings(**stated)
+    shared = {key: value for key, value in ground.items() if key in rules}
+    return kind.settings(**{**shared, **stated})
 
 
 def _with_reading_error(

@@ -18,7 +18,7 @@ from typing import (
 )
 
 from capsule_id.parameters import TABLE, Parameter
-from capsule_id.rig.domains import ANY, POSITIVE, Domain
+from capsule_id.rig.domains import ANY, INCLINE, POSITIVE, Domain
 from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import read_choice, read_name, read_quantity, shown
@@ -75,6 +75,24 @@ class QuantityRule:
         """See ``SettingRule``."""
         quantity = read_quantity(document, path, value, self.si, self.domain, self.has_sd)
         return quantity if self.has_sd else quantity.value
+
+
+#: Slope of the track and force that presses the capsule down, exact.
+SLOPE = QuantityRule("rad", INCLINE, usual=(INCLINE.low, INCLINE.high))
+PRESSING_FORCE = QuantityRule("N", ANY, usual=(-1e3, 1e3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundSettings(Settings):
+    """``slope`` of the track, rad, +X uphill, and ``N0``, N, besides the weight; absent: those of [rig]."""
+
+    slope: Annotated[float | None, SLOPE] = None
+    N0: Annotated[float | None, PRESSING_FORCE] = None
+
+    @property
+    def ground(self) -> dict[str, float]:
+        """The leaves of the capsule that differ from level ground and the weight alone, SI."""
+        return {name: value for name, value in (("slope", self.slope), ("N0", self.N0)) if value}
 
 
 @dataclass(frozen=True)
@@ -218,4 +236,6 @@ RIG_QUANTITIES: Mapping[str, QuantityRule] = {
     "m1": QuantityRule("kg", has_sd=True),
     "m2": QuantityRule("kg", has_sd=True),
     "g": QuantityRule("m/s^2", has_sd=True, usual=(9.5, 10.1)),
+    "slope": SLOPE,
+    "N0": PRESSING_FORCE,
 }

@@ -21,6 +21,8 @@ from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Table
 from capsule_id.rig.schema import ColumnRule
 
 PUSH_SCATTER = scatter(
@@ -73,6 +75,16 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     return Twin((TwinTable("dynamic_friction.csv", pushes(rng, values["mu"], values["v_s"], values["g"]), errors),))
 
 
+def _check_ground(entry: Entry[PushSettings]) -> None:
+    """Refuse a slope for the capsule model of a free rod."""
+    if entry.table.settings.forward == "capsule":
+        entry.refuse_ground("slope", 'pushes with forward = "capsule" must be on level ground')
+
+
+def _masses(table: Table[PushSettings]) -> tuple[str, ...]:
+    return ("m1", "m2") if table.settings.forward == "capsule" or "N0" in table.settings.ground else ()
+
+
 TEMPLATE = """\
 #: Pushes, a row each, the rod locked to the capsule: mu and v_s. Columns: speed [m/s], distance [mm].
 # [[experiment]]
@@ -89,7 +101,8 @@ KIND = Kind(
     columns={"speed": ColumnRule("m/s", POSITIVE), "distance": ColumnRule("m", POSITIVE)},
     sets=(("speed", "distance"),),
     settings=PushSettings,
-    masses=lambda table: ("m1", "m2") if table.settings.forward == "capsule" else (),
+    masses=_masses,
+    rules=(_check_ground,),
     masses_of_free=MASSES_OF_FREE,
     parameters=(PUSH_SCATTER,),
     make=made_by(

@@ -52,7 +52,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         FreeVibration.__init__(self, table, rig, friction, DecayModel())
-        self.smoothing = None
+        self.smoothing, self.ground = None, table.settings.ground
         gap = table.settings.gap
         self.within_reach = gap is not None
         self.gap = FAR if gap is None else gap.value
@@ -121,5 +121,5 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         return xp.asarray(t.X2)[:, -1]
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        locked, variance = self.locked_slide(theta)
-        return (Misfit(self.distance - self.slide(theta, xp), variance, locked, no_design(self.n, xp)),)
+        _, variance, change = self.locked_slide(theta)
+        return (Misfit(self.distance - self.slide(theta, xp), variance, change, no_design(self.n, xp)),)

@@ -20,9 +20,11 @@ class CapsuleForward(SurfaceExperiment):
     Attributes
     ----------
     smoothing : widths of the smoothed model; None: the exact model
+    ground : slope, rad, and N0, N, where they are not 0
     """
 
     smoothing: Smoothing | None
+    ground: dict[str, float]
 
     event_driven = True
 
@@ -53,6 +55,7 @@ class CapsuleForward(SurfaceExperiment):
             g=theta["g"],
             k_cubic=theta.get("k_cubic", 0.0),
             c2=theta.get("c2", 0.0),
+            **self.ground,
         )
 
     def simulated(
@@ -64,7 +67,7 @@ class CapsuleForward(SurfaceExperiment):
 
     def law(self, theta: ValuesBySymbol) -> FrictionLaw:
         """The friction law at ``theta``, N."""
-        return self.friction.force(theta)
+        return self.friction.force({**theta, **self.ground})
 
     def noise_facts(self) -> Facts:
         return {"model": "capsule"}

@@ -8,7 +8,8 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Values
-from capsule_id.rig.model import Settings, Table
+from capsule_id.rig.model import Table
+from capsule_id.rig.schema import GroundSettings
 from capsule_id.views import Message
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfaceSettings(Settings):
+class SurfaceSettings(GroundSettings):
     """``direction``: towards the support spring ("forward") or away from it; it matters where mu_back is free."""
 
     direction: Literal["forward", "backward"] = "forward"

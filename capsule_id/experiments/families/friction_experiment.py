@@ -13,7 +13,8 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.families.friction_checks import check_variants, variant_table
 from capsule_id.experiments.families.friction_model import FrictionModel, SurfaceExperiment
-from capsule_id.physics.friction import CoulombStribeck, slide_distance
+from capsule_id.experiments.families.inclined import weight_along
+from capsule_id.physics.friction import CoulombStribeck, normal_force, slide_distance
 from capsule_id.views import Comparison, Curve, Finding, Points
 
 #: Lower bound of v_s in the paper's fit, m/s.
@@ -79,6 +80,9 @@ def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) 
 class FrictionExperiment(SurfaceExperiment):
     """A friction experiment; all of them share the friction law, the paper's protocol and one panel."""
 
+    #: Slope, rad, and N0, N, where they are not 0; a tilt has none.
+    ground: dict[str, float]
+
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
     checks = (check_one_surface, check_variants)
     tables = (variant_table,)
@@ -86,6 +90,26 @@ class FrictionExperiment(SurfaceExperiment):
     @property
     def masses(self) -> tuple[str, ...]:
         return self.friction.masses
+
+    @property
+    def backward(self) -> bool:
+        """Whether the capsule slides away from the support spring, which is downhill for slope > 0."""
+        return self.friction.direction == "backward"
+
+    @property
+    def stated_normal_force(self) -> float:
+        """N of the stated masses."""
+        return normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value, **self.ground)
+
+    def along(self, theta: ValuesBySymbol) -> Any:
+        """Weight of capsule and rod along the slope, N, positive where it opposes the motion."""
+        return weight_along(theta["m1"] + theta["m2"], theta["g"], self.ground, self.backward) if self.ground else 0.0
+
+    @property
+    def stated_along(self) -> float:
+        """``along`` at the stated masses."""
+        stated = {name: self.rig.mass(name) for name in ("m1", "m2")} if self.ground else {}
+        return float(self.along({**stated, "g": self.rig.g.value}))
 
     @abstractmethod
     def point_errors(self) -> tuple[Any, Any]:
@@ -128,7 +152,7 @@ def friction_comparison(
     paper = paper_friction_fit(np.concatenate([p.x for p in points]), np.concatenate([p.y for p in points]))
     if "v_s" in paper:
         curves.append(Curve("the paper's fit", speed, unit_law(**paper).forward(speed), role="paper"))
-    if any(p.role == "dynamic" for p in points):
+    if any(e.role == "dynamic" for e in experiments) and not any(e.ground for e in experiments):
         reading = np.maximum(speed[1:], 1e-3 * speed[-1])
         distance = slide_distance(friction.coefficient(theta), 1.0 / theta["g"], reading)
         expected = reading**2 / (2.0 * theta["g"] * distance)

@@ -176,7 +176,7 @@ class FrictionModel:
                 raise InputError(rule, f"{row.symbol}: {known[row.symbol].meaning}", "rename it")
 
     def force(self, theta: ValuesBySymbol) -> FrictionLaw:
-        """The law at ``theta``, N; theta has m1, m2 and g, or N."""
+        """The law at ``theta``, N; theta has m1, m2, g and, off level ground, slope and N0; or N."""
         return self._at(theta, _weight(theta))
 
     def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
@@ -203,10 +203,10 @@ def _prior_of(row: Parameter) -> Prior:
 
 
 def _weight(theta: ValuesBySymbol) -> Any:
-    """Normal force, N: as stated, else the weight."""
+    """Normal force, N: as stated, else that of the weight on the slope, and N0."""
     if NORMAL_FORCE in theta:
         return theta[NORMAL_FORCE]
-    return normal_force(theta["m1"], theta["m2"], theta["g"])
+    return normal_force(theta["m1"], theta["m2"], theta["g"], theta.get("slope"), theta.get("N0"))
 
 
 #: Default friction law: eq. (1) of the paper.

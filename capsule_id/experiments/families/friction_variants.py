@@ -9,15 +9,16 @@ most 1/FACTOR (Markov's inequality, for parameters drawn from the prior).
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from scipy import special
 
 from capsule_id.experiments.families.friction_model import CONSTANT, FrictionModel, Reversed
+from capsule_id.experiments.families.inclined import Track
 from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
-from capsule_id.physics.friction import CoulombStribeck, normal_force, slide_distance
+from capsule_id.physics.friction import CoulombStribeck
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.friction_experiment import FrictionExperiment
@@ -78,6 +79,14 @@ def candidates(experiments: "Sequence[FrictionExperiment]") -> list[FrictionMode
     return sorted({in_use, *models}, key=lambda m: (len(m.parameters), not m.constant, m.free))
 
 
+@runtime_checkable
+class Slide(Protocol):
+    """A friction experiment that records slide distances."""
+
+    @property
+    def stated_track(self) -> Track: ...
+
+
 class Points:
     """The paper's points of all friction experiments, and their density under a law."""
 
@@ -88,8 +97,8 @@ class Points:
         self.logs = [np.log(coefficient) for _, coefficient in points]
         self.errors = [e.point_errors() for e in experiments]
         rig = experiments[0].rig
-        self.g = rig.g.value
-        self.weight = np.nan if rig.m1 is None or rig.m2 is None else normal_force(rig.m1.value, rig.m2.value, self.g)
+        weighed = rig.m1 is not None and rig.m2 is not None
+        self.normal_forces = [e.stated_normal_force if weighed else np.nan for e in experiments]
         self.priors = {name: stated.prior for name, stated in rig.priors.items()}
 
     def rows(self, model: FrictionModel) -> list[Parameter]:
@@ -101,15 +110,18 @@ class Points:
     def scaled(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Differences of log-coefficients and their sd, (s, n) each, at ``theta``: (s,) by symbol."""
         known = {row.symbol: theta[row.symbol] for row in model.parameters} | (CONSTANT if model.constant else {})
-        known["viscous"] = known.get("viscous", 0.0) / self.weight if "viscous" in known else 0.0
+        viscous = known.pop("viscous", None)
         raw, sd = [], []
-        for e, logs, (reading, per_scatter) in zip(self.experiments, self.logs, self.errors, strict=True):
-            axes = (1, 2) if e.role == "dynamic" else (1,)
-            law = CoulombStribeck(N=1.0, **{name: _expanded(value, axes) for name, value in known.items()})
+        for e, logs, (reading, per_scatter), N in zip(
+            self.experiments, self.logs, self.errors, self.normal_forces, strict=True
+        ):
+            axes = (1, 2) if isinstance(e, Slide) else (1,)
+            own = {**known, "viscous": 0.0 if viscous is None else viscous / N}
+            law = CoulombStribeck(N=1.0, **{name: _expanded(value, axes) for name, value in own.items()})
             law = Reversed(law) if e.friction.direction == "backward" else law
             speed = e.paper_points()[0]
-            if e.role == "dynamic":
-                expected = speed**2 / (2.0 * self.g * slide_distance(law, 1.0 / self.g, speed))
+            if isinstance(e, Slide):
+                expected = e.stated_track.coefficient(speed, e.stated_track.distance(law, speed))
             else:
                 expected = law.forward(speed)
             scatter = theta[str(e.scatters[0])][:, None] * per_scatter

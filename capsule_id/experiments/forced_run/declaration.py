@@ -14,8 +14,8 @@ from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.run_description import describe_run
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Quantity, Rig, Settings, Table
-from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
+from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.schema import ColumnRule, GroundSettings, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ RUNS_OF_DRIVES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunSettings(Settings):
+class RunSettings(GroundSettings):
     """Settings of a forced run, SI; ``<channel>_gain_sd`` and ``<channel>_delay_sd`` are sds of gain and delay."""
 
     drive: Literal["harmonic", "base", "pulses", "recorded"] = "harmonic"
@@ -96,7 +96,7 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
     from capsule_id.experiments.forced_run.feasibility import feasibility
 
     settings = table.settings
-    if settings.drive != "harmonic":
+    if settings.drive != "harmonic" or settings.ground:
         return []
     names = {symbol: symbol for symbol in ("k1", "c", "mu", "K")}
     if settings.spring is not None:

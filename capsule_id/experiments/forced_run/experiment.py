@@ -33,7 +33,7 @@ from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_gr
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, innovations
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.forces import rod_acceleration
+from capsule_id.physics.forces import equilibrium, rod_acceleration
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.records.stated_settings import stated_gap, stated_Omega
@@ -121,7 +121,7 @@ class ForcedRun(CapsuleForward):
         capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or estimated
         """
         settings, gap = table.settings, stated_gap(table)
-        self.friction, self.smoothing = friction, None
+        self.friction, self.smoothing, self.ground = friction, None, settings.ground
         self.reaction = rig.model.share_of_reaction
         self.channels = tuple(name for name in NOISE if name in table.columns and name not in self.inputs)
         self.time = table["time"]
@@ -232,7 +232,8 @@ class ForcedRun(CapsuleForward):
         p, e = self.capsule(theta)
         if self.settled:
             early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
-            run = self.simulated(theta, p, e, xp.concatenate([early, self.time]))
+            rest = (equilibrium(p), 0.0, 0.0, 0.0) if "slope" in self.ground else None
+            run = self.simulated(theta, p, e, xp.concatenate([early, self.time]), rest)
             settled = {name: getattr(run, name)[1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
             X2 = settled["X2"][0]
             return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})

@@ -88,6 +88,18 @@ def _check_forward(entry: Entry[DecaySettings]) -> None:
         raise entry.error("forward", rule, model.name, remedy)
 
 
+def _check_ground(entry: Entry[DecaySettings]) -> None:
+    """Refuse a slope that the closed form does not have: of a held capsule it shifts the rest position alone."""
+    settings = entry.table.settings
+    if settings.forward == "capsule":
+        return
+    if settings.stiffness == "cubic":
+        entry.refuse_ground("slope", "a decay with a cubic spring must be on level ground")
+    if settings.capsule == "free":
+        for key in ("slope", "N0"):
+            entry.refuse_ground(key, f'the closed form of a free capsule has no {key}; forward = "capsule" has')
+
+
 def _check_channels(entry: Entry[DecaySettings]) -> None:
     """Require x_rel alone for turning points and for the capsule model."""
     settings, names = entry.table.settings, set(CHANNELS).intersection(entry.table.columns)
@@ -316,6 +328,7 @@ KIND = Kind(
     settings=DecaySettings,
     rules=(
         Entry.check_spring_with_gap,
+        _check_ground,
         _check_channels,
         _check_window,
         _check_forward,

@@ -8,8 +8,8 @@ import numpy as np
 from capsule_id.experiments.free_vibration.readings.channels import channel_of
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
-from capsule_id.rig.model import Quantity, Settings, Table
-from capsule_id.rig.schema import CountRule, NameRule, QuantityRule, WordsRule
+from capsule_id.rig.model import Quantity, Table
+from capsule_id.rig.schema import CountRule, GroundSettings, NameRule, QuantityRule, WordsRule
 
 #: Parameter of every damping term besides the viscous one, and of the cubic spring.
 DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
@@ -20,7 +20,7 @@ _NOISES = {"ar1": "AR(1) noise", "arma": "ARMA noise"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class DecaySettings(Settings):
+class DecaySettings(GroundSettings):
     """Settings of a free vibration, SI.
 
     Absent words of the model stand for viscous damping, a linear spring, no drift and white noise. Where the record

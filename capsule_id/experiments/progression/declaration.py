@@ -10,8 +10,8 @@ from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE, SHARE
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Quantity, Rig, Settings, Table
-from capsule_id.rig.schema import ColumnRule, QuantityRule
+from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.schema import ColumnRule, GroundSettings, QuantityRule
 from capsule_id.views import Finding, Message
 
 SESSION_SD = scatter(
@@ -33,7 +33,7 @@ FEWEST_SETTINGS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProgressionSettings(Settings):
+class ProgressionSettings(GroundSettings):
     """Settings of a progression, SI. ``P_on``, ``P_d`` and ``lag`` are priors where they have an sd."""
 
     drive: Literal["pulses", "harmonic"] = "pulses"

@@ -36,6 +36,7 @@ from capsule_id.physics.batches import pool
 from capsule_id.physics.displacement import Progress, displacement
 from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.forces import equilibrium
 from capsule_id.physics.friction import scaled
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.rig.model import Rig, Table
@@ -79,7 +80,7 @@ class Progression(CapsuleForward):
     reaction: float = eqx.field(static=True)
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction, self.smoothing = friction, None
+        self.friction, self.smoothing, self.ground = friction, None, table.settings.ground
         self.drive, self.reaction = table.settings.drive, rig.model.share_of_reaction
         self.distance = table["distance"]
         self.reading_variance = table.columns["distance"].reading_sd ** 2
@@ -286,7 +287,8 @@ def _responses_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) 
 def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Progress:
     p, drive = e.capsule(theta, settings)
     law = scaled(e.law(theta), jnp.exp(s))
-    return displacement(p, drive, law, settings[:, 0], settings[:, 1])
+    r0 = equilibrium(p) if "slope" in e.ground else 0.0
+    return displacement(p, drive, law, settings[:, 0], settings[:, 1], r0)
 
 
 def _scale(prior: Prior | None) -> float:

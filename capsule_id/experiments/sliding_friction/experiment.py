@@ -13,12 +13,12 @@ from capsule_id.experiments.families.friction_experiment import FrictionExperime
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.sliding_friction.declaration import SLIDING_SCATTER
-from capsule_id.physics.friction import FrictionLaw, normal_force
+from capsule_id.physics.friction import FrictionLaw
 from capsule_id.rig.model import Rig, Table
 
 
 class SlidingFriction(FrictionExperiment):
-    """Steady sliding, y = w mu_d(v), with w = (m1 + m2) g for a force and 1 for a coefficient.
+    """Steady sliding, y = mu_d(v) for a coefficient. A force is N mu_d(v) and the weight along the slope.
 
     The variance has reading errors of y and of v (through the slope of the friction law) and relative scatter of mu.
     """
@@ -34,6 +34,7 @@ class SlidingFriction(FrictionExperiment):
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction = friction = replace(friction, direction=table.settings.direction)
         self.about = About(table, rig, (*friction.parameters, SLIDING_SCATTER))
+        self.ground = table.settings.ground
         self.quantity = "force" if "force" in table.columns else "coefficient"
         self.speed, self.values = table["speed"], table[self.quantity]
         self.speed_sd = table.columns["speed"].reading_sd
@@ -52,20 +53,23 @@ class SlidingFriction(FrictionExperiment):
         return self.values
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        theta = {**theta, **self.ground}
         law = self.friction.force(theta) if self.quantity == "force" else self.friction.coefficient(theta)
         predicted, slope = (xp.asarray(values) for values in _value_and_slope(law, self.speed))
         variance = self.values_sd**2 + (slope * self.speed_sd) ** 2
-        return (Misfit(self.values - predicted, variance, predicted, no_design(self.n, xp)),)
+        raw = self.values - predicted - (self.along(theta) if self.quantity == "force" else 0.0)
+        return (Misfit(raw, variance, predicted, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Measured points (speed, coefficient)."""
         if self.quantity == "coefficient":
             return self.speed, self.values
-        return self.speed, self.values / normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value)
+        return self.speed, (self.values - self.stated_along) / self.stated_normal_force
 
     def point_errors(self) -> tuple[np.ndarray, float]:
         """The reading error of the speed is left out: it enters through the slope of the law."""
-        return self.values_sd / self.values, 1.0
+        along = self.stated_along if self.quantity == "force" else 0.0
+        return self.values_sd / (self.values - along), 1.0
 
     def starts(self) -> dict[str, Start]:
         return {**self.rough_starts(), "sliding_scatter": Start(0.02, 0.3)}

@@ -19,6 +19,7 @@ from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE, SLOPE_ANGLE
 from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Table
 from capsule_id.rig.schema import ColumnRule, QuantityRule
 
 TILT_SD = scatter(
@@ -66,6 +67,24 @@ def _check_tilt(entry: Entry[TiltSettings]) -> None:
         raise entry.file.error(row, "height", "height must be less than the length of the board", value, remedy)
 
 
+def _check_ground(entry: Entry[TiltSettings]) -> None:
+    """Refuse a slope of its own and N0 for tilts, and N0 beside the normal force of a pull."""
+    settings = entry.table.settings
+    if "force" not in entry.table.columns:
+        if (*entry.path, "slope") in entry.document.keys:
+            rule = "a tilt takes its own angle as slope"
+            raise entry.error("slope", rule, "slope", "remove slope, or give the column force", of_key=True)
+        entry.refuse_ground("N0", "a tilt must have the weight alone as normal force")
+    elif settings.normal_force is not None and (*entry.path, "N0") in entry.document.keys:
+        raise entry.error("N0", "normal_force holds N0 too", "both", "remove N0, or normal_force", of_key=True)
+
+
+def _masses(table: Table[TiltSettings]) -> tuple[str, ...]:
+    # The pull overcomes the weight along the slope too.
+    weighed = table.settings.normal_force is None or "slope" in table.settings.ground
+    return ("m1", "m2") if "force" in table.columns and weighed else ()
+
+
 def tilts(
     rng: np.random.Generator, mu: float, trials: int = TRIALS, tilt_sd: float = TRIAL_SD
 ) -> dict[str, np.ndarray]:
@@ -82,8 +101,8 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
 TEMPLATE = """\
 #: Tilts of the board until the capsule slips: mu. Column: angle [deg]; or height [mm] and length [mm] with
 #: length_is = "board" (the sloping side) or "base" (the side on the floor).
-#: Or force [N]: the level pull at which the capsule slips. The normal force is (m1 + m2) g, or stated by
-#: normal_force = { value = 6.3, unit = "N" }.
+#: Or force [N]: the pull along the track at which the capsule slips. The normal force follows from the weight, slope
+#: and N0, or is stated by normal_force = { value = 6.3, unit = "N" }.
 # [[experiment]]
 # kind = "static_friction"
 # file = "static_friction.csv"
@@ -100,9 +119,9 @@ KIND = Kind(
         "force": ColumnRule("N", POSITIVE),
     },
     sets=(("angle",), ("height", "length"), ("force",)),
-    masses=lambda table: ("m1", "m2") if "force" in table.columns and table.settings.normal_force is None else (),
+    masses=_masses,
     settings=TiltSettings,
-    rules=(_check_tilt,),
+    rules=(_check_tilt, _check_ground),
     parameters=(TILT_SD, PULL_SCATTER),
     make=made_by("capsule_id.experiments.static_friction.experiment:StaticFriction"),
     template=TEMPLATE,

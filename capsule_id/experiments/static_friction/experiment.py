@@ -35,6 +35,7 @@ class StaticFriction(FrictionExperiment):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction = friction = replace(friction, direction=table.settings.direction)
+        self.ground = {}
         self.about = About(table, rig, (*friction.parameters_at_rest, TILT_SD))
         self.angle, self.reading_sd = _angles(table)
         self.mean, self.squares = float(np.mean(self.angle)), float(np.sum((self.angle - np.mean(self.angle)) ** 2))
@@ -87,7 +88,10 @@ class StaticFriction(FrictionExperiment):
 
 
 class StaticPulls(FrictionExperiment):
-    """Pulls on level ground: force_i = mu_0 N (1 + N(0, pull_scatter^2)) + reading error; N is stated or the weight."""
+    """Pulls along the track: force_i = mu_0 N (1 + N(0, pull_scatter^2)) + (m1 + m2) g sin(slope) + reading error.
+
+    N is stated, or follows from weight, slope and N0. The weight along the slope is negative for a pull downhill.
+    """
 
     force: np.ndarray
     reading_sd: float
@@ -97,13 +101,15 @@ class StaticPulls(FrictionExperiment):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction = friction = replace(friction, direction=table.settings.direction)
+        self.ground = table.settings.ground
         self.about = About(table, rig, (*friction.parameters_at_rest, PULL_SCATTER))
         self.force, self.reading_sd = table["force"], table.columns["force"].reading_sd
         self.normal_force = table.settings.normal_force
 
     @property
     def masses(self) -> tuple[str, ...]:
-        return ("m1", "m2") if self.normal_force is None or self.friction.law is not CoulombStribeck else ()
+        weighed = self.normal_force is None or "slope" in self.ground
+        return ("m1", "m2") if weighed or self.friction.law is not CoulombStribeck else ()
 
     @property
     def scatters(self) -> tuple[str]:
@@ -114,19 +120,20 @@ class StaticPulls(FrictionExperiment):
         return self.force
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        normal = normal_force(theta["m1"], theta["m2"], theta["g"]) if self.normal_force is None else self.normal_force
-        expected: Any = normal * self.friction.coefficient(theta).forward(0.0)
-        return (Misfit(self.force - expected, self.reading_sd**2, expected, no_design(self.n, xp)),)
+        normal: Any = self.normal_force
+        if normal is None:
+            normal = normal_force(theta["m1"], theta["m2"], theta["g"], **self.ground)
+        friction: Any = normal * self.friction.coefficient(theta).forward(0.0)
+        expected = friction + self.along(theta)
+        return (Misfit(self.force - expected, self.reading_sd**2, friction, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points by the paper's formula: mu = force/N at speed 0."""
-        normal = self.normal_force
-        if normal is None:
-            normal = normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value)
-        return np.zeros(self.n), self.force / normal
+        """Points by the paper's formula: mu = force/N at speed 0, without the weight along the slope."""
+        normal = self.stated_normal_force if self.normal_force is None else self.normal_force
+        return np.zeros(self.n), (self.force - self.stated_along) / normal
 
     def point_errors(self) -> tuple[np.ndarray, float]:
-        return self.reading_sd / self.force, 1.0
+        return self.reading_sd / (self.force - self.stated_along), 1.0
 
     def starts(self) -> dict[str, Start]:
         return {**self.rough_starts(), "pull_scatter": Start(0.02, 0.3)}

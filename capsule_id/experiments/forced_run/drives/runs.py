@@ -17,7 +17,7 @@ from capsule_id.experiments.forced_run.tables import predicted_motion
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.drives.recorded import RecordedDrive
-from capsule_id.physics.forces import rod_on_capsule
+from capsule_id.physics.forces import downhill, rod_on_capsule
 from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.rig.model import Rig, Table
 
@@ -64,7 +64,7 @@ class RecordedRun(ForcedRun):
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
         p = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.with_spring(theta))
         force = xp.asarray(theta["K"])[..., None] * self.current
-        return (force - rod_on_capsule(p, x_rel, rate)) / p.m1
+        return (force - rod_on_capsule(p, x_rel, rate) - downhill(p, p.m1)) / p.m1
 
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
         # The figures of the paper show a harmonic force.
