@@ -5,7 +5,7 @@ from math import cos
 from typing import Any, get_args, get_type_hints
 
 from capsule_id.parameters import TABLE
-from capsule_id.rig.model import ModelChoices, Table
+from capsule_id.rig.model import ModelChoices, Quantity, Table
 from capsule_id.rig.schema import GroundSettings, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_choice, read_table, refuse_unknown_keys, shown
@@ -75,21 +75,20 @@ def place_of(document: TomlDocument, path: KeyPath, key: str) -> KeyPath:
     return (*path, key) if (*path, key) in document.keys else ("rig", key)
 
 
-def check_normal_forces(
-    document: TomlDocument, tables: Sequence[Table[Any]], masses: Mapping[str, float], g: float
-) -> None:
-    """Refuse a pressing force that lifts the capsule off the ground.
+def check_normal_forces(document: TomlDocument, tables: Sequence[Table[Any]], stated: Mapping[str, Quantity]) -> None:
+    """Refuse a pressing force that lifts the capsule off the ground; ``stated``: g and the stated masses.
 
     Raises
     ------
     InputError
-        At the first N0 with (m1 + m2) g cos(slope) + N0 <= 0; ``masses``, kg, are those stated.
+        At the first N0 with (m1 + m2) g cos(slope) + N0 <= 0.
     """
+    mass = sum(stated[name].value for name in ("m1", "m2") if name in stated)
     for index, table in enumerate(tables):
         settings = table.settings
-        if not isinstance(settings, GroundSettings) or not settings.N0 or "m2" not in masses:
+        if not isinstance(settings, GroundSettings) or not settings.N0 or "m2" not in stated:
             continue
-        N = sum(masses.values()) * g * cos(settings.slope or 0.0) + settings.N0
+        N = mass * stated["g"].value * cos(settings.slope or 0.0) + settings.N0
         if N <= 0.0:
             rule = f"the normal force (m1 + m2) g cos(slope) + N0 of {table.label} must be positive"
             place = place_of(document, ("experiment", index), "N0")

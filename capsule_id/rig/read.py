@@ -71,7 +71,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     name = read_name(document, ("rig", "name"), head["name"])
     synthetic = read_bool(document, ("rig", "synthetic"), head.get("synthetic", False))
     faults: list[InputError] = []
-    stated = {}
+    stated = {"g": Quantity(STANDARD_GRAVITY)}
     for key, rule in RIG_QUANTITIES.items():
         if key in head:
             with collecting(faults):
@@ -82,16 +82,13 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     model = read_model(document)
     _check_masses(document, tables, kinds, set(stated))
     check_masses_of_free(document, model, tables, kinds, set(stated))
-    g = stated.get("g", Quantity(STANDARD_GRAVITY))
-    check_normal_forces(
-        document, tables, {name: stated[name].value for name in ("m1", "m2") if name in stated}, g.value
-    )
+    check_normal_forces(document, tables, stated)
     return Rig(
         name=name,
         synthetic=synthetic,
         m1=stated.get("m1"),
         m2=stated.get("m2"),
-        g=g,
+        g=stated["g"],
         priors=MappingProxyType(_read_priors(document, tables, [*parameter_rows(kinds).values(), *parameters])),
         tables=tables,
         files=MappingProxyType({"rig.toml": sha256, **files}),

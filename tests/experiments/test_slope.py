@@ -1,7 +1,9 @@
 """Experiments on a slope, with a pressing force: independent solutions, recovery of mu, starts at equilibrium."""
 
 from dataclasses import replace
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -59,7 +61,7 @@ def readings(direction: str, rng: np.random.Generator, **ground: float) -> list[
 def posterior_of_mu(experiment: Experiment) -> tuple[float, float]:
     """Mean and sd of mu, all other values known, on a grid."""
     grid = np.linspace(0.1, 1.2, 1101)
-    value = np.array([experiment.log_likelihood({**THETA, "mu": mu}, np) for mu in grid])
+    value = np.asarray(jax.jit(jax.vmap(lambda mu: experiment.log_likelihood({**THETA, "mu": mu})))(grid))
     weight = np.exp(value - value.max())
     mean = float(np.average(grid, weights=weight))
     return mean, float(np.sqrt(np.average((grid - mean) ** 2, weights=weight)))
@@ -86,11 +88,12 @@ def test_points_of_the_paper_show_mu_without_the_weight_along_the_slope() -> Non
     assert np.all(pushes.paper_points()[1] < 1.07 * MU)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize("k_cubic", [0.0, 4e8, -1e8])
+@pytest.mark.parametrize("k_cubic", [0.0, 4e8])
 def test_the_equilibrium_balances_the_weight(k_cubic: float) -> None:
     p = CapsuleParameters(**CAPSULE, k2=0.0, G=np.inf, slope=0.3, k_cubic=k_cubic)
     load = bench.M1 * bench.G * np.sin(0.3)
     expected = brentq(lambda r: bench.K1 * r + k_cubic * r**3 + load, -1e-3, 0.0, xtol=1e-15)
+    assert isinstance(expected, float)
     assert equilibrium(p) == pytest.approx(expected, rel=1e-10)
     still = simulate(replace(p, mu=5.0), Excitation(0.0, 1.0), np.linspace(0.0, 0.5, 5), (expected, 0.0, 0.0, 0.0))
     assert np.allclose(still.x_rel, expected, atol=1e-12)
@@ -119,7 +122,7 @@ def test_a_progression_on_a_slope_starts_at_equilibrium() -> None:
     assert not np.allclose(X2, [plain(row, r0, replace(p, slope=0.0)) for row in e.settings], atol=1e-5)
 
 
-def run_table(**settings: object) -> Table:
+def run_table(**settings: Any) -> Table:
     time = np.linspace(0.0, 0.4, 200)
     x = 1e-3 * np.cos(35.0 * time)
     return bench.table(

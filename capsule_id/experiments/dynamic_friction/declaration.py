@@ -94,6 +94,8 @@ TEMPLATE = """\
 # distance_sd = { value = 0.3, unit = "mm" }
 # forward = "closed"                                  # "capsule": the rod was free and vibrates
 # direction = "forward"                               # "backward": pushed away from the support spring
+# slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
+# N0 = { value = 0, unit = "N" }
 """
 
 KIND = Kind(

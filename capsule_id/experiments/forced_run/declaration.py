@@ -149,6 +149,8 @@ TEMPLATE = """\
 # drive = "harmonic"
 #: normal force on the ground where it is not (m1 + m2) g
 # normal_force = { value = 6.28, unit = "N" }
+# slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
+# N0 = { value = 0, unit = "N" }
 #: state of the capsule at the first sample: "auto" (default, from the record), "stuck", "moving" or "settled"
 # start = "auto"
 #: "white" (default) or "ar1": coloured noise, its correlation is estimated

@@ -16,6 +16,7 @@ from capsule_id.experiments.free_vibration.settings import (
     DAMPING,
     DecayModel,
     DecaySettings,
+    check_ground,
     cut_at_release,
     decay_window,
 )
@@ -86,18 +87,6 @@ def _check_forward(entry: Entry[DecaySettings]) -> None:
         rule = "forward capsule has viscous damping, a linear spring and white noise only"
         remedy = 'write forward = "closed", or remove damping, stiffness, drift and noise'
         raise entry.error("forward", rule, model.name, remedy)
-
-
-def _check_ground(entry: Entry[DecaySettings]) -> None:
-    """Refuse a slope that the closed form does not have: of a held capsule it shifts the rest position alone."""
-    settings = entry.table.settings
-    if settings.forward == "capsule":
-        return
-    if settings.stiffness == "cubic":
-        entry.refuse_ground("slope", "a decay with a cubic spring must be on level ground")
-    if settings.capsule == "free":
-        for key in ("slope", "N0"):
-            entry.refuse_ground(key, f'the closed form of a free capsule has no {key}; forward = "capsule" has')
 
 
 def _check_channels(entry: Entry[DecaySettings]) -> None:
@@ -222,6 +211,9 @@ TEMPLATE = """\
 # samples = "record"
 #: "closed" form (default), or the "capsule" model: a free capsule may slip, and the rod may hit the support spring
 # forward = "closed"
+#: slope of the track and pressing force of this record; default: those of [rig]
+# slope = { value = 0, unit = "deg" }
+# N0 = { value = 0, unit = "N" }
 #: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record
 # smoothing_window = { value = 10, unit = "ms" }
 # x_rel_sd = { value = 0.02, unit = "mm" }
@@ -328,7 +320,7 @@ KIND = Kind(
     settings=DecaySettings,
     rules=(
         Entry.check_spring_with_gap,
-        _check_ground,
+        check_ground,
         _check_channels,
         _check_window,
         _check_forward,

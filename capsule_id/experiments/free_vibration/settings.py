@@ -8,6 +8,7 @@ import numpy as np
 from capsule_id.experiments.free_vibration.readings.channels import channel_of
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
+from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import CountRule, GroundSettings, NameRule, QuantityRule, WordsRule
 
@@ -40,6 +41,18 @@ class DecaySettings(GroundSettings):
     spring: Annotated[str | None, NameRule()] = None
     gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
     forward: Literal["closed", "capsule"] = "closed"
+
+
+def check_ground(entry: Entry[DecaySettings]) -> None:
+    """Refuse a slope that the closed form does not have: of a held capsule it shifts the rest position alone."""
+    settings = entry.table.settings
+    if settings.forward == "capsule":
+        return
+    if settings.stiffness == "cubic":
+        entry.refuse_ground("slope", "a decay with a cubic spring must be on level ground")
+    if settings.capsule == "free":
+        for key in ("slope", "N0"):
+            entry.refuse_ground(key, f'the closed form of a free capsule has no {key}; forward = "capsule" has')
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,8 @@ TEMPLATE = """\
 # P_on = { value = 1.25, sd = 0.5, unit = "N" }
 # lag = { value = 5, sd = 2, unit = "ms" }
 # distance_sd = { value = 1, unit = "mm" }
+# slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
+# N0 = { value = 0, unit = "N" }
 """
 
 _SIZES = (

@@ -28,6 +28,8 @@ TEMPLATE = """\
 # kind = "sliding_friction"
 # file = "sliding_friction.csv"
 # direction = "forward"                               # "backward": it slid away from the support spring
+# slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
+# N0 = { value = 0, unit = "N" }
 """
 
 KIND = Kind(

@@ -71,7 +71,7 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
     """Refuse a slope of its own and N0 for tilts, and N0 beside the normal force of a pull."""
     settings = entry.table.settings
     if "force" not in entry.table.columns:
-        if (*entry.path, "slope") in entry.document.keys:
+        if settings.slope and (*entry.path, "slope") in entry.document.keys:
             rule = "a tilt takes its own angle as slope"
             raise entry.error("slope", rule, "slope", "remove slope, or give the column force", of_key=True)
         entry.refuse_ground("N0", "a tilt must have the weight alone as normal force")
@@ -108,6 +108,8 @@ TEMPLATE = """\
 # file = "static_friction.csv"
 # angle_resolution = { value = 0.1, unit = "deg" }
 # direction = "forward"                               # "backward": it slips away from the support spring
+# slope = { value = 0, unit = "deg" }                   # of pulls, and N0; default: those of [rig]
+# N0 = { value = 0, unit = "N" }
 """
 
 KIND = Kind(
