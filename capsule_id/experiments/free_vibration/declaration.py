@@ -211,8 +211,7 @@ TEMPLATE = """\
 # samples = "record"
 #: "closed" form (default), or the "capsule" model: a free capsule may slip, and the rod may hit the support spring
 # forward = "closed"
-#: slope of the track and pressing force of this record; default: those of [rig]
-# slope = { value = 0, unit = "deg" }
+# slope = { value = 0, unit = "deg" }                   # and N0: default those of [rig]
 # N0 = { value = 0, unit = "N" }
 #: window of the Savitzky-Golay filter for the paper's estimate; default: chosen from the record
 # smoothing_window = { value = 10, unit = "ms" }
