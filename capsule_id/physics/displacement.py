@@ -23,8 +23,9 @@ from capsule_id.physics.model import CapsuleParameters, Status, simulate, withou
 BLOCK = 6
 #: The motion repeats where the state changes by less than this part of itself over one period, dimensionless.
 REPEATS = 1e-5
-#: Bound on the steps of a block. A usual one needs 200; a motion that needs far more keeps its whole chunk waiting.
-BLOCK_STEPS = 3000
+#: Bound on the steps of a block, 150 per period. Plausible motions need 15 to 45 per period; a motion that needs far
+#: more keeps its whole chunk waiting.
+BLOCK_STEPS = 150 * BLOCK
 
 
 class Progress(NamedTuple):
@@ -51,6 +52,9 @@ def displacement(p: CapsuleParameters, e: Drive, law: FrictionLaw, period: Any, 
     p, e, law : leaves () or (L,)
     period, count : (L,) period of the drive, s, and number of periods
     r0 : () or (L,), m
+
+    A lane with a block of more than ``BLOCK_STEPS`` steps is given up with ``Status.TOO_MANY_STEPS``. Its displacement
+    is NaN, so that a log-posterior which needs it is -inf.
 
     Works under ``jit`` and ``vmap``, and is differentiable in forward mode.
     """

@@ -1,6 +1,8 @@
 """Progressions: the likelihood against SciPy, sessions, the start on its own, faults of a folder with their remedies."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from scipy.stats import multivariate_normal
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -109,6 +112,18 @@ def test_a_fault_is_named_and_its_remedy_works(
     assert rule in str(fault_of(tmp_path))
     (tmp_path / "rig.toml").write_text(head + instead + "\n")
     read_rig(tmp_path)
+
+
+@pytest.mark.parametrize(("relative", "level"), [(0.01, "ok"), (0.2, "warn"), (0.4, "fail")])
+def test_the_discrepancy_is_compared_with_scatter_and_motion(folder: Path, relative: float, level: str) -> None:
+    e = progression(folder)
+    rms = float(np.sqrt(np.mean((e.distance / (e.setting @ e.time)) ** 2)))
+    values = {**ROBOT, **SCATTERS, "trial_sd[progression]": 1e-3, "discrepancy[progression]": relative * rms}
+    (finding,) = check_discrepancy([e], cast(Any, SimpleNamespace(values={**values, "g": 9.81}, draws=[])))
+    assert (finding.code, finding.level, finding.experiment) == ("progression.discrepancy", level, e.label)
+    assert finding.facts["size"] == pytest.approx(1e3 * relative * rms)
+    assert finding.facts["rms"] == pytest.approx(1e3 * rms)
+    assert 0.01 * 1e3 * rms < finding.facts["scatter"] < 0.2 * 1e3 * rms
 
 
 def test_parts_of_periods_are_refused(folder: Path, tmp_path: Path) -> None:

@@ -192,7 +192,8 @@ class Progression(CapsuleForward):
         mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
         expected = self.setting @ mean
         design = xp.concatenate(
-            [(self.setting @ per_sd)[:, None] * self.session, theta["discrepancy"] * self.setting * self.time], axis=1
+            [(self.setting @ per_sd)[:, None] * self.session, theta["discrepancy"] * self.setting * self.time[None]],
+            axis=1,
         )
         variance = self.reading_variance + (theta["trial_scatter"] * expected) ** 2
         return Misfit(self.distance - expected, variance, xp.ones(len(self.distance)), design)

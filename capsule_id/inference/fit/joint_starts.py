@@ -26,7 +26,8 @@ def choose_starts(
 ) -> np.ndarray:
     """(at most MAX_STARTS, d) in u: the bench's estimates and the candidates of largest log-posterior.
 
-    The largest come first. The bench estimate, with the values of ``first``, is one of the first ``STARTS``.
+    The largest come first. The bench estimate, with the values of ``first``, is one of the first ``STARTS``. Without
+    estimates, and where an amplitude has no sign, it is the centre of the priors and has no place of its own.
     """
     rng = np.random.default_rng(seed)
     candidates = dispersed_starts(target, seed, CANDIDATES)
@@ -45,6 +46,8 @@ def choose_starts(
     value = weigh(target, candidates)
     ranked = 1 + np.argsort(-value[1:])[: MAX_STARTS - 1]
     ranked = ranked[np.isfinite(value[ranked])]
+    if not known and mirrored.any() and len(ranked) >= STARTS:
+        return candidates[ranked]
     early = np.append(ranked[: STARTS - 1], 0)
     return candidates[[*early[np.argsort(-value[early], kind="stable")], *ranked[STARTS - 1 :]]]
 

@@ -14,6 +14,8 @@ from capsule_id.views import ResultTable
 def make_notes(setting: Setting, predictive: Mapping[str, float | None]) -> list[ResultTable]:
     """Return all tables; those that compare bench tests and runs only where there are runs.
 
+    They need derivatives, which say little where residuals have kinks: then they are left out.
+
     Parameters
     ----------
     predictive : posterior predictive p-values by label; without a sample there is no such table
@@ -23,7 +25,8 @@ def make_notes(setting: Setting, predictive: Mapping[str, float | None]) -> list
         [table for maker in declared(setting.experiments, "tables", bench) for table in maker(setting)]
         for bench in (False, True)
     )
-    if any(not e.bench for e in setting.experiments):
+    kinked = any(e.has_joint_scatters for e in setting.experiments)
+    if any(not e.bench for e in setting.experiments) and not kinked:
         gained = precision_gained(target, fit, setting.posterior, setting.bench)
         of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
     tables = [*of_runs, *of_bench, prior_table(target)]

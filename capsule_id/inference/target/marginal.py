@@ -27,6 +27,9 @@ from capsule_id.inference.target.quadrature import NODES, Grid, add_to_blocks, c
 #: Smallest and largest distance from the point fit of the walkers that determine the nodes, in standard deviations.
 #: The largest is wide because few trials give the heavy tails of Student's t.
 NEAREST, FARTHEST = 0.5, 500.0
+#: Largest distance where scatters act together: only one scatter is integrated out there, and motions far from the
+#: point fit take very many steps.
+FARTHEST_WITH_KINKS = 20.0
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,9 @@ class MarginalPosterior:
         direction = np.random.default_rng(0).standard_normal((2 * BATCH, self.dimension))
         for block in self.blocks:
             direction[:, block] /= np.linalg.norm(direction[:, block], axis=1, keepdims=True)
-        radius = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, BATCH - 1)])
+        kinked = any(e.has_joint_scatters for e in self.target.experiments)
+        farthest = FARTHEST_WITH_KINKS if kinked else FARTHEST
+        radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, BATCH - 1)])
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
 
 
