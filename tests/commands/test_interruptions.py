@@ -76,7 +76,7 @@ def test_a_step_that_does_not_end_is_ended(tmp_path: Path) -> None:
 
 def test_interrupted_in_a_compilation_and_in_the_sample(tmp_path: Path) -> None:
     small_rig(tmp_path / "rig")
-    words = ("rig", "--quiet", "--max-steps", "60")
+    words = ("rig", "--quiet", "--max-steps", "60", "--ess", "100000")
     first = start(tmp_path, *words, "--out", "out", before=SHORT)
     wait_until(lambda: compilations(tmp_path) >= 2, first)
     assert interrupt(first, signal.SIGTERM) < LONGEST
