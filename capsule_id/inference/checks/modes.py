@@ -67,7 +67,8 @@ def modes(u: np.ndarray, size: float) -> list[tuple[float, float]]:
         return [(float(np.median(u)), 1.0)]
     count, edges = np.histogram(u, BINS, (low, high))
     spread = min(float(np.std(u)), float(np.subtract(*np.quantile(u, [0.75, 0.25]))) / 1.34)
-    bandwidth = 0.9 * spread * max(size, 10.0) ** -0.2 / (edges[1] - edges[0])
+    # The size is NaN where a walker never moved; the bandwidth is then that of few draws.
+    bandwidth = 0.9 * spread * max(10.0, size) ** -0.2 / (edges[1] - edges[0])
     density = gaussian_filter1d(count.astype(float), max(bandwidth, 1.0), mode="constant")
     # Each mode is a range of bins; ranges merge until every valley is deep and every mode has weight.
     inner = np.flatnonzero((density[1:-1] <= density[:-2]) & (density[1:-1] < density[2:])) + 1

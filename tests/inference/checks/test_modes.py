@@ -38,6 +38,11 @@ def test_one_mode_stays_one(density: stats.distributions.rv_frozen) -> None:
         assert len(modes(draws, 400.0)) == 1
 
 
+def test_a_sample_too_short_for_its_effective_size_has_modes_too() -> None:
+    """emcee's size of a few draws is NaN where a walker never moved."""
+    assert modes(np.random.default_rng(0).normal(size=400), float("nan"))
+
+
 def test_a_light_second_mode_does_not_count() -> None:
     draws = np.random.default_rng(1).standard_normal(10_000)
     draws[:200] += 30.0
