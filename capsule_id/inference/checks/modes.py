@@ -77,7 +77,8 @@ def modes(u: np.ndarray, size: float) -> list[tuple[float, float]]:
         parts = [slice(a, b) for a, b in pairwise(cuts)]
         weight = np.array([np.sum(count[part]) for part in parts]) / np.sum(count)
         peak = np.array([np.max(density[part]) for part in parts])
-        depth = density[cuts[1:-1]] / np.minimum(peak[:-1], peak[1:])
+        # A range without draws has no peak; it merges because it has no weight.
+        depth = density[cuts[1:-1]] / np.maximum(np.minimum(peak[:-1], peak[1:]), np.finfo(float).tiny)
         light = np.minimum(weight[:-1], weight[1:]) < SMALLEST_MODE
         worst = int(np.argmax(np.where(light, 2.0, depth)))
         if not light[worst] and depth[worst] < DEEPEST_VALLEY:

@@ -43,6 +43,13 @@ def test_a_sample_too_short_for_its_effective_size_has_modes_too() -> None:
     assert modes(np.random.default_rng(0).normal(size=400), float("nan"))
 
 
+def test_a_range_without_draws_is_no_mode() -> None:
+    """Three draws far below the others: the first range is empty."""
+    u = np.concatenate([np.random.default_rng(0).normal(size=5000), [-100.0, -80.0, -60.0]])
+    (mode,) = modes(u, 5000.0)
+    assert mode[1] == pytest.approx(1.0)
+
+
 def test_a_light_second_mode_does_not_count() -> None:
     draws = np.random.default_rng(1).standard_normal(10_000)
     draws[:200] += 30.0
