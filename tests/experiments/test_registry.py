@@ -19,7 +19,17 @@ from capsule_id.report.texts.messages import FIT_MESSAGES, messages_of
 from capsule_id.report.texts.readings import DATA_MESSAGES
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE
 from capsule_id.rig.model import Settings
-from capsule_id.rig.schema import ChoiceRule, ColumnRule, CountRule, NameRule, QuantityRule, SettingRule, WordsRule
+from capsule_id.rig.schema import (
+    PRESSING_FORCE,
+    SLOPE,
+    ChoiceRule,
+    ColumnRule,
+    CountRule,
+    NameRule,
+    QuantityRule,
+    SettingRule,
+    WordsRule,
+)
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Message
@@ -35,8 +45,10 @@ _FORWARD = (ChoiceRule(("closed", "capsule")), "closed")
 _FORCE = QuantityRule("N", ANY, has_sd=True)
 _LAG = QuantityRule("s", NOT_NEGATIVE, has_sd=True)
 _GAP = QuantityRule("m", NOT_NEGATIVE, has_sd=True)
+_GROUND: dict[str, tuple[SettingRule, object]] = {"slope": (SLOPE, None), "N0": (PRESSING_FORCE, None)}
 SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
     "free_vibration": {
+        **_GROUND,
         "start": (QuantityRule("s", ANY), None),
         "stop": (QuantityRule("s", ANY), None),
         "capsule": (ChoiceRule(("held", "free")), "held"),
@@ -52,12 +64,13 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "forward": _FORWARD,
     },
     "static_friction": {
+        **_GROUND,
         "length_is": (ChoiceRule(("board", "base")), None),
         "normal_force": (QuantityRule("N"), None),
         "direction": _DIRECTION,
     },
-    "dynamic_friction": {"forward": _FORWARD, "direction": _DIRECTION},
-    "sliding_friction": {"direction": _DIRECTION},
+    "dynamic_friction": {**_GROUND, "forward": _FORWARD, "direction": _DIRECTION},
+    "sliding_friction": {**_GROUND, "direction": _DIRECTION},
     "motor_current": {"sd_ratio": (QuantityRule("N/A"), None)},
     "support_spring": {
         "spring": (NameRule(), ...),
@@ -66,6 +79,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
     },
     "transducer": {"sd_ratio": (QuantityRule("1/N"), None)},
     "forced_run": {
+        **_GROUND,
         "drive": (ChoiceRule(("harmonic", "base", "pulses", "recorded")), "harmonic"),
         "spring": (NameRule(), None),
         "gap": (_GAP, None),
@@ -83,6 +97,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         **{f"{name}_delay_sd": (QuantityRule("s"), None) for name in _CHANNELS},
     },
     "progression": {
+        **_GROUND,
         "drive": (ChoiceRule(("pulses", "harmonic")), "pulses"),
         "P_on": (_FORCE, None),
         "P_d": (_FORCE, None),
@@ -176,6 +191,7 @@ def hop() -> Kind:
         sets=(("period", "distance"), ("f", "distance")),
         optional=("duty",),
         settings=ProgressionSettings,
+        rules=(),
         masses=lambda table: ("m2",) if "duty" in table.columns else (),
         parameters=(),
     )
