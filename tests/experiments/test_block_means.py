@@ -176,9 +176,7 @@ def test_blocks_that_lose_the_oscillation_are_refused(tmp_path: Path) -> None:
     for thin in (100_000, 300):
         with pytest.raises(InputError, match="means of the record and 4 means in a period") as caught:
             read(thin)
-    found = re.search(r"write thin = (\d+) or less", str(caught.value))
-    assert found is not None
-    most = int(found[1])
+    (most,) = (int(number) for number in re.findall(r"write thin = (\d+) or less", str(caught.value)))
     assert abs(most - 2.0 * np.pi / 113.0 / 5e-4 / 4.0) < 2.0
     read(most)
     with pytest.raises(InputError, match="4 means in a period"):
