@@ -12,20 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.experiments.checks.context import RunRecord
-from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
-from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.predictability import check_predictable
+from capsule_id.experiments.forced_run.drives.runs import OtherRun
 from capsule_id.experiments.forced_run.start_state.rough import RunStart, rough_start
-from capsule_id.experiments.forced_run.tables import predicted_motion
 from capsule_id.physics.drives.recorded import RodMotion
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.records.stated_settings import relative_position
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Table
 
 
-class BaseRun(ForcedRun):
+class BaseRun(OtherRun):
     """One record of a capsule on a spring whose other end moves as recorded.
 
     Attributes
@@ -37,22 +33,10 @@ class BaseRun(ForcedRun):
     base_rate: np.ndarray
 
     prescribed = True
-    checks = (check_predictable,)
-    tables = (predicted_motion,)
 
-    def __init__(
-        self,
-        table: Table,
-        rig: Rig,
-        friction: FrictionModel = EQUATION_1,
-        part_of: str | None = None,
-        leads: bool = True,
-        capsule_rate: float | None = None,
-    ) -> None:
-        """Make one record, or a part of one; arguments as for ``ForcedRun``."""
+    def read_drive(self, table: Table) -> None:
         motion = RodMotion.through(table["time"], table["x_base"] - table["x_base"][0])
         self.base, self.base_rate = np.asarray(motion.X1), np.asarray(motion.Y1)
-        super().__init__(table, rig, friction, part_of, leads, capsule_rate)
 
     @property
     def masses(self) -> tuple[str, ...]:
@@ -72,7 +56,3 @@ class BaseRun(ForcedRun):
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Any]:
         X1 = jnp.add.outer(theta["x_start"], self.base)
         return self.with_spring({"m1": 0.0, **theta}), RodMotion(self.time, X1, self.base_rate)
-
-    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        # The figures of the paper show a harmonic force.
-        return None

@@ -120,6 +120,7 @@ class ForcedRun(CapsuleForward):
             second reading of the current's amplitude counts in the first part only.
         capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or estimated
         """
+        self.read_drive(table)
         settings, gap = table.settings, stated_gap(table)
         self.friction, self.smoothing, self.ground = friction, None, settings.ground
         self.reaction = rig.model.share_of_reaction
@@ -151,6 +152,9 @@ class ForcedRun(CapsuleForward):
         self.moves = float(start == "moving")
         self.about = AboutRun(table, rig, (), part_of or table.label, leads, start, is_open, rough)
         self.about = replace(self.about, parameters=run_parameters(self, ranges))
+
+    def read_drive(self, table: Table) -> None:
+        """Set the fields that a subclass has besides those of this class; ``__init__`` calls it first."""
 
     def first_state(self, table: Table) -> RunStart:
         """Starting values from the record."""

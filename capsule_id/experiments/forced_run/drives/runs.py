@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
-from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.predictability import check_predictable
 from capsule_id.experiments.forced_run.tables import predicted_motion
@@ -19,13 +18,24 @@ from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.drives.recorded import RecordedDrive
 from capsule_id.physics.forces import downhill, rod_on_capsule
 from capsule_id.physics.model import CapsuleParameters, Trajectory
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Table
 
 #: Periods before the first sample from which pulses act: a lag forgets its start in a few periods.
 EARLIER_PERIODS = 50.0
 
 
-class RecordedRun(ForcedRun):
+class OtherRun(ForcedRun):
+    """A run without a harmonic force: what the paper's protocol and figures take from one is left out."""
+
+    checks = (check_predictable,)
+    tables = (predicted_motion,)
+
+    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
+        del theta
+        return None
+
+
+class RecordedRun(OtherRun):
     """One record whose drive is K times the recorded current, linear between the samples.
 
     The current is taken as recorded: its noise and the phase shift of its filter act as a force on the rod. Noise of
@@ -41,21 +51,9 @@ class RecordedRun(ForcedRun):
 
     has_phase = False
     inputs = ("current",)
-    checks = (check_predictable,)
-    tables = (predicted_motion,)
 
-    def __init__(
-        self,
-        table: Table,
-        rig: Rig,
-        friction: FrictionModel = EQUATION_1,
-        part_of: str | None = None,
-        leads: bool = True,
-        capsule_rate: float | None = None,
-    ) -> None:
-        """Make one record, or a part of one; arguments as for ``ForcedRun``."""
+    def read_drive(self, table: Table) -> None:
         self.current = table["current"]
-        super().__init__(table, rig, friction, part_of, leads, capsule_rate)
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         force = jnp.multiply.outer(jnp.asarray(theta["K"]), self.current)
@@ -66,12 +64,8 @@ class RecordedRun(ForcedRun):
         force = xp.asarray(theta["K"])[..., None] * self.current
         return (force - rod_on_capsule(p, x_rel, rate) - downhill(p, p.m1)) / p.m1
 
-    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        # The figures of the paper show a harmonic force.
-        return None
 
-
-class PulseRun(ForcedRun):
+class PulseRun(OtherRun):
     """One record driven by pulses of stated period and duty, which act since long before the first sample.
 
     Attributes
@@ -83,23 +77,10 @@ class PulseRun(ForcedRun):
     P_on: float
     lag: float
 
-    checks = (check_predictable,)
-    tables = (predicted_motion,)
-
-    def __init__(
-        self,
-        table: Table,
-        rig: Rig,
-        friction: FrictionModel = EQUATION_1,
-        part_of: str | None = None,
-        leads: bool = True,
-        capsule_rate: float | None = None,
-    ) -> None:
-        """Make one record, or a part of one; arguments as for ``ForcedRun``."""
+    def read_drive(self, table: Table) -> None:
         settings = table.settings
         self.duty, self.P_on = settings.duty, settings.P_on.value
         self.lag = 0.0 if settings.lag is None else settings.lag.value
-        super().__init__(table, rig, friction, part_of, leads, capsule_rate)
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         force, lag = theta.get("P_on", self.P_on), theta.get("lag", self.lag)
@@ -113,7 +94,3 @@ class PulseRun(ForcedRun):
     ) -> Trajectory:
         earlier = EARLIER_PERIODS * 2.0 * np.pi / self.Omega
         return super().simulated(theta, p, e, jnp.asarray(times) - self.time[0] + earlier, initial)
-
-    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        # The figures of the paper show a harmonic force.
-        return None
