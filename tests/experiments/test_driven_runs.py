@@ -8,6 +8,7 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.predictability import growth
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.drives.recorded import RecordedDrive
@@ -65,6 +66,28 @@ def test_pulses_explain_a_record_of_pulses(tmp_path: Path) -> None:
     own = {"P_on": 6.0, "lag": LAG, "phase": PHASE}
     assert largest_residual(run, own) < 1.15
     assert largest_residual(run, {**own, "lag": 2.0 * LAG}) > 3.0
+
+
+def test_the_growth_of_initial_errors_is_that_of_the_motion_under_the_same_pulses(tmp_path: Path) -> None:
+    """Pulses of an earlier or later phase let the capsule slide at other times, and give another growth."""
+    write(tmp_path, Pulses(6.0, PERIOD, DUTY, phase=PHASE, lag=LAG), 50 * PERIOD, None, PULSES)
+    toml = (tmp_path / "rig.toml").read_text()
+    stop = '"moving"\nsegment = { value = 30, unit = "ms" }'
+    (tmp_path / "rig.toml").write_text(toml.replace('start = "stuck"', f"start = {stop}"))
+    run = make_experiments(read_rig(tmp_path))[0]
+    own = {"P_on": 6.0, "lag": LAG, "phase": PHASE, "x_start": 1e-3, "y_start": -0.05, "capsule_start": -0.1}
+    size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
+
+    def end(name: str, change: float) -> np.ndarray:
+        t = run.motion({**TRUTH, **own, name: own[name] + change}, np)
+        return np.array([t.x_rel[-1], t.Y1[-1] - t.Y2[-1], t.Y2[-1]])
+
+    step = 1e-7
+    columns = [
+        (end(name, step * scale) - end(name, -step * scale)) / (2.0 * step * size)
+        for name, scale in zip(("x_start", "y_start", "capsule_start"), size, strict=True)
+    ]
+    assert growth(run, {**TRUTH, **own}) == pytest.approx(np.linalg.norm(columns, 2), rel=1e-3)
 
 
 def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted
-from capsule_id.physics.model import Status, simulate
+from capsule_id.physics.model import Status
 from capsule_id.views import Finding
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
     start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
     x_rel, rate, Y2 = np.concatenate([start + STEP * np.diag(size), start - STEP * np.diag(size)]).T
     times = np.linspace(run.time[0], run.time[-1], INSTANTS + 1)
-    t = simulate(*run.capsule(theta), times, (x_rel, rate + Y2, np.zeros(6), Y2), friction=run.law(theta))
+    t = run.simulated(theta, *run.capsule(theta), times, (x_rel, rate + Y2, np.zeros(6), Y2))
     states = np.stack([t.x_rel, t.Y1 - t.Y2, t.Y2], axis=-1)[:, 1:] / (2.0 * STEP * size)
     if not np.isfinite(states).all():
         return float("inf")
