@@ -3,8 +3,6 @@
 Run as a script for a study: ``python -m tests.experiments.decay_calibration NUMBER [FIRST_SEED]``.
 """
 
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +11,7 @@ import numpy as np
 import capsule_id as cid
 from capsule_id.experiments.free_vibration.decay_models import decay
 from tests.experiments import bench
+from tests.experiments.misfit_study import study
 
 #: Misfits: AR(1) noise, drift of the zero, cubic spring, dry friction.
 MISFITS = ("noise", "drift", "cubic", "dry")
@@ -71,19 +70,5 @@ def outcome(misfit: str, seed: int, **settings: Any) -> Outcome:
     return Outcome(misfit, seed, (float(z["k1"]), float(z["c"])), result.clean, models[0] if models else "stated")
 
 
-def coverage(outcomes: Sequence[Outcome]) -> tuple[float, float, float]:
-    """Share of clean results; of those, shares of parameters within 1.96 sd and beyond 4 sd."""
-    z = np.abs([each.z for each in outcomes if each.clean])
-    return float(np.mean([each.clean for each in outcomes])), float(np.mean(z < 1.96)), float(np.mean(z > 4.0))
-
-
 if __name__ == "__main__":
-    number, first = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    found = []
-    for seed in range(first, first + number):
-        for misfit in MISFITS:
-            found.append(outcome(misfit, seed))
-            print(found[-1], flush=True)
-    for misfit in MISFITS:
-        print(misfit, coverage([each for each in found if each.misfit == misfit]))
-    print("all", coverage(found))
+    study(MISFITS, outcome)

@@ -3,8 +3,6 @@
 Run as a script for a study: ``python -m tests.experiments.friction_calibration NUMBER [FIRST_SEED]``.
 """
 
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,6 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 import capsule_id as cid
+from tests.experiments.misfit_study import study
 from tests.measured.folders import Entry, make_rig
 
 #: Misfits: kinetic over static friction 0.8, with the default law and with the free ratio; trials in sessions, of
@@ -60,19 +59,5 @@ def outcome(misfit: str, seed: int) -> Outcome:
     return Outcome(misfit, seed, tuple(float(one) for one in z), result.clean, float(rows.at["mu", "sd"]))
 
 
-def coverage(outcomes: Sequence[Outcome]) -> tuple[float, float, float]:
-    """Share of clean results; of those, shares of parameters within 1.96 sd and beyond 4 sd (NaN without any)."""
-    z = np.abs([one for each in outcomes if each.clean for one in each.z])
-    shares = (float(np.mean(z < 1.96)), float(np.mean(z > 4.0))) if len(z) else (np.nan, np.nan)
-    return float(np.mean([each.clean for each in outcomes])), *shares
-
-
 if __name__ == "__main__":
-    number, first = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    found = []
-    for seed in range(first, first + number):
-        for misfit in MISFITS:
-            found.append(outcome(misfit, seed))
-            print(found[-1], flush=True)
-    for misfit in MISFITS:
-        print(misfit, coverage([each for each in found if each.misfit == misfit]))
+    study(MISFITS, outcome)

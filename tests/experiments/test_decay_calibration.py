@@ -5,7 +5,8 @@ import pytest
 
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from tests.experiments import bench
-from tests.experiments.decay_calibration import MISFITS, TIME, coverage, outcome, twin
+from tests.experiments.decay_calibration import MISFITS, TIME, outcome, twin
+from tests.experiments.misfit_study import coverage
 
 #: Twins of each misfit in the study.
 NUMBER = 10

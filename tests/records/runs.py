@@ -30,7 +30,7 @@ LONGER = {
 }
 
 #: (m1, m2, k1, k2, c, mu, G, P_d, Omega) with v_s = 0.3 m/s and the period of the model (``response``), 0: aperiodic.
-#: Drawn at random after the settings of ``find_period`` were fixed.
+#: Drawn at random, and not looked at while the settings of ``find_period`` were chosen.
 FRESH = {
     (0.1885, 0.3013, 2809.0, 10700.0, 1.948, 0.4032, 1.465e-3, 1.411, 188.2): 1,
     (0.09933, 0.4282, 1184.0, 88960.0, 2.098, 0.6784, 0.95e-3, 1.766, 98.38): 1,
