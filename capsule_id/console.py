@@ -1,5 +1,6 @@
 """Standard streams that may be closed or have another encoding; the progress of long computations."""
 
+import errno
 import io
 import os
 import shutil
@@ -34,19 +35,22 @@ def say(text: str) -> None:
     """Print to standard output and flush; a closed pipe (``| head``) is no error."""
     try:
         print(text, flush=True)
-    except BrokenPipeError:
-        _discard()
+    except OSError as error:
+        _discard(error)
 
 
 def finish() -> None:
     """Flush standard output; otherwise the interpreter reports a failed flush at exit."""
     try:
         sys.stdout.flush()
-    except BrokenPipeError:
-        _discard()
+    except OSError as error:
+        _discard(error)
 
 
-def _discard() -> None:
+def _discard(error: OSError) -> None:
+    """Discard what follows if ``error`` is a closed pipe, which Windows calls an invalid argument."""
+    if error.errno not in (errno.EPIPE, errno.EINVAL):
+        raise error
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

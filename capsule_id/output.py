@@ -1,21 +1,25 @@
 """Output directories: an unfinished result is ``DIR.partial``; one rename makes it ``DIR``."""
 
-import fcntl
+import errno
 import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from capsule_id.errors import InputError
 
 #: Files of a result directory. A directory with another file is never replaced.
 RESULT_FILES = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})
-STATE, CHAINS, LOCK = "state.json", "chains.h5", "lock"
+STATE, CHAINS = "state.json", "chains.h5"
 #: Additional files of an unfinished run.
-WORK_FILES = frozenset({STATE, "state.new", CHAINS, "chains.saved", "chains.saved-new", LOCK})
-PARTIAL, OLD = ".partial", ".partial.old"
+WORK_FILES = frozenset({STATE, "state.new", CHAINS, "chains.saved", "chains.saved-new"})
+#: The lock stands beside ``DIR.partial``: Windows renames no directory with an open file.
+PARTIAL, OLD, LOCK = ".partial", ".partial.old", ".partial.lock"
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)  # a file system without locks
 
 
 def partial_directory(directory: Path) -> Path:
@@ -32,8 +36,8 @@ def check_directory(directory: Path) -> None:
         If it is something else; this is never overwritten.
     """
     rule, remedy = "the output directory must be new or a result of fit-params", "choose another --out"
-    if directory.name in ("", "..") or directory.name.endswith((PARTIAL, OLD)):
-        named = f"the output directory must have a name, which must not end in {PARTIAL} or {OLD}"
+    if directory.name in ("", "..") or directory.name.endswith((PARTIAL, OLD, LOCK)):
+        named = f"the output directory must have a name, which must not end in {PARTIAL}, {OLD} or {LOCK}"
         raise InputError(named, f"'{directory}'", remedy)
     try:
         if directory.is_symlink() or (directory.exists() and not directory.is_dir()):
@@ -84,32 +88,61 @@ def work_in_progress(directory: Path, fingerprint: Mapping[str, object], resume:
         ``DIR.partial`` is something else.
     """
     partial = partial_directory(directory)
+    with _locked(directory):
+        new = not partial.exists()
+        try:
+            with _writable(partial):
+                _check_partial(partial, resume)
+                _check_old(directory)
+                partial.mkdir(exist_ok=True)
+            _recover(directory)
+            if resume:
+                _check_fingerprint(partial, fingerprint)
+            else:
+                _clear(partial)
+            _write_state(partial, fingerprint)
+            yield partial
+        except InputError:
+            if new:
+                shutil.rmtree(partial, ignore_errors=True)
+            raise
+
+
+@contextmanager
+def _writable(partial: Path) -> Iterator[None]:
+    """Refuse an output directory that the operating system refuses."""
     try:
-        _check_partial(partial, resume)
-        _check_old(directory)
-        made = [path for path in (partial, *partial.parents) if not path.exists()]
-        partial.mkdir(parents=True, exist_ok=True)
-        lock = os.open(partial / LOCK, os.O_RDWR | os.O_CREAT)
+        yield
     except OSError as error:
         rule, remedy = "the output directory must be writable", "choose another --out"
         raise InputError(rule, str(error.strerror), remedy, partial) from None
+
+
+@contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """Hold the lock of ``directory``. The operating system releases it when this process ends."""
+    partial, lock = partial_directory(directory), FileLock(directory.with_name(directory.name + LOCK), blocking=False)
+    missing = [path for path in directory.parents if not path.exists()]
     try:
-        _lock(lock, partial)
-        _recover(directory)
-        if resume:
-            _check_fingerprint(partial, fingerprint)
-        else:
-            _clear(partial)
-        _write_state(partial, fingerprint)
-        yield partial
-    except InputError:
-        if made:
-            shutil.rmtree(made[0], ignore_errors=True)
-            for path in made[1:]:
-                path.rmdir()
-        raise
+        with _writable(partial):
+            directory.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.acquire()
+            except Timeout:
+                rule, remedy = "one run at a time writes to a directory", "wait, or choose another --out"
+                raise InputError(rule, "another run is active", remedy, partial) from None
+            except OSError as error:
+                if error.errno not in _WITHOUT_LOCKS:
+                    raise
+        yield
     finally:
-        os.close(lock)
+        if lock.is_locked:
+            with suppress(PermissionError):  # Windows removes an open file only with the release
+                Path(lock.lock_file).unlink(missing_ok=True)
+        lock.release()
+        for path in missing:
+            with suppress(OSError):  # it holds what this run has written
+                path.rmdir()
 
 
 def _check_partial(partial: Path, resume: bool) -> None:
@@ -123,23 +156,6 @@ def _check_partial(partial: Path, resume: bool) -> None:
     foreign = sorted(names - RESULT_FILES - WORK_FILES)
     if foreign or (names and not names & WORK_FILES):
         raise InputError(rule, f"it holds {(foreign or sorted(names))[0]}", remedy, partial)
-
-
-def _lock(lock: int, partial: Path) -> None:
-    """Take the lock. The operating system releases it when this process ends."""
-    rule, remedy = "one run at a time writes to a directory", "wait, or choose another --out"
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise InputError(rule, "another run is active", remedy, partial) from None
-    except OSError:
-        return  # a file system without locks
-    try:
-        same = os.path.samestat(os.fstat(lock), (partial / LOCK).stat())
-    except FileNotFoundError:
-        same = False
-    if not same:
-        raise InputError(rule, "another run has just finished", remedy, partial)
 
 
 def _check_old(directory: Path) -> None:
@@ -162,7 +178,7 @@ def _clear(partial: Path) -> None:
     for path in partial.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
-        elif path.name != LOCK:
+        else:
             path.unlink()
 
 
@@ -182,7 +198,7 @@ def _check_fingerprint(partial: Path, fingerprint: Mapping[str, object]) -> None
 
 def _write_state(partial: Path, fingerprint: Mapping[str, object]) -> None:
     new = partial / "state.new"
-    new.write_text(json.dumps({"fingerprint": dict(fingerprint)}, indent=1), encoding="utf-8")
+    new.write_text(json.dumps({"fingerprint": dict(fingerprint)}, indent=1), encoding="utf-8", newline="\n")
     new.replace(partial / STATE)
 
 

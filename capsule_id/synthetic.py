@@ -120,10 +120,12 @@ def synthesize(
     folder.mkdir(parents=True, exist_ok=True)
     for table in (table for _, twin in twins for table in twin.tables):
         _write_csv(folder / table.file, table.columns)
-    (folder / "rig.toml").write_text(_rig_toml(name, seed, truth.g, masses, priors, entries), encoding="utf-8")
+    (folder / "rig.toml").write_text(
+        _rig_toml(name, seed, truth.g, masses, priors, entries), encoding="utf-8", newline="\n"
+    )
     beside = _truth_file(folder)
     known = {"seed": seed, "parameters": values, **({"runs": behind} if behind else {})}
-    beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")
     return truth
 
 
@@ -150,7 +152,7 @@ def _entry(kind: Kind, table: TwinTable) -> str:
 def _write_csv(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     rows = zip(*columns.values(), strict=True)
     lines = [",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in rows)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
 def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], priors: list[str], entries: list[str]) -> str:

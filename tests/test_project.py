@@ -95,8 +95,7 @@ def test_dependencies_are_what_is_imported() -> None:
         for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [each.name for each in node.names])
     }
     imported = {"pillow" if name == "PIL" else name for name in found - sys.stdlib_module_names - {"capsule_id"}}
-    # xarray writes through h5netcdf, JAX bounds its cache with filelock: they need no import of ours.
-    imported |= {"filelock"} if "JAX_COMPILATION_CACHE_MAX_SIZE" in text else set()
+    # xarray writes through h5netcdf: it needs no import of ours.
     imported |= {"h5netcdf"} if 'engine="h5netcdf"' in text else set()
     imported = {{"nptdms": "npTDMS"}.get(name, name) for name in imported}
     extras = SETTINGS["project"]["optional-dependencies"]

@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
         name = folder.resolve().name
         usable = re.fullmatch(NAME_PATTERN, name) and name.strip(".")
         text = template(kinds, name if usable else "rig", [entry for entry, _ in guesses.values()])
-        (folder / "rig.toml").write_text(text, encoding="utf-8")
+        (folder / "rig.toml").write_text(text, encoding="utf-8", newline="\n")
         for file, content in contents.items():
             if (folder / file).resolve() not in own:
                 (folder / file).write_bytes(content)

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
 
     table = load(args.result).predict(args.settings, seed=args.seed)
     try:
-        table.to_csv(args.out, index=False, float_format="%.6g")
+        table.to_csv(args.out, index=False, float_format="%.6g", lineterminator="\n")
     except OSError as error:
         raise InputError("--out must be writable", str(error.strerror), "name another file", args.out) from None
     say(f"wrote {args.out}: {len(table)} settings")

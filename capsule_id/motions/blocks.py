@@ -138,7 +138,7 @@ def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Seq
         return
     if any(store.iterdir()):
         raise InputError("a store is a new folder or one of this program", "it is neither", "name another one", store)
-    file.write_text(json.dumps(mine, indent=1), encoding="utf-8")
+    file.write_text(json.dumps(mine, indent=1), encoding="utf-8", newline="\n")
 
 
 def _file(store: Path, begin: int) -> Path:

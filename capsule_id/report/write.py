@@ -35,12 +35,12 @@ def write_result(result: Result, directory: Path) -> None:
     for picture in drawn:
         (figures / f"{picture.name}.png").write_bytes(picture.png)
     save(result, directory)
-    (directory / "report.html").write_text(render(result, drawn), encoding="utf-8")
+    (directory / "report.html").write_text(render(result, drawn), encoding="utf-8", newline="\n")
     if result.posterior is not None:
         write_posterior(result, directory / "posterior.nc")
     table_frame(result).to_csv(directory / "parameters.csv", lineterminator="\n")
     text = json.dumps(parameters_json(result), indent=1, ensure_ascii=False, allow_nan=False)
-    (directory / "parameters.json").write_text(text + "\n", encoding="utf-8")
+    (directory / "parameters.json").write_text(text + "\n", encoding="utf-8", newline="\n")
 
 
 def parameters_json(result: Result) -> dict[str, object]:

@@ -12,6 +12,7 @@ from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 NAME_PATTERN = r"[A-Za-z0-9._-]+"
+_DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 _LONGEST_SHOWN = 60  # characters of a faulty value in an error line
 
 
@@ -58,8 +59,11 @@ def read_bool(document: TomlDocument, path: KeyPath, value: object) -> bool:
 
 
 def read_name(document: TomlDocument, path: KeyPath, value: object) -> str:
-    """A name. ``.`` and ``..`` are refused, because results are written to a folder of that name."""
+    """A name. Results are written to a folder of that name; ``.``, ``..`` and the names of Windows' devices are refused."""
     name = read_string(document, path, value)
+    if _DEVICE.fullmatch(name):
+        rule = f"{path[-1]} must not be the name of a device of Windows"
+        raise document.error(path, rule, shown(name), f'write e.g. "{name.split(".")[0]}-1"')
     if not re.fullmatch(NAME_PATTERN, name) or not name.strip("."):
         rule = f"{path[-1]} must be a name of letters, digits, dot, underscore and hyphen"
         raise document.error(path, rule, shown(name), 'write e.g. "rig-1"')

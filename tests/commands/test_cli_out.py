@@ -73,6 +73,7 @@ def test_directories_that_are_refused(here: Path, capsys: pytest.CaptureFixture[
         ("taken", "a file or a link"),
         ("kept", "something else"),
         ("x.partial", "must not end"),
+        ("x.partial.lock", "must not end"),
         (".", "must have a name"),
         ("..", "must have a name"),
         ("", "must have a name"),
@@ -153,9 +154,10 @@ def test_one_run_at_a_time(here: Path) -> None:
         work_in_progress(here / "out", {}, resume=False),
     ):
         pass
-    holder = "import fcntl, os, sys\nfile = os.open(sys.argv[1], os.O_RDWR)\nfcntl.flock(file, fcntl.LOCK_EX)\n"
-    holder += "print('locked', flush=True)\nsys.stdin.read()\n"
-    command = [sys.executable, "-c", holder, str(here / "out.partial" / LOCK)]
+    holder = "import sys\nfrom pathlib import Path\nfrom capsule_id.output import work_in_progress\n"
+    holder += "with work_in_progress(Path(sys.argv[1]), {}, resume=False):\n"
+    holder += "    print('locked', flush=True)\n    sys.stdin.read()\n"
+    command = [sys.executable, "-c", holder, str(here / "out")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         # The other process holds the lock from here on.
         assert cast("IO[bytes]", other.stdout).readline() == b"locked\n"
@@ -164,7 +166,9 @@ def test_one_run_at_a_time(here: Path) -> None:
             assert fit_params(["rig", "--no-sample", "--out", "out", *more]) == 2
             assert listing(here) == before
         other.kill()
+    assert (here / f"out{LOCK}").exists()
     fake_run(here / "out")  # the lock died with its holder
+    assert {path.name for path in here.iterdir()} == {"rig", "out"}
 
 
 @pytest.mark.parametrize("damage", [None, "", "{", "[]", '{"fingerprint": 1}', "\udcff"])

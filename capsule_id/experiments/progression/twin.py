@@ -108,7 +108,7 @@ def synthesize_robot(
     columns = robot_progression(seed, design, truth)
     folder.mkdir(parents=True, exist_ok=True)
     lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))]
-    (folder / "progression.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "progression.csv").write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
     masses = {name: truth[name] * (1.0 + MASS_SD * rng.standard_normal()) for name in ("m1", "m2")}
     stated = "\n".join(
@@ -123,10 +123,10 @@ def synthesize_robot(
         P_on_sd=P_ON_SD,
         reading=1e3 * design.reading_sd,
     )
-    (folder / "rig.toml").write_text(text, encoding="utf-8")
+    (folder / "rig.toml").write_text(text, encoding="utf-8", newline="\n")
     beside = folder.resolve().with_name(folder.resolve().name + ".truth.json")
     known = {"seed": seed, "parameters": {**truth, "session_sd": design.session_sd}}
-    beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")
 
 
 RIG = """\
