@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from capsule_id.errors import InputError as InputError
     from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign
     from capsule_id.experiments.progression.twin import synthesize_robot as synthesize_robot
+    from capsule_id.importing.entry import propose_entry as propose_entry
     from capsule_id.motions.response import Response as Response
     from capsule_id.motions.response import Settling as Settling
     from capsule_id.motions.response import response as response
@@ -85,6 +86,7 @@ _MODULE_OF = {
     "InputError": "capsule_id.errors",
     "load": "capsule_id.api",
     "motion_map": "capsule_id.motions.sweep",
+    "propose_entry": "capsule_id.importing.entry",
     "Pulses": "capsule_id.physics.drives.pulses",
     "read_rig": "capsule_id.api",
     "RecordedDrive": "capsule_id.physics.drives.recorded",

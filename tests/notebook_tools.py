@@ -1,8 +1,11 @@
 """Reads, inspects and runs notebooks. Their tests are in two files, because a worker takes a whole file."""
 
+import ast
 import os
 import re
 import shutil
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import nbformat
@@ -10,6 +13,7 @@ import pytest
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
+import capsule_id as cid
 from tests.cli_tools import ROOT
 
 FOLDER = ROOT / "notebooks"
@@ -28,6 +32,9 @@ SHORT = {
     "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
     "08": "DRAWS, POINTS = 24, 16",
 }
+LONGEST_CELL = 25  # lines
+#: What notebooks import besides the standard library. Of this package they import its public names.
+LIBRARIES = {"numpy", "scipy", "pandas", "matplotlib.pyplot", "jax", "emcee", "arviz"}
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -54,6 +61,32 @@ def printed(notebook: NotebookNode) -> str:
 
 def ends_with_an_assertion(notebook: NotebookNode) -> bool:
     return bool(re.search(r"(?m)^assert ", code(notebook)[-1].source))
+
+
+def not_public(notebook: NotebookNode) -> list[str]:
+    """What the code takes from inside the package, or from a library that notebooks do not use."""
+    nodes = [node for cell in code(notebook) for node in ast.walk(ast.parse(cell.source))]
+    inside = {
+        f"cid.{node.attr}"
+        for node in nodes
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "cid"
+    }
+    own = {f"cid.{name}" for name in cid.__all__}
+    return sorted((inside - own) | {module for node in nodes for module in _modules(node) if not _allowed(module)})
+
+
+def _modules(node: ast.AST) -> Iterator[str]:
+    """The modules that an import statement names; ``capsule_id as cid`` with its new name."""
+    if isinstance(node, ast.Import):
+        yield from (f"{n.name} as {n.asname}" if n.name == "capsule_id" else n.name for n in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        yield str(node.module)
+
+
+def _allowed(module: str) -> bool:
+    """Whether a notebook may import it."""
+    first = module.split(".")[0]
+    return module == "capsule_id as cid" or first in sys.stdlib_module_names or bool({module, first} & LIBRARIES)
 
 
 def shorten(notebook: NotebookNode, values: str) -> None:

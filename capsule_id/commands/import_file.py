@@ -6,6 +6,7 @@ from pathlib import Path
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import default_registry
+from capsule_id.importing.entry import read_file
 from capsule_id.importing.report import clock_line, import_report
 
 
@@ -35,20 +36,3 @@ def run(args: argparse.Namespace) -> int:
         return 0
     say("\n".join(import_report(read_file(args.file), args.file, default_registry())))
     return 0
-
-
-def read_file(path: Path) -> bytes:
-    """The bytes of a regular file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
-    try:
-        if not path.is_file():
-            found = "a directory" if path.is_dir() else "no such file"
-            raise InputError("FILE must be a regular file", found, "correct the name", path)
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None

@@ -5,11 +5,10 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from capsule_id.commands.import_file import read_file
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry, default_registry
-from capsule_id.importing.entry import entry_of
+from capsule_id.importing.entry import entry_of, read_file
 from capsule_id.rig.toml_values import NAME_PATTERN
 
 # Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.

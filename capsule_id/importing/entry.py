@@ -9,6 +9,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
+from capsule_id.experiments.registry import default_registry
 from capsule_id.importing.guess import TIME, ColumnGuess, Guess, disordered_times, free_part, guess
 from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.filters import dominant_frequency
@@ -22,6 +23,37 @@ _LONGEST_HEADER = 40  # characters; a column with a longer header is named by it
 def dimensions_of(kinds: Mapping[str, Kind]) -> tuple[str, ...]:
     """The SI units of all columns of all kinds."""
     return tuple(sorted({rule.si for kind in kinds.values() for rule in kind.columns.values()}))
+
+
+def propose_entry(file: str | Path) -> str:
+    """The lines of ``rig.toml`` that read an export; a comment gives the confidence and the reason of each guess.
+
+    The lines name the file without its folder: put the file beside ``rig.toml``. ``capsule-id import`` prints them too.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    path = Path(file)
+    return entry_of(read_file(path), path, path.name, default_registry())[0]
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a regular file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        if not path.is_file():
+            found = "a directory" if path.is_dir() else "no such file"
+            raise InputError("FILE must be a regular file", found, "correct the name", path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None
 
 
 def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:

@@ -77,6 +77,22 @@ def test_the_release_is_proposed_where_a_record_rests_before_it(tmp_path: Path) 
     assert abs(float(start.split("value = ")[1].split(",")[0]) - 0.8) < 0.03
 
 
+def test_the_entry_in_python_is_the_one_that_the_command_prints(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export = EXPORTS[0]
+    (tmp_path / export.file).write_bytes(export.content)
+    entry = capsule_id.propose_entry(tmp_path / export.file)
+    assert cli.capsule_id(["import", str(tmp_path / export.file)]) == 0
+    assert capsys.readouterr().out.endswith(f"\n\n{entry}")
+    masses = '[rig]\nname = "a"\nm1 = { value = 110, unit = "g" }\n\n'
+    (tmp_path / "rig.toml").write_text(masses + entry, encoding="utf-8")
+    (table,) = capsule_id.read_rig(tmp_path).tables
+    assert all(_equal(table[name], true) for name, true in export.columns.items())
+    with pytest.raises(capsule_id.InputError, match="regular file"):
+        capsule_id.propose_entry(tmp_path / "absent.csv")
+
+
 def test_the_import_report_names_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     time = np.delete(np.arange(1200) * 1e-3, [300, 301, 302])
     x = np.round(np.minimum(3.6 * np.exp(-4.0 * time) * np.cos(113.0 * time), 2.5), 3)
