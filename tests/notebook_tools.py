@@ -23,7 +23,7 @@ EVEN = [name for name in NAMES if name not in ODD]
 SECONDS = 600  # of one cell
 #: Instead of the cell with the tag ``parameters``: the same study, smaller. Notebooks without such a cell run as they are.
 SHORT = {
-    "01": "RECORDS = 100",
+    "01": "RECORDS = 60",
     "02": "RECORDS = 60",
     "03": "STEPS = 1500",
     "04": "CALIBRATIONS = 1500",
