@@ -5,6 +5,7 @@ Experiments and checks make them with codes and numbers; the report adds the tex
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from string import Formatter
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -17,8 +18,24 @@ Level = Literal["ok", "warn", "fail"]
 Trust = Literal["trusted", "not judged", "not trusted"]
 #: What a check or a table has found, by name; quantities in the unit that the text prints.
 Facts = Mapping[str, Any]
-#: A format string over facts, or a function of them.
+#: A format string over facts, or a function of them. ``{rows:# row}`` writes a count: ``1 row``, ``2 rows``.
 Text = str | Callable[[Facts], str]
+
+
+def counted(number: int, noun: str) -> str:
+    """``1 row``, ``2 rows``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+class _Texts(Formatter):
+    """Fills in facts; the format ``# noun`` writes a count."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """The text of one fact."""
+        return counted(value, format_spec[2:]) if format_spec.startswith("# ") else format(value, format_spec)
+
+
+_TEXTS = _Texts()
 
 
 @dataclass(frozen=True)
@@ -79,7 +96,7 @@ class Message:
             If a function returns no string.
         """
         text: Text = getattr(self, part)
-        filled_in = text.format_map(facts) if isinstance(text, str) else text(facts)
+        filled_in = _TEXTS.vformat(text, (), facts) if isinstance(text, str) else text(facts)
         if not isinstance(filled_in, str):
             raise TypeError(f"the text must be a string, found {filled_in!r}")
         return filled_in

@@ -13,7 +13,7 @@ from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
-from capsule_id.views import Finding
+from capsule_id.views import Finding, counted
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """
     kinds = default_registry()
     rig = read_rig(args.data, kinds)
-    lines = [f"{rig.name}: {_number(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}"]
+    lines = [f"{rig.name}: {counted(len(rig.tables), 'experiment')}{', SYNTHETIC data' if rig.synthetic else ''}"]
     lines += [_summary(table) for table in rig.tables]
     lines += [f"{table.label}: {line}" for table in rig.tables for line in kinds[table.kind].describe(table)]
     findings = (*lint(rig, kinds, rig.tables), *lint_settings(rig, kinds, rough_values(rig, kinds)))
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     lines += [f"{finding.level}: {finding_text(finding, messages)}" for finding in findings]
     if args.figures is not None:
         lines += _draw(rig, findings, args.figures)
-    say("\n".join([*lines, _number(len(findings), "finding")]))
+    say("\n".join([*lines, counted(len(findings), "finding") if findings else "no findings"]))
     return 0
 
 
@@ -67,17 +67,12 @@ def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
     return [f"figures: {len(rig.tables)} in {folder}"]
 
 
-def _number(count: int, what: str) -> str:
-    """``no findings``, ``1 finding``, ``2 findings``."""
-    return f"{count or 'no'} {what}{'' if count == 1 else 's'}"
-
-
 def _summary(table: Table) -> str:
     """Kind, label, rows, columns and sampling of one experiment."""
     columns = ", ".join(f"{column.name} [{column.unit}]" for column in table.columns.values())
-    text = f"{table.kind} {table.label}: {len(table.rows)} rows of {columns}"
+    text = f"{table.kind} {table.label}: {counted(len(table.rows), 'row')} of {columns}"
     dropped = [
-        f"{number} rows {why}"
+        f"{counted(number, 'row')} {why}"
         for number, why in (
             (table.other, "outside where"),
             (table.missing, "with a missing reading"),

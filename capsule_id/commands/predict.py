@@ -6,6 +6,7 @@ from pathlib import Path
 from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.console import say
 from capsule_id.errors import InputError
+from capsule_id.views import counted
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,5 +40,5 @@ def run(args: argparse.Namespace) -> int:
         table.to_csv(args.out, index=False, float_format="%.6g", lineterminator="\n")
     except OSError as error:
         raise InputError("--out must be writable", str(error.strerror), "name another file", args.out) from None
-    say(f"wrote {args.out}: {len(table)} settings")
+    say(f"wrote {args.out}: {counted(len(table), 'setting')}")
     return 0

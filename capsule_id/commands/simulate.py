@@ -15,6 +15,7 @@ from capsule_id.commands.capsule_options import (
 )
 from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
 from capsule_id.errors import InputError
+from capsule_id.views import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -94,7 +95,9 @@ def run(args: argparse.Namespace) -> int:
             _draw(args.figure, t, np.isin(times, section), values["G"])
     except OSError as error:
         raise InputError("the output must be writable", str(error), "choose another name") from None
-    print(f"wrote {args.out}: {samples} samples of {end:g} s, {int(t.contacts)} contacts, {int(t.events)} events")
+    numbers = (samples, "sample"), (int(t.contacts), "contact"), (int(t.events), "event")
+    counts = [counted(number, noun) for number, noun in numbers]
+    print(f"wrote {args.out}: {counts[0]} of {end:g} s, {counts[1]}, {counts[2]}")
     return 0
 
 

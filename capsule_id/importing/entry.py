@@ -15,6 +15,7 @@ from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
 from capsule_id.rig.units import factor_to_si, scale
+from capsule_id.views import counted
 
 _SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
 _LONGEST_HEADER = 40  # characters; a column with a longer header is named by its number
@@ -110,7 +111,7 @@ def _commented(line: str, confidence: str, reason: str) -> str:
 def _description(found: FoundLayout, content: bytes) -> str:
     """Rows and separator of a file in words."""
     rows = len(found.export.lines)
-    text = f"{rows} rows"
+    text = counted(rows, "row")
     if found.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
         return text
     line = content.decode("utf-8-sig", "replace").replace("\r\n", "\n").split("\n")[int(found.export.lines[0]) - 1]

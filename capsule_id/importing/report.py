@@ -16,6 +16,7 @@ from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples
 from capsule_id.rig.units import factor_to_si, scale
+from capsule_id.views import counted
 
 _SHOWN_ROWS = 3
 _SHOWN_COLUMNS = 20
@@ -32,7 +33,8 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     dimensions = dimensions_of(kinds)
     found = find_layout(content, path, dimensions)
     rows = len(next(iter(found.columns.values())))
-    lines = [f"{path.name}: {rows} rows of {found.export.width} columns, {len(found.columns)} with numbers"]
+    size = f"{counted(rows, 'row')} of {counted(found.export.width, 'column')}"
+    lines = [f"{path.name}: {size}, {len(found.columns)} with numbers"]
     guessed = guess(found, kinds)
     time = None
     if guessed is not None and TIME in guessed.columns:
@@ -44,7 +46,7 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     for index in list(found.columns)[:_SHOWN_COLUMNS]:
         lines += _channel(found, index, dimensions, time is not None)
     if len(found.columns) > _SHOWN_COLUMNS:
-        lines.append(f"{len(found.columns) - _SHOWN_COLUMNS} more columns")
+        lines.append(counted(len(found.columns) - _SHOWN_COLUMNS, "more column"))
     lines += _rows(found, rows)
     text, _ = entry_of(content, path, path.name, kinds)
     return [*lines, "", text.rstrip()]
@@ -88,7 +90,7 @@ def _sampling(time: np.ndarray) -> Iterable[str]:
     """Rate, jitter and gaps of the times, (n,) s."""
     steps = np.diff(time)
     if len(steps) < 2 or not np.all(steps > 0.0):
-        yield f"sampling: the times do not increase at {int(np.sum(steps <= 0.0))} rows"
+        yield f"sampling: the times do not increase at {counted(int(np.sum(steps <= 0.0)), 'row')}"
         return
     step = float(np.median(steps))
     jitter = float(np.sqrt(np.mean((steps[steps < 1.5 * step] / step - 1.0) ** 2)))
@@ -96,7 +98,7 @@ def _sampling(time: np.ndarray) -> Iterable[str]:
     gaps = find_gaps(time)
     if gaps is not None:
         first = time[gaps.rows[0]]
-        yield f"gaps: {len(gaps.rows)}, {int(gaps.lost.sum())} samples lost, the first after {first:.6g} s"
+        yield f"gaps: {len(gaps.rows)}, {counted(int(gaps.lost.sum()), 'sample')} lost, the first after {first:.6g} s"
 
 
 def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record: bool) -> Iterable[str]:
@@ -112,10 +114,10 @@ def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record
     faults = []
     if record and len(values) > 2 and np.ptp(values) > 0.0:
         for clipped in clipped_samples(values, np.inf):
-            faults.append(f"{len(clipped.rows)} samples clipped at {clipped.level:g}")
-        for what, rows in (("drop-outs", dropouts(values)), ("samples of a frozen sensor", frozen_samples(values))):
+            faults.append(f"{counted(len(clipped.rows), 'sample')} clipped at {clipped.level:g}")
+        for what, rows in (("drop-out", dropouts(values)), ("frozen sample", frozen_samples(values))):
             if len(rows):
-                faults.append(f"{len(rows)} {what}, the first in line {found.export.lines[rows[0]]}")
+                faults.append(f"{counted(len(rows), what)}, the first in line {found.export.lines[rows[0]]}")
     yield "; ".join([line, *faults])
 
 

@@ -18,7 +18,7 @@ from capsule_id.report.figures.runs import force_on_rod, run_overview
 from capsule_id.report.figures.style import figure_of, mark, png
 from capsule_id.report.figures.traces import traces
 from capsule_id.report.sampled_parameters import sampled_parameters
-from capsule_id.views import Comparison
+from capsule_id.views import Comparison, counted
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 # Wider than this (CSS pixels) does not go in pairs.
@@ -76,15 +76,16 @@ def pictures(result: Result) -> tuple[Picture, ...]:
     if result.posterior is not None:
         corner_caption = "Posterior of the physical parameters: histograms, and contours of every pair."
         ensembles = len(result.posterior.draws)
-        trace_caption = f"A few walkers of each ensemble, one colour per ensemble ({ensembles} ensembles)."
+        trace_caption = f"A few walkers of each ensemble, one colour per ensemble ({counted(ensembles, 'ensemble')})."
         drawing = Drawing("corner", "sample", "Corner plot", corner_caption, _corner_alt(result))
         drawn.append(drawing.on(result, figure_of(corner(result))))
-        worst = f"{ensembles} ensembles; the largest split R-hat is {max(result.posterior.rhat):.4f}."
+        worst = f"{counted(ensembles, 'ensemble')}; the largest split R-hat is {max(result.posterior.rhat):.4f}."
         drawing = Drawing("traces", "sample", "Traces", trace_caption, f"Traces of every physical parameter, {worst}")
         drawn.append(drawing.on(result, figure_of(traces(result))))
     fit = result.point_fit
     starts_caption = "Where each start began and where it ended, in standard deviations of the Laplace approximation."
-    starts_alt = f"{len(fit.starts)} starts; {int(fit.at_other_maximum.sum())} ended at another maximum than the best."
+    ended = int(fit.at_other_maximum.sum())
+    starts_alt = f"{counted(len(fit.starts), 'start')}; {ended} ended at another maximum than the best."
     drawing = Drawing("point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts_alt)
     return (*drawn, drawing.on(result, figure_of(figures.point_fit_starts(fit))))
 
@@ -131,7 +132,7 @@ def comparison_alt(item: Comparison) -> str:
     parts = [f"{item.y_label} against {item.x_label}"]
     if readings:
         x = np.concatenate([points.x for points in readings])
-        parts.append(f"{x.size} readings from {np.nanmin(x):.3g} to {np.nanmax(x):.3g}")
+        parts.append(f"{counted(x.size, 'reading')} from {np.nanmin(x):.3g} to {np.nanmax(x):.3g}")
     parts.append(f"curves: {', '.join(curve.label for curve in item.curves)}" if item.curves else "no curve")
     if item.residuals is not None and item.residuals.size:
         size = np.abs(item.residuals)
@@ -147,7 +148,7 @@ def _corner_alt(result: Result) -> str:
     columns = sampled_parameters(result)
     names, flat = columns.names, columns.draws.reshape(-1, len(columns.names))
     if len(names) < 2 or not np.all(np.std(flat, axis=0) > 0.0):
-        return f"Histograms of {len(names)} parameters."
+        return f"Histograms of {counted(len(names), 'parameter')}."
     correlation = np.triu(np.corrcoef(flat.T), 1)
     i, j = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
     strongest = f"strongest correlation {correlation[i, j]:.2f}, of {names[i]} with {names[j]}"

@@ -37,5 +37,7 @@ NOT_NEGATIVE = Domain("be 0 or greater", low=0.0, low_allowed=True)
 #: A share, both ends included: the bound lies a rounding error of unit conversion above 1.
 SHARE = Domain("lie between 0 and 100 %", low=0.0, high=1.0 + 1e-12, low_allowed=True)
 ABOVE_ONE = Domain("be greater than 1", low=1.0)
+#: A number of drive periods; the simulation of more takes minutes for each trial.
+PERIODS = Domain("lie between 1 and 100000", low=1.0, high=1e5 + 0.5, low_allowed=True)
 INCLINE = Domain("lie between -90 and 90 deg", low=-pi / 2, high=pi / 2)
 SLOPE_ANGLE = Domain("lie between 0 and 90 deg", low=0.0, high=pi / 2)

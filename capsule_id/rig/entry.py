@@ -9,6 +9,7 @@ from capsule_id.rig.model import S, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.rig.tables import TableFile
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
+from capsule_id.views import counted
 
 
 @dataclass(frozen=True)
@@ -72,4 +73,4 @@ class Entry(Generic[S]):
         if samples < SHORTEST_RECORD:
             rule = f"a record must have at least {SHORTEST_RECORD} samples"
             remedy = f"record {self.table.kind} for longer or faster"
-            raise self.file.error(samples - 1, "time", rule, f"{samples} samples", remedy)
+            raise self.file.error(samples - 1, "time", rule, counted(samples, "sample"), remedy)

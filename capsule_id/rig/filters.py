@@ -13,6 +13,7 @@ from jaxtyping import Float, Num
 from numpy.polynomial import legendre
 
 from capsule_id.errors import InputError
+from capsule_id.views import counted
 
 #: Samples of one channel, or their times.
 Record = Num[np.ndarray, " n"]
@@ -190,12 +191,12 @@ def _least_squares(samples: int, order: int, derivative: int) -> tuple[np.ndarra
 def _check_window(samples: int, order: int, available: int) -> None:
     """Refuse a window with no more samples than ``order``, or longer than the record."""
     if samples <= order:
-        value = f"{samples} samples for order {order}"
+        value = f"{counted(samples, 'sample')} for order {order}"
         raise InputError(
             "the window must hold more samples than the order", value, "widen the window or lower the order"
         )
     if samples > available:
-        value = f"{samples} samples of {available}"
+        value = f"{counted(samples, 'sample')} of {available}"
         raise InputError("the window must fit into the record", value, "shorten the window")
 
 

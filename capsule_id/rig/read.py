@@ -170,12 +170,13 @@ def _read_experiments(
         raise document.error(("experiment",), "a rig must have at least one [[experiment]]", shown(entries), remedy)
     tables: list[Table] = []
     files: dict[str, str] = {}
+    labels = _default_labels(entries)
     for index, entry in enumerate(entries):
         stop_if_interrupted()
         path: KeyPath = ("experiment", index)
         with collecting(faults):
             read_table(document, path, entry, "[[experiment]]")
-            table, sha256 = _read_experiment(document, path, entry, kinds, ground)
+            table, sha256 = _read_experiment(document, path, entry, kinds, ground, labels[index])
             for other in tables:
                 if other.label == table.label:
                     place = next(key for key in ("label", "file", "files") if key in entry)
@@ -186,14 +187,27 @@ def _read_experiments(
     return tuple(tables), files
 
 
+def _default_labels(entries: Sequence[Any]) -> list[str]:
+    """The name of the first file of each entry, with its folders where several folders have a file of that name."""
+    paths = []
+    for entry in entries:
+        stated = {} if not isinstance(entry, dict) or "label" in entry else entry
+        files = stated.get("files")
+        name = files[0] if isinstance(files, list) and files else stated.get("file")
+        paths.append(Path(name) if isinstance(name, str) else Path())
+    folders = {path.stem: {other.parent for other in paths if other.stem == path.stem} for path in paths}
+    return ["_".join((*path.parent.parts, path.stem)) if len(folders[path.stem]) > 1 else path.stem for path in paths]
+
+
 def _read_experiment(
     document: TomlDocument,
     path: KeyPath,
     entry: dict[str, Any],
     kinds: Mapping[str, KindRule],
     ground: Mapping[str, float],
+    label: str,
 ) -> tuple[Table, Mapping[str, str]]:
-    """One entry with its table, and the sha256 of its files."""
+    """One entry with its table, and the sha256 of its files; ``label`` where the entry states none."""
     if "kind" not in entry:
         raise document.error(path, "an experiment must have a kind", "none", 'add kind = "..."')
     word = read_string(document, (*path, "kind"), entry["kind"])
@@ -207,7 +221,7 @@ def _read_experiment(
     settings = _read_settings(document, path, entry, kind, ground)
     file = read_experiment_files(document, path, entry, kind)
     name = next(iter(file.sha256))
-    label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else Path(name).stem
+    label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else label
     columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
     _refuse_reading_errors_without_column(document, path, entry, errors, file)
     dropped = file.missing, file.other, file.rejected

@@ -136,7 +136,7 @@ def test_lint(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     rows = '[rig]\nname = "a"\n[[experiment]]\nkind = "motor_current"\nfile = "motor_current.csv"\n'
     found = findings(write_folder(tmp_path / "rig", rows), capsys)
     assert found == [
-        "motor_current: 3 rows are too few to estimate the scatter; 5 are wanted. Measure more rows.",
+        "motor_current: too few rows to estimate the scatter: 3 instead of 5. Measure more rows.",
         "motor_current: no reading error is stated for force and current. Add force_sd to the experiment.",
     ]
     twice = rows + '[[experiment]]\nkind = "motor_current"\nfile = "copy.csv"\n'

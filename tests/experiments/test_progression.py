@@ -126,14 +126,28 @@ def test_the_discrepancy_is_compared_with_scatter_and_motion(folder: Path, relat
     assert 0.01 * 1e3 * rms < finding.facts["scatter"] < 0.2 * 1e3 * rms
 
 
-def test_parts_of_periods_are_refused(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("periods", "rule", "value"),
+    [
+        ("66.5", "be a whole number", "66.5"),
+        ("1e9", "lie between 1 and 100000", r"1e\+09 1"),
+        ("100001", "lie between 1 and 100000", "100001 1"),
+        ("0", "lie between 1 and 100000", "0 1"),
+    ],
+)
+def test_periods_that_no_trial_has_are_refused(
+    folder: Path, tmp_path: Path, periods: str, rule: str, value: str
+) -> None:
     (tmp_path / "rig.toml").write_text((folder / "rig.toml").read_text())
     lines = (folder / "progression.csv").read_text().splitlines()
     cells = lines[1].split(",")
-    lines[1] = ",".join([*cells[:2], "66.5", *cells[3:]])
+    lines[1] = ",".join([*cells[:2], periods, *cells[3:]])
     (tmp_path / "progression.csv").write_text("\n".join(lines) + "\n")
-    with pytest.raises(InputError, match=r"progression.csv:2:.*periods must be a whole number, 66.5"):
+    with pytest.raises(InputError, match=rf"progression.csv:2:.*periods must {rule}, {value}, "):
         read_rig(tmp_path)
+    lines[1] = ",".join([*cells[:2], "100000", *cells[3:]])
+    (tmp_path / "progression.csv").write_text("\n".join(lines) + "\n")
+    read_rig(tmp_path)
 
 
 def test_a_duty_in_per_cent_under_a_header_without_unit_is_refused(folder: Path, tmp_path: Path) -> None:

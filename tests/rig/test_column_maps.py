@@ -141,7 +141,7 @@ def test_rows_with_a_missing_reading_are_refused_or_counted(tmp_path: Path, caps
     assert cli.capsule_id(["check", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "(2 rows with a missing reading not used)" in out
-    assert "2 rows with a missing reading are dropped, 10 are used" in out
+    assert "the fit drops 2 rows with a missing reading and uses 10" in out
 
 
 def test_a_missing_reading_keeps_the_times_of_a_stated_rate(tmp_path: Path) -> None:

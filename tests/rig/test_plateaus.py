@@ -102,6 +102,25 @@ def test_remedies_of_plateaus_work(tmp_path: Path) -> None:
         rig_of(tmp_path, text, COLUMNS, re.sub(r"\[.*\]", '"0 to 40"', PLATEAUS))
 
 
+@pytest.mark.parametrize("levels", [[0.0, 10.0, 20.0, 30.0, 40.0, 25.0, 15.0, 5.0, 0.0], [0.0, 5.0, 15.0, 40.0]])
+def test_levels_in_reverse_order_are_named(tmp_path: Path, levels: list[float]) -> None:
+    time = np.arange(100 * len(levels)) * 0.1
+    noise = NOISE * np.random.default_rng(6).standard_normal(len(time))
+    reading = np.round(OFFSET + SENSITIVITY * np.repeat(levels, 100) + noise)
+    text = "".join(f"{1e3 * t:.0f},{value:.0f}\n" for t, value in zip(time, reading, strict=True))
+    stated = f'plateaus = {{ levels = {levels[::-1]}, unit = "lbf", guard = "2 s" }}'
+    with pytest.raises(InputError, match=r"rig\.toml:7:\d+: the levels must stand in the order of time") as caught:
+        rig_of(tmp_path, text, COLUMNS, stated)
+    assert "reverse the levels" in caught.value.remedy
+    right = rig_of(tmp_path, text, COLUMNS, stated.replace(str(levels[::-1]), str(levels)))
+    assert slope(right)[0] == pytest.approx(SENSITIVITY / LBF, rel=1e-2)
+    # A sensor of the other sign.
+    mirrored = "".join(f"{1e3 * t:.0f},{-value:.0f}\n" for t, value in zip(time, reading, strict=True))
+    forward = stated.replace(str(levels[::-1]), str(levels))
+    turned = rig_of(tmp_path, mirrored, COLUMNS.replace('unit = "1"', 'unit = "1", scale = -1'), forward)
+    assert slope(turned)[0] == pytest.approx(SENSITIVITY / LBF, rel=1e-2)
+
+
 def test_outliers_of_a_record_are_dropped_by_the_rule_and_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -120,7 +139,7 @@ def test_outliers_of_a_record_are_dropped_by_the_rule_and_counted(
     assert cli.capsule_id(["check", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "2 rows with an outlier not used" in out
-    assert "2 rows are dropped as outliers by the rule reject, 398 are used" in out
+    assert "the rule reject drops 2 rows as outliers, the fit uses 398" in out
     for wrong, part in (
         ('{ rule = "hampel", window = "20 ms" }', "must have a n_sd"),
         ('{ rule = "grubbs", window = "20 ms", n_sd = 5 }', 'rule must be "hampel"'),

@@ -33,7 +33,7 @@ def test_round_trip(delimiter: str, decimal: str, ending: str, mark: str, column
     rows = [delimiter.join(repr(float(cell)).replace(".", decimal) for cell in row) for row in values]
     if columns == 1 and decimal == ",":
         # A single header gives no evidence of semicolons: the comma separates cells.
-        with pytest.raises(InputError, match="a row must have 1 cells"):
+        with pytest.raises(InputError, match="a row must have 1 cell"):
             read_csv(ending.join([mark + header, *rows]).encode(), Path("t.csv"))
         return
     table = read_csv(ending.join([mark + header, *rows, "", "  ", ""]).encode(), Path("t.csv"))

@@ -165,6 +165,25 @@ def test_a_link_inside_the_folder_and_an_upper_case_suffix_are_fine(tmp_path: Pa
     assert read_rig(folder).tables[1].label == "link"
 
 
+def test_files_of_one_name_in_several_folders_have_labels_of_their_own(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text('[rig]\nname = "r"\n', encoding="utf-8")
+    names = ["monday/tilt.csv", "tuesday/late/tilt.csv", "slow.csv"]
+    with (tmp_path / "rig.toml").open("a", encoding="utf-8") as file:
+        for number, name in enumerate(names):
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(f"angle [deg]\n{30 + number}\n31\n", encoding="utf-8")
+            file.write(f'[[experiment]]\nkind = "static_friction"\nfile = "{name}"\n')
+    rig = read_rig(tmp_path)
+    assert [table.label for table in rig.tables] == ["monday_tilt", "tuesday_late_tilt", "slow"]
+    text = (tmp_path / "rig.toml").read_text(encoding="utf-8")
+    stated = text.replace('monday/tilt.csv"', 'monday/tilt.csv"\nlabel = "first"')
+    (tmp_path / "rig.toml").write_text(stated, encoding="utf-8")
+    assert [table.label for table in read_rig(tmp_path).tables] == ["first", "tilt", "slow"]
+    (tmp_path / "rig.toml").write_text(text + '[[experiment]]\nkind = "static_friction"\nfiles = 5\n', encoding="utf-8")
+    with pytest.raises(InputError, match="files must be a list of files"):
+        read_rig(tmp_path)
+
+
 def test_the_same_file_may_be_used_under_two_labels(tmp_path: Path) -> None:
     twice = '\n[[experiment]]\nkind = "static_friction"\nfile = "static_friction.csv"\n'
     with pytest.raises(InputError, match="labels must be unique"):

@@ -25,6 +25,7 @@ from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.rig.units import UnitError, factor_to_si
+from capsule_id.views import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -305,5 +306,5 @@ def _summary_text(data: "xr.Dataset", axes: Sequence[Axis], out: Path) -> str:
         return f"{found}{middle:.3g} mm/s (95 %: {low:.3g} to {high:.3g})\nwrote {out} and {out.with_suffix('.png')}"
     label = data["label"].to_numpy().ravel()
     failed, kinds = int((label == "failed").sum()), len(set(label.tolist()) - {"failed"})
-    failures = f", {failed} runs failed (see status)" if failed else ""
-    return f"{label.size} motions of {kinds} kinds{failures}\nwrote {out} and {out.with_suffix('.png')}"
+    failures = f", {counted(failed, 'run')} failed (see status)" if failed else ""
+    return f"{counted(label.size, 'motion')} of {counted(kinds, 'kind')}{failures}\nwrote {out} and {out.with_suffix('.png')}"

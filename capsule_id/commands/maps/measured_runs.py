@@ -14,6 +14,7 @@ from capsule_id.records.stated_settings import stated_gap, stated_Omega
 from capsule_id.records.tone import recorded_drive
 from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.views import counted
 
 #: A setting agrees with the diagram within this relative difference, or within this many of its own sds.
 RELATIVE_TOLERANCE: Mapping[str, float] = {"k2": 0.05, "G": 0.05, "P_d": 0.05, "Omega": 0.005}
@@ -37,7 +38,7 @@ class Overlay:
 
     def sentence(self) -> str:
         """Number of shown runs, and the other runs with reasons, in one line."""
-        count = f"{len(self.motions)} of {len(self.motions) + len(self.left_out)} measured runs overlaid"
+        count = f"{len(self.motions)} of {counted(len(self.motions) + len(self.left_out), 'measured run')} overlaid"
         return f"{count}; omitted: {'; '.join(self.left_out)}" if self.left_out else count
 
 

@@ -10,7 +10,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Values
 from capsule_id.rig.model import Table
 from capsule_id.rig.schema import GroundSettings
-from capsule_id.views import Message
+from capsule_id.views import Message, counted
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.friction_experiment import FrictionExperiment
@@ -105,4 +105,4 @@ def check_scatter(tables: Sequence[Table[Any]]) -> None:
     if not any(column.reading_sd > 0.0 for table in tables for column in table.columns.values()):
         name = next(iter(tables[0].columns))
         rule = f"{tables[0].kind} readings that are all the same need their reading step"
-        raise InputError(rule, f"{len(rows)} rows", f"state {name}_resolution", tables[0].file)
+        raise InputError(rule, counted(len(rows), "row"), f"state {name}_resolution", tables[0].file)

@@ -111,7 +111,7 @@ class FrictionModel:
             raise InputError(rule, str(error), "give every field a row with the field's name as its symbol") from None
         if len(leaves) != len(law.parameters) or any(isinstance(leaf, law) for leaf in leaves):
             rule = f"the friction law {law.__name__} must be a pytree whose leaves are its parameters"
-            raise InputError(rule, f"{len(leaves)} leaves", "add @jax.tree_util.register_dataclass above @dataclass")
+            raise InputError(rule, f"leaves: {len(leaves)}", "add @jax.tree_util.register_dataclass above @dataclass")
 
     @property
     def name(self) -> str:

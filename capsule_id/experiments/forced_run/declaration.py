@@ -203,7 +203,7 @@ MESSAGES = {
     ),
     "runs.predictable": Message(
         "runs predictable",
-        ok="an error of the initial state grows less than {limit:g} times in each of {number} runs",
+        ok="an error of the initial state grows less than {limit:g} times in {number:# run}",
         fail=(
             "expected a motion that forgets its start; an error of the initial state grows {growth:.2g} times over the record, "
             "so one initial state cannot predict it. State segment, or record less of it."

@@ -17,7 +17,7 @@ from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
-from capsule_id.views import Finding, Message
+from capsule_id.views import Finding, Message, counted
 
 #: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
@@ -141,7 +141,7 @@ def check_thin(entry: Entry[DecaySettings]) -> None:
     if thin > most:
         rule = f"thin must leave {SHORTEST_RECORD} means of the record and {FEWEST_MEANS} means in a period"
         remedy = f"write thin = {most} or less" if most > 1 else "remove thin"
-        raise entry.error("thin", rule, f"{thin} of {len(time)} samples", remedy)
+        raise entry.error("thin", rule, f"{thin} of {counted(len(time), 'sample')}", remedy)
 
 
 def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:

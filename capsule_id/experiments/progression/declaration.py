@@ -8,7 +8,7 @@ import numpy as np
 
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, scatter
-from capsule_id.rig.domains import ANY, NOT_NEGATIVE, POSITIVE, SHARE
+from capsule_id.rig.domains import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings, QuantityRule
@@ -122,7 +122,7 @@ MESSAGES = {
     ),
     "progression.settings": Message(
         "settings",
-        warn="{settings} settings of the drive, and {wanted} or more are wanted to test the model: vary period or duty",
+        warn="{settings:# setting} of the drive, and {wanted} or more are wanted to test the model: vary period or duty",
     ),
 }
 
@@ -135,7 +135,7 @@ KIND = Kind(
         "P_on": ColumnRule("N"),
         "P_d": ColumnRule("N"),
         "current": ColumnRule("A"),
-        "periods": ColumnRule("1", POSITIVE, usual=(1.0, 1e4)),
+        "periods": ColumnRule("1", PERIODS, usual=(1.0, 1e4)),
         "distance": ColumnRule("m"),
         "session": ColumnRule("1", usual=(1.0, 1e9)),
     },

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capsule_id.errors import InputError
+from capsule_id.views import counted
 
 #: Derivatives of n residuals with respect to d parameters.
 Jacobian = Float[np.ndarray, "n d"]
@@ -62,7 +63,7 @@ def covariance(jacobian: Jacobian, residuals: Residuals, residual_sd: float | No
         if count <= parameters:
             raise InputError(
                 "the residual sd can be estimated only from more residuals than parameters",
-                f"{count} residuals for {parameters} parameters",
+                f"{counted(count, 'residual')} for {counted(parameters, 'parameter')}",
                 "give the sd of the measurements or more measurements",
             )
         residual_sd = float(np.sqrt(residuals @ residuals / (count - parameters)))

@@ -27,6 +27,7 @@ from capsule_id.inference.fit.point_fit import AGREEMENT
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.interruption import stop_if_interrupted
+from capsule_id.views import counted
 
 #: Tolerance, dimensionless, and largest number of solver steps of one descent.
 SOLVER = Solver(tolerance=1e-7, max_steps=80, normal_equations=True, heavy=True)
@@ -96,7 +97,7 @@ def joint_fit(
     if not np.isfinite(value[best]):
         raise InputError(
             "bench and runs are fitted from a start at which every motion is finite",
-            f"none of {len(starts)} starts leads to one",
+            f"none in {counted(len(starts), 'start')}",
             "check masses, gaps and settings of the runs, and fit the bench alone (--experiments bench)",
         )
     fit, located = ends[best].fit, target.located

@@ -8,7 +8,7 @@ import numpy as np
 from capsule_id.inference.result import Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report.texts.messages import finding_text, messages_of
-from capsule_id.views import Finding
+from capsule_id.views import Finding, counted
 
 #: Weighed constants: more tests do not narrow them.
 _WEIGHED = ("m1", "m2")
@@ -55,9 +55,8 @@ def _widest(result: Result) -> Iterator[tuple[str, str]]:
     if largest == 0.0:
         return
     name = str(relative.idxmax())
-    readings = [
-        f"{table.label} ({len(table.rows)} rows)" for table in result.rig.tables if table.kind in _kinds(result, name)
-    ]
+    tables = [table for table in result.rig.tables if table.kind in _kinds(result, name)]
+    readings = [f"{table.label} ({counted(len(table.rows), 'row')})" for table in tables]
     source = f" It rests on {', '.join(readings)}." if readings else ""
     sentence = f"{name} has the largest relative sd, {100.0 * largest:.2g} %.{source}"
     yield f"Narrow {name}", f"{sentence} Four times as many independent readings halve the sd."

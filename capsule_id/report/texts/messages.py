@@ -7,7 +7,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
 from capsule_id.report.texts.posterior import POSTERIOR_MESSAGES, stated_p
 from capsule_id.report.texts.readings import DATA_MESSAGES
-from capsule_id.views import Facts, Finding, Level, Message, ResultTable
+from capsule_id.views import Facts, Finding, Level, Message, ResultTable, counted
 
 #: Errors of a text that does not match its facts.
 TEXT_ERRORS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
@@ -133,8 +133,8 @@ def _largest_disagreement(facts: Facts) -> str:
     (name, sd, p), *_ = facts["distances"]
     judge = " by the bench's sample" if facts["sampled"] else ""
     return (
-        f"largest disagreement in {name} ({sd:+.1f} sd of the curvature, {stated_p(p)}{judge} over {facts['shared']} shared "
-        "parameters)"
+        f"largest disagreement in {name} ({sd:+.1f} sd of the curvature, {stated_p(p)}{judge} over "
+        f"{counted(facts['shared'], 'shared parameter')})"
     )
 
 
@@ -152,12 +152,12 @@ FIT_MESSAGES: Mapping[str, Message] = {
     **POSTERIOR_MESSAGES,
     "residuals.white": Message(
         "residuals white",
-        ok="residuals of {records} records are white (Ljung–Box, {lags} lags)",
+        ok="residuals of {records:# record} are white (Ljung–Box, {lags} lags)",
         fail=_coloured_residuals,
     ),
     "trials.order": Message(
         "order of trials",
-        ok="residuals of neighbouring rows are uncorrelated in {number} tables",
+        ok="residuals of neighbouring rows are uncorrelated in {number:# table}",
         fail=(
             "expected residuals without order; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
             "(p = {p:.1g}). The trials drift or come in sessions, and the sd is too small by a factor of about {factor:.1f}. "
@@ -166,7 +166,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
     ),
     "residuals.statistics": Message(
         "residuals like noise",
-        ok="runs of signs, largest residual and trend of {number} bench tests are those of noise",
+        ok="runs of signs, largest residual and trend of {number:# bench test} are those of noise",
         warn=(
             "expected residuals like those of noise through the same fit; their {statistic} is too large (p = {p:.1g}). A "
             "fitted scatter cannot absorb this. Look at the residuals: a bend, a wrong model or a wrong reading."
@@ -195,8 +195,9 @@ FIT_MESSAGES: Mapping[str, Message] = {
     "bench_and_runs.estimates": Message(
         "bench and runs agree",
         warn=lambda facts: (
-            f"expected finite estimates of all {facts['shared']} shared parameters from bench and runs; there is none of "
-            f"{', '.join(facts['missing'])}, so nothing was compared. Look at what the records and tests determine."
+            f"expected finite estimates of {counted(facts['shared'], 'shared parameter')} from bench and runs; "
+            f"there is none of {', '.join(facts['missing'])}, so nothing was compared. "
+            "Look at what the records and tests determine."
         ),
     ),
     "runs.precision": Message(

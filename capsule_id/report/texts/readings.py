@@ -20,20 +20,20 @@ DATA_MESSAGES: Mapping[str, Message] = {
     ),
     "readings.few": Message(
         "number of readings",
-        warn="{rows} rows are too few to estimate the scatter; {wanted} are wanted. Measure more rows.",
+        warn="too few rows to estimate the scatter: {rows} instead of {wanted}. Measure more rows.",
     ),
     "readings.missing": Message(
         "missing readings",
         warn=(
-            "{file}: {rows} rows with a missing reading are dropped, {used} are used. Check that the losses do not depend on "
+            "{file}: the fit drops {rows:# row} with a missing reading and uses {used}. Check that the losses do not depend on "
             "the reading."
         ),
     ),
     "readings.rejected": Message(
         "outliers",
         warn=(
-            "{file}: {rows} rows are dropped as outliers by the rule reject, {used} are used. Check with --figures that no "
-            "impact or step is among them."
+            "{file}: the rule reject drops {rows:# row} as outliers, the fit uses {used}. Check with --figures that no impact "
+            "or step is among them."
         ),
     ),
     "readings.errors": Message(
@@ -57,7 +57,7 @@ DATA_MESSAGES: Mapping[str, Message] = {
     "readings.gaps": Message(
         "gaps in a record",
         warn=(
-            "{file}:{line}: the times must be evenly spaced; found {lost} missing samples of {step:.4g} s, the first after "
+            "{file}:{line}: the times must be evenly spaced; found {lost:# missing sample} of {step:.4g} s, the first after "
             "{time:.6g} s. The fit uses the times as recorded. Record without gaps."
         ),
     ),
@@ -68,22 +68,22 @@ DATA_MESSAGES: Mapping[str, Message] = {
     "readings.clipped": Message(
         "clipped samples",
         fail=(
-            "{file}:{line}: {column} is clipped: {samples} samples ({share:.2g} of the record) lie at its {side} limit "
-            "{level:.5g} {unit}, the last at {time:.5g} s. Repeat with a wider range of the sensor, or use the record after "
-            "the clipped part only."
+            "{file}:{line}: {column} is clipped at its {side} limit {level:.5g} {unit}: {samples:# sample} "
+            "({share:.2g} of the record), the last at {time:.5g} s. Repeat with a wider range of the sensor, or use the "
+            "record after the clipped part only."
         ),
     ),
     "readings.dropouts": Message(
         "drop-outs",
         fail=(
-            "{file}:{line}: {column} drops out: {samples} samples have a value far from both neighbours, the first "
+            "{file}:{line}: {column} drops out: {samples:# sample} far from both neighbours, the first "
             "{value:.6g} {unit} at {time:.5g} s. Delete these rows."
         ),
     ),
     "readings.frozen": Message(
         "frozen channel",
         fail=(
-            "{file}:{line}: {column} freezes: {samples} samples keep the value before them, the first {value:.6g} {unit} at "
+            "{file}:{line}: {column} freezes: {samples:# sample} with the value before, the first {value:.6g} {unit} at "
             "{time:.5g} s. Delete these rows."
         ),
     ),

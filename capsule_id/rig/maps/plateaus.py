@@ -22,6 +22,8 @@ _EXAMPLE = '{ levels = [0, 10, 20], unit = "N", guard = "2 s" }'
 MOST_BLOCKS = 1500
 #: Smallest correlation of the levels with the means of the parts.
 SMALLEST_CORRELATION = 0.9
+#: Reversed levels that leave less than this share of the misfit, 1 - correlation, are the true order.
+CLEARLY_LESS = 0.1
 #: Fewest samples of a plateau.
 FEWEST_SAMPLES = 3
 #: Largest step inside a plateau relative to the median step between plateaus, where both sides of it hold at least this
@@ -108,6 +110,7 @@ def readings_of_plateaus(
             raise document.error(place, rule, value, "shorten guard, or state a level for each plateau of the trace")
     means = np.array([trace[part].mean(axis=0) for part in parts])
     correlation = abs(float(np.corrcoef(plateaus.levels, means[:, 0])[0, 1]))
+    _check_order(document, place, plateaus.levels, means[:, 0])
     if not correlation >= SMALLEST_CORRELATION:
         rule = f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)"
         value = f"{correlation:.2g}; means {' '.join(f'{mean:.4g}' for mean in means[:, 0])}"
@@ -121,6 +124,22 @@ def readings_of_plateaus(
         return raw.place(None if row is None else int(starts[row]), channels[min(column, len(channels) - 1)])
 
     return RawTable(names, units, np.column_stack([means, plateaus.levels]), raw.rows[starts], cell), starts
+
+
+def _check_order(document: TomlDocument, place: KeyPath, levels: np.ndarray, means: np.ndarray) -> None:
+    """Refuse levels (k,) that fit the means (k,) of the parts in reverse order only: every sensitivity is positive.
+
+    Raises
+    ------
+    InputError
+        At the list of levels.
+    """
+    stated, reversed_ = (float(np.corrcoef(order, means)[0, 1]) for order in (levels, levels[::-1]))
+    if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):
+        rule = "the levels must stand in the order of time, and the readings must increase with them"
+        value = f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order"
+        remedy = "reverse the levels, or state scale = -1 for a sensor of the other sign"
+        raise document.error((*place, "levels"), rule, value, remedy)
 
 
 def _check_constant(

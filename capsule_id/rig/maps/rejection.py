@@ -12,6 +12,7 @@ from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import read_choice, read_string, read_table, refuse_unknown_keys, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
+from capsule_id.views import counted
 
 _EXAMPLE = '{ rule = "hampel", window = "50 ms", n_sd = 5 }'
 _DURATION = re.compile(r"\s*([+-]?[0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?)\s*([^\s0-9]+)\s*")
@@ -90,7 +91,7 @@ def outlying_rows(
     half = rejection.window / step / 2.0
     if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
         rule = "the window must hold two sampling steps or more, and fit into the record"
-        value = f"{rejection.window:g} s; the record has {len(time)} samples, a step is {step:.4g} s"
+        value = f"{rejection.window:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s"
         remedy = "write a window of about 10 steps"
         raise document.error((*path, "reject", "window"), rule, value, remedy)
     samples = 2 * round(half) + 1

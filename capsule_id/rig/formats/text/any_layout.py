@@ -14,6 +14,7 @@ from capsule_id.errors import InputError
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_column, read_plain_rows, shown_cell
 from capsule_id.rig.formats.text.decode import decode
+from capsule_id.views import counted
 
 _COMMENTS = ("#", "%")
 _MANY_ROWS = 50  # whose whole parts do not increase by chance
@@ -48,9 +49,9 @@ def read_text(content: bytes, path: Path, layout: Layout) -> Export:
     width = len(rows[0])
     for i, row in zip(numbers, rows, strict=False):
         if len(row) != width:
-            rule = f"a row must have {width} cells, as line {numbers[0] + 1} has"
+            rule = f"a row must have {counted(width, 'cell')}, as line {numbers[0] + 1} has"
             remedy = f"correct the row, or state data_from_line = {i + 1} if the readings begin here"
-            raise InputError(rule, f"{len(row)} cells", remedy, path, i + 1, 1)
+            raise InputError(rule, counted(len(row), "cell"), remedy, path, i + 1, 1)
     found = [(i, names) for i in range(first - 1, -1, -1) if (names := _headers(lines[i], delimiter, width, layout))]
 
     def values(column: int) -> np.ndarray:

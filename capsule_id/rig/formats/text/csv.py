@@ -14,6 +14,7 @@ from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.formats.text.cells import cells_of, read_number, read_plain_rows, shown_cell
 from capsule_id.rig.formats.text.decode import decode
+from capsule_id.views import counted
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
@@ -100,7 +101,8 @@ def _read_cells(lines: list[str], delimiter: str, decimal: str, columns: int, pa
             if delimiter == "," and len(cells) == 2 * columns:
                 remedy += " (a decimal comma needs semicolons or tabs between the cells)"
             place = cells[columns][1] if len(cells) > columns else len(line) + 1
-            raise InputError(f"a row must have {columns} cells", f"{len(cells)} cells", remedy, path, row + 2, place)
+            rule = f"a row must have {counted(columns, 'cell')}"
+            raise InputError(rule, counted(len(cells), "cell"), remedy, path, row + 2, place)
         for index, (cell, column) in enumerate(cells):
             values[row, index] = read_number(cell, decimal, path, row + 2, column)
     return values
