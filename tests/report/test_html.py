@@ -259,7 +259,7 @@ def test_minimal_result(result: Result) -> None:
     ("words", "error"),
     [
         ("{missing} of them", "KeyError: 'missing'"),
-        ("{} of them", "ValueError"),
+        ("{} of them", "IndexError"),
         ("{number:.1q}", "ValueError"),
         ("{pair[2]}", "IndexError"),
         ("{pair:.2f}", "TypeError"),
