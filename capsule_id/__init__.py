@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign
     from capsule_id.experiments.progression.twin import synthesize_robot as synthesize_robot
     from capsule_id.importing.entry import propose_entry as propose_entry
+    from capsule_id.motions.bias import smoothing_bias as smoothing_bias
     from capsule_id.motions.response import Response as Response
     from capsule_id.motions.response import Settling as Settling
     from capsule_id.motions.response import response as response
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
     from capsule_id.physics.drives.pulses import Pulses as Pulses
     from capsule_id.physics.drives.recorded import RecordedDrive as RecordedDrive
     from capsule_id.physics.drives.recorded import RodMotion as RodMotion
+    from capsule_id.physics.energy import energy_balance as energy_balance
     from capsule_id.physics.model import CapsuleParameters as CapsuleParameters
     from capsule_id.physics.model import Excitation as Excitation
     from capsule_id.physics.model import Status as Status
@@ -80,6 +82,7 @@ _MODULE_OF = {
     "compare": "capsule_id.api",
     "continuation": "capsule_id.motions.sweep",
     "diagram": "capsule_id.motions.sweep",
+    "energy_balance": "capsule_id.physics.energy",
     "Excitation": "capsule_id.physics.model",
     "Fit": "capsule_id.api",
     "fit": "capsule_id.api",
@@ -97,6 +100,7 @@ _MODULE_OF = {
     "Settling": "capsule_id.motions.response",
     "simulate": "capsule_id.physics.model",
     "Smoothing": "capsule_id.physics.smooth.engine",
+    "smoothing_bias": "capsule_id.motions.bias",
     "Status": "capsule_id.physics.model",
     "status_message": "capsule_id.physics.model",
     "synthesize": "capsule_id.synthetic",

@@ -1,11 +1,6 @@
-"""Bias of the smoothed model against the exact one, as data.
+"""Bias of the smoothed model against the exact one, as data."""
 
-smoothing_bias        one set of widths: mean velocity, advance and contacts of both models
-bias_against_width    a grid of widths: how fast the bias goes to zero, with the fitted slope
-"""
-
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -45,25 +40,6 @@ class SmoothingBias:
     def relative(self) -> np.ndarray:
         """(L,), 1: |bias| / (|exact| + 5e-5 m/s); the certified widths stay below 0.02."""
         return np.abs(self.bias) / (np.abs(self.exact) + VELOCITY_SCALE)
-
-
-@dataclass(frozen=True)
-class BiasStudy:
-    """Bias over a grid of one width; relative (W, L) as in ``SmoothingBias``, widths (W,) in m/s or m."""
-
-    kind: Literal["velocity", "penetration"]
-    widths: np.ndarray
-    relative: np.ndarray
-
-    @property
-    def median(self) -> np.ndarray:
-        """(W,): median over the lanes."""
-        return np.median(self.relative, axis=1)
-
-    @property
-    def slope(self) -> float:
-        """d log(median bias) / d log(width) by least squares over the whole grid: the order of the smoothing."""
-        return float(np.polyfit(np.log(self.widths), np.log(self.median), 1)[0])
 
 
 def smoothing_bias(
@@ -106,21 +82,3 @@ def smoothing_bias(
 
 def _mean_velocity(t: Trajectory) -> np.ndarray:
     return np.asarray((t.X2[:, -1] - t.X2[:, 0]) / (t.times[:, -1] - t.times[:, 0]))
-
-
-def bias_against_width(
-    p: CapsuleParameters,
-    e: Excitation,
-    widths: Sequence[float],
-    kind: Literal["velocity", "penetration"] = "velocity",
-    smoothing: Smoothing | None = None,
-    periods: int = 10,
-) -> BiasStudy:
-    """The bias over a grid of ``kind``'s width; the other widths and the tolerance are those of ``smoothing``.
-
-    The solver's own error is part of the bias: to see the order of a width, give a ``smoothing`` with a tolerance and
-    other widths small enough.
-    """
-    base = smoothing or Smoothing()
-    rows = [smoothing_bias(p, e, replace(base, **{kind: width}), periods).relative for width in widths]
-    return BiasStudy(kind, np.asarray(widths, float), np.stack(rows))

@@ -1,23 +1,9 @@
 """Figures of simulated motions draw what they are given, where they are told to."""
 
 import numpy as np
-import pytest
 
-from capsule_id.motions.bias import BiasStudy
-from capsule_id.report.figures.capsule import MotionView, motion, phase_plane, smoothing_bias
+from capsule_id.report.figures.capsule import MotionView, motion, phase_plane
 from capsule_id.report.figures.style import new_figure, png
-
-
-def _study() -> BiasStudy:
-    widths = np.geomspace(1e-4, 1e-2, 5)
-    return BiasStudy("velocity", widths, np.stack([3.0 * widths**2, 5.0 * widths**2, 7.0 * widths**2], axis=1))
-
-
-def test_slope_of_a_power_law_is_found_and_shown() -> None:
-    assert _study().slope == pytest.approx(2.0, abs=1e-12)
-    ax = smoothing_bias(_study())
-    assert any("slope 2.00" in text.get_text() for text in ax.get_legend().get_texts())
-    assert ax.get_xscale() == ax.get_yscale() == "log"
 
 
 def test_phase_plane_shows_impact_line_and_section() -> None:

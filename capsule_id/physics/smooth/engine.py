@@ -51,8 +51,8 @@ class Smoothing:
     """Widths of the smoothed model, each a number or an array (batch,).
 
     The defaults are certified: the mean velocity over ten periods from rest is within 2 % (+1e-6 m/s) of the exact one
-    on all 25 reference cases (worst 0.4 %), and on 98 % of random capsules around them; ``bias.smoothing_bias`` says
-    how far off it is for given parameters.
+    on all 25 reference cases (worst 0.4 %), and on 98 % of random capsules around them; ``smoothing_bias``
+    measures the difference for given parameters.
 
     velocity : half-width of the stick-slip switch in Y2, m/s
     penetration : half-width of the contact's Heaviside function in r - G, m

@@ -9,12 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from capsule_id.motions.bias import BiasStudy
 from capsule_id.report.figures.style import (
     BLACK,
     BLUE,
     GREEN,
-    GREY,
     VERMILION,
     make_room,
     new_figure,
@@ -87,23 +85,3 @@ def motion(view: MotionView) -> Figure:
     capsule_displacement(view, figure.add_subplot(grid[1, 0]))
     phase_plane(view, figure.add_subplot(grid[:, 1]))
     return figure
-
-
-def smoothing_bias(study: BiasStudy, ax: Axes | None = None) -> Axes:
-    """Bias of the mean velocity against the width, both on a logarithmic scale, with the fitted slope.
-
-    A point per lane and width, the median over the lanes, the fitted power law, and the bar of 2 %.
-    """
-    ax = own_axes(ax)
-    unit = {"velocity": "m/s", "penetration": "m"}[study.kind]
-    widths = np.broadcast_to(study.widths[:, None], study.relative.shape)
-    ax.loglog(widths.ravel(), study.relative.ravel(), ls="none", marker=".", ms=4, color=GREY, label="a motion")
-    ax.loglog(study.widths, study.median, ls="none", marker="o", color=BLUE, label="median")
-    middle = np.exp(np.mean(np.log(study.widths)))
-    level = np.exp(np.mean(np.log(study.median)))
-    law = level * (study.widths / middle) ** study.slope
-    ax.loglog(study.widths, law, color=BLUE, lw=1.4, label=f"slope {study.slope:.2f}")
-    ax.axhline(0.02, color=VERMILION, ls="--", lw=1.2, label="2 %")
-    set_text(ax, f"{study.kind} width, {unit}", "bias of the mean velocity, 1")
-    set_legend(ax, place="lower right")
-    return ax
