@@ -36,7 +36,11 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if hasattr(config, "workerinput") or "JAX_COMPILATION_CACHE_DIR" in os.environ:
+    if hasattr(config, "workerinput"):
+        return
+    # The workers occupy the cores. More threads of BLAS wait for each other and take up to fifty times the CPU time.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     folder = tempfile.mkdtemp(prefix="capsule-id-compiled-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
