@@ -1,5 +1,6 @@
 """Findings on the readings of a rig before a fit."""
 
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from capsule_id.experiments.kind import Estimate, Kind
 from capsule_id.experiments.lint_magnitudes import lint_magnitudes, lint_rig_quantities
 from capsule_id.records.faults.duplicates import Readings, repeated_blocks
+from capsule_id.rig.formats.text.blocks import WINDOWS
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Finding
 
@@ -27,6 +29,9 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     findings += lint_rig_quantities(rig)
     for table in tables:
         findings += lint_magnitudes(table, kinds[table.kind])
+        if table.encoding == WINDOWS:
+            facts = {"file": table.file, "encoding": table.encoding}
+            findings.append(Finding("readings.encoding", "ok", facts, table.label))
         if table.missing:
             facts = {"file": table.file, "rows": table.missing, "used": len(table.rows)}
             findings.append(Finding("readings.missing", "warn", facts, table.label))
@@ -56,7 +61,8 @@ def _same_files(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
 
 def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
     """Equal for two tables with the same readings of the same file; column maps may read different ones."""
-    readings = ((name, column.values.tobytes()) for name, column in table.columns.items())
+    columns = table.columns.items()
+    readings = ((name, hashlib.sha256(np.ascontiguousarray(column.values).data).digest()) for name, column in columns)
     return rig.files.get(table.file, table.label), *readings
 
 

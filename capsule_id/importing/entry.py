@@ -14,6 +14,7 @@ from capsule_id.importing.guess import TIME, ColumnGuess, Guess, disordered_time
 from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
+from capsule_id.rig.formats.text.blocks import TextFile
 from capsule_id.rig.units import factor_to_si, scale
 from capsule_id.views import counted
 
@@ -114,7 +115,7 @@ def _description(found: FoundLayout, content: bytes) -> str:
     text = counted(rows, "row")
     if found.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
         return text
-    line = content.decode("utf-8-sig", "replace").replace("\r\n", "\n").split("\n")[int(found.export.lines[0]) - 1]
+    line = TextFile(content, found.path).line(int(found.export.lines[0]) - 1)
     return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
 
 

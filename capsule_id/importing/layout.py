@@ -9,14 +9,15 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.importing.headers import is_units_row
-from capsule_id.rig.formats import COMPRESSED, EXPORTS, suffix_of, unpack
+from capsule_id.rig.formats import EXPORTS, suffix_of
 from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.text.blocks import COMPRESSED, TextFile
 
 #: Texts that loggers and spreadsheets write where a reading is missing.
 MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
 #: Largest share of missing readings in a column of readings.
 MOST_MISSING = 0.5
-_BEGINNING = 100_000  # bytes in which the first row of readings is searched
+_BEGINNING = 100_000  # characters in which the first row of readings is searched
 _MOST_TITLES = 100  # lines
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
 _RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate")
@@ -65,8 +66,7 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     text = suffix.removesuffix(COMPRESSED) in (".csv", ".txt", ".tsv", ".dat")
     beginning = b""
     if text:
-        beginning = unpack(content, path) if suffix.endswith(COMPRESSED) else content
-        beginning = beginning[: beginning.rfind(b"\n", 0, _BEGINNING) + 1 or len(beginning)]
+        beginning = _beginning(TextFile(content, path))
         layout = _text_layout(beginning, path.with_suffix("") if suffix.endswith(COMPRESSED) else path)
     else:
         layout = Layout(missing=MARKERS)
@@ -94,6 +94,17 @@ def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layo
         fewer = tuple(each for each in missing if each != marker)
         missing = fewer if reads(fewer) else missing
     return replace(found.layout, missing=missing)
+
+
+def _beginning(file: TextFile) -> bytes:
+    """The first lines of a text in UTF-8, about ``_BEGINNING`` characters."""
+    lines, size = [], 0
+    for line in file.lines():
+        size += len(line) + 1
+        if lines and size > _BEGINNING:
+            break
+        lines.append(line)
+    return "\n".join([*lines, ""]).encode()
 
 
 def _text_layout(beginning: bytes, path: Path) -> Layout:

@@ -113,6 +113,7 @@ class Table(Generic[S]):
     bench : its kind is a bench test; else a forced run
     missing, other : rows of the files that a column map drops: for a missing cell, and outside ``where``
     rejected : rows dropped as outliers, by the rule ``reject``
+    encoding : of a text
     """
 
     kind: str
@@ -125,6 +126,7 @@ class Table(Generic[S]):
     missing: int = 0
     other: int = 0
     rejected: int = 0
+    encoding: str = "UTF-8"
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""

@@ -27,6 +27,8 @@ from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_string, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
+_BLOCK = 1 << 20  # rows that are checked at a time
+
 
 @dataclass(frozen=True)
 class TableFile:
@@ -95,25 +97,26 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
         At a key of ``rig.toml`` or at a place in a file.
     """
     places = _file_places(document, path, entry)
-    files, contents = {}, {}
+    files: dict[str, Path] = {}
+    hashes: dict[str, str] = {}
     for place, name in places:
         file = table_path(document, place, name)
         if file in files.values():
             raise document.error(place, "files must be named once", shown(name), "remove the second one")
         try:
-            files[name], contents[name] = file, file.read_bytes()
+            with file.open("rb") as opened:
+                files[name], hashes[name] = file, hashlib.file_digest(opened, "sha256").hexdigest()
         except OSError as error:
             value = f"{shown(name)} ({error.strerror})"
             raise document.error(place, "file must be readable", value, "check its permissions") from None
     first = places[0][1]
     rejection, plateaus = read_rejection(document, path, entry), read_plateaus(document, path, entry, kind)
-    column_map = read_map(document, path, entry, kind, partial(_proposal, contents[first], files[first], kind))
-    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    column_map = read_map(document, path, entry, kind, partial(_proposal, files[first], kind))
     if column_map is None:
-        table = _read_plain(document, places[0][0], files[first], contents[first], hashes, kind)
+        table = _read_plain(document, places[0][0], files[first], hashes, kind)
     else:
         _check_map_names(document, path, column_map, kind, plateaus)
-        read = [EXPORTS[suffix_of(file)](contents[name], file, column_map.layout) for name, file in files.items()]
+        read = [EXPORTS[suffix_of(file)](file, file, column_map.layout) for file in files.values()]
         mapped = apply_map(document, path, read, column_map)
         table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other)
     if (clock := read_clock(document, path, entry)) is not None:
@@ -141,7 +144,7 @@ def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]
         raise InputError("the settings must be a table", "no such table", remedy, path)
     columns = {name: rule for name, rule in kind.columns.items() if name != without}
     sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
-    raw = READERS[path.suffix.lower()](path.read_bytes(), path)
+    raw = READERS[path.suffix.lower()](path, path)
     table = TableFile({}, raw, {}, lambda row, column: path)
     asked = replace(kind, columns=columns, sets=sets)
     _check_names(raw.names, asked, lambda name, *text: table.error(None, name, *text))
@@ -164,30 +167,30 @@ def _file_places(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]
 
 
 def _read_plain(
-    document: TomlDocument, place: KeyPath, file: Path, content: bytes, hashes: Mapping[str, str], kind: KindRule
+    document: TomlDocument, place: KeyPath, file: Path, hashes: Mapping[str, str], kind: KindRule
 ) -> TableFile:
     """A file with the column names of the kind; an error about its header proposes a column map."""
     suffix = suffix_of(file)
     if suffix not in READERS:
-        remedy = f"add {_proposal(content, file, kind, Layout())}"
+        remedy = f"add {_proposal(file, kind, Layout())}"
         raise document.error(place, f"a {suffix} file needs a column map", "no columns", remedy)
     try:
-        raw = READERS[suffix](content, file)
+        raw = READERS[suffix](file, file)
         table = TableFile(hashes, raw, {}, lambda row, column: file)
         _check_names(raw.names, kind, lambda name, *text: table.error(None, name, *text))
     except InputError as error:
         if error.line != 1:
             raise
-        remedy = f"{error.remedy}; or add {_proposal(content, file, kind, Layout())} to the experiment"
+        remedy = f"{error.remedy}; or add {_proposal(file, kind, Layout())} to the experiment"
         raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
     return table
 
 
-def _proposal(content: bytes, file: Path, kind: KindRule, layout: Layout) -> str:
+def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:
     """The column map that reads a file as ``kind``."""
     export: Export | None = None
     with suppress(InputError):
-        export = EXPORTS[suffix_of(file)](content, file, layout)
+        export = EXPORTS[suffix_of(file)](file, file, layout)
     return proposal(kind, export)
 
 
@@ -206,11 +209,12 @@ def _without_outliers(document: TomlDocument, path: KeyPath, table: TableFile, r
     kept = RawTable(
         raw.names,
         raw.units,
-        raw.values[keep],
+        tuple(column[keep] for column in raw.columns),
         raw.rows[keep],
         lambda row, column: raw.place(None if row is None else int(keep[row]), column),
+        raw.encoding,
     )
-    return replace(_with_rows(table, kept, keep), rejected=len(raw.values) - len(keep))
+    return replace(_with_rows(table, kept, keep), rejected=len(raw.rows) - len(keep))
 
 
 def _with_rows(table: TableFile, raw: RawTable, origin: np.ndarray) -> TableFile:
@@ -268,18 +272,10 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
         factor = factor_to_si(unit, rule.si)
     except UnitError as error:
         raise table.error(None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
-    written = table.raw.values[:, index]
+    written = table.raw.columns[index]
     with np.errstate(over="ignore"):
-        values = scale(written, factor)
-    valid = np.isfinite(values) & rule.domain.holds(values)
-    _raise_at_first_false(table, name, valid, f"{name} must {rule.domain.text}", "correct the value or delete the row")
-    magnitude = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
-    _raise_at_first_false(table, name, is_plausible(values), magnitude, "correct the value or the unit of the column")
-    if rule.increasing:
-        rises = np.concatenate([[True], np.diff(values) > 0.0])
-        _raise_at_first_false(
-            table, name, rises, f"{name} must increase from row to row", "sort the rows and delete repeated ones"
-        )
+        values = written if factor == 1.0 else scale(written, factor)
+    _check_values(table, index, rule, values)
     if rule.varies and len(values) > 1 and np.ptp(values) == 0.0:
         value = f"{written[0]:g} {unit} in every row"
         raise table.error(None, name, f"{name} must not be constant", value, "check the sensor and the export")
@@ -289,9 +285,30 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
     return Column(name, unit, 1.0 / factor, values)
 
 
-def _raise_at_first_false(table: TableFile, name: str, good: np.ndarray, rule: str, remedy: str) -> None:
-    """Raise at the first row that is not ``good``."""
+def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.ndarray) -> None:
+    """Refuse a value of column ``index`` outside its domain, (n,) SI; in blocks, so that no copy of it is made."""
+    name = table.raw.names[index]
+    magnitude = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
+    checks: list[tuple[Callable[[np.ndarray], np.ndarray], str, str]] = [
+        (
+            lambda part: np.isfinite(part) & rule.domain.holds(part),
+            f"{name} must {rule.domain.text}",
+            "correct the value or delete the row",
+        ),
+        (is_plausible, magnitude, "correct the value or the unit of the column"),
+    ]
+    for holds, text, remedy in checks:
+        for first in range(0, len(values), _BLOCK):
+            _raise_at_first_false(table, index, holds(values[first : first + _BLOCK]), (text, remedy), first)
+    if rule.increasing:
+        text, remedy = f"{name} must increase from row to row", "sort the rows and delete repeated ones"
+        for first in range(0, len(values) - 1, _BLOCK):
+            rises = np.diff(values[first : first + _BLOCK + 1]) > 0.0
+            _raise_at_first_false(table, index, rises, (text, remedy), first + 1)
+
+
+def _raise_at_first_false(table: TableFile, index: int, good: np.ndarray, message: tuple[str, str], first: int) -> None:
+    """Raise at the first row from ``first`` on that is not ``good``; ``message``: rule and remedy."""
     if not good.all():
-        row = int(np.argmin(good))
-        index = table.raw.names.index(name)
-        raise table.error(row, name, rule, f"{table.raw.values[row, index]:g} {table.raw.units[index]}", remedy)
+        row, name, (rule, remedy) = first + int(np.argmin(good)), table.raw.names[index], message
+        raise table.error(row, name, rule, f"{table.raw.columns[index][row]:g} {table.raw.units[index]}", remedy)

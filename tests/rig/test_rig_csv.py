@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.text.cells import read_plain_rows
+from capsule_id.rig.formats.text.blocks import TextFile
 from capsule_id.rig.formats.text.csv import _read_cells, read_csv
+from capsule_id.rig.formats.text.rows import Shape, plain_block
 
 DIALECTS = [
     (delimiter, decimal, ending, mark)
@@ -46,9 +47,11 @@ def test_round_trip(delimiter: str, decimal: str, ending: str, mark: str, column
 def test_cell_by_cell_reading_agrees_with_the_fast_one() -> None:
     values = numbers(500, 2, seed=8)
     lines = ["a [m];b [s]", *(f"{a!r}; +{abs(b)!r} " for a, b in values.tolist())]
-    fast = read_plain_rows(lines[1:], ";", ".")
+    shape = Shape(1, ";", 2, ".")
+    fast = plain_block("\n".join([*lines[1:], ""]), shape, [0, 1])
     assert fast is not None
-    np.testing.assert_array_equal(fast, _read_cells(lines, ";", ".", 2, Path("t.csv")))
+    file = TextFile("\n".join(lines).encode(), Path("t.csv"))
+    np.testing.assert_array_equal(fast, np.column_stack(_read_cells(file, shape)))
 
 
 def test_places_are_line_and_first_character_of_the_cell() -> None:

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -225,14 +226,14 @@ def test_a_pipe_is_no_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "at"), [("rig.toml", None), ("static_friction.csv", '"static_friction.csv"')])
 def test_a_file_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, at: str | None) -> None:
     folder = write_folder(tmp_path / "rig")
-    read_bytes = Path.read_bytes
+    opened = Path.open
 
-    def refuse(path: Path) -> bytes:
+    def refuse(path: Path, *words: Any, **options: Any) -> Any:
         """Refuse like the system for a file of another user; root may read every file."""
         if path.name == name:
             raise PermissionError(13, "Permission denied")
-        return read_bytes(path)
+        return opened(path, *words, **options)
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr(Path, "open", refuse)
     place = place_of(RIG_TOML, at) if at else (1, 1)
     assert_fault(fault_of(folder), folder / "rig.toml", place, "must be readable")

@@ -84,9 +84,10 @@ def dropouts(values: np.ndarray) -> np.ndarray:
     far = (jump > DROPOUT_RANGE * (high - low)) & (np.abs(after - before) < 0.5 * jump)
     far &= np.sign(own - before) == np.sign(own - after)
     # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
-    same = np.array([np.sum(own[far] == value) for value in own], dtype=int)
+    levels, counts = np.unique(own[far], return_counts=True)
+    repeated = np.isin(own, levels[counts > 1])
     extreme = np.maximum(low - own, own - high) > EXTREME * (high - low)
-    chosen = far & ((same > 1) | extreme | (own == 0.0))
+    chosen = far & (repeated | extreme | (own == 0.0))
     pairs = zip(starts[chosen], lengths[chosen], strict=True)
     return np.concatenate([np.arange(s, s + n) for s, n in pairs]) if chosen.any() else np.arange(0)
 

@@ -22,6 +22,9 @@ DATA_MESSAGES: Mapping[str, Message] = {
         "number of readings",
         warn="too few rows to estimate the scatter: {rows} instead of {wanted}. Measure more rows.",
     ),
+    "readings.encoding": Message(
+        "encoding", ok="{file} is read as {encoding}, because it is no UTF-8. Check letters such as µ in its headers."
+    ),
     "readings.missing": Message(
         "missing readings",
         warn=(

@@ -16,11 +16,13 @@ class Layout:
     data_from_line : 1-based line of the first row of numbers (None: the first line that holds a number)
     missing : texts of cells without a reading, such as ``--`` or ``NaN``
     decimal : decimal mark of a text table, "." or "," (None: found in the file)
+    columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
     """
 
     data_from_line: int | None = None
     missing: tuple[str, ...] = ()
     decimal: str | None = None
+    columns: tuple[str | int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,10 @@ class Export:
     headers : rows of headers, the last one first; each row has one header a column
     width : number of columns
     lines : (rows,) 1-based line of every row
-    values : column index -> (rows,) numbers in the file's units, NaN at a stated missing marker; it raises
-        ``InputError`` at the first other cell
+    values : index of a column that ``Layout.columns`` names -> (rows,) numbers in the file's units, NaN at a stated
+        missing marker; it raises ``InputError`` at the first other cell
     place : (row index or None for the header, column index) -> 1-based (line, column) in the file
+    encoding : of a text
     """
 
     path: Path
@@ -44,3 +47,4 @@ class Export:
     lines: np.ndarray
     values: Callable[[int], np.ndarray]
     place: Callable[[int | None, int], tuple[int, int]]
+    encoding: str = "UTF-8"

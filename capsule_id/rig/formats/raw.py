@@ -13,13 +13,20 @@ class RawTable:
     Attributes
     ----------
     names, units : of every column, as written
-    values : (rows, columns), finite, in the units written
+    columns : of each name (rows,) numbers, finite, in the units written
     rows : (rows,) 1-based line number of every row
     place : (row index or None for the header, column index) -> 1-based (line, column) in the file
+    encoding : of the text, or "UTF-8"
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    values: np.ndarray
+    columns: tuple[np.ndarray, ...]
     rows: np.ndarray
     place: Callable[[int | None, int], tuple[int, int]]
+    encoding: str = "UTF-8"
+
+    @property
+    def values(self) -> np.ndarray:
+        """A copy of the numbers, (rows, columns)."""
+        return np.column_stack(self.columns)

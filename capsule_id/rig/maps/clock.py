@@ -59,10 +59,11 @@ def on_reference(document: TomlDocument, path: KeyPath, raw: RawTable, clock: tu
         value = " ".join(raw.names)
         raise document.error((*path, "clock"), "clock needs a record with times", value, "remove clock", of_key=True)
     offset, drift = clock
-    index, values = raw.names.index("time"), raw.values.copy()
+    index = raw.names.index("time")
     try:
         factor = factor_to_si(raw.units[index], "s")
     except UnitError:  # reported at its place, where the column is converted
         return raw
-    values[:, index] = offset / factor + (1.0 + drift) * values[:, index]
-    return replace(raw, values=values)
+    columns = list(raw.columns)
+    columns[index] = offset / factor + (1.0 + drift) * columns[index]
+    return replace(raw, columns=tuple(columns))

@@ -1,7 +1,7 @@
 """Reads the column map of an experiment in ``rig.toml``: ``columns`` and the keys that go with it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from types import MappingProxyType
 from typing import Any
@@ -81,14 +81,19 @@ def read_map(
                 raise document.error((*path, key), f"{key} needs a column map", "no columns", remedy, of_key=True)
         return None
     place = (*path, "columns")
-    stated = read_table(document, place, entry["columns"], propose(layout))
+    if not isinstance(entry["columns"], dict):
+        read_table(document, place, entry["columns"], propose(layout))
+    stated = entry["columns"]
     if not stated:
         raise document.error(place, "a column map must have columns", "none", f"write {propose(layout)}")
     # Plateaus are readings of a time trace, whatever the columns of the kind.
     rules = {**({"time": ColumnRule("s")} if "plateaus" in entry else {}), **kind.columns}
     refuse_unknown_keys(document, place, stated, tuple(rules))
     sources = {name: _source(document, (*place, name), stated[name], rules[name]) for name in stated}
-    return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(_where(document, path, entry)))
+    where = _where(document, path, entry)
+    named = [header for source in sources.values() for header in (source.header, source.minus) if header is not None]
+    keys = [form for key in where for form in (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))]
+    return ColumnMap(MappingProxyType(sources), replace(layout, columns=(*named, *keys)), MappingProxyType(where))
 
 
 def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRule) -> Source:

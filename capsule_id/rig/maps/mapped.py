@@ -14,6 +14,7 @@ from capsule_id.rig.toml_values import closest, shown
 
 #: Relative difference below which a column that several files hold is the same.
 ROUNDING = 1e-9
+UTF8 = "UTF-8"
 _MOST_VALUES = 6  # shown of a column where no row has the value wanted
 
 
@@ -64,40 +65,45 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     found = [
         {name: part.find((*place, name, "from"), source.header) for name, source in sources.items()} for part in parts
     ]
-    values = {
-        name: np.concatenate(
-            [_scaled(part, here, (*place, name), source) for part, here in zip(parts, found, strict=True)]
+    cells = [{name: (column.export, column.column) for name, column in here.items()} for here in found]
+    values: dict[str, np.ndarray] = {}
+    for name, source in sources.items():
+        values[name] = _joined(
+            [_scaled(part, here.pop(name), (*place, name), source) for part, here in zip(parts, found, strict=True)]
         )
-        for name, source in sources.items()
-    }
     where = {
-        key: np.concatenate([part.find((*path, "where", key), _where_header(part, key)).values for part in parts])
+        key: _joined([part.find((*path, "where", key), _where_header(part, key)).values for part in parts])
         for key in column_map.where
     }
-    lengths = [part.rows for part in parts]
+    first_rows = np.cumsum([0, *(part.rows for part in parts)])
+    keep, missing, other = _kept(document, path, values, where, column_map.where)
     for name, source in column_map.sources.items():
         if source.rate is not None:
-            values[name] = np.arange(sum(lengths)) / source.rate
-    keep, missing, other = _kept(document, path, {name: values[name] for name in sources}, where, column_map.where)
+            values[name] = np.arange(first_rows[-1]) / source.rate
     names = tuple(column_map.sources)
-    table = np.column_stack([values[name] for name in names])[keep]
-    origin = [(part, int(row)) for part, length in enumerate(lengths) for row in range(length)]
-    origin = [origin[index] for index in np.flatnonzero(keep)]
-    lines = np.array([parts[part].exports[0].lines[row] for part, row in origin])
+    columns = tuple(values.pop(name)[keep] for name in names)
+    origin = None if isinstance(keep, slice) else np.flatnonzero(keep)
 
     def cell(row: int | None, column: int) -> tuple[Export, int | None, int]:
-        part, index = (0, None) if row is None else origin[row]
-        here = found[part].get(names[column], next(iter(found[part].values())))
-        return here.export, index, here.column
+        index = 0 if row is None else row if origin is None else int(origin[row])
+        part = 0 if row is None else int(np.searchsorted(first_rows, index, side="right")) - 1
+        export, position = cells[part].get(names[column], next(iter(cells[part].values())))
+        return export, None if row is None else index - int(first_rows[part]), position
 
     def place_of(row: int | None, column: int) -> tuple[int, int]:
         export, index, position = cell(row, column)
         return export.place(index, position)
 
     units = tuple(column_map.sources[name].unit for name in names)
-    rows = lines if len(parts) == 1 else np.arange(1, len(lines) + 1)
-    raw = RawTable(names, units, table, rows, place_of)
+    rows = exports[0].lines[keep] if len(parts) == 1 else np.arange(1, len(columns[0]) + 1)
+    encoding = next((each.encoding for each in exports if each.encoding != UTF8), UTF8)
+    raw = RawTable(names, units, columns, rows, place_of, encoding)
     return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)
+
+
+def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Columns put one below the other; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 class _Part:
@@ -170,11 +176,13 @@ def _where_header(part: _Part, key: str) -> Header:
     return int(key) if key.isascii() and key.isdigit() and int(key) > 0 and not stated else " ".join(key.split())
 
 
-def _scaled(part: _Part, found: Mapping[str, _Found], place: KeyPath, source: Source) -> np.ndarray:
+def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.ndarray:
     """The values of a column in its stated unit."""
-    values = found[str(place[-1])].values
+    values = found.values
     if source.minus is not None:
         values = values - part.find((*place, "minus"), source.minus).values
+    if source.scale == 1.0 and source.offset == 0.0:
+        return values
     with np.errstate(over="ignore"):
         return values * source.scale + source.offset
 
@@ -185,8 +193,8 @@ def _kept(
     values: Mapping[str, np.ndarray],
     where: Mapping[str, np.ndarray],
     wanted: Mapping[str, float],
-) -> tuple[np.ndarray, int, int]:
-    """Which rows are used, and how many are dropped: for a missing cell, and outside ``where``."""
+) -> tuple[np.ndarray | slice, int, int]:
+    """Which rows are used (all as a slice), and how many are dropped: for a missing cell, and outside ``where``."""
     unknown = np.any([np.isnan(column) for column in where.values()], axis=0) if where else np.array(False)
     inside = np.ones(next(iter(values.values())).size, bool)
     for key, column in where.items():
@@ -204,5 +212,7 @@ def _kept(
     if not keep.any():
         remedy = "correct where, or map another column"
         raise document.error((*path, "columns"), "a table must have rows", "none is left", remedy)
+    if keep.all():
+        return slice(None), 0, 0
     missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
     return keep, missing, inside.size - int(np.sum(keep)) - missing

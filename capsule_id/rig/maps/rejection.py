@@ -96,7 +96,7 @@ def outlying_rows(
         raise document.error((*path, "reject", "window"), rule, value, remedy)
     samples = 2 * round(half) + 1
     found = np.zeros(len(time), bool)
-    for index, name in enumerate(raw.names):
+    for name, values in zip(raw.names, raw.columns, strict=True):
         if name != "time":
-            found |= hampel_outliers(raw.values[:, index], samples, rejection.n_sd)
+            found |= hampel_outliers(values, samples, rejection.n_sd)
     return found

@@ -14,7 +14,6 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
 _SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
 _NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
-_PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
 _LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
 
 
@@ -31,6 +30,17 @@ def cells_of(line: str, delimiter: str | None) -> list[tuple[str, int]]:
         cells.append((bare, start + (len(cell) - len(cell.lstrip(BLANKS)) if bare else 0) + 1))
         start += len(cell) + 1
     return cells
+
+
+def place_of_cell(line: str, delimiter: str | None, column: int) -> int:
+    """1-based character at which a cell begins; 1 where the line has no such cell."""
+    cells = cells_of(line, delimiter)
+    return cells[column][1] if column < len(cells) else 1
+
+
+def bare(cell: str) -> str:
+    """A cell without blanks and quotation marks around it."""
+    return cell.strip(BLANKS).strip('"')
 
 
 def number_in(cell: str, decimal: str) -> float | None:
@@ -62,18 +72,10 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
     return value
 
 
-def read_plain_rows(lines: Sequence[str], delimiter: str | None, decimal: str) -> np.ndarray | None:
-    """The (rows, columns) numbers of lines that hold numbers alone, by NumPy's C reader; None for any other lines."""
-    allowed = f"{_PLAIN}{delimiter or ''}{decimal}".encode()
-    if "".join(lines).encode("utf-8", "replace").translate(None, allowed):
-        return None
-    if decimal == ",":
-        lines = [line.replace(",", ".") for line in lines]
-    try:
-        values = np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, dtype=np.float64)
-    except ValueError:
-        return None
-    return values if len(values) == len(lines) and np.isfinite(values).all() else None
+def decimal_mark(texts: Sequence[str], missing: Sequence[str]) -> str | None:
+    """The first point or comma of the cells of a column, None where they have none."""
+    found = re.search("[.,]", "\n".join(text for text in texts if text not in missing))
+    return found[0] if found else None
 
 
 def read_column(
@@ -96,8 +98,7 @@ def read_column(
     InputError
         At the first cell that is neither a finite number nor a marker.
     """
-    marks = None if decimal else re.search("[.,]", "\n".join(text for text in texts if text not in missing))
-    mark = decimal or (marks[0] if marks else ".")
+    mark = decimal or decimal_mark(texts, missing) or "."
     if (_NUMBER_CHARACTERS | {mark}).issuperset("".join(texts)):  # quickly, where all are numbers
         with suppress(ValueError):
             values = np.array([float(text.replace(mark, ".")) for text in texts])

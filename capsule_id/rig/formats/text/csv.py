@@ -1,30 +1,32 @@
 """Reads CSV tables: a header ``name [unit]`` per column, then a row of numbers per line.
 
 Cells are separated by comma, semicolon or tab. The decimal mark is a point, or a comma if commas do not separate cells.
-NumPy's C reader reads the whole body. If it fails, the cells are read one by one to locate the first fault. Places are
+A reader in C reads the rows block by block. If it fails, the cells are read one by one to locate the first fault. Places are
 1-based: the line of the file, and the character of that line at which the cell begins.
 """
 
 import re
+from array import array
 from pathlib import Path
 
 import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.formats.text.cells import cells_of, read_number, read_plain_rows, shown_cell
-from capsule_id.rig.formats.text.decode import decode
+from capsule_id.rig.formats.text.blocks import Content, TextFile
+from capsule_id.rig.formats.text.cells import BLANKS, cells_of, read_number, shown_cell
+from capsule_id.rig.formats.text.rows import Growing, Shape, plain_block
 from capsule_id.views import counted
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
 
 
-def read_csv(content: bytes, path: Path) -> RawTable:
+def read_csv(content: Content, path: Path) -> RawTable:
     """Read a CSV table.
 
     Parameters
     ----------
-    content : the bytes of the file
+    content : the bytes of the file, or where they lie
     path : its name, for error lines
 
     Raises
@@ -32,41 +34,52 @@ def read_csv(content: bytes, path: Path) -> RawTable:
     InputError
         Naming line and column of the first fault.
     """
-    lines = _lines(content, path)
-    delimiter = next((mark for mark in "\t;," if mark in lines[0]), ",")
-    names, units = _header(lines[0], delimiter, path)
-    if len(lines) == 1:
-        raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
-    marks = (re.search("[.,]", line) for line in lines[1:]) if delimiter != "," else iter(())
+    file = TextFile(content, path)
+    header = file.line(0)
+    if not header.strip():
+        _refuse_blank(file)
+    delimiter = next((mark for mark in "\t;," if mark in header), ",")
+    names, units = _header(header, delimiter, path)
+    marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
-    values = read_plain_rows(lines[1:], delimiter, decimal)
-    if values is not None and values.shape[1] != len(names):
-        values = None
-    if values is None:
-        values = _read_cells(lines, delimiter, decimal, len(names), path)
+    shape = Shape(1, delimiter, len(names), decimal)
+    columns = _plain_columns(file, shape)
+    if columns is None:
+        columns = _read_cells(file, shape)
 
     def place(row: int | None, column: int) -> tuple[int, int]:
         line = 0 if row is None else row + 1
-        return line + 1, cells_of(lines[line], delimiter)[column][1]
+        return line + 1, cells_of(file.line(line), delimiter)[column][1]
 
-    return RawTable(names, units, values, np.arange(2, len(lines) + 1), place)
+    rows = np.arange(2, len(columns[0]) + 2, dtype=np.int32)
+    return RawTable(names, units, columns, rows, place, file.encoding)
 
 
-def _lines(content: bytes, path: Path) -> list[str]:
-    """The lines without line ends. Trailing blank lines are dropped; another blank line is an error."""
-    lines = decode(content, path).split("\n")
-    while lines and not lines[-1].strip():
-        lines.pop()
-    if not lines:
+def _refuse_blank(file: TextFile) -> None:
+    """Raise where the first line is blank."""
+    if not any(line.strip() for line in file.lines()):
         remedy = "write a header `name [unit]` per column and one row per reading"
-        raise InputError("a table must not be empty", "no text at all", remedy, path, 1, 1)
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
-            remedy = "remove the line" if number > 1 else "put the header on the first line"
-            raise InputError(
-                "lines between the first and the last must not be blank", "a blank line", remedy, path, number, 1
-            )
-    return lines
+        raise InputError("a table must not be empty", "no text at all", remedy, file.path, 1, 1)
+    rule, remedy = "lines between the first and the last must not be blank", "put the header on the first line"
+    raise InputError(rule, "a blank line", remedy, file.path, 1, 1)
+
+
+def _plain_columns(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...] | None:
+    """The columns of a table of numbers alone, with blank lines at its end or none; None for any other table."""
+    columns, ended = tuple(Growing() for _ in range(shape.width)), False
+    for _, text in file.blocks(shape.first):
+        rows = text.rstrip(f"{BLANKS}\n")
+        if ended and rows:
+            return None
+        ended = len(rows) + 1 < len(text)
+        if not rows:
+            continue
+        values = plain_block(f"{rows}\n", shape, range(shape.width))
+        if values is None:
+            return None
+        for column, more in zip(columns, values.T, strict=True):
+            column.extend(more)
+    return tuple(column.values for column in columns) if len(columns[0].values) else None
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -88,21 +101,31 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
     return tuple(units), tuple(units.values())
 
 
-def _read_cells(lines: list[str], delimiter: str, decimal: str, columns: int, path: Path) -> np.ndarray:
-    """The (rows, columns) numbers, read cell by cell; raises at the first fault."""
-    values = np.empty((len(lines) - 1, columns))
-    for row, line in enumerate(lines[1:]):
-        cells = cells_of(line, delimiter)
-        if line.lstrip().startswith("#"):
+def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
+    """The columns, read cell by cell; raises at the first fault."""
+    path, columns, blank = file.path, shape.width, None
+    assert shape.delimiter is not None, "a table has a separator"
+    values: list[array[float]] = [array("d") for _ in range(columns)]
+    for line, text in enumerate(file.lines(shape.first), shape.first + 1):
+        if not text.strip():
+            blank = blank or line
+            continue
+        if blank is not None:
+            rule = "lines between the first and the last must not be blank"
+            raise InputError(rule, "a blank line", "remove the line", path, blank, 1)
+        cells = cells_of(text, shape.delimiter)
+        if text.lstrip().startswith("#"):
             remedy = "remove comments from the table"
-            raise InputError("a row must be numbers", shown_cell(line.strip()), remedy, path, row + 2, 1)
+            raise InputError("a row must be numbers", shown_cell(text.strip()), remedy, path, line, 1)
         if len(cells) != columns:
             remedy = "give every row one cell per header"
-            if delimiter == "," and len(cells) == 2 * columns:
+            if shape.delimiter == "," and len(cells) == 2 * columns:
                 remedy += " (a decimal comma needs semicolons or tabs between the cells)"
-            place = cells[columns][1] if len(cells) > columns else len(line) + 1
+            place = cells[columns][1] if len(cells) > columns else len(text) + 1
             rule = f"a row must have {counted(columns, 'cell')}"
-            raise InputError(rule, counted(len(cells), "cell"), remedy, path, row + 2, place)
-        for index, (cell, column) in enumerate(cells):
-            values[row, index] = read_number(cell, decimal, path, row + 2, column)
-    return values
+            raise InputError(rule, counted(len(cells), "cell"), remedy, path, line, place)
+        for (cell, column), numbers in zip(cells, values, strict=True):
+            numbers.append(read_number(cell, shape.decimal or ".", path, line, column))
+    if not values[0]:
+        raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
+    return tuple(np.array(numbers) for numbers in values)

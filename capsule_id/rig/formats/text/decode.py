@@ -1,4 +1,4 @@
-"""Decodes the bytes of a text file and locates the first byte that is not text."""
+"""Decodes a text in UTF-8 and locates the first byte that is not text."""
 
 import re
 from pathlib import Path
@@ -16,17 +16,17 @@ def decode(content: bytes, path: Path) -> str:
     """
     nul = content.find(b"\0")
     if nul >= 0:
-        remedy = "export it as text"
-        raise InputError("the file must be text", "a binary file (NUL byte)", remedy, path, *_place(content, nul))
+        place, remedy = place_of_byte(content[:nul]), "export it as text"
+        raise InputError("the file must be text", "a binary file (NUL byte)", remedy, path, *place)
     try:
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
-        place = _place(error.object, error.start)  # error.object: the bytes after the byte-order mark
+        place = place_of_byte(error.object[: error.start])  # error.object: the bytes after the byte-order mark
         value = f"byte 0x{error.object[error.start]:02x}"
         raise InputError("the file must be UTF-8 text", value, "save it as UTF-8", path, *place) from None
 
 
-def _place(content: bytes, offset: int) -> tuple[int, int]:
-    """1-based line and character of a byte; the bytes before it on its line may be invalid too."""
-    lines = re.split(rb"\r\n?|\n", content[:offset])
+def place_of_byte(before: bytes) -> tuple[int, int]:
+    """1-based line and character of a byte; the bytes ``before`` it on its line may be invalid too."""
+    lines = re.split(rb"\r\n?|\n", before)
     return len(lines), len(lines[-1].decode("utf-8", "replace")) + 1

@@ -12,8 +12,8 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.binary.arrays import refuse_line
 from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.text.blocks import Content, TextFile
 from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_column, shown_cell
-from capsule_id.rig.formats.text.decode import decode
 
 _END = "***End_of_Header***"
 _SPECIAL, _END_SPECIAL = "***Start_Special***", "***End_Special***"
@@ -83,7 +83,7 @@ class _File:
         return line + 1, cells[column][1] if column < len(cells) else len(self.lines[line]) + 1
 
 
-def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
+def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
     """Read the columns of a LabVIEW measurement file; segments follow one another.
 
     ``X_Value`` is the column of times (or another abscissa). A file without such columns has them computed from X0 and
@@ -91,7 +91,7 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
 
     Parameters
     ----------
-    content : the bytes of the file
+    content : the bytes of the file, or where they lie
     path : its name, for error lines
     layout : ``missing`` may hold texts of cells
 
@@ -101,7 +101,8 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
         If the headers are incomplete, or segments have different channels.
     """
     refuse_line(layout, path)
-    file = _take_apart(decode(content, path).split("\n"), path, layout.missing)
+    text = TextFile(content, path)
+    file = _take_apart([*text.lines(), ""], path, layout.missing)
     names = file.segments[0].names
     channels = range(1, len(names))
     #: A column of the file, or the computed times of channel k as -k.
@@ -120,7 +121,7 @@ def read_lvm(content: bytes, path: Path, layout: Layout) -> Export:
         return file.place(numbers[0] - 1 if row is None else numbers[row], max(sources[column], 0))
 
     headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
-    return Export(path, (headers,), len(headers), np.asarray(numbers) + 1, values, place)
+    return Export(path, (headers,), len(headers), np.asarray(numbers) + 1, values, place, text.encoding)
 
 
 def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:

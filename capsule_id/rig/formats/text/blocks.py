@@ -1,0 +1,140 @@
+"""The text of a file in blocks of whole lines, so that memory does not grow with the file."""
+
+import codecs
+import gzip
+import io
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from capsule_id.errors import InputError
+from capsule_id.rig.formats.limits import complete, refuse_large
+from capsule_id.rig.formats.text.decode import place_of_byte
+
+#: The bytes of a file, or where they lie.
+Content = bytes | Path
+COMPRESSED = ".gz"
+#: Characters of a block, and bytes that are read at a time.
+BLOCK = 1 << 22
+WINDOWS = "Windows-1252"
+_CODECS = {"UTF-8": "utf-8-sig", "UTF-16": "utf-16", WINDOWS: "cp1252"}
+_NOT_WINDOWS = re.compile(rb"[\x81\x8d\x8f\x90\x9d]")
+
+
+class TextFile:
+    """A text in UTF-8, in UTF-16 with a byte-order mark, or in Windows-1252, compressed where its name ends in ``.gz``.
+
+    Attributes
+    ----------
+    path : its name, for error lines
+    encoding : its encoding
+
+    Raises
+    ------
+    InputError
+        If the content is no text, at its line and character, or a compressed file is damaged or too large.
+    """
+
+    def __init__(self, content: Content, path: Path) -> None:
+        self._content, self.path = content, path
+        self._compressed = path.suffix.lower() == COMPRESSED
+        self.encoding = self._find_encoding()
+
+    def blocks(self, first: int = 0) -> Iterator[tuple[int, str]]:
+        """Blocks of lines from line ``first``, counted from 0: the number of their first line, and their text.
+
+        Every line ends with a line feed, the last one too.
+        """
+        number = 0
+        with self._open() as raw, io.TextIOWrapper(raw, _CODECS[self.encoding]) as file:
+            while text := self._block(file, number):
+                lines = text.count("\n")
+                if number + lines > first:
+                    yield max(number, first), text.split("\n", first - number)[-1] if first > number else text
+                number += lines
+
+    def lines(self, first: int = 0) -> Iterator[str]:
+        """The lines from line ``first`` on, counted from 0."""
+        for _, text in self.blocks(first):
+            yield from text[:-1].split("\n")
+
+    def line(self, number: int) -> str:
+        """Line ``number``, counted from 0; "" where the file has none."""
+        return next(self.lines(number), "")
+
+    def _open(self) -> BinaryIO:
+        """The bytes of the text."""
+        stored = io.BytesIO(self._content) if isinstance(self._content, bytes) else self._content
+        if self._compressed:
+            return cast(BinaryIO, gzip.open(stored))
+        return stored.open("rb") if isinstance(stored, Path) else stored
+
+    def _chunks(self) -> Iterator[tuple[int, bytes]]:
+        """The bytes of the text, and the place of the first one of each chunk."""
+        offset = 0
+        with self._open() as file:
+            while True:
+                if self._compressed:
+                    with complete(self.path, "compress it again by gzip"):
+                        chunk = file.read(BLOCK)
+                    refuse_large(offset + len(chunk), self.path)
+                else:
+                    chunk = file.read(BLOCK)
+                if not chunk:
+                    return
+                yield offset, chunk
+                offset += len(chunk)
+
+    def _block(self, file: io.TextIOWrapper, number: int) -> str:
+        """The next block, "" at the end; ``number`` is that of its first line."""
+        try:
+            text = file.read(BLOCK)
+            text += file.readline() if text else ""
+        except UnicodeError as error:
+            value, remedy = f"no UTF-16 ({error})", "save it as UTF-8"
+            raise InputError("the file must be text", value, remedy, self.path, number + 1) from None
+        return text if not text or text.endswith("\n") else f"{text}\n"
+
+    def _find_encoding(self) -> str:
+        """The encoding, by one pass through the file; Windows-1252 where it is no UTF-8 and begins with ASCII."""
+        decoder, fault, end = codecs.getincrementaldecoder("utf-8")(), None, 0
+        encoding = "UTF-8"
+        for offset, chunk in self._chunks():
+            if offset == 0 and chunk.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+                encoding = "UTF-16"
+            if encoding == "UTF-8" and (nul := chunk.find(b"\0")) >= 0:
+                self._refuse(offset + nul, "the file must be text", "a binary file (NUL byte)", "export it as text")
+            end = offset + len(chunk)
+            waiting = len(decoder.getstate()[0])
+            if encoding == "UTF-8" and fault is None and (waiting or not chunk.isascii()):
+                fault = _fault(decoder, chunk, offset - waiting)
+        waiting = len(decoder.getstate()[0])
+        if encoding == "UTF-8" and fault is None and waiting:
+            fault = end - waiting
+        return encoding if fault is None else self._windows(fault)
+
+    def _windows(self, fault: int) -> str:
+        """Windows-1252, for a text that is ASCII before the byte ``fault``, which is no UTF-8."""
+        for offset, chunk in self._chunks():
+            wrong = fault if not chunk[: max(fault - offset, 0)].isascii() else None
+            if wrong is None and (found := _NOT_WINDOWS.search(chunk)):
+                wrong = offset + found.start()
+            if wrong is not None:
+                self._refuse(wrong, "the file must be UTF-8 text", None, "save it as UTF-8")
+        return WINDOWS
+
+    def _refuse(self, offset: int, rule: str, value: str | None, remedy: str) -> None:
+        """Raise at a byte; ``value`` None names the byte."""
+        with self._open() as file:
+            before, byte = file.read(offset), file.read(1)
+        raise InputError(rule, value or f"byte 0x{byte.hex()}", remedy, self.path, *place_of_byte(before))
+
+
+def _fault(decoder: codecs.IncrementalDecoder, chunk: bytes, offset: int) -> int | None:
+    """Place of the first byte that ``decoder`` refuses, None where there is none; it waits for bytes at ``offset``."""
+    try:
+        decoder.decode(chunk)
+    except UnicodeDecodeError as error:
+        return offset + error.start
+    return None

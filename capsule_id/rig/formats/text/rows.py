@@ -1,0 +1,213 @@
+"""Reads rows of numbers from a text in blocks: quickly where all cells are numbers, else cell by cell."""
+
+import csv
+import io
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.rig.formats.text.blocks import TextFile
+from capsule_id.rig.formats.text.cells import bare, decimal_mark, place_of_cell, read_column
+from capsule_id.views import counted
+
+COMMENTS = ("#", "%")
+_PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
+_SHORT = 1_000_000  # characters of a text that NumPy reads before pandas is imported
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The rows of a text.
+
+    Attributes
+    ----------
+    first : 0-based line of the first one
+    delimiter : separator; None: any number of spaces and tabs
+    width : cells of a row
+    decimal : decimal mark; None: that of each column
+    trailing : every row ends with a separator and a blank cell, which is not counted
+    """
+
+    first: int
+    delimiter: str | None
+    width: int
+    decimal: str | None
+    trailing: bool = False
+
+
+class Growing:
+    """A column of numbers that grows block by block, without a second copy."""
+
+    def __init__(self, dtype: type[np.generic] = np.float64) -> None:
+        self.values = np.empty(0, dtype)
+
+    def extend(self, more: np.ndarray) -> None:
+        """Append numbers."""
+        size = len(self.values)
+        self.values.resize(size + len(more), refcheck=False)
+        self.values[size:] = more
+
+
+class Rows:
+    """Numbers of some columns of a text; a column with another cell holds the error about it."""
+
+    def __init__(self, columns: Sequence[int]) -> None:
+        self._lines = Growing(np.int32)
+        self._columns: dict[int, Growing | InputError] = {column: Growing() for column in columns}
+
+    @property
+    def lines(self) -> np.ndarray:
+        """(rows,) 1-based line of every row."""
+        return self._lines.values
+
+    def column(self, index: int) -> np.ndarray:
+        """The numbers of a column, (rows,).
+
+        Raises
+        ------
+        InputError
+            At the first cell that is neither a number nor a missing marker.
+        """
+        column = self._columns[index]
+        if isinstance(column, InputError):
+            raise column
+        return column.values
+
+    def add_lines(self, numbers: np.ndarray | Sequence[int]) -> None:
+        """Append rows by their 0-based lines."""
+        self._lines.extend(np.asarray(numbers) + 1)
+
+    def add(self, index: int, values: np.ndarray | InputError) -> None:
+        """Append numbers to a column; the first error of a column stays."""
+        column = self._columns[index]
+        if isinstance(column, InputError):
+            return
+        if isinstance(values, InputError):
+            self._columns[index] = values
+        else:
+            column.extend(values)
+
+
+def is_comment(line: str) -> bool:
+    """Whether a line is a comment."""
+    return line.lstrip().startswith(COMMENTS)
+
+
+def plain_block(text: str, shape: Shape, columns: Sequence[int]) -> np.ndarray | None:
+    """The (rows, columns) numbers of lines that hold numbers alone, by a reader in C; None for any other lines.
+
+    Parameters
+    ----------
+    text : lines, each with a line feed
+    columns : indices of the columns that are returned
+    """
+    delimiter, decimal, count = shape.delimiter, shape.decimal or ".", text.count("\n")
+    allowed = f"{_PLAIN}{delimiter or ''}{decimal}\n".encode()
+    if not text.strip() or text.encode("utf-8", "replace").translate(None, allowed):
+        return None
+    # Rows with a last cell have all cells, by the number of separators. Cells between spaces are counted by the reader.
+    if delimiter is not None and text.count(delimiter) != count * (shape.width - 1 + shape.trailing):
+        return None
+    used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
+    values = _parse(text.replace(",", ".") if decimal == "," else text, delimiter, used)
+    if values is None or values.shape != (count, len(used)) or not np.isfinite(values).all():
+        return None
+    return values[:, np.searchsorted(used, columns)]
+
+
+def _parse(text: str, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
+    """The numbers of the columns of a text, correctly rounded; None where a cell is no number."""
+    usecols = None if delimiter is None else columns
+    try:
+        if len(text) < _SHORT:
+            return np.loadtxt(io.StringIO(text), delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
+        import pandas as pd
+
+        with warnings.catch_warnings():
+            # pandas 2 rounds correctly by this option alone; pandas 3 always does so, and warns of the option.
+            warnings.simplefilter("ignore")
+            frame = pd.read_csv(
+                io.StringIO(text),
+                sep=delimiter or r"\s+",
+                header=None,
+                usecols=usecols,
+                dtype=np.float64,
+                na_filter=False,
+                quoting=csv.QUOTE_NONE,
+                float_precision="round_trip",
+                low_memory=False,
+            )
+    except ValueError:
+        return None
+    return frame.to_numpy()
+
+
+def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | None:
+    """The rows of a text without missing, empty or other cells; None for any other text."""
+    rows = Rows(columns)
+    for number, text in file.blocks(shape.first):
+        numbers: np.ndarray | list[int] = np.arange(number, number + text.count("\n"))
+        values = plain_block(text, shape, columns)
+        if values is None:
+            kept = list(_rows_in(number, text))
+            if not kept:
+                continue
+            numbers, lines = [line for line, _ in kept], [line for _, line in kept]
+            if len(lines) < text.count("\n"):  # blank lines or comments
+                values = plain_block("\n".join(lines) + "\n", shape, columns)
+        if values is None:
+            return None
+        rows.add_lines(numbers)
+        for index, column in enumerate(columns):
+            rows.add(column, values[:, index])
+    return rows
+
+
+def any_rows(file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str]) -> Rows:
+    """The rows of a text, with NaN at a missing marker.
+
+    Raises
+    ------
+    InputError
+        If a row has another number of cells than the first one.
+    """
+    rows = Rows(columns)
+    marks = dict.fromkeys(columns, shape.decimal)
+    for number, text in file.blocks(shape.first):
+        kept = list(_rows_in(number, text))
+        cells = [_cells(line, text, shape, file.path) for line, text in kept]
+        rows.add_lines([line for line, _ in kept])
+        for column in columns:
+            texts = [bare(row[column]) for row in cells]
+            marks[column] = marks[column] or decimal_mark(texts, missing)
+
+            def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> tuple[Path, int, int]:
+                line, text = kept[k]
+                return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
+
+            try:
+                rows.add(column, read_column(texts, marks[column] or ".", missing, place))
+            except InputError as error:
+                rows.add(column, error)
+    return rows
+
+
+def _rows_in(number: int, text: str) -> Iterator[tuple[int, str]]:
+    """The rows of a block with their 0-based lines; ``number`` is that of the first line."""
+    lines = enumerate(text[:-1].split("\n"), number)
+    return ((line, row) for line, row in lines if row.strip() and not is_comment(row))
+
+
+def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
+    """The cells of a row, as many as the first row has."""
+    cells = text.split(shape.delimiter)
+    cells = cells[:-1] if shape.trailing else cells
+    if len(cells) != shape.width:
+        rule = f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has"
+        remedy = f"correct the row, or state data_from_line = {line + 1} if the readings begin here"
+        raise InputError(rule, counted(len(cells), "cell"), remedy, path, line + 1, 1)
+    return cells

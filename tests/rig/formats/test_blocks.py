@@ -1,0 +1,173 @@
+"""Texts are read in blocks: the size of a block, the encoding and the parser change nothing but time and memory."""
+
+import codecs
+import gzip
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsule_id import read_rig
+from capsule_id.cli import capsule_id
+from capsule_id.errors import InputError
+from capsule_id.rig.formats import EXPORTS, READERS
+from capsule_id.rig.formats.export import Layout
+from capsule_id.rig.formats.text import blocks, rows
+from capsule_id.rig.formats.text.blocks import TextFile
+from capsule_id.rig.formats.text.rows import Shape, plain_block
+
+#: Texts with every layout and every fault that depends on more than one line.
+TEXTS = [
+    "time [s],x_rel [mm]\n0,1.5\n1,2.5\n2,-3e-4\n",
+    "time [s];x_rel [mm]\r\n0;1\r\n1;2,5\r\n2;3,25\r\n\r\n  \r\n",
+    "\ufefftime [s]\tx_rel [mm]\r0\t1\r1\t2\r",
+    "time [s],x_rel [mm]\n0,1\n\n1,2\n",
+    "time [s],x_rel [mm]\n\n",
+    "\n\ntime [s],x_rel [mm]\n0,1\n",
+    "",
+    " \n\t\n",
+    "Logger 7\n# a comment\nt;x\ns;mm\n0;1,5\n1;--\n% another\n2;3,5\n\n3;4,5",
+    "t x y\n0  1.5 2\n 1\t2.5 3 \n2 3.5 4\n",
+    "t,x,\n0,1.5,\n1,2.5,\n2,3.5,\n",
+    "t,x,\n0,1.5,\n1,2.5,\n2,3.5,4\n",
+    "t,x\n0,1.5\n1,2.5,7\n2,3.5\n",
+    "t,x\n0,1.5\n1\n2,3.5,4\n",
+    "t;x\n0;1\n1;2,5\n2;3.5\n",
+    "1,25\n1,50\n",
+    "".join(f"{k},{k % 7}\n" for k in range(60)),
+    "".join(f"{k},{k % 7}\n" for k in [*range(60), 3]),
+    "no numbers at all\nnor here\n",
+    "t,x\n0,1e400\n1,2\n",
+    "t,x\n0,1\n1,2 3\n",
+    "t,x µm\n0,1\n1,nan\n2,3\n",
+    "0,1.5\n" * 40 + "0,x\n",
+]
+SIZES = [1, 3, 16, 1000]
+
+
+def outcome(text: str, suffix: str, layout: Layout | None) -> list[str]:
+    """All that a reader says about a text, or its error."""
+    path = Path(f"f{suffix}")
+    try:
+        if layout is None:
+            raw = READERS[suffix](text.encode(), path)
+            return [repr((raw.names, raw.units, raw.values.tolist(), raw.rows.tolist(), raw.place(0, 0), raw.encoding))]
+        export = EXPORTS[suffix](text.encode(), path, layout)
+    except InputError as error:
+        return [str(error)]
+    found = [
+        repr((export.headers, export.lines.tolist(), export.place(None, 0), export.place(len(export.lines) - 1, 0)))
+    ]
+    for column in range(export.width):
+        try:
+            found.append(repr(export.values(column).tolist()))
+        except InputError as error:
+            found.append(str(error))
+    return found
+
+
+@pytest.mark.parametrize("layout", [None, Layout(missing=("--", "")), Layout(data_from_line=2), Layout(decimal=",")])
+def test_blocks_of_any_size_read_the_same(monkeypatch: pytest.MonkeyPatch, layout: Layout | None) -> None:
+    wanted = [outcome(text, ".csv", layout) for text in TEXTS]
+    assert sum(len(found) > 1 or found[0].startswith("(") for found in wanted) >= 3
+    for size in SIZES:
+        monkeypatch.setattr(blocks, "BLOCK", size)
+        for short in (0, 10**9):
+            monkeypatch.setattr(rows, "_SHORT", short)
+            for text, expected in zip(TEXTS, wanted, strict=True):
+                assert outcome(text, ".csv", layout) == expected, (size, short, text)
+
+
+@pytest.mark.parametrize("short", [0, 10**9])
+def test_both_parsers_round_correctly_and_refuse_the_same_cells(monkeypatch: pytest.MonkeyPatch, short: int) -> None:
+    monkeypatch.setattr(rows, "_SHORT", short)
+    rng = np.random.default_rng(3)
+    values = rng.standard_normal((2000, 3)) * 10.0 ** rng.integers(-300, 300, (2000, 3))
+    for delimiter, decimal in ((",", "."), (";", ","), ("\t", "."), (None, ".")):
+        text = "".join((delimiter or "  ").join(map(repr, row)) + "\n" for row in values.tolist())
+        shape = Shape(0, delimiter, 3, decimal)
+        found = plain_block(text if decimal == "." else text.replace(".", ","), shape, [2, 0])
+        assert found is not None
+        np.testing.assert_array_equal(found, values[:, [2, 0]])
+    for cell in ("", " ", "1e", "e5", ".", "+", "--1", "+-1", "1.5.2", "1 2", "1e5.5", "1e999", "-", "1+1"):
+        assert plain_block(f"1,2\n{cell},4\n", Shape(0, ",", 2, "."), [0, 1]) is None, cell
+    for cell in ("1.", ".5", "+1", "-0", " 7\t", "1E5", "0001", "1" * 400 + "e-400"):
+        found = plain_block(f"1,2\n{cell},4\n", Shape(0, ",", 2, "."), [0])
+        assert found is not None
+        assert found[1, 0] == float(cell)
+    for text in ("1,2\n1\n", "1,2\n1,2,3\n", "1,2\n1\n1,2,3\n", "1,2\n\n1,2\n"):
+        assert plain_block(text, Shape(0, ",", 2, "."), [0]) is None, text
+
+
+def test_columns_that_are_not_named_are_not_kept() -> None:
+    text = ("time (s),x (mm),spare\n" + "0,1,2\n" * 10).encode()
+    export = EXPORTS[".csv"](text, Path("f.csv"), Layout(columns=("time (s)", 2)))
+    assert (export.width, export.headers[0]) == (3, ("time (s)", "x (mm)", "spare"))
+    assert (export.values(0)[0], export.values(1)[0]) == (0.0, 1.0)
+    with pytest.raises(KeyError):
+        export.values(2)
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".txt.gz"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_encodings_of_laboratories(
+    tmp_path: Path, encoding: str, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "Prüfstand\r\nZeit (ms);Weg (µm)\r\n" + "".join(
+        f"{k};{(k % 5) * 0.5:g}\r\n".replace(".", ",") for k in range(20)
+    )
+    content = text.encode(encoding)
+    (tmp_path / f"d{suffix}").write_bytes(gzip.compress(content) if suffix.endswith(".gz") else content)
+    (tmp_path / "rig.toml").write_text(
+        f'[rig]\nname = "d"\nm1 = {{ value = 0.1, sd = 0.001, unit = "kg" }}\n'
+        f'[[experiment]]\nkind = "free_vibration"\nfile = "d{suffix}"\n'
+        'columns = { time = { from = "Zeit (ms)", unit = "ms" }, x_rel = { from = "Weg (µm)", unit = "µm" } }\n',
+        encoding="utf-8",
+    )
+    (table,) = read_rig(tmp_path).tables
+    np.testing.assert_array_equal(table["x_rel"], np.array([(k % 5) * 0.5 for k in range(20)]) / 1e6)
+    assert capsule_id(["check", str(tmp_path)]) == 0
+    said = f"d{suffix} is read as Windows-1252" in capsys.readouterr().out
+    assert said == (encoding == "cp1252")
+
+
+@pytest.mark.parametrize(
+    ("content", "place", "value"),
+    [
+        ("é [s]\n1\n2".encode() + b"\xe9\n", "3:2", "byte 0xe9"),  # UTF-8 that is damaged
+        (b"a [s]\n1\n\x81\n", "3:1", "byte 0x81"),
+        (b"a [s]\n1\n\xe9\x8d\n", "3:2", "byte 0x8d"),
+        (b"a [s]\n1\n\xc3", "3:1", "byte 0xc3"),
+        (b"a [s]\n1\n2\x00\n", "3:2", "NUL"),
+    ],
+)
+def test_what_is_no_text_is_located(content: bytes, place: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for size in (1, 4, 1 << 22):
+        monkeypatch.setattr(blocks, "BLOCK", size)
+        if value == "byte 0xc3":
+            assert TextFile(content, Path("f.csv")).encoding == "Windows-1252"
+            continue
+        with pytest.raises(InputError, match=rf"^f\.csv:{place}: the file must be .*{value}"):
+            TextFile(content, Path("f.csv"))
+
+
+def test_damaged_utf_16_is_an_error_line() -> None:
+    with pytest.raises(InputError, match=r"^f\.csv:1: the file must be text, no UTF-16"):
+        READERS[".csv"](codecs.BOM_UTF16_LE + b"a\0 \0[\0s\0]\0\n\0001", Path("f.csv"))
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
+    """Eleven columns of which two are kept: beside them a block is in memory, not the file."""
+    line = "0.5," + ",".join(["1.23456789"] * 10)
+    peaks = []
+    for count in (60_000, 240_000):
+        path = tmp_path / f"{count}.csv"
+        path.write_text("t," + ",".join(f"x{k}" for k in range(10)) + f"\n{line}\n" + f"{line}\n" * (count - 1))
+        tracemalloc.start()
+        export = EXPORTS[".csv"](path, path, Layout(columns=("t", "x3")))
+        peaks.append(tracemalloc.get_traced_memory()[1] - 20 * count)  # two columns and the lines
+        tracemalloc.stop()
+        assert len(export.values(0)) == count
+    assert peaks[1] < 1.1 * peaks[0]
+    assert path.stat().st_size > 1.5 * peaks[1] / 4
