@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from capsule_id.experiments.progression.twin import synthesize_robot as synthesize_robot
     from capsule_id.importing.entry import propose_entry as propose_entry
     from capsule_id.motions.bias import smoothing_bias as smoothing_bias
+    from capsule_id.motions.operating import draws_diagram as draws_diagram
     from capsule_id.motions.response import Response as Response
     from capsule_id.motions.response import Settling as Settling
     from capsule_id.motions.response import response as response
@@ -82,6 +83,7 @@ _MODULE_OF = {
     "compare": "capsule_id.api",
     "continuation": "capsule_id.motions.sweep",
     "diagram": "capsule_id.motions.sweep",
+    "draws_diagram": "capsule_id.motions.operating",
     "energy_balance": "capsule_id.physics.energy",
     "Excitation": "capsule_id.physics.model",
     "Fit": "capsule_id.api",

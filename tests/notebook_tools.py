@@ -28,7 +28,7 @@ SHORT = {
     "03": "STEPS = 1500",
     "04": "CALIBRATIONS = 1500",
     "05": "WIDTHS = 2",
-    "06": "RUNS, SAMPLES = (1,), 2000",
+    "06": "RUNS, SAMPLES = (1,), 1000",
     "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
     "08": "DRAWS, POINTS = 24, 16",
 }

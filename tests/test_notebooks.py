@@ -25,7 +25,7 @@ from tests.notebook_tools import (
 )
 
 #: Chapters that still import modules of the package or have longer cells.
-NOT_YET = {"06", "07", "08"}
+NOT_YET = {"07"}
 LARGEST, LARGEST_TOGETHER = 600_000, 3_000_000  # bytes
 
 

@@ -1,4 +1,4 @@
-"""Figures of simulated motions: time histories, phase plane, and the bias of the smoothed model against its width.
+"""Figures of simulated motions: time histories and phase plane.
 
 Every figure is ``(data, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own.
 """
