@@ -30,7 +30,7 @@ from capsule_id.interruption import stop_if_interrupted
 from capsule_id.views import counted
 
 #: Tolerance, dimensionless, and largest number of solver steps of one descent.
-SOLVER = Solver(tolerance=1e-7, max_steps=80, normal_equations=True, heavy=True)
+SOLVER = Solver(tolerance=1e-7, max_steps=80, heavy=True)
 #: Largest number of rounds of least squares and scatters. Convergence tolerance of a round, in standard deviations.
 ROUNDS, SMALL_MOVE_IN_SD = 8, 0.01
 #: Largest number of rounds where residuals have kinks: small moves go on there without an end.

@@ -4,27 +4,36 @@ Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the mini
 σ² (JᵀJ)⁻¹ with σ² = Σ r² / (n − d) unless it is known (Seber & Wild, *Nonlinear Regression*, 1989, ch. 2).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 
 from capsule_id.inference.fit.covariance import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
 from capsule_id.inference.target.compiling import COMPILE, COMPILE_QUICKLY
+from capsule_id.interruption import stop_if_interrupted
 from capsule_id.precision import require_float64
 
 require_float64()
 
 Residual = Callable[[jax.Array], jax.Array]
-#: Points (s, d) -> residuals (s, n) and their Jacobians (s, n, d).
-Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+#: A point (d,) -> residuals (n,) and their Jacobian (n, d).
+Linearise = Callable[[np.ndarray], tuple[Residuals, Jacobian]]
+
+LEAST_DECREASE, EXPECTED_DECREASE = 0.01, 0.99
+"""Parts of the decrease of the cost that the linear model predicts. A step with less than the first is rejected. A step
+with more than the second enlarges the trust region (Gould et al., *4OR* 3, 2005, 227)."""
+
+ENLARGED, REDUCED = 3.5, 0.25
+"""Factors of the trust region's size after such steps. The damping is the inverse of this size."""
+
+LARGEST_DAMPING = 1.0 / float(np.finfo(float).eps)
+"""Damping beside squared column norms of at most about 1, beyond which a step vanishes in rounding."""
 
 FIRST_DAMPING = 1e-6
 """Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
@@ -84,14 +93,11 @@ class Solver:
     tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
         tolerance (1 + its size)
     max_steps : solver steps, rejected ones included, after which a start counts as stalled
-    normal_equations : solve each step by Cholesky of J'J instead of QR of J: half the digits, but a hundred times as
-        fast for thousands of residuals
     heavy : residuals take milliseconds, so the code is optimised and parameters are scaled by effect (Marquardt 1963)
     """
 
     tolerance: float = 1e-9
     max_steps: int = 1024
-    normal_equations: bool = False
     heavy: bool = False
 
 
@@ -99,10 +105,11 @@ class Solver:
 SOLVER = Solver()
 
 
-def least_squares(
-    residual: Residual, starts: np.ndarray, solver: Solver = SOLVER, linearise: Linearise | None = None
-) -> LeastSquaresFit:
+def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVER) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
+
+    Only residuals and Jacobian are compiled, in one program. The steps are NumPy, because a second program that holds
+    the residuals takes as long to compile again.
 
     Damping and tolerance of Levenberg-Marquardt require parameters of comparable size. Each start is therefore solved
     in v_j = x_j / scale_j with scale_j = |start_j| (at zero: ``SMALLEST_EFFECT``). The residuals are divided by the
@@ -114,8 +121,6 @@ def least_squares(
         passes its arrays as arguments: other values of the same shapes then need no new compilation
     starts : (s, d), units of the parameters
     solver : tolerance and linear algebra of each start
-    linearise : residuals and Jacobians for scaling the starts and testing convergence; None compiles forward-mode
-        differentiation for them
 
     Raises
     ------
@@ -125,36 +130,79 @@ def least_squares(
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    linearise = linearise or partial(_forward_mode, residual, solver.heavy)
-    scale, unit = zip(*map(_effects if solver.heavy else _scales, linearise(starts)[1], starts), strict=True)
-    solve = partial(_PROGRAMS[solver.heavy][1], residual, solver)
-    # A batched solver takes twice as long to compile and saves only milliseconds, so starts run one by one.
-    arguments = (map(jnp.asarray, one) for one in zip(starts, scale, unit, strict=True))
-    ends, steps, results = zip(*(solve(*one) for one in arguments), strict=True)
-    x, steps = np.stack(ends), np.array(steps, dtype=int)
-    residuals, jacobian = linearise(x)
-    rounding = [solver.tolerance * one for one in unit]
-    message = [_reason(*one) for one in zip(results, jacobian, residuals, rounding, strict=True)]
+    ends = [_descend(partial(_linearised, residual, solver.heavy), start, solver) for start in starts]
+    x, residuals, jacobian, steps, message = zip(*ends, strict=True)
     return LeastSquaresFit(
-        x=x,
-        cost=0.5 * np.sum(residuals**2, axis=1),
+        x=np.stack(x),
+        cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
         stalled=np.array([reason != "" for reason in message]),
-        steps=steps,
-        message=tuple(message),
-        residuals=residuals,
-        jacobian=jacobian,
+        steps=np.array(steps),
+        message=message,
+        residuals=np.stack(residuals),
+        jacobian=np.stack(jacobian),
     )
 
 
-def _reason(result: optx.RESULTS, jacobian: Jacobian, residuals: Residuals, rounding: float) -> str:
-    """Reason why an end point is not a minimum; "" where it is one."""
-    reason = optx.RESULTS[result]
+class _End(NamedTuple):
+    """Where one start ended: x (d,), residuals (n,) and Jacobian (n, d) there, steps, reason for no convergence."""
+
+    x: np.ndarray
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    steps: int
+    message: str
+
+
+def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
+    """Levenberg-Marquardt from one start (d,)."""
+    x, (residuals, jacobian) = start, linearise(start)
     if not all_finite(jacobian, residuals):
-        return "The residuals or their Jacobian are not finite where this start ended: try another start."
+        return _End(x, residuals, jacobian, 1, "The residuals or their Jacobian are not finite: try another start.")
+    scale, unit = (_effects if solver.heavy else _scales)(jacobian, start)
+    damping, steps, converged = 1.0, 1, False
+    reduced = _reduced(jacobian * scale / unit, residuals / unit)
+    while not converged and steps < solver.max_steps and damping < LARGEST_DAMPING:
+        stop_if_interrupted()
+        move, predicted = _damped_step(reduced, damping)
+        trial = x + move * scale
+        at_trial, slopes = linearise(trial)
+        steps += 1
+        with np.errstate(over="ignore", invalid="ignore"):
+            change = 0.5 * float(np.sum((at_trial / unit) ** 2) - np.sum((residuals / unit) ** 2))
+        if not (change <= LEAST_DECREASE * predicted and all_finite(slopes, at_trial)):
+            damping /= REDUCED
+            continue
+        damping /= ENLARGED if change < EXPECTED_DECREASE * predicted else 1.0
+        converged = _is_small(trial / scale, move, solver) and _is_small(
+            at_trial / unit, (at_trial - residuals) / unit, solver
+        )
+        x, residuals, jacobian = trial, at_trial, slopes
+        reduced = _reduced(jacobian * scale / unit, residuals / unit)
+    if not converged and steps == solver.max_steps:
+        return _End(x, residuals, jacobian, steps, "The maximum number of steps was reached: try another start.")
     # The solver tests step sizes only, and heavy damping makes steps small far from a minimum.
-    if not reason and not _stationary(jacobian, residuals, rounding):
-        return "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
-    return reason
+    stationary = _stationary(jacobian, residuals, solver.tolerance * unit)
+    reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
+    return _End(x, residuals, jacobian, steps, "" if stationary else reason)
+
+
+def _reduced(jacobian: Jacobian, residuals: Residuals) -> np.ndarray:
+    """(min(n, d + 1), d + 1) triangle of (J, r): |J v + r| is the same with its columns in the place of J and r."""
+    return np.asarray(np.linalg.qr(np.column_stack([jacobian, residuals]), mode="r"))
+
+
+def _damped_step(reduced: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
+    """Minimise |J v + r|² + damping |v|²: return v (d,) and the predicted change of ½ |r|²."""
+    jacobian, residuals = reduced[:, :-1], reduced[:, -1]
+    d = jacobian.shape[1]
+    damped = np.concatenate([jacobian, np.sqrt(damping) * np.eye(d)])
+    move = -np.linalg.lstsq(damped, np.concatenate([residuals, np.zeros(d)]))[0]
+    return move, 0.5 * float(np.sum((jacobian @ move + residuals) ** 2) - np.sum(residuals**2))
+
+
+def _is_small(values: np.ndarray, change: np.ndarray, solver: Solver) -> bool:
+    """Whether every change is below the tolerance times (1 + its value)."""
+    return bool(np.all(np.abs(change) < solver.tolerance * (1.0 + np.abs(values))))
 
 
 def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bool:
@@ -168,17 +216,14 @@ def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bo
     return tangential <= max(LARGEST_OFFSET * radius, rounding)
 
 
-def _forward_mode(residual: Residual, heavy: bool, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (s, n) and Jacobians (s, n, d) at points (s, d)."""
-    parts = [_PROGRAMS[heavy][0](residual, point) for point in jnp.asarray(points)]
-    residuals, jacobians = (np.stack(part) for part in zip(*parts, strict=True))
-    return residuals, jacobians
-
-
 def linearised(residual: Residual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (n,) and Jacobian (n, d) of heavy residuals at x (d,)."""
-    residuals, jacobians = _forward_mode(residual, True, x[None])
-    return residuals[0], jacobians[0]
+    return _linearised(residual, True, x)
+
+
+def _linearised(residual: Residual, heavy: bool, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    residuals, jacobian = _PROGRAMS[heavy](residual, jnp.asarray(x))
+    return np.asarray(residuals), np.asarray(jacobian)
 
 
 def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -192,57 +237,17 @@ def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return value, jacobian
 
 
-def _solve(
-    residual: Residual, solver: Solver, start: jax.Array, scale: jax.Array, unit: jax.Array
-) -> tuple[jax.Array, jax.Array, optx.RESULTS]:
-    """Solve from one start (d,): return x (d,), steps and result code."""
-    function = _with_jacobian(lambda v: residual(v * scale) / unit)
-    solution = optx.least_squares(
-        lambda v, _: function(v),
-        optx.LevenbergMarquardt(
-            rtol=solver.tolerance,
-            atol=solver.tolerance,
-            linear_solver=lx.Normal(lx.Cholesky()) if solver.normal_equations else lx.QR(),
-        ),
-        start / scale,
-        max_steps=solver.max_steps,
-        throw=False,
-    )
-    return solution.value * scale, solution.stats["num_steps"], solution.result
-
-
-def _with_jacobian(function: Residual) -> Residual:
-    """Return ``function`` with a tangent rule that computes value and full Jacobian in one pass.
-
-    The solver linearises and then evaluates every column. This rule compiles a third faster than transposition.
-    An event-driven run is a loop of unknown length and cannot be transposed.
-    """
-    wrapped = jax.custom_jvp(function)
-
-    @wrapped.defjvp
-    def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
-        value, jacobian = _linearise(function, *primals)
-        return value, jacobian @ tangents[0]
-
-    return wrapped
-
-
-def _compiled(function: Callable[..., Any], options: Mapping[str, object]) -> Callable[..., Any]:
+#: Compiled ``_linearise``, indexed by whether the residuals are heavy.
+_PROGRAMS: dict[bool, Callable[..., Any]] = {
     # Equinox passes the options to jax.jit, but its annotations omit them.
-    return eqx.filter_jit(function, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
-
-
-#: Compiled (linearise, solve), indexed by whether the residuals are heavy.
-_PROGRAMS = {
-    heavy: tuple(_compiled(function, COMPILE if heavy else COMPILE_QUICKLY) for function in (_linearise, _solve))
-    for heavy in (False, True)
+    heavy: eqx.filter_jit(_linearise, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+    for heavy, options in ((True, COMPILE), (False, COMPILE_QUICKLY))
 }
 
 
 def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Scale as ``_scales`` does, but give every column of the Jacobian the same norm, the unit of the residuals."""
     column_norm = np.linalg.norm(jacobian, axis=0)
-    column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
     unit = float(np.max(column_norm)) or 1.0
     scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), np.ones_like(start))
     # The solver's initial damping is 1. Larger residual units reduce its effect by their square.
@@ -252,8 +257,6 @@ def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
 def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
     column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
-    # The solver reports values that are not finite.
-    column_norm = np.where(np.isfinite(column_norm), column_norm, 0.0)
     strongest = np.max(column_norm * size)
     # With all starts at zero no scale exists, so every parameter counts as equally strong.
     step = SMALLEST_EFFECT * strongest if strongest > 0 else 1.0

@@ -7,7 +7,6 @@ seconds to compile and only milliseconds to run.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +39,7 @@ MAX_STEPS = 400
 LOG_POSTERIOR_FLOOR = -1e12
 #: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
 #: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
-BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=50, normal_equations=True)
+BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=50)
 #: Relative step of the difference quotients of residuals; their relative error is about 1e-10.
 DIFFERENCE = 1e-5
 
@@ -62,12 +61,7 @@ def point_fit(
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
         compiled = pool.submit(target.batch, np.repeat(starts[:1], BATCH, axis=0))
-        rough = least_squares(
-            HeldResiduals(target, jnp.asarray(starts[0])),
-            starts[:, located],
-            BASIN_SOLVER,
-            partial(_linearise, target, starts[0]),
-        )
+        rough = least_squares(HeldResiduals(target, jnp.asarray(starts[0])), starts[:, located], BASIN_SOLVER)
         compiled.result()
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
@@ -129,20 +123,6 @@ def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tup
         value,
         value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM),
     )
-
-
-def _linearise(target: LogPosterior, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (s, n) and Jacobians (s, n, d) at located u (s, d), scatters fixed at ``start``; not compiled."""
-    located = target.located
-
-    def residuals(v: np.ndarray) -> np.ndarray:
-        u = start.copy()
-        u[located] = v
-        with np.errstate(all="ignore"):
-            return target.plain_residuals(u)
-
-    step = _steps(target)[located]
-    return np.stack([residuals(v) for v in points]), np.stack([jacobian(residuals, v, step) for v in points])
 
 
 def _steps(target: LogPosterior) -> np.ndarray:
