@@ -24,8 +24,6 @@ from tests.notebook_tools import (
     run_short,
 )
 
-#: Chapters that still import modules of the package or have longer cells.
-NOT_YET = {"07"}
 LARGEST, LARGEST_TOGETHER = 600_000, 3_000_000  # bytes
 
 
@@ -48,7 +46,7 @@ def test_what_a_notebook_keeps_is_whole(name: str) -> None:
     assert notebook.cells[0].source.startswith(f"# {int(name[:2])}. ")
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name[:2] not in NOT_YET])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_uses_public_names_in_short_cells(name: str) -> None:
     notebook = read(name)
     assert not_public(notebook) == []
