@@ -87,17 +87,17 @@ def test_both_parsers_round_correctly_and_refuse_the_same_cells(monkeypatch: pyt
     for delimiter, decimal in ((",", "."), (";", ","), ("\t", "."), (None, ".")):
         text = "".join((delimiter or "  ").join(map(repr, row)) + "\n" for row in values.tolist())
         shape = Shape(0, delimiter, 3, decimal)
-        found = plain_block(text if decimal == "." else text.replace(".", ","), shape, [2, 0])
+        found = plain_block((text if decimal == "." else text.replace(".", ",")).encode(), shape, [2, 0])
         assert found is not None
         np.testing.assert_array_equal(found, values[:, [2, 0]])
     for cell in ("", " ", "1e", "e5", ".", "+", "--1", "+-1", "1.5.2", "1 2", "1e5.5", "1e999", "-", "1+1"):
-        assert plain_block(f"1,2\n{cell},4\n", Shape(0, ",", 2, "."), [0, 1]) is None, cell
+        assert plain_block(f"1,2\n{cell},4\n".encode(), Shape(0, ",", 2, "."), [0, 1]) is None, cell
     for cell in ("1.", ".5", "+1", "-0", " 7\t", "1E5", "0001", "1" * 400 + "e-400"):
-        found = plain_block(f"1,2\n{cell},4\n", Shape(0, ",", 2, "."), [0])
+        found = plain_block(f"1,2\n{cell},4\n".encode(), Shape(0, ",", 2, "."), [0])
         assert found is not None
         assert found[1, 0] == float(cell)
     for text in ("1,2\n1\n", "1,2\n1,2,3\n", "1,2\n1\n1,2,3\n", "1,2\n\n1,2\n"):
-        assert plain_block(text, Shape(0, ",", 2, "."), [0]) is None, text
+        assert plain_block(text.encode(), Shape(0, ",", 2, "."), [0]) is None, text
 
 
 def test_columns_that_are_not_named_are_not_kept() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.export import Export, Layout
-from capsule_id.rig.formats.text.blocks import Content, TextFile
+from capsule_id.rig.formats.text.blocks import Content, TextFile, lines_of
 from capsule_id.rig.formats.text.cells import BLANKS, bare, number_in, place_of_cell, shown_cell
 from capsule_id.rig.formats.text.rows import COMMENTS, Shape, any_rows, is_comment, plain_rows
 
@@ -67,9 +67,9 @@ def _is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[
     return column + 1 in wanted or any(names[column] in wanted for names in headers)
 
 
-def _ends_blank(text: str, delimiter: str | None) -> bool:
+def _ends_blank(text: bytes, delimiter: str | None) -> bool:
     """Whether the last cell of every row in ``text`` is blank."""
-    rows = (line for line in text[:-1].split("\n") if line.strip() and not is_comment(line))
+    rows = (line for line in lines_of(text) if line.strip() and not is_comment(line))
     return all(not line.split(delimiter)[-1].strip(BLANKS) for line in rows)
 
 

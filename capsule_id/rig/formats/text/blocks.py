@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
 
+import numpy as np
+
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.limits import complete, refuse_large
 from capsule_id.rig.formats.text.decode import place_of_byte
@@ -41,23 +43,23 @@ class TextFile:
         self._compressed = path.suffix.lower() == COMPRESSED
         self.encoding = self._find_encoding()
 
-    def blocks(self, first: int = 0) -> Iterator[tuple[int, str]]:
-        """Blocks of lines from line ``first``, counted from 0: the number of their first line, and their text.
+    def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
+        """Blocks of lines from line ``first``, counted from 0: the number of their first line, and their text in UTF-8.
 
         Every line ends with a line feed, the last one too.
         """
         number = 0
         with self._open() as raw, io.TextIOWrapper(raw, _CODECS[self.encoding]) as file:
             while text := self._block(file, number):
-                lines = text.count("\n")
+                lines = occurrences("\n", text)
                 if number + lines > first:
-                    yield max(number, first), text.split("\n", first - number)[-1] if first > number else text
+                    yield max(number, first), text.split(b"\n", first - number)[-1] if first > number else text
                 number += lines
 
     def lines(self, first: int = 0) -> Iterator[str]:
         """The lines from line ``first`` on, counted from 0."""
         for _, text in self.blocks(first):
-            yield from text[:-1].split("\n")
+            yield from lines_of(text)
 
     def line(self, number: int) -> str:
         """Line ``number``, counted from 0; "" where the file has none."""
@@ -86,15 +88,15 @@ class TextFile:
                 yield offset, chunk
                 offset += len(chunk)
 
-    def _block(self, file: io.TextIOWrapper, number: int) -> str:
-        """The next block, "" at the end; ``number`` is that of its first line."""
+    def _block(self, file: io.TextIOWrapper, number: int) -> bytes:
+        """The next block, b"" at the end; ``number`` is that of its first line."""
         try:
             text = file.read(BLOCK)
             text += file.readline() if text else ""
         except UnicodeError as error:
             value, remedy = f"no UTF-16 ({error})", "save it as UTF-8"
             raise InputError("the file must be text", value, remedy, self.path, number + 1) from None
-        return text if not text or text.endswith("\n") else f"{text}\n"
+        return (text if not text or text.endswith("\n") else f"{text}\n").encode()
 
     def _find_encoding(self) -> str:
         """The encoding, by one pass through the file; Windows-1252 where it is no UTF-8 and begins with ASCII."""
@@ -129,6 +131,16 @@ class TextFile:
         with self._open() as file:
             before, byte = file.read(offset), file.read(1)
         raise InputError(rule, value or f"byte 0x{byte.hex()}", remedy, self.path, *place_of_byte(before))
+
+
+def occurrences(mark: str, text: bytes) -> int:
+    """How often an ASCII character occurs; faster than ``count`` where it is frequent."""
+    return int(np.count_nonzero(np.frombuffer(text, np.uint8) == ord(mark)))
+
+
+def lines_of(text: bytes) -> list[str]:
+    """The lines of a block, without line feeds."""
+    return text[:-1].decode().split("\n")
 
 
 def _fault(decoder: codecs.IncrementalDecoder, chunk: bytes, offset: int) -> int | None:

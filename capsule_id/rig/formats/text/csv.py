@@ -68,13 +68,13 @@ def _plain_columns(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...] | Non
     """The columns of a table of numbers alone, with blank lines at its end or none; None for any other table."""
     columns, ended = tuple(Growing() for _ in range(shape.width)), False
     for _, text in file.blocks(shape.first):
-        rows = text.rstrip(f"{BLANKS}\n")
+        rows = text.rstrip(f"{BLANKS}\n".encode())
         if ended and rows:
             return None
         ended = len(rows) + 1 < len(text)
         if not rows:
             continue
-        values = plain_block(f"{rows}\n", shape, range(shape.width))
+        values = plain_block(rows + b"\n", shape, range(shape.width))
         if values is None:
             return None
         for column, more in zip(columns, values.T, strict=True):

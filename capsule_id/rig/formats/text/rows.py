@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.text.blocks import TextFile
+from capsule_id.rig.formats.text.blocks import TextFile, lines_of, occurrences
 from capsule_id.rig.formats.text.cells import bare, decimal_mark, place_of_cell, read_column
 from capsule_id.views import counted
 
@@ -97,41 +97,42 @@ def is_comment(line: str) -> bool:
     return line.lstrip().startswith(COMMENTS)
 
 
-def plain_block(text: str, shape: Shape, columns: Sequence[int]) -> np.ndarray | None:
+def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray | None:
     """The (rows, columns) numbers of lines that hold numbers alone, by a reader in C; None for any other lines.
 
     Parameters
     ----------
-    text : lines, each with a line feed
+    text : lines in UTF-8, each with a line feed
     columns : indices of the columns that are returned
     """
-    delimiter, decimal, count = shape.delimiter, shape.decimal or ".", text.count("\n")
+    delimiter, decimal, count = shape.delimiter, shape.decimal or ".", occurrences("\n", text)
     allowed = f"{_PLAIN}{delimiter or ''}{decimal}\n".encode()
-    if not text.strip() or text.encode("utf-8", "replace").translate(None, allowed):
+    if not text.strip() or text.translate(None, allowed):
         return None
     # Rows with a last cell have all cells, by the number of separators. Cells between spaces are counted by the reader.
-    if delimiter is not None and text.count(delimiter) != count * (shape.width - 1 + shape.trailing):
+    if delimiter is not None and occurrences(delimiter, text) != count * (shape.width - 1 + shape.trailing):
         return None
     used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
-    values = _parse(text.replace(",", ".") if decimal == "," else text, delimiter, used)
+    values = _parse(text.replace(b",", b".") if decimal == "," else text, delimiter, used)
     if values is None or values.shape != (count, len(used)) or not np.isfinite(values).all():
         return None
     return values[:, np.searchsorted(used, columns)]
 
 
-def _parse(text: str, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
+def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
     """The numbers of the columns of a text, correctly rounded; None where a cell is no number."""
     usecols = None if delimiter is None else columns
     try:
         if len(text) < _SHORT:
-            return np.loadtxt(io.StringIO(text), delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
+            lines = io.StringIO(text.decode())
+            return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
         import pandas as pd
 
         with warnings.catch_warnings():
             # pandas 2 rounds correctly by this option alone; pandas 3 always does so, and warns of the option.
             warnings.simplefilter("ignore")
             frame = pd.read_csv(
-                io.StringIO(text),
+                io.BytesIO(text),
                 sep=delimiter or r"\s+",
                 header=None,
                 usecols=usecols,
@@ -150,15 +151,15 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
     """The rows of a text without missing, empty or other cells; None for any other text."""
     rows = Rows(columns)
     for number, text in file.blocks(shape.first):
-        numbers: np.ndarray | list[int] = np.arange(number, number + text.count("\n"))
+        numbers: np.ndarray | list[int] = np.arange(number, number + occurrences("\n", text), dtype=np.int32)
         values = plain_block(text, shape, columns)
         if values is None:
             kept = list(_rows_in(number, text))
             if not kept:
                 continue
             numbers, lines = [line for line, _ in kept], [line for _, line in kept]
-            if len(lines) < text.count("\n"):  # blank lines or comments
-                values = plain_block("\n".join(lines) + "\n", shape, columns)
+            if len(lines) < occurrences("\n", text):  # blank lines or comments
+                values = plain_block("\n".join([*lines, ""]).encode(), shape, columns)
         if values is None:
             return None
         rows.add_lines(numbers)
@@ -196,9 +197,9 @@ def any_rows(file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequ
     return rows
 
 
-def _rows_in(number: int, text: str) -> Iterator[tuple[int, str]]:
+def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:
     """The rows of a block with their 0-based lines; ``number`` is that of the first line."""
-    lines = enumerate(text[:-1].split("\n"), number)
+    lines = enumerate(lines_of(text), number)
     return ((line, row) for line, row in lines if row.strip() and not is_comment(row))
 
 
