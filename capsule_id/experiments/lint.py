@@ -74,7 +74,7 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
     for names, members in groups.items():
         by_label = {table.label: table for table in members}
         readings = [
-            Readings(table.label, np.stack([table[name] for name in names], axis=1), "time" in table.columns)
+            Readings(table.label, _matrix([table[name] for name in names]), "time" in table.columns)
             for table in members
         ]
         for block in repeated_blocks(readings):
@@ -89,6 +89,11 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
                 "rows": list(range(block.row, block.row + block.count)),
             }
             yield Finding("readings.repeated", "fail", facts, block.label)
+
+
+def _matrix(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Columns side by side, (n, columns); a single one is not copied."""
+    return columns[0][:, None] if len(columns) == 1 else np.stack(columns, axis=1)
 
 
 def lint_rows(table: Table[Any], rig: Rig, fewest: int) -> Iterable[Finding]:

@@ -24,7 +24,7 @@ def lint_magnitudes(table: Table[Any], kind: Kind) -> Iterable[Finding]:
     """Warn of columns and settings with unusual values."""
     for name, column in table.columns.items():
         rule = kind.columns[name]
-        largest = float(np.max(np.abs(column.values)))
+        largest = float(max(np.max(column.values), -np.min(column.values)))
         # A channel that may be constant, as a capsule at rest, has no smallest amplitude.
         if rule.si in USUAL and (rule.varies or rule.domain.low == 0.0 or largest > USUAL[rule.si][1]):
             name = f"the largest {name} of {table.file}"

@@ -5,6 +5,8 @@ import math
 import numpy as np
 from jaxtyping import Num
 
+from capsule_id.rig.filters import PIECE
+
 #: Median of |z| for a standard normal z.
 NORMAL_QUARTILE = 0.6745
 
@@ -13,6 +15,7 @@ def noise_level(values: Num[np.ndarray, " n"], order: int = 3) -> float:
     """Standard deviation of the white noise on an evenly sampled record, by the median of its differences.
 
     Differencing removes a smooth motion. The median ignores contacts and stops, which take a small part of the time.
+    Of a long record the middle is taken.
     Order 3 suits a well-sampled decay; order 6 removes a forced motion too.
 
     Parameters
@@ -20,5 +23,7 @@ def noise_level(values: Num[np.ndarray, " n"], order: int = 3) -> float:
     values : (n,), n > ``order``
     order : of the differences; those of unit white noise have the variance binomial(2 order, order)
     """
+    if len(values) >= 2 * PIECE:
+        values = values[(len(values) - PIECE) // 2 :][:PIECE]
     differences = np.abs(np.diff(values, order))
     return float(np.median(differences) / (NORMAL_QUARTILE * math.sqrt(math.comb(2 * order, order))))

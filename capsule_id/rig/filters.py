@@ -8,6 +8,8 @@ Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. S
 111 (2011).
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Float, Num
 from numpy.polynomial import legendre
@@ -21,6 +23,7 @@ Record = Num[np.ndarray, " n"]
 TIMING_TOLERANCE = 0.01  # largest distance from an even grid, in sampling steps, of evenly spaced samples
 SMALLEST_GAIN = 0.99  # smallest gain of `choose_window` at the dominant frequency
 _HAMPEL_BLOCK = 2_000_000  # readings that are sorted at a time
+PIECE = 1 << 18  # samples that are looked at together of a record with twice as many or more
 _ZERO_PADDING = 8  # the frequency grid of the spectrum is 8 times finer than 1 / duration
 
 
@@ -63,6 +66,41 @@ def savitzky_golay(
     return np.concatenate(parts) / (max(half, 1) * step) ** derivative
 
 
+def loudest_part(values: Record) -> slice:
+    """The part of ``PIECE`` samples with the largest variance; the whole record where it has less than two parts."""
+    count = len(values) // PIECE
+    if count < 2:
+        return slice(0, len(values))
+    first = PIECE * int(np.argmax([np.var(values[k * PIECE : (k + 1) * PIECE]) for k in range(count)]))
+    return slice(first, first + PIECE)
+
+
+def pieces(samples: int, overlap: int = 0) -> Iterator[slice]:
+    """Parts of a record, one after the other, each with ``overlap`` samples of the next; one for a short record."""
+    size = samples if samples < 2 * PIECE else PIECE
+    for first in range(0, max(samples, 1), max(size, 1)):
+        yield slice(first, min(first + size + overlap, samples))
+
+
+def thinned(values: Record) -> Num[np.ndarray, " m"]:
+    """Samples at equal distances of a long record, one to two pieces; a short record itself."""
+    return values if len(values) < 2 * PIECE else values[:: len(values) // PIECE]
+
+
+def median_step(time: Record) -> float:
+    """The median of the steps, s; of a long record that of as many steps as a piece has, at equal distances."""
+    if len(time) < 2 * PIECE:
+        return float(np.median(np.diff(time)))
+    first = np.arange(0, len(time) - 1, len(time) // PIECE)
+    return float(np.median(time[first + 1] - time[first]))
+
+
+def largest_offset(time: Record, step: float) -> float:
+    """Largest distance of the times from an even grid with ``step`` that begins at the first one, s."""
+    grid = ((part, np.arange(part.start, part.stop)) for part in pieces(len(time)))
+    return float(np.max([np.max(np.abs(time[part] - time[0] - step * index)) for part, index in grid]))
+
+
 def sampling_step(time: Record) -> float:
     """The sampling step of an evenly spaced record, s.
 
@@ -78,7 +116,7 @@ def sampling_step(time: Record) -> float:
     if len(time) < 2:
         raise InputError("a filter needs at least 2 samples", f"{len(time)}", "give a longer record")
     step = float(time[-1] - time[0]) / (len(time) - 1)
-    offset = float(np.max(np.abs(time - time[0] - step * np.arange(len(time)))))
+    offset = largest_offset(time, step)
     if not offset <= TIMING_TOLERANCE * step:
         steps = np.diff(time)
         value = f"steps from {steps.min():g} to {steps.max():g} s"
@@ -151,7 +189,7 @@ def choose_window(time: Record, values: Record, order: int) -> float:
 
 
 def dominant_frequency(time: Record, values: Record) -> float:
-    """Frequency of the highest peak of the spectrum, Hz, after removal of the linear trend.
+    """Frequency of the highest peak of the spectrum, Hz, after removal of the linear trend; of a long record's loudest part.
 
     Parameters
     ----------
@@ -164,9 +202,10 @@ def dominant_frequency(time: Record, values: Record) -> float:
         As ``sampling_step``.
     """
     step = sampling_step(time)
-    index = np.arange(len(time)) / len(time)
+    values = values[loudest_part(values)]
+    index = np.arange(len(values)) / len(values)
     residual = values - np.polyval(np.polyfit(index, values, 1), index)
-    length = _ZERO_PADDING * len(time)
+    length = _ZERO_PADDING * len(values)
     spectrum = np.abs(np.fft.rfft(residual, length))
     # Below 1 / duration a peak is a remainder of the trend.
     return float(np.fft.rfftfreq(length, step)[_ZERO_PADDING + int(np.argmax(spectrum[_ZERO_PADDING:]))])

@@ -26,7 +26,7 @@ from capsule_id.parameters import Parameter, Prior, nuisance, scatter
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
-from capsule_id.views import Facts, Message
+from capsule_id.views import Facts, Message, counted
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
@@ -71,7 +71,7 @@ def _check_window(entry: Entry[DecaySettings]) -> None:
     inside = len(decay_window(entry.table)[0])
     if inside < SHORTEST_RECORD:
         rule = f"at least {SHORTEST_RECORD} samples must lie between start and stop"
-        raise entry.error(place, rule, f"{inside} samples", "widen the window")
+        raise entry.error(place, rule, counted(inside, "sample"), "widen the window")
 
 
 def _check_forward(entry: Entry[DecaySettings]) -> None:

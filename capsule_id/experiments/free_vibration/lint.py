@@ -7,14 +7,14 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.readings.blocks import block_size, default_block_size
-from capsule_id.experiments.free_vibration.settings import DecaySettings, decay_window, release_time, rows_in_window
+from capsule_id.experiments.free_vibration.settings import DecaySettings, decay_window, release_time, window_of
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import TABLE
 from capsule_id.records.faults.aliasing import aliases
 from capsule_id.records.faults.magnitudes import USUAL, unit_meant
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.filters import dominant_frequency, sampling_step
+from capsule_id.rig.filters import dominant_frequency, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.views import Finding, Message, counted
@@ -33,7 +33,7 @@ RATIOS = (("1000 (s and ms)", 1000.0), ("60 (min and s)", 60.0), ("2 pi (rad and
 
 def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Report faults of the record, rest before the release, low sampling rate and short length."""
-    used = rows_in_window(table)
+    used = window_of(table)
     yield from lint_times(table, used)
     if table.settings.samples == "turning_points":
         return
@@ -44,7 +44,9 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     faults = [found for name in channels for found in lint_channel(table, name, used, period)]
     if decay is not None:
         yield from _release(table, decay, bool(faults))
-        used = used & (time >= decay.start) & (time <= (np.inf if decay.stop is None else decay.stop))
+        inside = time[used]
+        last = len(inside) if decay.stop is None else int(np.searchsorted(inside, decay.stop, side="right"))
+        used = slice(used.start + int(np.searchsorted(inside, decay.start)), used.start + last)
         faults = faults or [found for name in channels for found in lint_smooth(table, name, used, period)]
     yield from faults
     window = time[used], table[channels[0]][used]
@@ -56,8 +58,9 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 
 def _dominant(time: np.ndarray, values: np.ndarray) -> float:
     """Dominant frequency of a record that may be sampled unevenly, Hz."""
-    even = np.linspace(time[0], time[-1], len(time))
-    return dominant_frequency(even, np.interp(even, time, values))
+    part = loudest_part(values)
+    even = np.linspace(time[part][0], time[part][-1], len(time[part]))
+    return dominant_frequency(even, np.interp(even, time[part], values[part]))
 
 
 def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[Finding]:
@@ -66,7 +69,7 @@ def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[
     channel = next(name for name in first.columns if name != "time")
     if first.label == table.label or channel not in table.columns:
         return
-    used = rows_in_window(first)
+    used = window_of(first)
     ratio = frequency / _dominant(first["time"][used], first[channel][used])
     if not 1.0 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         near = next(
@@ -95,11 +98,12 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
         median, factor = stated.median, stated.factor
     k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
     # Of aliased records one in ten seems to have more samples per period: 18 Hz sampled at 17 Hz shows sixteen.
-    coarse = float(np.median(np.diff(time))) * frequency * SAMPLES_PER_PERIOD > 1.0
+    coarse = median_step(time) * frequency * SAMPLES_PER_PERIOD > 1.0
     inside = median / factor <= k1 <= median * factor
     if not coarse and inside:
         return
-    others = aliases(time, values, frequency)
+    part = loudest_part(values)
+    others = aliases(time[part], values[part], frequency)
     stiffnesses = rig.m1.value * (2.0 * np.pi * others) ** 2
     possible = (stiffnesses >= median / factor) & (stiffnesses <= median * factor)
     if possible.any():

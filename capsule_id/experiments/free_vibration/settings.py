@@ -126,17 +126,17 @@ class DecayModel:
         return ", ".join(words)
 
 
-def rows_in_window(table: Table) -> np.ndarray:
-    """(n,) bool: the rows from ``start`` to ``stop`` inclusive, which a fit reads; default: all."""
+def window_of(table: Table) -> slice:
+    """The rows from ``start`` to ``stop`` inclusive, which a fit reads; default: all."""
     time, settings = table["time"], table.settings
-    start = time[0] if settings.start is None else settings.start
-    stop = time[-1] if settings.stop is None else settings.stop
-    return (time >= start) & (time <= stop)
+    first = 0 if settings.start is None else int(np.searchsorted(time, settings.start, side="left"))
+    last = len(time) if settings.stop is None else int(np.searchsorted(time, settings.stop, side="right"))
+    return slice(first, max(first, last))
 
 
 def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
     """Return (time, channel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
-    inside = rows_in_window(table)
+    inside = window_of(table)
     return table["time"][inside], table[channel_of(table)][inside]
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from capsule_id.records.faults.duplicates import reading_step
+from capsule_id.rig.filters import pieces
 
 #: Fewest samples at the limit; how many times as many as at the neighbouring values.
 FEWEST_CLIPPED, EXCESS = 3, 5.0
@@ -36,19 +37,31 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
         return []
     step = reading_step(values)
     sides: tuple[tuple[Literal["upper", "lower"], float], ...] = (("upper", 1.0), ("lower", -1.0))
+    limits = float(np.max(values)), float(np.min(values))
+    tolerance = max(0.25 * step, 4e-16 * max(abs(limit) for limit in limits))
     return [
-        Clipped(side, sign * float(np.max(sign * values)), rows)
-        for side, sign in sides
-        if len(rows := _at_limit(sign * values, step, period))
+        Clipped(side, limit, rows)
+        for (side, sign), limit in zip(sides, limits, strict=True)
+        if len(rows := _at_limit(values, (limit, sign), (tolerance, step), period))
     ]
 
 
-def _at_limit(values: np.ndarray, step: float, period: float) -> np.ndarray:
-    """Indices of the samples at the maximum, () where a smooth peak has as many."""
-    tolerance = max(0.25 * step, 4e-16 * float(np.max(np.abs(values))))
-    depth = np.max(values) - values
-    rows = np.flatnonzero(depth <= tolerance)
-    near = np.sum(depth <= (NEIGHBOURS + 0.25) * step) - len(rows) if step > 0.0 else 0
+def _at_limit(
+    values: np.ndarray, limit: tuple[float, float], resolution: tuple[float, float], period: float
+) -> np.ndarray:
+    """Indices of the samples at a limit, () where a smooth peak has as many.
+
+    Parameters
+    ----------
+    limit : largest value and 1, or smallest value and -1
+    resolution : distance at which values count as equal, and reading step
+    """
+    (level, sign), (tolerance, step), found, near = limit, resolution, [], 0
+    for part in pieces(len(values)):
+        depth = sign * (level - values[part])
+        found.append(part.start + np.flatnonzero(depth <= tolerance))
+        near += int(np.sum(depth <= (NEIGHBOURS + 0.25) * step)) - len(found[-1]) if step > 0.0 else 0
+    rows = np.concatenate(found)
     if len(rows) < FEWEST_CLIPPED + EXCESS * near / NEIGHBOURS:
         return rows[:0]
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)

@@ -4,12 +4,13 @@ Two independent readings agree by chance with probability q/s: q is the reading 
 counts as repeated where agreement by chance is practically impossible, so coarse readings that agree are no duplicates.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from capsule_id.records.noise import noise_level
+from capsule_id.rig.filters import PIECE, thinned
 
 #: Expected number of blocks that agree by chance, below which a block counts as repeated.
 CHANCE = 1e-6
@@ -17,6 +18,8 @@ CHANCE = 1e-6
 SHORTEST_BLOCK, SHORTEST_RECORD = 8, 50
 #: Width of a scatter, in standard deviations; scatter of a table of single readings, relative to its range.
 WIDTH, TABLE_SCATTER = 3.5, 0.01
+#: Rows that are compared at a time.
+COMPARED = 4096
 #: Most decimal places of a reading step.
 MOST_DECIMALS = 15
 #: Distance of a level from an even spacing, in spacings; share of the levels that must be within it.
@@ -48,6 +51,7 @@ def reading_step(values: np.ndarray) -> float:
     scale = float(np.max(np.abs(values), initial=0.0))
     if scale == 0.0:
         return 0.0
+    values = thinned(values)
     levels = np.unique(values)
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * scale]
@@ -104,24 +108,60 @@ def _longest_block(earlier: Readings, later: Readings) -> Repeated | None:
     shortest = max(shortest, SHORTEST_BLOCK if later.record else 1)
     if min(len(earlier.values), len(later.values)) < shortest + (earlier is later):
         return None
-    _, rows = np.unique(np.concatenate([earlier.values, later.values]), axis=0, return_inverse=True)
-    rows = rows.reshape(-1)
-    one, other = rows[: len(earlier.values)], rows[len(earlier.values) :]
-    first = {}
-    for start in range(len(one) - shortest + 1):
-        first.setdefault(one[start : start + shortest].tobytes(), start)
     best: Repeated | None = None
-    # Samples of a channel at rest repeat anyway.
-    changes = np.concatenate([[0], np.cumsum(np.diff(other) != 0)])
-    for start in range(len(other) - shortest + 1):
-        where = first.get(other[start : start + shortest].tobytes())
-        if where is None or (earlier is later and where >= start):
+    ends: dict[int, int] = {}  # by distance of the two blocks: the end of the last one
+    for where, start in _equal_windows(earlier.values, later.values, shortest, earlier is later):
+        if start < ends.get(start - where, 0):
             continue
-        if later.record and changes[start + shortest - 1] - changes[start] < shortest // 2:
+        # Samples of a channel at rest repeat anyway.
+        window = later.values[start : start + shortest]
+        if later.record and np.sum(np.any(window[1:] != window[:-1], axis=1)) < shortest // 2:
             continue
-        most = min(len(one) - where, len(other) - start)
-        equal = one[where : where + most] == other[start : start + most]
-        count = most if equal.all() else int(np.argmin(equal))
-        if best is None or count > best.count:
+        if len(earlier.values) >= 2 * PIECE:  # the block may begin before a window that was compared
+            back = _equal_rows(earlier.values[:where][::-1], later.values[:start][::-1])
+            where, start = where - back, start - back
+        count = _equal_rows(earlier.values[where:], later.values[start:])
+        ends[start - where] = start + count
+        if count >= shortest and (best is None or count > best.count):
             best = Repeated(later.label, start, earlier.label, where, count)
     return best
+
+
+def _equal_rows(one: np.ndarray, other: np.ndarray) -> int:
+    """Number of rows at the beginning of both tables that are equal."""
+    most = min(len(one), len(other))
+    for first in range(0, most, COMPARED):
+        last = min(first + COMPARED, most)
+        equal = np.all(one[first:last] == other[first:last], axis=1)
+        if not equal.all():
+            return first + int(np.argmin(equal))
+    return most
+
+
+def _equal_windows(earlier: np.ndarray, later: np.ndarray, length: int, same: bool) -> Iterable[tuple[int, int]]:
+    """First rows of windows of ``length`` rows with equal hashes: in ``earlier``, the first such one, and in ``later``.
+
+    Of a long table only every ``length``-th window of ``earlier`` is compared, which finds blocks twice as long.
+    """
+    stride = 1 if len(earlier) < 2 * PIECE else length
+    # The first window of a piece whose row is a multiple of the stride is -begin % stride rows after its first one.
+    hashes = np.concatenate([found[-begin % stride :: stride] for begin, found in _hashes(earlier, length)])
+    known, index = np.unique(hashes, return_index=True)
+    for begin, found in _hashes(later, length):
+        place = np.minimum(np.searchsorted(known, found), len(known) - 1)
+        where, start = stride * index[place], begin + np.arange(len(found))
+        equal = (known[place] == found) & ((where < start) if same else True)
+        yield from zip(where[equal].tolist(), start[equal].tolist(), strict=True)
+
+
+def _hashes(values: np.ndarray, length: int) -> Iterable[tuple[int, np.ndarray]]:
+    """Hashes of all windows of ``length`` rows, piece by piece, each with the row of its first window."""
+    factors = np.random.default_rng(0).integers(1, 1 << 62, (length, values.shape[1]), dtype=np.uint64)
+    for begin in range(0, len(values) - length + 1, PIECE):
+        rows = (values[begin : begin + PIECE + length - 1] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
+        rows ^= rows >> np.uint64(29)
+        total = np.zeros(len(rows) - length + 1, np.uint64)
+        for offset, factor in enumerate(factors):
+            for column, each in enumerate(factor):
+                total += rows[offset : offset + len(total), column] * (each | np.uint64(1))
+        yield begin, total

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.noise import noise_level
+from capsule_id.rig.filters import pieces
 
 #: Order of the polynomials on both sides of a sample; their length, periods, with the smallest jump, rad, that they show
 #: beyond their own error. Long ones see through noise, short ones show small jumps of quiet records. A jump above LARGE
@@ -41,8 +42,14 @@ def phase_jump(values: np.ndarray, period: float) -> Jump | None:
     """
     # Errors of reading in steps are correlated in a slow record, so they do not average out.
     noise = max(noise_level(values), reading_step(values))
-    found = [_jump(values, period, round(side * period), smallest, noise) for side, smallest in SIDES]
-    return next((jump for jump in found if jump is not None), None)
+    for share, smallest in SIDES:
+        side = round(share * period)
+        parts = [(part.start, values[part]) for part in pieces(len(values), 2 * side)]
+        found = [(first, _jump(own, period, side, smallest, noise)) for first, own in parts]
+        jumps = [Jump(first + jump.row, jump.size) for first, jump in found if jump is not None]
+        if jumps:
+            return max(jumps, key=lambda jump: jump.size)
+    return None
 
 
 def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float) -> Jump | None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.records.noise import NORMAL_QUARTILE
-from capsule_id.rig.filters import dominant_frequency
+from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part
 
 #: Half cycles whose height is below this fraction of the largest one belong to the rest before the release.
 REST_HEIGHT = 0.2
@@ -52,6 +52,7 @@ def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
     time : (n,) s, increasing, evenly or unevenly spaced
     values : (n,) displacement, velocity or acceleration
     """
+    time, values = _shortened(time, values)
     even = np.linspace(time[0], time[-1], len(time))
     on_grid = np.interp(even, time, values)
     noise = _noise(on_grid)
@@ -84,6 +85,20 @@ def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
     twice = np.flatnonzero(grown[1:] & grown[:-1])
     stop = float(later[max(twice[0] - 1, 0)]) if len(twice) else None
     return FreeDecay(float(time[0]) if starts_at_once else start, stop, 0.0 if starts_at_once else before, period)
+
+
+def _shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of blocks of a long record, about ``PIECE`` of them and 32 or more in a period; a short record itself."""
+    part = loudest_part(values)
+    if len(time[part]) == len(time):
+        return time, values
+    grid = np.linspace(time[part][0], time[part][-1], len(time[part]))
+    period = 1.0 / dominant_frequency(grid, np.interp(grid, time[part], values[part]))
+    size = max(1, min(len(time) // PIECE, int(period / (grid[1] - grid[0]) / 32.0)))
+    count = len(time) // size
+    means, readings = (x[: count * size].reshape(count, size).mean(axis=1) for x in (time, values))
+    means[[0, -1]] = time[[0, -1]]
+    return means, readings
 
 
 def _departure(values: np.ndarray, noise: float) -> int:

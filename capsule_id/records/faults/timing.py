@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capsule_id.records.faults.duplicates import reading_step
+from capsule_id.rig.filters import largest_offset, median_step, pieces, thinned
 
 #: Share of steps that must equal the sampling step before a longer one counts as a gap.
 REGULAR_SHARE = 0.9
@@ -36,16 +37,19 @@ def find_gaps(time: np.ndarray) -> Gaps | None:
     ----------
     time : (n,) s, increasing
     """
-    steps = np.diff(time)
-    if len(steps) < 8:
+    if len(time) < 9:
         return None
-    step = float(np.median(steps))
-    multiple = np.round(steps / step)
-    regular = np.abs(steps / step - 1.0) <= STEP_TOLERANCE
-    rows = np.flatnonzero((multiple >= 2) & (np.abs(steps / step - multiple) <= STEP_TOLERANCE * np.sqrt(multiple)))
-    if len(rows) == 0 or np.mean(regular) < REGULAR_SHARE:
-        return None
-    return Gaps(rows, multiple[rows].astype(int) - 1, step)
+    step = median_step(time)
+    rows, lost, regular = [], [], 0
+    for part in pieces(len(time) - 1):
+        steps = np.diff(time[part.start : part.stop + 1]) / step
+        multiple = np.round(steps)
+        long = np.flatnonzero((multiple >= 2) & (np.abs(steps - multiple) <= STEP_TOLERANCE * np.sqrt(multiple)))
+        regular += int(np.sum(np.abs(steps - 1.0) <= STEP_TOLERANCE))
+        rows.append(part.start + long)
+        lost.append(multiple[long].astype(int) - 1)
+    gaps = Gaps(np.concatenate(rows), np.concatenate(lost), step)
+    return gaps if len(gaps.rows) and regular / (len(time) - 1) >= REGULAR_SHARE else None
 
 
 def time_rounding(time: np.ndarray) -> float | None:
@@ -57,10 +61,8 @@ def time_rounding(time: np.ndarray) -> float | None:
     """
     if len(time) < 8:
         return None
-    step = float(np.median(np.diff(time)))
-    written = reading_step(time)
-    even = time[0] + np.arange(len(time)) * (time[-1] - time[0]) / (len(time) - 1)
-    off = np.max(np.abs(time - even))
+    step, written = median_step(time), reading_step(time)
+    off = largest_offset(time, (time[-1] - time[0]) / (len(time) - 1))
     rounded = ROUNDING[0] * step <= written <= ROUNDING[1] * step
     # Rounding moves a time by half the written step, and the ends of the even grid by as much again.
     return written if rounded and ROUNDING[0] * step / 2.0 < off <= 1.01 * written else None
@@ -73,23 +75,35 @@ def dropouts(values: np.ndarray) -> np.ndarray:
     ----------
     values : (n,) readings of one channel
     """
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1])
+    # Nine in ten samples hold no drop-out, so their range is that of the motion.
+    low, high = np.quantile(thinned(values), [0.05, 0.95])
+    runs = [np.empty((0, 2), int)]
+    for part in pieces(len(values)):
+        first = max(part.start - LONGEST_DROPOUT - 1, 0)
+        found = first + _far_runs(values[first : part.stop + LONGEST_DROPOUT + 1], high - low)
+        runs.append(found[(found[:, 0] >= part.start) & (found[:, 0] < part.stop)])
+    starts, ends = np.concatenate(runs).T
+    own = values[starts]
+    # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
+    levels, counts = np.unique(own, return_counts=True)
+    repeated = np.isin(own, levels[counts > 1])
+    extreme = np.maximum(low - own, own - high) > EXTREME * (high - low)
+    chosen = repeated | extreme | (own == 0.0)
+    pairs = zip(starts[chosen], ends[chosen], strict=True)
+    return np.concatenate([np.arange(s, e) for s, e in pairs]) if chosen.any() else np.arange(0)
+
+
+def _far_runs(values: np.ndarray, spread: float) -> np.ndarray:
+    """First sample and end, (k, 2), of short runs of one value that stand far off the samples on both sides."""
+    starts = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1])
     lengths = np.diff(np.concatenate([starts, [len(values)]]))
     inside = (starts > 0) & (starts + lengths < len(values)) & (lengths <= LONGEST_DROPOUT)
     starts, lengths = starts[inside], lengths[inside]
     before, after, own = values[starts - 1], values[starts + lengths], values[starts]
-    # Nine in ten samples hold no drop-out, so their range is that of the motion.
-    low, high = np.quantile(values, [0.05, 0.95])
     jump = np.minimum(np.abs(own - before), np.abs(own - after))
-    far = (jump > DROPOUT_RANGE * (high - low)) & (np.abs(after - before) < 0.5 * jump)
+    far = (jump > DROPOUT_RANGE * spread) & (np.abs(after - before) < 0.5 * jump)
     far &= np.sign(own - before) == np.sign(own - after)
-    # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
-    levels, counts = np.unique(own[far], return_counts=True)
-    repeated = np.isin(own, levels[counts > 1])
-    extreme = np.maximum(low - own, own - high) > EXTREME * (high - low)
-    chosen = far & (repeated | extreme | (own == 0.0))
-    pairs = zip(starts[chosen], lengths[chosen], strict=True)
-    return np.concatenate([np.arange(s, s + n) for s, n in pairs]) if chosen.any() else np.arange(0)
+    return np.stack([starts, starts + lengths], axis=1)[far]
 
 
 def frozen_samples(values: np.ndarray) -> np.ndarray:
@@ -97,11 +111,11 @@ def frozen_samples(values: np.ndarray) -> np.ndarray:
 
     Runs at the limits of the record belong to clipping and to rest, and are left out.
     """
-    repeats = np.concatenate([[False], np.diff(values) == 0.0])
-    starts = np.flatnonzero(np.diff(np.concatenate([[False], repeats])[:].astype(int)) == 1)
+    repeats = np.concatenate([[False], values[1:] == values[:-1], [False]])
+    edges = np.flatnonzero(repeats[1:] != repeats[:-1]) + 1
+    starts, ends = edges[::2], edges[1::2]
     if len(starts) == 0 or len(values) < 50:
         return np.arange(0)
-    ends = np.array([start + int(np.argmin(np.append(repeats[start:], False))) for start in starts])
     long = ends - starts + 1 >= FROZEN
     inside = (values[starts] < np.max(values)) & (values[starts] > np.min(values)) & (starts > 1) & (ends < len(values))
     chosen = long & inside

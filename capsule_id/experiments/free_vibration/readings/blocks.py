@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.filters import dominant_frequency, sampling_step
+from capsule_id.rig.filters import dominant_frequency, loudest_part, sampling_step
 
 #: Block means per period that replace a long record; with more, a decay's parameters gain less than 0.5 % in precision.
 READINGS_PER_PERIOD = 32
@@ -98,6 +98,8 @@ def is_even(time: np.ndarray) -> bool:
 
 def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READINGS_PER_PERIOD) -> int:
     """Samples per block that leave about ``per_period`` readings a period; 1 for a record that does not oscillate."""
+    part = loudest_part(values)
+    time, values = time[part], values[part]
     grid = np.linspace(time[0], time[-1], len(time))
     try:
         period = 1.0 / dominant_frequency(grid, np.interp(grid, time, values))
