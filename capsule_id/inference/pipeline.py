@@ -33,7 +33,7 @@ from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.model_error.run_widening import run_widenings
 from capsule_id.inference.checks.model_error.widening import widenings
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import PointStage
@@ -100,7 +100,7 @@ def sample_posterior(
     store: Path | None = None,
     progress: OnProgress | None = None,
     ess: float = DEFAULT_ESS,
-) -> Setting:
+) -> SampledFit:
     """Sample the posterior; return the point fit with its sample, without checks.
 
     Parameters
@@ -114,7 +114,7 @@ def sample_posterior(
         posterior = sample(MarginalPosterior(target, point.fit), seed, budget, store, progress, ess)
     fit = point.fit if posterior is None else higher_maximum(point, posterior)
     values, draws = {**target.fixed, **fit.values}, _draws(target, posterior)
-    return Setting(target, fit, posterior, values, draws, point.seed, findings=point.findings, bench=point.bench)
+    return SampledFit(target, fit, posterior, values, draws, point.seed, findings=point.findings, bench=point.bench)
 
 
 def higher_maximum(point: PointStage, posterior: Posterior) -> PointFit:
@@ -129,7 +129,7 @@ def higher_maximum(point: PointStage, posterior: Posterior) -> PointFit:
     return again if np.max(again.log_posterior) > np.max(point.fit.log_posterior) else point.fit
 
 
-def check_fit(sampled: Setting, before: Sequence[Finding] = ()) -> Setting:
+def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit:
     """Run all checks: return ``sampled`` with all findings and flagged outliers.
 
     The findings include those of the point fit and ``before``, those on the readings.
@@ -146,7 +146,7 @@ def check_fit(sampled: Setting, before: Sequence[Finding] = ()) -> Setting:
 
 
 def make_result(
-    checked: Setting, registry: Registry, seed: int, made_from: Provenance, kind: type[AnyResult] = Result
+    checked: SampledFit, registry: Registry, seed: int, made_from: Provenance, kind: type[AnyResult] = Result
 ) -> AnyResult:
     """Assemble the result: tables, panels, records, and the arrays that are saved with the sample.
 
@@ -200,7 +200,7 @@ def _draws(target: LogPosterior, posterior: Posterior | None) -> list[dict[str, 
 
 
 def _comparisons(
-    checked: Setting, predictive: Mapping[str, float | None], registry: Registry
+    checked: SampledFit, predictive: Mapping[str, float | None], registry: Registry
 ) -> tuple[Comparison, ...]:
     """Return the panels, with flagged rows and predictive p-values."""
     panels = []

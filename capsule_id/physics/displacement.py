@@ -28,7 +28,7 @@ REPEATS = 1e-5
 BLOCK_STEPS = 150 * BLOCK
 
 
-class Progress(NamedTuple):
+class Displacement(NamedTuple):
     """Displacement X2 after the periods, m, NaN where the run failed, and a ``Status`` code; (L,) each."""
 
     X2: Any
@@ -44,7 +44,9 @@ class _Lane(NamedTuple):
     status: Any
 
 
-def displacement(p: CapsuleParameters, e: Drive, law: FrictionLaw, period: Any, count: Any, r0: Any = 0.0) -> Progress:
+def displacement(
+    p: CapsuleParameters, e: Drive, law: FrictionLaw, period: Any, count: Any, r0: Any = 0.0
+) -> Displacement:
     """X2 after ``count`` periods of ``e`` from rest at x_rel = ``r0``, by the exact engine.
 
     Parameters
@@ -66,25 +68,25 @@ def displacement(p: CapsuleParameters, e: Drive, law: FrictionLaw, period: Any, 
 
 
 @cache
-def _folding(structure: Any) -> Callable[..., Progress]:
+def _folding(structure: Any) -> Callable[..., Displacement]:
     """The run of leaves (L,); the axis of a ``jax.vmap`` joins the lanes."""
 
     @custom_vmap
-    def run(*leaves: Any) -> Progress:
+    def run(*leaves: Any) -> Displacement:
         return _in_chunks(structure, leaves)
 
     @run.def_vmap
-    def _fold(size: int, batched: list[bool], *leaves: Any) -> tuple[Progress, Progress]:
+    def _fold(size: int, batched: list[bool], *leaves: Any) -> tuple[Displacement, Displacement]:
         if not any(batched):
-            return _in_chunks(structure, leaves), Progress(False, False)
+            return _in_chunks(structure, leaves), Displacement(False, False)
         full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)]
         out = run(*(x.reshape(-1) for x in full))
-        return Progress(*(x.reshape(size, -1) for x in out)), Progress(True, True)
+        return Displacement(*(x.reshape(size, -1) for x in out)), Displacement(True, True)
 
     return jax.jit(run)
 
 
-def _in_chunks(structure: Any, leaves: tuple[Any, ...]) -> Progress:
+def _in_chunks(structure: Any, leaves: tuple[Any, ...]) -> Displacement:
     """Run lanes (L,) in chunks of ``CHUNK``, sorted by period."""
     lanes = leaves[0].shape[0]
     order = jnp.argsort(stop_gradient(jax.tree.unflatten(structure, leaves)[-2]))
@@ -92,10 +94,10 @@ def _in_chunks(structure: Any, leaves: tuple[Any, ...]) -> Progress:
     chunks = [leaf[index].reshape(-1, CHUNK) for leaf in leaves]
     out = jax.lax.map(lambda one: _run(*jax.tree.unflatten(structure, one)), chunks)
     back = jnp.argsort(order)
-    return Progress(*(x.reshape(-1)[:lanes][back] for x in out))
+    return Displacement(*(x.reshape(-1)[:lanes][back] for x in out))
 
 
-def _run(p: CapsuleParameters, e: Drive, law: FrictionLaw, r0: Any, period: Any, count: Any) -> Progress:
+def _run(p: CapsuleParameters, e: Drive, law: FrictionLaw, r0: Any, period: Any, count: Any) -> Displacement:
     """One chunk of lanes."""
     omega = 2.0 * np.pi / period
 
@@ -121,4 +123,4 @@ def _run(p: CapsuleParameters, e: Drive, law: FrictionLaw, r0: Any, period: Any,
     zero = jnp.zeros_like(period)
     first = _Lane(zero, (r0 + zero, zero, zero, zero), count > 0.0, jnp.zeros(period.shape, jnp.int32))
     last = jax.lax.while_loop(lambda lane: jnp.any(lane.active), block, first)
-    return Progress(jnp.where(last.status <= Status.GRAZING, last.state[2], jnp.nan), last.status)
+    return Displacement(jnp.where(last.status <= Status.GRAZING, last.state[2], jnp.nan), last.status)

@@ -19,7 +19,7 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.tables.notes import make_notes
@@ -156,12 +156,12 @@ def test_a_kind_from_elsewhere_is_fitted_checked_and_tabulated() -> None:
     target = LogPosterior(bench.rig(), [decay(1), *own])
     assert [group.members for group in target.groups] == [(0,), (1, 2)]
     fit = point_fit(target, 0)
-    setting = run_checks(Setting(target, fit, None, target.mapping(target.theta(fit.u))))
+    fitted = run_checks(SampledFit(target, fit, None, target.mapping(target.theta(fit.u))))
     assert fit.values["load"] == pytest.approx(0.505, abs=1e-4)
     assert fit.standard_errors["load"] == pytest.approx(0.01 / np.sqrt(8.0), rel=1e-3)
-    (balance,) = [f for f in setting.findings if f.code == "balance"]
+    (balance,) = [f for f in fitted.findings if f.code == "balance"]
     assert balance.facts == {"members": 2, "load": fit.values["load"]}
-    assert "weighings" in [note.code for note in make_notes(setting, {})]
+    assert "weighings" in [note.code for note in make_notes(fitted, {})]
 
 
 class ReadsItsTable(FreeVibration):

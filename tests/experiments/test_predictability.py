@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from capsule_id.experiments.forced_run import predictability
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.predictability import LARGEST_GROWTH, check_predictable, growth
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from tests.forced_runs import make, theta
@@ -56,10 +56,10 @@ def test_a_motion_that_forgets_its_start_is_predictable_and_a_chaotic_one_is_not
     assert found[0].experiment == "run_1"
 
 
-def fitted(run: ForcedRun, values: dict[str, float]) -> Setting:
+def fitted(run: ForcedRun, values: dict[str, float]) -> SampledFit:
     """A fit of ``run`` alone at ``values`` by symbol."""
     by_symbol = {row.symbol: row.name for row in run.parameters}
     named = {by_symbol.get(symbol, symbol): value for symbol, value in values.items()}
     target, none = LogPosterior(run.rig, [run]), np.zeros((1, 1))
     fit = PointFit(target.names, none[0], named, none, {}, none, none, none[0], none[0] > 0, none[0] > 0)
-    return Setting(target, fit, None, named)
+    return SampledFit(target, fit, None, named)

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from capsule_id.experiments.families.friction_model import FrictionModel
 from capsule_id.experiments.forced_run.base_run import BaseRun
 from capsule_id.inference.checks.model_error.run_widening import run_widenings
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -43,7 +43,7 @@ def test_the_frame_is_a_run_with_a_prescribed_rod(tmp_path: Path, load: str) -> 
     assert measured_motion(rig.tables[0]).label == "P-1"
 
 
-def fitted(folder: Path) -> Setting:
+def fitted(folder: Path) -> SampledFit:
     """Both loads with one K, constant friction and AR(1) noise: least squares, its noise level from the residuals."""
     entries, own = [], {"drive": '"base"', "noise": '"ar1"'}
     for load in ("350g", "450g"):
@@ -78,7 +78,7 @@ def fitted(folder: Path) -> Setting:
             values[f"noise_x_capsule[{run.label}]"] *= float(np.sqrt(np.mean(rest**2)))
     none = np.zeros(0)
     findings = tuple(Finding("residuals.white", "fail", {}, run.label) for run in runs)
-    return Setting(target, PointFit(target.names, u, values, *[none] * 7), None, values, findings=findings)  # type: ignore[arg-type]
+    return SampledFit(target, PointFit(target.names, u, values, *[none] * 7), None, values, findings=findings)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ from capsule_id.experiments.progression.panels import progression_panels
 from capsule_id.experiments.progression.trials import sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import pool
-from capsule_id.physics.displacement import Progress, displacement
+from capsule_id.physics.displacement import Displacement, displacement
 from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.forces import equilibrium
@@ -285,7 +285,7 @@ def _responses_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) 
 
 
 @eqx.filter_jit
-def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Progress:
+def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Displacement:
     p, drive = e.capsule(theta, settings)
     law = scaled(e.law(theta), jnp.exp(s))
     r0 = equilibrium(p) if "slope" in e.ground else 0.0

@@ -9,11 +9,11 @@ from scipy import stats
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LAGS, LEVEL, ljung_box
 from capsule_id.inference.checks.regression import MOST_FLAGGED, outliers
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.views import Finding
 
 
-def check_whiteness(s: Setting) -> list[Finding]:
+def check_whiteness(s: SampledFit) -> list[Finding]:
     """Check that the residuals of every record are white (Ljung–Box)."""
     records = [
         (e, label, residuals)
@@ -32,7 +32,7 @@ def check_whiteness(s: Setting) -> list[Finding]:
     return findings or [Finding("residuals.white", "ok", {"records": len(records), "lags": LAGS})]
 
 
-def check_outliers(s: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
+def check_outliers(s: SampledFit) -> tuple[list[Finding], dict[str, list[int]]]:
     """Check every table for outliers; also return the flagged row indices, by label."""
     tables = [e for e in s.experiments if not e.time_series]
     findings, flagged = [], {}
@@ -58,7 +58,7 @@ def check_outliers(s: Setting) -> tuple[list[Finding], dict[str, list[int]]]:
     return findings or [Finding("outliers", "ok")] * bool(tables), flagged
 
 
-def check_stated_errors(s: Setting) -> list[Finding]:
+def check_stated_errors(s: SampledFit) -> list[Finding]:
     """Check that stated reading errors explain the scatter (chi-square)."""
     known = [e for e in s.experiments if e.scale_known and e.label not in s.flagged]
     findings = []

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.views import Finding
@@ -25,7 +25,7 @@ BINS = 256
 NEGLIGIBLE, NEGLIGIBLE_UNSAMPLED = 4.0, 20.0
 
 
-def check_maximum(s: Setting) -> list[Finding]:
+def check_maximum(s: SampledFit) -> list[Finding]:
     """Check that the sample of every physical parameter has one mode, at the maximum of the posterior."""
     if s.posterior is None:
         return []
@@ -50,7 +50,7 @@ def check_maximum(s: Setting) -> list[Finding]:
     return findings or [Finding("sample.maximum", "ok")]
 
 
-def _block(s: Setting, i: int) -> tuple[str, ...]:
+def _block(s: SampledFit, i: int) -> tuple[str, ...]:
     """Names of the parameters that share data with parameter ``i``, itself first."""
     (block,) = [block for block in s.target.blocks if i in block]
     return (s.target.names[i], *(s.target.names[j] for j in block if j != i and s.target.parameters[j].physical))

@@ -5,7 +5,7 @@ from scipy import stats
 
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.inference.checks.regression import design
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.views import Finding
 
 #: Family-wise false-alarm rate over the tables, and smallest correlation that counts: it widens the sd by a fifth.
@@ -18,7 +18,7 @@ FEWEST_ROWS = 6
 SMALLEST_SCATTER = 0.02
 
 
-def check_order(s: Setting) -> list[Finding]:
+def check_order(s: SampledFit) -> list[Finding]:
     """Check that residuals of neighbouring rows are uncorrelated (permutation test of the lag-1 correlation)."""
     findings, tables = [], []
     for e in s.experiments:

@@ -13,7 +13,7 @@ from scipy.fft import dct
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.order import SMALLEST_SCATTER
 from capsule_id.inference.checks.regression import DIFFERENCE, moving_symbols
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.curvature import jacobian
 from capsule_id.views import Finding
 
@@ -108,7 +108,7 @@ def _linearised(e: Experiment, theta: Mapping[str, float]) -> tuple[np.ndarray, 
     return residuals(at), columns[:, size > 0.0] / size[size > 0.0]
 
 
-def check_statistics(s: Setting) -> list[Finding]:
+def check_statistics(s: SampledFit) -> list[Finding]:
     """Compare runs of signs, largest residual and trend of every bench test with replicates."""
     findings, judged = [], 0
     for e in s.experiments:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from capsule_id.experiments.checks.series import LEVEL
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.trust import MASSES
 from capsule_id.inference.target.priors import prior_of
 from capsule_id.views import Finding
@@ -37,7 +37,7 @@ class Conflict:
     informed: float
 
 
-def conflicts(s: Setting) -> dict[str, Conflict]:
+def conflicts(s: SampledFit) -> dict[str, Conflict]:
     """Distance of the priors of physical parameters and scatters, and of every stated one, by name.
 
     A scatter far above its prior is one by which the fit explains what its law does not; one below is harmless.
@@ -59,7 +59,7 @@ def conflicts(s: Setting) -> dict[str, Conflict]:
     return found
 
 
-def check_priors(s: Setting) -> list[Finding]:
+def check_priors(s: SampledFit) -> list[Finding]:
     """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
     findings = []
     found = conflicts(s)
@@ -70,7 +70,7 @@ def check_priors(s: Setting) -> list[Finding]:
     return findings or [Finding("priors.conflict", "ok", {"number": len(found)})]
 
 
-def _location(s: Setting) -> tuple[np.ndarray, np.ndarray]:
+def _location(s: SampledFit) -> tuple[np.ndarray, np.ndarray]:
     """(d,) posterior location and sd of every parameter, in the variable of its prior."""
     lognormal = np.asarray(s.target.priors.lognormal)
     if s.posterior is None:
@@ -81,7 +81,7 @@ def _location(s: Setting) -> tuple[np.ndarray, np.ndarray]:
     return np.median(x, axis=0), np.std(x, axis=0)
 
 
-def _finding(s: Setting, name: str, conflict: Conflict, p: float) -> Finding:
+def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
     """The conflict of parameter ``name``; it concerns all parameters of the experiments that read it."""
     (row,) = [row for row in s.target.parameters if row.name == name]
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.views import Finding, Trust
 
 #: Weighed constants: their prior is a reading.
@@ -25,18 +25,18 @@ def concerned(finding: Finding, experiments: Sequence[Experiment]) -> frozenset[
     return frozenset(row.name for e in named for row in e.parameters) if named else None
 
 
-def trust_words(setting: Setting, informed: np.ndarray) -> dict[str, Trust]:
+def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:
     """Word of every sampled parameter, by name.
 
     Parameters
     ----------
     informed : (d,) whether the data narrow the prior of each parameter
     """
-    failed = [concerned(f, setting.experiments) for f in setting.findings if f.level == "fail"]
-    doubtful = {name for f in setting.findings if f.level == "warn" for name in f.parameters}
+    failed = [concerned(f, sampled.experiments) for f in sampled.findings if f.level == "fail"]
+    doubtful = {name for f in sampled.findings if f.level == "warn" for name in f.parameters}
     words: dict[str, Trust] = {}
-    for row, known in zip(setting.target.parameters, informed, strict=True):
-        judged = setting.posterior is not None and (known or row.name in MASSES) and row.name not in doubtful
+    for row, known in zip(sampled.target.parameters, informed, strict=True):
+        judged = sampled.posterior is not None and (known or row.name in MASSES) and row.name not in doubtful
         words[row.name] = "trusted" if judged else "not judged"
         if any(names is None or row.name in names for names in failed):
             words[row.name] = "not trusted"

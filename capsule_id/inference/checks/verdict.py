@@ -16,7 +16,7 @@ from capsule_id.inference.checks.modes import check_maximum, check_starts
 from capsule_id.inference.checks.order import check_order
 from capsule_id.inference.checks.predictive import check_statistics
 from capsule_id.inference.checks.priors import check_priors
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -28,34 +28,34 @@ INFORMED_RATIO = 0.9
 PRIOR_PULL = 2.5
 
 
-def run_checks(setting: Setting) -> Setting:
-    """Run all checks: return ``setting`` with all findings and flagged outliers."""
-    whiteness = check_whiteness(setting)
-    outliers, flagged = check_outliers(setting)
-    setting = replace(setting, flagged=flagged)
+def run_checks(sampled: SampledFit) -> SampledFit:
+    """Run all checks: return ``sampled`` with all findings and flagged outliers."""
+    whiteness = check_whiteness(sampled)
+    outliers, flagged = check_outliers(sampled)
+    sampled = replace(sampled, flagged=flagged)
     findings = [
-        *check_starts(setting.fit, setting.target, setting.posterior),
-        *check_maximum(setting),
-        *_chains(setting),
+        *check_starts(sampled.fit, sampled.target, sampled.posterior),
+        *check_maximum(sampled),
+        *_chains(sampled),
         *whiteness,
         *outliers,
-        *check_stated_errors(setting),
-        *check_order(setting),
-        *check_statistics(setting),
-        *_declared_findings(setting, bench=True),
-        *_informed(setting),
-        *check_priors(setting),
-        *_boundary(setting),
-        *_declared_findings(setting, bench=False),
+        *check_stated_errors(sampled),
+        *check_order(sampled),
+        *check_statistics(sampled),
+        *_declared_findings(sampled, bench=True),
+        *_informed(sampled),
+        *check_priors(sampled),
+        *_boundary(sampled),
+        *_declared_findings(sampled, bench=False),
     ]
-    return replace(setting, findings=tuple(findings))
+    return replace(sampled, findings=tuple(findings))
 
 
-def _declared_findings(setting: Setting, bench: bool) -> Iterator[Finding]:
+def _declared_findings(sampled: SampledFit, bench: bool) -> Iterator[Finding]:
     """Findings of the checks that experiments declare; one without an experiment is about those that declare it."""
-    for check in declared(setting.experiments, "checks", bench):
+    for check in declared(sampled.experiments, "checks", bench):
         names = dict.fromkeys(row.name for e in check.args[0] for row in e.parameters)
-        for finding in check(setting):
+        for finding in check(sampled):
             general = finding.level == "fail" and not (finding.experiment or finding.parameters)
             yield replace(finding, parameters=tuple(names)) if general else finding
 
@@ -71,7 +71,7 @@ def declared(
     return [partial(function, own) for function, own in members.items()]
 
 
-def _chains(s: Setting) -> list[Finding]:
+def _chains(s: SampledFit) -> list[Finding]:
     p = s.posterior
     if p is None:
         return [Finding("chains.converged", "warn")]
@@ -102,7 +102,7 @@ def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -
     return sd <= INFORMED_RATIO * target.prior_sd
 
 
-def _informed(s: Setting) -> list[Finding]:
+def _informed(s: SampledFit) -> list[Finding]:
     known = informed(s.target, s.posterior, s.fit)
     # No other reading narrows a weighed mass. A scatter with a stated reading error may be zero.
     names = [
@@ -113,7 +113,7 @@ def _informed(s: Setting) -> list[Finding]:
     return [Finding("parameters.informed", "warn" if names else "ok", {"names": ", ".join(names)})]
 
 
-def _boundary(s: Setting) -> list[Finding]:
+def _boundary(s: SampledFit) -> list[Finding]:
     """Find parameters whose posterior lies in the tail of the prior."""
     z = np.abs(s.target.prior_residuals(s.fit.u))
     names = [row.name for row, pull in zip(s.target.parameters, z, strict=True) if pull > PRIOR_PULL]

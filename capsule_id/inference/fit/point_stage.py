@@ -1,6 +1,6 @@
-"""Stages of the point fit: closed forms, division of unpredictable runs, joint fit.
+"""Stages of the point fit: bench tests in closed form, division of unpredictable runs, joint fit.
 
-experiments -> bench fit (closed forms) -> divide runs that amplify initial errors -> LogPosterior -> joint fit
+experiments -> fit of the bench tests in closed form -> divide runs that amplify initial errors -> LogPosterior -> joint fit
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,10 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class BenchFit:
-    """Fit and sample of the closed forms alone; None where there are none, or nothing was sampled."""
+    """Fit and sample of the bench tests in closed form alone, ``event_driven`` false.
+
+    Both are None where there are none; the sample is None where nothing was sampled.
+    """
 
     fit: PointFit | None = None
     sample: Posterior | None = None

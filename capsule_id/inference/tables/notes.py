@@ -4,14 +4,14 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.verdict import declared
 from capsule_id.inference.tables.run_notes import precision_gained, smoothing_certificate
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.views import ResultTable
 
 
-def make_notes(setting: Setting, predictive: Mapping[str, float | None]) -> list[ResultTable]:
+def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> list[ResultTable]:
     """Return all tables; those that compare bench tests and runs only where there are runs.
 
     They need derivatives, which say little where residuals have kinks: then they are left out.
@@ -20,17 +20,17 @@ def make_notes(setting: Setting, predictive: Mapping[str, float | None]) -> list
     ----------
     predictive : posterior predictive p-values by label; without a sample there is no such table
     """
-    target, fit = setting.target, setting.fit
+    target, fit = sampled.target, sampled.fit
     of_runs, of_bench = (
-        [table for maker in declared(setting.experiments, "tables", bench) for table in maker(setting)]
+        [table for maker in declared(sampled.experiments, "tables", bench) for table in maker(sampled)]
         for bench in (False, True)
     )
-    kinked = any(e.has_joint_scatters for e in setting.experiments)
-    if any(not e.bench for e in setting.experiments) and not kinked:
-        gained = precision_gained(target, fit, setting.posterior, setting.bench)
+    kinked = any(e.has_joint_scatters for e in sampled.experiments)
+    if any(not e.bench for e in sampled.experiments) and not kinked:
+        gained = precision_gained(target, fit, sampled.posterior, sampled.bench)
         of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
     tables = [*of_runs, *of_bench, prior_table(target)]
-    return [*tables, predictive_table(setting, predictive)] if setting.draws else tables
+    return [*tables, predictive_table(sampled, predictive)] if sampled.draws else tables
 
 
 def prior_table(target: LogPosterior) -> ResultTable:
@@ -43,8 +43,8 @@ def prior_table(target: LogPosterior) -> ResultTable:
     return ResultTable("parameters.priors", pd.DataFrame(rows).set_index("parameter"))
 
 
-def predictive_table(setting: Setting, predictive: Mapping[str, float | None]) -> ResultTable:
+def predictive_table(sampled: SampledFit, predictive: Mapping[str, float | None]) -> ResultTable:
     """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
-    rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in setting.experiments}
+    rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in sampled.experiments}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"])
     return ResultTable("readings.predictive", frame.rename_axis("experiment"))

@@ -9,7 +9,7 @@ import pandas as pd
 from capsule_id.experiments import paper_estimates
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.model_error.widening import Widening
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.trust import trust_words
 from capsule_id.inference.checks.verdict import informed
 from capsule_id.inference.result import Posterior
@@ -22,14 +22,14 @@ SUMMARY_COLUMNS = (
 )  # fmt: skip
 
 
-def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame, pd.DataFrame]:
+def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the tables of physical parameters and of nuisances; see ``Result``."""
-    target, point, posterior = setting.target, setting.fit, setting.posterior
-    masses = {"m1": setting.rig.m1, "m2": setting.rig.m2}
+    target, point, posterior = sampled.target, sampled.fit, sampled.posterior
+    masses = {"m1": sampled.rig.m1, "m2": sampled.rig.m2}
     paper = paper_estimates(target.experiments, registry)
     paper |= {name: mass.value for name, mass in masses.items() if mass is not None}
     known = informed(target, posterior, point)
-    words = trust_words(setting, known)
+    words = trust_words(sampled, known)
     rows: list[tuple[Parameter, dict[str, object]]] = []
     for i, row in enumerate(target.parameters):
         entry: dict[str, object] = {
@@ -45,7 +45,7 @@ def parameter_tables(setting: Setting, registry: Registry) -> tuple[pd.DataFrame
             "informed": bool(known[i]),
         }
         entry |= {} if posterior is None else _sample_columns(posterior, i)
-        rows.append((row, entry | _widened(entry, setting.widened.get(row.name), row.positive)))
+        rows.append((row, entry | _widened(entry, sampled.widened.get(row.name), row.positive)))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
         exact = dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value)

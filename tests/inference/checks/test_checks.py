@@ -15,7 +15,7 @@ from capsule_id.experiments.free_vibration.twin import DECAY_NOISE, RELEASES, de
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.static_friction.declaration import tilts as tilted
 from capsule_id.inference.checks.regression import outliers
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -81,7 +81,7 @@ def findings(folder: Path, fault: Callable[[Path], None] | None = None) -> list[
     rig = read_rig(folder)
     target = LogPosterior(rig, make_experiments(rig))
     fit = point_fit(target, SEED)
-    return list(run_checks(Setting(target, fit, None, {**target.fixed, **fit.values})).findings)
+    return list(run_checks(SampledFit(target, fit, None, {**target.fixed, **fit.values})).findings)
 
 
 @pytest.fixture(scope="module")

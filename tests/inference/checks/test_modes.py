@@ -11,7 +11,7 @@ import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.checks.modes import check_maximum, check_starts, modes
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.pipeline import higher_maximum, sample_posterior, stage_seeds
@@ -100,12 +100,12 @@ def test_two_modes_fail_with_their_weights(tmp_path: Path) -> None:
     rig = sliding(tmp_path, np.array([0.1, 0.2, 0.4]), np.array([0.4, 0.35, 0.3]))
     target = LogPosterior(rig, make_experiments(rig))
     fit = point_fit(target, 0, 2)
-    setting = sample_posterior(fit_points(target, default_registry(), 0, sampled=True), 0, budget=200)
-    assert setting.posterior is not None
+    fitted = sample_posterior(fit_points(target, default_registry(), 0, sampled=True), 0, budget=200)
+    assert fitted.posterior is not None
     draws = np.exp(fit.u + 0.1 * np.random.default_rng(0).standard_normal((2, 500, 4, target.dimension)))
     draws[..., :2, target.names.index("mu")] *= 3.0
-    posterior = replace(setting.posterior, draws=draws, ess=np.full(target.dimension, 1000.0))
-    (found,) = check_maximum(Setting(target, fit, posterior, {**target.fixed, **fit.values}))
+    posterior = replace(fitted.posterior, draws=draws, ess=np.full(target.dimension, 1000.0))
+    (found,) = check_maximum(SampledFit(target, fit, posterior, {**target.fixed, **fit.values}))
     assert (found.code, found.level, found.parameters[0]) == ("sample.modes", "fail", "mu")
     assert finding_text(found, FIT_MESSAGES).count("with weight 0.50") == 2
 

@@ -12,7 +12,7 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.inference.checks.priors import conflicts
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import PriorOverride, Rig
@@ -26,22 +26,22 @@ CURRENT = np.linspace(0.5, 2.0, 6)
 FORCE_SD = 0.05
 
 
-def calibration(rng: np.random.Generator, median: float, K: float) -> Setting:
+def calibration(rng: np.random.Generator, median: float, K: float) -> SampledFit:
     """A motor with exact currents and stated errors, and a prior of K."""
     force = K * CURRENT + FORCE_SD * rng.standard_normal(6)
     columns = [column("force", force, FORCE_SD), column("current", CURRENT, 1e-9)]
     known = rig(table("motor_current", columns), priors={"K": PriorOverride(median, FACTOR)})
     target = LogPosterior(known, make_experiments(known))
     fit = point_fit(target, 0, 1)
-    return Setting(target, fit, None, {**target.fixed, **fit.values})
+    return SampledFit(target, fit, None, {**target.fixed, **fit.values})
 
 
 def test_the_distance_is_that_of_prior_and_least_squares() -> None:
-    setting = calibration(np.random.default_rng(0), 2.0, 2.2)
-    (experiment,) = setting.experiments
+    fitted = calibration(np.random.default_rng(0), 2.0, 2.2)
+    (experiment,) = fitted.experiments
     slope, covariance = np.polyfit(CURRENT, experiment.observed, 1, w=np.full(6, 1.0 / FORCE_SD), cov="unscaled")
     value, sd = slope[0], np.sqrt(covariance[0, 0])
-    found = conflicts(setting)["K"]
+    found = conflicts(fitted)["K"]
     assert (found.value, found.sd) == pytest.approx((value, sd), rel=0.08)  # curvature of the logarithm
     assert found.z == pytest.approx(np.log(value / 2.0) / np.hypot(sd / value, WIDTH), rel=0.08)
 

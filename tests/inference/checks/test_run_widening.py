@@ -16,7 +16,7 @@ from capsule_id.inference.checks.model_error.run_widening import (
     steps_of_parts,
 )
 from capsule_id.inference.checks.model_error.widening import FEWEST_PARTS, widening
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -27,7 +27,7 @@ NO_ARRAY = np.zeros(0)
 
 
 @cache
-def setting(folder: Path) -> Setting:
+def fitted(folder: Path) -> SampledFit:
     """The shaken capsule of the tests of base runs at its true values, with a failed check."""
     rig = shaken.rig(folder)
     run = BaseRun(rig.tables[0], rig)
@@ -36,15 +36,15 @@ def setting(folder: Path) -> Setting:
     u = target.unconstrain(np.array([truth[name] for name in target.names]))
     fit = PointFit(target.names, u, truth, NO_ARRAY, {}, NO_ARRAY, NO_ARRAY, NO_ARRAY, NO_ARRAY, NO_ARRAY)
     finding = Finding("residuals.white", "fail", {}, "shaken")
-    return Setting(target, fit, None, {**target.fixed, **truth}, findings=(finding,))
+    return SampledFit(target, fit, None, {**target.fixed, **truth}, findings=(finding,))
 
 
 @pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> Setting:
-    return setting(tmp_path_factory.mktemp("shaken"))
+def known(tmp_path_factory: pytest.TempPathFactory) -> SampledFit:
+    return fitted(tmp_path_factory.mktemp("shaken"))
 
 
-def pulls(s: Setting, misfit: float, divisions: tuple = (by_time, by_phase)) -> tuple[np.ndarray, np.ndarray]:
+def pulls(s: SampledFit, misfit: float, divisions: tuple = (by_time, by_phase)) -> tuple[np.ndarray, np.ndarray]:
     """Errors of k1 over its sd, and over 1.96 times the widened sd and t quantile, of 300 linearised fits.
 
     misfit : amplitude of each of six random harmonics of the excitation in x_capsule, units of the noise
@@ -69,7 +69,7 @@ def pulls(s: Setting, misfit: float, divisions: tuple = (by_time, by_phase)) -> 
     return np.abs(plain), np.abs(widened)
 
 
-def test_intervals_cover_under_a_misfit_that_repeats(known: Setting) -> None:
+def test_intervals_cover_under_a_misfit_that_repeats(known: SampledFit) -> None:
     plain, widened = pulls(known, 5.0)
     assert np.mean(plain < 1.96) < 0.5
     assert np.mean(widened < 1.0) >= 0.9
@@ -77,13 +77,13 @@ def test_intervals_cover_under_a_misfit_that_repeats(known: Setting) -> None:
     assert np.mean(pulls(known, 5.0, (by_time,))[1] < 1.0) < 0.7
 
 
-def test_noise_alone_widens_little(known: Setting) -> None:
+def test_noise_alone_widens_little(known: SampledFit) -> None:
     plain, widened = pulls(known, 0.0)
     assert np.mean(plain < 1.96) == pytest.approx(0.95, abs=0.04)
     assert np.median(plain / widened) / 1.96 < 1.8  # t quantile of 4 to 8 parts included
 
 
-def test_a_failed_check_widens_the_parameters_of_its_run(known: Setting) -> None:
+def test_a_failed_check_widens_the_parameters_of_its_run(known: SampledFit) -> None:
     assert run_widenings(replace(known, findings=())) == {}
     quiet = run_widenings(known)
     assert all(one.factor < 2.0 for one in quiet.values())
@@ -96,7 +96,7 @@ def test_a_failed_check_widens_the_parameters_of_its_run(known: Setting) -> None
     assert set(wide) <= set(shaken.TRUTH)
 
 
-def test_parts_are_whole_periods_and_phases(known: Setting) -> None:
+def test_parts_are_whole_periods_and_phases(known: SampledFit) -> None:
     run = known.experiments[0]
     assert isinstance(run, BaseRun)
     time, phase = by_time(run), by_phase(run)

@@ -8,7 +8,7 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.trust import trust_words
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.result import Posterior
@@ -18,7 +18,7 @@ from capsule_id.views import Finding, Trust
 
 
 @pytest.fixture(scope="module")
-def sampled(tmp_path_factory: pytest.TempPathFactory) -> Setting:
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> SampledFit:
     """A bench without runs; no check reads the draws of its sample."""
     folder = tmp_path_factory.mktemp("trust") / "rig"
     synthesize(folder, 0)
@@ -28,22 +28,22 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> Setting:
     nothing = np.zeros(target.dimension)
     draws = np.zeros((1, 1, 1, target.dimension))
     posterior = Posterior(target.names, draws, draws[..., 0], *[nothing] * 6, 1.0, True, {}, 1, 1)
-    return Setting(target, fit, posterior, {**target.fixed, **fit.values})
+    return SampledFit(target, fit, posterior, {**target.fixed, **fit.values})
 
 
-def words(setting: Setting, *findings: Finding, uninformed: str = "") -> dict[str, Trust]:
-    known = np.array([name != uninformed for name in setting.target.names])
-    return trust_words(replace(setting, findings=findings), known)
+def words(fitted: SampledFit, *findings: Finding, uninformed: str = "") -> dict[str, Trust]:
+    known = np.array([name != uninformed for name in fitted.target.names])
+    return trust_words(replace(fitted, findings=findings), known)
 
 
-def test_a_clean_sample_is_trusted_and_a_point_fit_is_not_judged(sampled: Setting) -> None:
+def test_a_clean_sample_is_trusted_and_a_point_fit_is_not_judged(sampled: SampledFit) -> None:
     assert set(words(sampled, Finding("x", "warn", {}, "motor_current")).values()) == {"trusted"}
     assert set(words(replace(sampled, posterior=None)).values()) == {"not judged"}
 
 
-def test_a_failed_check_concerns_the_parameters_of_its_experiment(sampled: Setting) -> None:
-    for setting in (sampled, replace(sampled, posterior=None)):
-        found = words(setting, Finding("x", "fail", {}, "free_vibration_1"))
+def test_a_failed_check_concerns_the_parameters_of_its_experiment(sampled: SampledFit) -> None:
+    for fitted in (sampled, replace(sampled, posterior=None)):
+        found = words(fitted, Finding("x", "fail", {}, "free_vibration_1"))
         assert [name for name, word in found.items() if word == "not trusted"] == [
             "k1",
             "c",
@@ -51,19 +51,19 @@ def test_a_failed_check_concerns_the_parameters_of_its_experiment(sampled: Setti
         ]
 
 
-def test_a_finding_may_name_its_parameters_or_concern_all(sampled: Setting) -> None:
+def test_a_finding_may_name_its_parameters_or_concern_all(sampled: SampledFit) -> None:
     named = words(sampled, Finding("x", "fail", {}, "free_vibration_1", ("m1",)))
     assert [name for name, word in named.items() if word == "not trusted"] == ["m1"]
     assert set(words(sampled, Finding("x", "fail")).values()) == {"not trusted"}
 
 
-def test_what_the_data_do_not_inform_is_not_judged_except_a_weighing(sampled: Setting) -> None:
+def test_what_the_data_do_not_inform_is_not_judged_except_a_weighing(sampled: SampledFit) -> None:
     assert words(sampled, uninformed="v_s")["v_s"] == "not judged"
     assert words(sampled, uninformed="m1")["m1"] == "trusted"
     assert words(sampled, Finding("x", "fail"), uninformed="v_s")["v_s"] == "not trusted"
 
 
-def test_a_warning_that_names_parameters_leaves_them_not_judged(sampled: Setting) -> None:
+def test_a_warning_that_names_parameters_leaves_them_not_judged(sampled: SampledFit) -> None:
     found = words(sampled, Finding("x", "warn", {}, "motor_current", ("K",)))
     assert [name for name, word in found.items() if word == "not judged"] == ["K"]
 

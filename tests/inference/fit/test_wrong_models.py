@@ -7,7 +7,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.checks.experiment_checks import check_whiteness
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
@@ -43,7 +43,7 @@ def whiteness_of(**departures: float) -> Finding:
     rig = bench.rig(table, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
     stage = fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)
     values = stage.target.mapping(stage.target.theta(stage.fit.u))
-    return check_whiteness(Setting(stage.target, stage.fit, None, values))[0]
+    return check_whiteness(SampledFit(stage.target, stage.fit, None, values))[0]
 
 
 def test_the_papers_model_leaves_white_residuals() -> None:

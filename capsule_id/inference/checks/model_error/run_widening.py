@@ -21,7 +21,7 @@ from capsule_id.inference.checks.model_error.widening import (
     Widening,
     widening,
 )
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import residual_jacobian
 
 #: Parts of an excitation period. They are long beside most waves of a misfit, so that their steps are independent.
@@ -30,7 +30,7 @@ PHASES = 6
 Division = Callable[[CapsuleForward], Int[np.ndarray, " n"] | None]
 
 
-def run_widenings(s: Setting) -> dict[str, Widening]:
+def run_widenings(s: SampledFit) -> dict[str, Widening]:
     """Error of the model of every physical parameter of a run with a failed check, by name."""
     failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
     runs = [e for e in s.experiments if isinstance(e, CapsuleForward) and {e.label, e.table.label} & failed]
@@ -73,7 +73,7 @@ def by_phase(run: CapsuleForward) -> Int[np.ndarray, " n"] | None:
     return (run.table["time"] / period % 1.0 * PHASES).astype(int) % PHASES
 
 
-def parts_of_residuals(s: Setting, runs: Sequence[CapsuleForward], division: Division) -> Int[np.ndarray, " m"]:
+def parts_of_residuals(s: SampledFit, runs: Sequence[CapsuleForward], division: Division) -> Int[np.ndarray, " m"]:
     """Part of each of ``LogPosterior.plain_residuals``; -1, one more part, where no record of ``runs`` gives it."""
     parts, used = [], 0
     for e in s.experiments:

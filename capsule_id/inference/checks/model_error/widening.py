@@ -15,7 +15,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.families.friction_model import EQUATION_1
-from capsule_id.inference.checks.setting import Setting
+from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.rig.model import Table
 
 #: Fewest parts of the data, and most parts of one table.
@@ -49,7 +49,7 @@ class Widening:
         return self.factor * self.quantile
 
 
-def widenings(s: Setting) -> dict[str, Widening]:
+def widenings(s: SampledFit) -> dict[str, Widening]:
     """Error of the model of every physical parameter that a failed check of its bench test concerns, by name."""
     failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
     kinds = {e.kind for e in s.experiments if e.label in failed or e.table.label in failed}

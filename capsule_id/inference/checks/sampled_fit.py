@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Setting:
-    """A fit and its findings so far; see ``capsule_id.experiments.checks.context.Fitted``.
+class SampledFit:
+    """A point fit, its sample (None where nothing was sampled) and its findings so far.
+
+    See ``capsule_id.experiments.checks.context.Fitted``.
 
     Attributes
     ----------
