@@ -4,7 +4,7 @@ emcee keeps the state of a run only in ``run_mcmc``. Saving after every draw req
 must keep its own state between calls.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -56,18 +56,12 @@ class Ensemble:
         """(walker,) share of accepted proposals among the stored draws."""
         return self._sampler.backend.accepted / self._sampler.iteration
 
-    def advance(self, draws: int, thin: int = 1, store: bool = True) -> Iterator[None]:
-        """Make ``draws`` more draws of ``thin`` steps each; yield after each one is stored."""
+    def run(self, draws: int, thin: int = 1, store: bool = True) -> "Ensemble":
+        """Make ``draws`` more draws of ``thin`` steps each and return the ensemble itself."""
         if draws > 0:
             for state in self._sampler.sample(self.state, iterations=draws, thin_by=thin, store=store):
                 self.state = state
                 stop_if_interrupted()
-                yield
-
-    def run(self, steps: int, store: bool = True) -> "Ensemble":
-        """Make ``steps`` steps and return the ensemble itself."""
-        for _ in self.advance(steps, store=store):
-            pass
         return self
 
 

@@ -1,6 +1,9 @@
 """Sampling by independent emcee ensembles until convergence or a step limit, with regular saving."""
 
-from collections.abc import Iterator, Mapping
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +23,9 @@ from capsule_id.inference.sampling.diagnostics import (
     split_rhat,
 )
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
-from capsule_id.inference.sampling.moves import LARGE, Moves, block_move, candidates
+from capsule_id.inference.sampling.moves import Moves, block_move, other_moves
+from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
+from capsule_id.inference.sampling.refinement import refined
 
 #: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
@@ -35,10 +40,19 @@ DEFAULT_ESS = 4000.0
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks.
 FIRST_CHECK, CHECK_EVERY = 120, 30
+#: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well.
+LARGE = 9
+#: Smallest ratio of pilot sd to Laplace sd at which a large block's proposal is widened. Smaller ratios may be noise
+#: of a short pilot.
+WIDER = 1.1
 #: Burn-in of every ensemble before its first stored draw, in autocorrelation times of the pilot.
 BURN_IN_IN_TAU = 8.0
-#: Spread of the initial walkers relative to the Laplace approximation, dimensionless.
+#: Spread of the initial walkers relative to the approximate posterior, dimensionless.
 OVERDISPERSION = 1.2
+#: Ensembles that advance side by side.
+CORES = min(ENSEMBLES, os.cpu_count() or 1)
+#: Time after which ensembles wait for each other, s.
+ROUND = 1.0
 #: Largest number of emcee steps of an ensemble after burn-in, unless stated.
 DEFAULT_BUDGET = 20_000
 #: Stored draws per autocorrelation time of the pilot, and the largest number of steps per stored draw. The limit is
@@ -46,6 +60,8 @@ DEFAULT_BUDGET = 20_000
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
 #: Steps of the pilot's burn-in, half of which determines the block proposal, and steps of each measured move (short, long).
 PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
+#: Name of the first move.
+FIRST = "block independence + differential evolution"
 #: Name of the move that the pilot adapts to its own sample, largest number of adaptations, and steps of each.
 ADAPTED, ADAPTATIONS, ADAPTING_STEPS = "adapted block independence + differential evolution", 4, 200
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
@@ -56,8 +72,9 @@ FAIR_TAU = 40.0
 
 @dataclass(frozen=True)
 class Schedule:
-    """Move, thinning and burn-in of the recorded run, chosen by the pilot run."""
+    """First walkers, move, thinning and burn-in of the recorded run, chosen by the pilot run."""
 
+    start: BlockProposal
     move: str
     moves: Moves
     measured: Mapping[str, float]
@@ -73,6 +90,8 @@ class Target(Protocol):
     blocks: list[np.ndarray]
     centre: np.ndarray
     covariance: np.ndarray
+    normal_priors: np.ndarray
+    kinked: bool
 
     @property
     def fingerprint(self) -> str:
@@ -110,17 +129,15 @@ def sample(
     schedule = pilot(target, pilot_seed)
     with nullcontext() if store is None else ChainStore(store, f"{target.fingerprint} {seed}") as chains:
         backends = [None if chains is None else chains.backend(f"ensemble_{i}") for i in range(ENSEMBLES)]
-        samplers = [_sampler(target, schedule, *one) for one in zip(seeds, backends, strict=True)]
-        done = [sampler.stored for sampler in samplers]
+        with ThreadPoolExecutor(CORES) as threads:
+            samplers = list(threads.map(lambda *one: _sampler(target, schedule, *one), seeds, backends))
         draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
         last = max(budget // schedule.thin, 2)
-        for goal in _checks(min(done), last):
-            for i, sampler in enumerate(samplers):
-                for _ in sampler.advance(goal - done[i], schedule.thin):
-                    done[i] += 1
-                    if chains is not None:
-                        chains.between_draws()
-                    report(sum(done), ENSEMBLES * goal, schedule.move)
+        for goal in _checks(min(sampler.stored for sampler in samplers), last):
+            for done in _advance(samplers, goal, schedule.thin):
+                if chains is not None:
+                    chains.between_draws()
+                report(done, ENSEMBLES * goal, schedule.move)
             located = np.stack([sampler.chain[:goal] for sampler in samplers])
             if goal == last or _converged(located, ess):
                 draws, lp = target.restore(located, restore_seed)
@@ -156,25 +173,21 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
 
 
 def pilot(target: Target, seed: int) -> Schedule:
-    """Burn in one ensemble, then measure autocorrelation times of candidate moves until one is short enough."""
-    start = _initial(target, np.random.RandomState(seed))
-    # In 30 dimensions a proposal that is 20 % too wide is almost never accepted: large blocks are not widened.
-    wider = np.ones(target.dimension)
-    wider[[i for block in target.blocks if len(block) < LARGE for i in block]] = OVERDISPERSION
-    rough = block_move(target.blocks, target.centre, target.covariance * np.outer(wider, wider))
-    ensemble = Ensemble(target.parts, start, rough).run(PILOT_BURN_IN)
-    sample = ensemble.chain[PILOT_BURN_IN // 2 :].reshape(-1, target.dimension)
-    measured, moves = {}, dict(candidates(sample, target.blocks, target.centre, target.covariance))
-    first, *others = moves
-    # The most promising move runs first, briefly, then longer. Moves adapted to the sample follow, because a posterior
-    # with kinks differs from the Laplace approximation. All other moves come last, because they are slow.
-    plan = [(first, PILOT_STEPS), (first, LONG_PILOT_STEPS), *[(ADAPTED, ADAPTING_STEPS)] * ADAPTATIONS]
-    for name, steps in [*plan, *((name, LONG_PILOT_STEPS) for name in others)]:
-        if name in others and min(measured.values()) < FAIR_TAU:
+    """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
+    random = np.random.RandomState(seed)
+    start, proposal = _by_short_chain(target, random) if target.kinked else _by_importance(target, random)
+    ensemble = Ensemble(target.parts, _initial(target, start, random), block_move(proposal))
+    moves, measured = {FIRST: block_move(proposal), **other_moves()}, dict[str, float]()
+    # The most promising move runs first, briefly, then longer. Where the density has kinks, moves adapted to the sample
+    # follow. All other moves come last, because they are slow.
+    plan = [(FIRST, PILOT_STEPS), (FIRST, LONG_PILOT_STEPS), *[(ADAPTED, ADAPTING_STEPS)] * ADAPTATIONS * target.kinked]
+    for name, steps in [*plan, *((name, LONG_PILOT_STEPS) for name in other_moves())]:
+        if name in other_moves() and min(measured.values()) < FAIR_TAU:
             break
         if name == ADAPTED:
             found = ensemble.chain.reshape(-1, target.dimension)
-            moves[name] = block_move(target.blocks, np.mean(found, axis=0), np.atleast_2d(np.cov(found.T)))
+            covariance = np.atleast_2d(np.cov(found.T))
+            moves[name] = block_move(_concentric(target, np.mean(found, axis=0), covariance))
         ensemble = Ensemble(target.parts, ensemble.state, moves[name]).run(steps)
         measured[name] = float(np.max(ensemble_time(ensemble.chain[None])))
         if measured[name] < GOOD_TAU:
@@ -182,7 +195,45 @@ def pilot(target: Target, seed: int) -> Schedule:
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
-    return Schedule(best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
+    return Schedule(start, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
+
+
+def _by_importance(target: Target, random: np.random.RandomState) -> tuple[BlockProposal, BlockProposal]:
+    """Density of the first walkers and proposal of their moves, by importance sampling; it is wide enough for both."""
+    laplace = OVERDISPERSION**2 * target.covariance
+    proposal = refined(
+        target.parts, block_proposal(target.blocks, target.centre, laplace), target.normal_priors, random
+    )
+    return proposal, proposal
+
+
+def _by_short_chain(target: Target, random: np.random.RandomState) -> tuple[BlockProposal, BlockProposal]:
+    """Density of the first walkers and proposal of their moves, from a short chain.
+
+    The correlations of large blocks come from the Laplace approximation, because a short chain estimates them badly.
+    Their widths come from the chain where it finds larger ones.
+    """
+    wider, large = OVERDISPERSION**2 * target.covariance, _large(target)
+    start = block_proposal(target.blocks, target.centre, wider)
+    # In 30 dimensions a proposal that is 20 % too wide is almost never accepted: large blocks are not widened.
+    rough = _concentric(target, target.centre, np.where(np.outer(large, large), target.covariance, wider))
+    ensemble = Ensemble(target.parts, _initial(target, start, random), block_move(rough)).run(PILOT_BURN_IN)
+    sample = ensemble.chain[PILOT_BURN_IN // 2 :].reshape(-1, target.dimension)
+    covariance = np.atleast_2d(np.cov(sample.T))
+    ratio = np.sqrt(np.diag(covariance) / np.diag(target.covariance))
+    factors = np.where(ratio > WIDER, ratio, 1.0)
+    covariance = np.where(np.outer(large, large), target.covariance * np.outer(factors, factors), covariance)
+    return start, _concentric(target, np.where(large, target.centre, np.median(sample, axis=0)), covariance)
+
+
+def _large(target: Target) -> np.ndarray:
+    """(d,) parameters of large blocks."""
+    return np.isin(np.arange(target.dimension), [i for block in target.blocks if len(block) >= LARGE for i in block])
+
+
+def _concentric(target: Target, centre: np.ndarray, covariance: np.ndarray) -> BlockProposal:
+    """Proposals of one centre for each block; narrow for large blocks."""
+    return block_proposal(target.blocks, centre, covariance, [len(block) >= LARGE for block in target.blocks])
 
 
 def _checks(done: int, last: int) -> Iterator[int]:
@@ -191,26 +242,42 @@ def _checks(done: int, last: int) -> Iterator[int]:
     yield last
 
 
+def _advance(samplers: Sequence[Ensemble], goal: int, thin: int) -> Iterator[int]:
+    """Advance all ensembles to ``goal`` stored draws, side by side; yield their total about every ``ROUND`` seconds.
+
+    No ensemble is moving while the generator waits, so that their file can be copied.
+    """
+    number = 1
+    with ThreadPoolExecutor(CORES) as threads:
+        while any(sampler.stored < goal for sampler in samplers):
+            started = time.monotonic()
+            runs = [threads.submit(one.run, min(number, goal - one.stored), thin) for one in samplers]
+            for run in runs:
+                run.result()
+            number = max(int(number * ROUND / max(time.monotonic() - started, 1e-9)), 1)
+            yield sum(sampler.stored for sampler in samplers)
+
+
 def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
     """Return one ensemble: burnt in from its own overdispersed start, or resumed from ``backend``."""
     last = None if backend is None else backend.last_state()
     if last is not None:
         return Ensemble(target.parts, last, schedule.moves, backend)
-    start = _initial(target, np.random.RandomState(seed))
+    start = _initial(target, schedule.start, np.random.RandomState(seed))
     burnt_in = Ensemble(target.parts, start, schedule.moves).run(schedule.burn_in, store=False).state
     if backend is not None:
         backend.reset(*start.coords.shape)
     return Ensemble(target.parts, burnt_in, schedule.moves, backend)
 
 
-def _initial(target: Target, random: np.random.RandomState) -> State:
-    """Walkers from the widened Laplace approximation, each at a finite log-posterior."""
+def _initial(target: Target, density: BlockProposal, random: np.random.RandomState) -> State:
+    """Walkers drawn from ``density``, each at a finite log-posterior."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
-    root = OVERDISPERSION * np.linalg.cholesky(target.covariance)
-    u = target.centre + random.standard_normal((walkers, target.dimension)) @ root.T
+    u = np.empty((0, target.dimension))
     for _ in range(100):
-        bad = ~np.all(np.isfinite(target.parts(u)), axis=1)
-        if not bad.any():
-            return initial_state(u, random)
-        u[bad] = target.centre + random.standard_normal((int(bad.sum()), target.dimension)) @ root.T
+        drawn = density.draw(random, walkers)
+        drawn = drawn[np.all(np.isfinite(drawn), axis=1)]
+        u = np.concatenate([u, drawn[np.all(np.isfinite(target.parts(drawn)), axis=1)]])
+        if len(u) >= walkers:
+            return initial_state(u[:walkers], random)
     raise RuntimeError("no finite log-posterior near the point fit: the Laplace approximation does not hold there")

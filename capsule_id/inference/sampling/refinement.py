@@ -1,0 +1,147 @@
+"""Adapt a proposal to the posterior by population Monte Carlo (Cappé et al. 2008), before any chain starts.
+
+A short chain from the Laplace approximation misses tails where the width of the posterior depends on one parameter, as
+on the correlation time of noise, or where two terms replace each other, as viscous and dry damping do. Weighted draws
+from a wide proposal find them. Each round draws from the mixture of the round before and updates it by one step of
+expectation maximisation.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from capsule_id.inference.sampling.coordinates import coordinates_of
+from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, concentric
+
+#: Draws of a round, and rounds with one component and with several.
+DRAWS, SINGLE, SEVERAL = 4096, 3, 9
+#: Number of components of a posterior that one component does not describe; components of less weight are dropped.
+COMPONENTS, LEAST_WEIGHT = 8, 0.01
+#: Rounds end where the effective sample size of every block is this share of the draws.
+ENOUGH = 0.3
+#: Weights are tempered, w^a, where their effective sample size is below this number per parameter; exponents a to try.
+LEAST_SIZE, TEMPERS = 20.0, 0.8 ** np.arange(30)
+#: Covariances of components grow by this share of the variances of all draws, so that none collapses.
+FLOOR = 1e-3
+#: Share of the components about the mean of all draws where there are several others.
+DEFENSIVE = 0.2
+
+
+def refined(
+    parts: Callable[[np.ndarray], np.ndarray],
+    first: BlockProposal,
+    prior: Float[np.ndarray, "2 d"],
+    rng: np.random.RandomState,
+) -> BlockProposal:
+    """Proposal adapted to a posterior, from the proposal ``first``.
+
+    Parameters
+    ----------
+    parts : (n, d) -> (n, blocks), log-densities of the blocks
+    prior : centre and width of the normal prior of u; NaN for a parameter with another prior
+    """
+    proposal = first
+    for i in range(SINGLE + SEVERAL):
+        u = proposal.draw(rng, DRAWS)
+        inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in proposal.blocks], axis=1)
+        u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
+        log_weights = np.where(inside, parts(u) - proposal.log_density(u), -np.inf)
+        mixtures = list(proposal.mixtures)
+        for j, (block, own) in enumerate(zip(proposal.blocks, log_weights.T, strict=True)):
+            if i == 0 or effective_size(own) < ENOUGH * DRAWS:
+                weights = tempered(own, LEAST_SIZE * len(block))
+                mixtures[j] = _adapted(mixtures[j], u[:, block], weights, prior[:, block], i, rng)
+        if all(new is old for new, old in zip(mixtures, proposal.mixtures, strict=True)):
+            break
+        proposal = BlockProposal(proposal.blocks, mixtures)
+    return proposal
+
+
+def effective_size(log_weights: Float[np.ndarray, " w"]) -> float:
+    """Effective sample size of weights, 1/sum of their squares where their sum is 1."""
+    weights = np.exp(log_weights - np.max(log_weights))
+    return float(np.sum(weights) ** 2 / np.sum(weights**2))
+
+
+def tempered(log_weights: Float[np.ndarray, " w"], least: float) -> Float[np.ndarray, " w"]:
+    """Normalised weights to the largest power of ``TEMPERS`` whose effective sample size is at least ``least``."""
+    power = next((a for a in TEMPERS if effective_size(a * log_weights) >= least), TEMPERS[-1])
+    weights = np.exp(power * (log_weights - np.max(log_weights)))
+    return weights / np.sum(weights)
+
+
+def _adapted(
+    mixture: Mixture,
+    u: Float[np.ndarray, "n d"],
+    weights: Float[np.ndarray, " n"],
+    prior: Float[np.ndarray, "2 d"],
+    done: int,
+    rng: np.random.RandomState,
+) -> Mixture:
+    """Mixture of one block after ``done`` rounds.
+
+    Parameters
+    ----------
+    u, weights : draws and their normalised weights
+    prior : see ``refined``
+    """
+    coordinates = mixture.coordinates
+    if done < SINGLE:
+        coordinates = coordinates_of(u[rng.choice(len(u), len(u), p=weights)], prior)
+    w = coordinates.w(u)
+    mean, covariance = np.average(w, axis=0, weights=weights), np.atleast_2d(np.cov(w.T, aweights=weights))
+    wide = concentric(mean, covariance, coordinates=coordinates)
+    if done < SINGLE:
+        return wide
+    if done == SINGLE:
+        centres = w[rng.choice(len(w), COMPONENTS, p=weights)]
+        covariances = np.repeat(covariance[None], COMPONENTS, axis=0)
+        return _with_wide(np.full(COMPONENTS, 1.0 / COMPONENTS), centres, covariances, wide)
+    local = slice(0, len(mixture.weights) - len(wide.weights))
+    return _with_wide(*maximised(mixture, u, weights, local, FLOOR * np.diag(np.diag(covariance))), wide)
+
+
+def _with_wide(
+    weights: Float[np.ndarray, " k"],
+    centres: Float[np.ndarray, "k d"],
+    covariances: Float[np.ndarray, "k d d"],
+    wide: Mixture,
+) -> Mixture:
+    """Components in u or theta alone, then those of ``wide`` with the share ``DEFENSIVE`` and with their priors' share."""
+    alone = ~np.any(wide.drawn, axis=1)
+    own = np.where(alone, DEFENSIVE * wide.weights, wide.weights)
+    return Mixture(
+        wide.freedom,
+        np.concatenate([(1.0 - np.sum(own)) * weights, own]),
+        np.concatenate([centres, wide.centres]),
+        np.concatenate([covariances, wide.covariances]),
+        np.concatenate([np.zeros(centres.shape, dtype=bool), wide.drawn]),
+        wide.coordinates,
+    )
+
+
+def maximised(
+    mixture: Mixture,
+    u: Float[np.ndarray, "n d"],
+    weights: Float[np.ndarray, " n"],
+    local: slice,
+    floor: Float[np.ndarray, "d d"],
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k d"], Float[np.ndarray, "k d d"]]:
+    """Weights, centres and covariances of the ``local`` components after one step of expectation maximisation.
+
+    Parameters
+    ----------
+    u, weights : draws and their normalised weights
+    floor : added to the covariance of every component
+    """
+    terms, square = mixture.components(u)
+    shares = (weights * np.exp(terms - np.logaddexp.reduce(terms, axis=0)))[local]
+    total, w = np.sum(shares, axis=1), mixture.coordinates.w(u)
+    kept = total > LEAST_WEIGHT * np.sum(total)
+    shares, square, total = shares[kept], square[local][kept], total[kept]
+    near = shares * (mixture.freedom + w.shape[1]) / (mixture.freedom + square)
+    centres = near @ w / np.sum(near, axis=1)[:, None]
+    off = w - centres[:, None]
+    covariances = (near[:, :, None] * off).transpose(0, 2, 1) @ off / total[:, None, None] + floor
+    return total / np.sum(total), centres, covariances

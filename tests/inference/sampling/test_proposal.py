@@ -1,0 +1,128 @@
+"""Proposal densities against quadrature, and the posterior of two terms that replace each other."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from capsule_id.inference.sampling import coordinates, refinement
+from capsule_id.inference.sampling.coordinates import Coordinates, coordinates_of
+from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time
+from capsule_id.inference.sampling.ensembles import pilot, sample
+from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, block_proposal, concentric
+from capsule_id.inference.sampling.refinement import effective_size, refined
+from tests.inference.stub import Gaussian
+
+#: Normal prior of the logarithms of both terms: centre, width.
+CENTRE, WIDTH = 1.0, 3.5
+#: The readings give the sum of the terms, and the second term alone less well: value and sd of each.
+SUM, SUM_SD, SECOND, SECOND_SD = 1.0, 0.02, 0.75, 0.3
+
+
+class TwoTerms(Gaussian):
+    """Log-density of the logarithms of two positive terms whose sum is known."""
+
+    def __init__(self) -> None:
+        super().__init__(np.log([0.25, 0.75]), np.diag([0.5, 0.1]))
+        self.normal_priors = np.array([[CENTRE, CENTRE], [WIDTH, WIDTH]])
+
+    def parts(self, v: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            theta = np.exp(v)
+        prior = np.sum(stats.norm.logpdf(v, CENTRE, WIDTH), axis=1)
+        readings = stats.norm.logpdf(np.sum(theta, axis=1), SUM, SUM_SD) + stats.norm.logpdf(
+            theta[:, 1], SECOND, SECOND_SD
+        )
+        return (prior + readings)[:, None]
+
+    def exact(self) -> np.ndarray:
+        """(4,) means and sds of both logarithms by quadrature over the first logarithm and the sum."""
+        u = np.linspace(CENTRE - 6.0 * WIDTH, np.log(SUM + 8.0 * SUM_SD), 6001)
+        total = np.linspace(SUM - 8.0 * SUM_SD, SUM + 8.0 * SUM_SD, 801)
+        second = total - np.exp(u)[:, None]
+        inside = second > 1e-12
+        other = np.log(np.where(inside, second, 1.0))
+        v = np.stack([np.broadcast_to(u[:, None], other.shape), other], axis=-1).reshape(-1, 2)
+        # At a fixed first term the second logarithm changes by d(sum)/second.
+        weights = np.where(inside, np.exp(self.parts(v)[:, 0].reshape(other.shape) - other), 0.0)
+        weights = (weights / np.sum(weights)).ravel()
+        mean = weights @ v
+        return np.concatenate([mean, np.sqrt(weights @ (v - mean) ** 2)])
+
+
+def mixture(linear: bool = True) -> Mixture:
+    """Components in theta and in u, and one that draws the first parameter from its prior."""
+    shape = Coordinates(
+        np.array([linear, False]), (0,), np.array([-1.0, 0.0]), np.array([2.0, 1.0]), np.array([0.5, 0.0])
+    )
+    if linear:
+        return concentric(np.array([0.6, 0.3]), np.array([[0.04, 0.05], [0.05, 0.25]]), coordinates=shape)
+    return concentric(np.array([-0.6, 0.3]), np.array([[0.25, 0.1], [0.1, 0.25]]), coordinates=shape)
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_draws_have_the_density(linear: bool) -> None:
+    """Weights of a known normal density average to 1. Negative control: without the parts drawn from the prior."""
+    proposal, rng = mixture(linear), np.random.RandomState(0)
+    u = proposal.draw(rng, 100_000)
+    u = np.where(np.isfinite(u), u, -1e3)
+    known = stats.norm.logpdf(u[:, 0], -0.7, 0.5) + stats.norm.logpdf(u[:, 1], 0.3, 0.4)
+    weights = np.exp(known - proposal.log_density(u))
+    error = np.std(weights) / np.sqrt(len(weights))
+    assert error < 0.01
+    assert abs(np.mean(weights) - 1.0) < 4.0 * error
+    terms = proposal.components(u)[0][~np.any(proposal.drawn, axis=1)]
+    weights = np.exp(known - np.logaddexp.reduce(terms, axis=0))
+    assert abs(np.mean(weights) - 1.0) > 8.0 * np.std(weights) / np.sqrt(len(weights))
+
+
+def test_two_terms_that_replace_each_other() -> None:
+    """Means and sds of the logarithms within 4 Monte Carlo standard errors of quadrature; one term may be absent."""
+    target = TwoTerms()
+    found = sample(target, 1)
+    assert found.converged
+    mean, sd = np.split(target.exact(), 2)
+    y = (found.draws - mean) / sd
+    functions = np.concatenate([y, y**2 - 1.0], axis=-1)
+    ess = effective_sample_size(functions, ensemble_time(functions))
+    z = np.mean(functions, axis=(0, 1, 2)) / (np.std(functions, axis=(0, 1, 2)) / np.sqrt(ess))
+    assert sd[0] > 1.0, "the first term is not seen to be different from zero"
+    assert np.max(np.abs(z)) < 4.0
+
+
+def test_the_coordinates_make_the_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: with one component in u alone the chain takes more than three times as long."""
+    target = TwoTerms()
+    good = pilot(target, 2)
+    monkeypatch.setattr(coordinates, "BENT", np.inf)
+    monkeypatch.setattr(coordinates, "WEAK", np.inf)
+    monkeypatch.setattr(refinement, "SEVERAL", 0)
+    poor = pilot(target, 2)
+    assert min(poor.measured.values()) > 3.0 * min(good.measured.values())
+
+
+def test_coordinates_are_those_closest_to_normal() -> None:
+    """Terms on a line go to theta; normal logarithms stay, and so does a parameter without a normal prior."""
+    rng = np.random.default_rng(0)
+    first = rng.uniform(0.05, 0.95, 4000)
+    sample_of = np.log(np.stack([first, 1.0 - first + 0.01 * rng.standard_normal(4000) ** 2], axis=1))
+    prior = np.full((2, 2), 1.0)
+    assert np.all(coordinates_of(sample_of, prior).linear)
+    assert not np.any(coordinates_of(0.5 * rng.standard_normal((4000, 2)), prior).linear)
+    assert not np.any(coordinates_of(sample_of, np.full((2, 2), np.nan)).linear)
+
+
+def test_refinement_finds_a_posterior_from_a_poor_start() -> None:
+    """A funnel in five dimensions: the effective size per draw rises to more than a tenth, from less than a hundredth."""
+
+    def funnel(u: np.ndarray) -> np.ndarray:
+        scale = np.exp(0.7 * u[:, :1])
+        return np.sum(stats.norm.logpdf(u[:, 1:], 0.0, scale), axis=1, keepdims=True) + stats.norm.logpdf(u[:, :1])
+
+    def share(proposal: BlockProposal) -> float:
+        u = proposal.draw(np.random.RandomState(1), 20_000)
+        return effective_size((funnel(u) - proposal.log_density(u))[:, 0]) / 20_000
+
+    first = block_proposal([np.arange(5)], np.full(5, 0.8), 0.05 * np.eye(5))
+    better = refined(funnel, first, np.full((2, 5), np.nan), np.random.RandomState(0))
+    assert share(first) < 0.01
+    assert share(better) > 0.1
