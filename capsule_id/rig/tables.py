@@ -37,7 +37,7 @@ class TableFile:
     Attributes
     ----------
     sha256 : of the bytes read, by name in ``rig.toml``, the first file first
-    raw : the numbers as written
+    raw : the numbers as written, until they are converted
     columns : by name, still without reading errors
     file_of : (row index or None for the header, column index) -> the file, for error lines
     missing, other : rows that a column map drops: for a missing cell, and outside ``where``
@@ -116,8 +116,10 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
         table = _read_plain(document, places[0][0], files[first], hashes, kind)
     else:
         _check_map_names(document, path, column_map, kind, plateaus)
-        read = [EXPORTS[suffix_of(file)](file, file, column_map.layout) for file in files.values()]
-        mapped = apply_map(document, path, read, column_map)
+        layout = column_map.layout
+        mapped = apply_map(
+            document, path, [EXPORTS[suffix_of(file)](file, file, layout) for file in files.values()], column_map
+        )
         table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other)
     if (clock := read_clock(document, path, entry)) is not None:
         table = replace(table, raw=on_reference(document, path, table.raw, clock))
@@ -128,7 +130,7 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
         table = _with_rows(table, raw, starts)
     table.raw.rows.flags.writeable = False
     columns = {column: _to_si(table, index, kind.columns[column]) for index, column in enumerate(table.raw.names)}
-    return replace(table, columns=columns)
+    return replace(table, raw=replace(table.raw, columns=()), columns=columns)
 
 
 def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:

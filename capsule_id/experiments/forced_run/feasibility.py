@@ -17,6 +17,7 @@ from capsule_id.physics.grazing import grazing_load
 from capsule_id.physics.model import CapsuleParameters, Excitation, without_absent
 from capsule_id.records.stated_settings import stated_gap, stated_Omega
 from capsule_id.records.tone import tone_at
+from capsule_id.rig.filters import median_step
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
@@ -124,7 +125,7 @@ def contact_time(m1: float, m2: float, k2: float) -> float:
 
 def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[Finding]:
     """Check the number of samples per contact; the shortest contact is that with a sliding capsule."""
-    step = float(np.median(np.diff(table["time"])))
+    step = median_step(table["time"])
     touch = contact_time(theta["m1"], theta["m2"], theta.get("k2", 0.0))
     if not touches or touch / step >= SAMPLES_PER_CONTACT:
         return []

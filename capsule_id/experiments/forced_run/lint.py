@@ -16,6 +16,7 @@ from capsule_id.records.faults.channels import (
 )
 from capsule_id.records.stated_settings import stated_Omega
 from capsule_id.records.tone import recorded_drive
+from capsule_id.rig.filters import median_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Facts, Finding, Message
 
@@ -55,7 +56,7 @@ def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
 def _time_scale(table: Table[Any], period: float) -> Iterable[Finding]:
     """Report a stated frequency of which the record holds no period, or which its sampling cannot follow."""
     time = table["time"]
-    samples, periods = period / float(np.median(np.diff(time))), float(time[-1] - time[0]) / period
+    samples, periods = period / median_step(time), float(time[-1] - time[0]) / period
     if samples < FEWEST_SAMPLES or periods < 1.0:
         facts = {"file": table.file, "periods": periods, "samples": samples}
         yield Finding("runs.time_scale", "fail", facts, table.label)

@@ -24,6 +24,7 @@ from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.kind import Kind, Values, made_by
 from capsule_id.parameters import Parameter, Prior, nuisance, scatter
 from capsule_id.rig.entry import Entry
+from capsule_id.rig.filters import median_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
 from capsule_id.views import Facts, Message, counted
@@ -54,8 +55,7 @@ def _check_window(entry: Entry[DecaySettings]) -> None:
     """Require start < stop, both inside the record to one sampling step, and enough samples between them."""
     entry.check_length()
     time, settings = entry.table["time"], entry.table.settings
-    # The stated duration of n samples is often n steps, one more than the record has.
-    step = float(np.median(np.diff(time)))
+    step = median_step(time)  # the stated duration of n samples is often n steps, one more than the record has
     edges = {"start": float(time[0]), "stop": float(time[-1])}
     for key, value in (("start", settings.start), ("stop", settings.stop)):
         if value is None:

@@ -46,6 +46,15 @@ class _Found:
     column: int
 
 
+@dataclass(frozen=True)
+class _Cell:
+    """Where the cells of a column stand."""
+
+    path: Path
+    place: Callable[[int | None, int], tuple[int, int]]
+    column: int
+
+
 def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], column_map: ColumnMap) -> Mapped:
     """The table of the experiment at ``path``.
 
@@ -65,7 +74,10 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     found = [
         {name: part.find((*place, name, "from"), source.header) for name, source in sources.items()} for part in parts
     ]
-    cells = [{name: (column.export, column.column) for name, column in here.items()} for here in found]
+    # The numbers of the files are not kept beside the table.
+    cells = [
+        {name: _Cell(each.export.path, each.export.place, each.column) for name, each in here.items()} for here in found
+    ]
     values: dict[str, np.ndarray] = {}
     for name, source in sources.items():
         values[name] = _joined(
@@ -84,15 +96,15 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     columns = tuple(values.pop(name)[keep] for name in names)
     origin = None if isinstance(keep, slice) else np.flatnonzero(keep)
 
-    def cell(row: int | None, column: int) -> tuple[Export, int | None, int]:
+    def cell(row: int | None, column: int) -> tuple[_Cell, int | None]:
         index = 0 if row is None else row if origin is None else int(origin[row])
         part = 0 if row is None else int(np.searchsorted(first_rows, index, side="right")) - 1
-        export, position = cells[part].get(names[column], next(iter(cells[part].values())))
-        return export, None if row is None else index - int(first_rows[part]), position
+        here = cells[part].get(names[column], next(iter(cells[part].values())))
+        return here, None if row is None else index - int(first_rows[part])
 
     def place_of(row: int | None, column: int) -> tuple[int, int]:
-        export, index, position = cell(row, column)
-        return export.place(index, position)
+        here, index = cell(row, column)
+        return here.place(index, here.column)
 
     units = tuple(column_map.sources[name].unit for name in names)
     rows = exports[0].lines[keep] if len(parts) == 1 else np.arange(1, len(columns[0]) + 1)
@@ -138,6 +150,8 @@ class _Part:
                 rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {each.values.size}"
                 remedy = "map columns of equal length, or make an experiment of each file, with a clock"
                 raise self.document.error(place, rule, value, remedy)
+            if each is first:
+                continue
             scale = float(np.nanmax(np.abs(first.values), initial=0.0))
             if not np.allclose(each.values, first.values, rtol=0.0, atol=ROUNDING * scale, equal_nan=True):
                 rule = f"{shown(header)} must be the same in {first.export.path.name} and {each.export.path.name}"
@@ -207,7 +221,9 @@ def _kept(
                 (*path, "where", key), rule, f"{wanted[key]:g}", "write one of the values of the column"
             )
         inside &= same
-    empty = np.any([np.isnan(column) for column in values.values()], axis=0)
+    empty = np.zeros_like(inside)
+    for column in values.values():
+        empty |= np.isnan(column)
     keep = inside & ~empty
     if not keep.any():
         remedy = "correct where, or map another column"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from capsule_id.rig.filters import hampel_outliers
+from capsule_id.rig.filters import hampel_outliers, median_step
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import read_choice, read_string, read_table, refuse_unknown_keys, shown
@@ -87,7 +87,7 @@ def outlying_rows(
     InputError
         If the window holds less than two sampling steps, or does not fit into the record.
     """
-    step = float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+    step = median_step(time) if len(time) > 1 else np.inf
     half = rejection.window / step / 2.0
     if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
         rule = "the window must hold two sampling steps or more, and fit into the record"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.filters import dominant_frequency, loudest_part, sampling_step
+from capsule_id.rig.filters import dominant_frequency, loudest_part, median_step, sampling_step
 
 #: Block means per period that replace a long record; with more, a decay's parameters gain less than 0.5 % in precision.
 READINGS_PER_PERIOD = 32
@@ -58,7 +58,7 @@ def block_means(time: np.ndarray, values: np.ndarray, size: int, by_sample: bool
     if is_even(time):
         number = np.arange(len(time) // size * size) // size
     else:
-        width = size * float(np.median(np.diff(time)))
+        width = size * median_step(time)
         number = np.unique(((time - time[0]) // width).astype(int), return_inverse=True)[1]
     time, values = time[: len(number)], values[: len(number)]
     count = np.bincount(number).astype(float)
@@ -105,7 +105,7 @@ def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READING
         period = 1.0 / dominant_frequency(grid, np.interp(grid, time, values))
     except (InputError, ZeroDivisionError):
         return 1
-    return max(1, int(period / per_period / float(np.median(np.diff(time)))))
+    return max(1, int(period / per_period / median_step(time)))
 
 
 def default_block_size(time: np.ndarray, values: np.ndarray) -> int:

@@ -52,14 +52,16 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     rows = plain_rows(file, shape, wanted) or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing)
 
+    lines = rows.lines
+
     def values(column: int) -> np.ndarray:
         return rows.column(column)
 
     def place(row: int | None, column: int) -> tuple[int, int]:
-        line = int(rows.lines[row]) - 1 if row is not None else found[0][0] if found else first
+        line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    return Export(path, headers, width, rows.lines, values, place, file.encoding)
+    return Export(path, headers, width, lines, values, place, file.encoding)
 
 
 def _is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:
