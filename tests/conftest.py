@@ -12,6 +12,7 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
+from capsule_id.commands.compilation import XLA_EMITTER_OPTION
 from tests.capsule_cases import Cases, read_cases
 
 #: Programs that take longer than this to compile, s, are kept.
@@ -40,6 +41,9 @@ def pytest_configure(config: pytest.Config) -> None:
         return
     # The workers occupy the cores. More threads of BLAS wait for each other and take up to fifty times the CPU time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # As the commands do; benchmarks time the options that their caller sets.
+    if config.getoption("markexpr") != "benchmark":
+        os.environ.setdefault("XLA_FLAGS", XLA_EMITTER_OPTION)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     folder = tempfile.mkdtemp(prefix="capsule-id-compiled-")

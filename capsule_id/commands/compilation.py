@@ -13,6 +13,8 @@ from platformdirs import user_cache_path
 
 # XLA then compiles each loop of an engine as one function: a single run is several times faster. CPU only.
 XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+# Without XLA's newer emitters of fused loops a program compiles in half the time, and runs no slower. CPU only.
+XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false"
 #: Programs that take longer than this to compile are kept, s.
 WORTH_KEEPING = 0.3
 #: Largest size of the cache, bytes; JAX removes the programs that were not used for the longest time.
@@ -21,11 +23,15 @@ LARGEST_CACHE = 256 * 2**20
 DIRECTORY, DAMAGED = "JAX_COMPILATION_CACHE_DIR", "Error reading persistent compilation cache entry"
 
 
-def set_loop_option() -> None:
-    """Set ``XLA_LOOP_OPTION`` for this process, unless JAX is imported or the user has set such options."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "jax" not in sys.modules and "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {XLA_LOOP_OPTION}".strip()
+def set_xla_options(loop: bool = True) -> None:
+    """Set the options of XLA for this process, unless JAX is imported; those that the user has set stay.
+
+    loop : set ``XLA_LOOP_OPTION`` too
+    """
+    for option in (XLA_EMITTER_OPTION, XLA_LOOP_OPTION)[: 1 + loop]:
+        flags = os.environ.get("XLA_FLAGS", "")
+        if "jax" not in sys.modules and option.partition("=")[0] not in flags:
+            os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
 
 
 def add_cache_argument(options: argparse._ActionsContainer) -> None:

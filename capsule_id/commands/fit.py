@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments import CHOICES, make_experiments
@@ -70,8 +70,7 @@ def run(args: argparse.Namespace) -> int:
     if args.no_sample and (directory / "posterior.nc").exists():
         rule, remedy = "--no-sample must not replace a result with a sample", "choose another --out, or move it away"
         raise InputError(rule, "it holds posterior.nc", remedy, directory)
-    if args.experiments != "bench" and rig.has_runs:
-        set_loop_option()
+    set_xla_options(loop=args.experiments != "bench" and rig.has_runs)
     if not args.no_cache:
         keep_programs()
     # JAX loads only now, so that a faulty folder is reported at once.
@@ -128,7 +127,7 @@ def _compare(args: argparse.Namespace, rig: Rig, kinds: Registry) -> int:
     if ignored:
         names = ", ".join(ignored).replace("_", "-")
         raise InputError("--compare prints a table and writes nothing", names, f"remove {names}")
-    set_loop_option()
+    set_xla_options()
     if not args.no_cache:
         keep_programs()
     from capsule_id.inference.choice.compare import compare_models

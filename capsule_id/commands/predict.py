@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
 from capsule_id.console import say
 from capsule_id.errors import InputError
 from capsule_id.views import counted
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
     if args.out.exists():
         raise InputError("--out must name a new file", "it exists", "choose another name", args.out)
-    set_loop_option()
+    set_xla_options()
     if not args.no_cache:
         keep_programs()
     from capsule_id.api import load

@@ -13,7 +13,7 @@ from capsule_id.commands.capsule_options import (
     capsule_values,
     number,
 )
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
 from capsule_id.errors import InputError
 from capsule_id.views import counted
 
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
-    set_loop_option()
+    set_xla_options()
     if not args.no_cache:
         keep_programs()
     import numpy as np

@@ -13,14 +13,22 @@ MOTION = ("simulate", "--k2", "18960", "--P_d", "4", "--Omega", "34.56", "--G", 
 
 def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compilation.sys, "modules", {})
+    emitter, loop = compilation.XLA_EMITTER_OPTION, compilation.XLA_LOOP_OPTION
     for before, after in (
-        ("", compilation.XLA_LOOP_OPTION),
-        ("--xla_a=1", f"--xla_a=1 {compilation.XLA_LOOP_OPTION}"),
-        ("--xla_backend_extra_options=other", "--xla_backend_extra_options=other"),
+        ("", f"{emitter} {loop}"),
+        ("--xla_a=1", f"--xla_a=1 {emitter} {loop}"),
+        ("--xla_backend_extra_options=other", f"--xla_backend_extra_options=other {emitter}"),
+        ("--xla_cpu_use_fusion_emitters=true", f"--xla_cpu_use_fusion_emitters=true {loop}"),
     ):
         monkeypatch.setenv("XLA_FLAGS", before)
-        compilation.set_loop_option()
+        compilation.set_xla_options()
         assert compilation.os.environ["XLA_FLAGS"] == after
+    monkeypatch.setenv("XLA_FLAGS", "")
+    compilation.set_xla_options(loop=False)
+    assert compilation.os.environ["XLA_FLAGS"] == emitter
+    monkeypatch.setattr(compilation.sys, "modules", {"jax": None})
+    compilation.set_xla_options()
+    assert compilation.os.environ["XLA_FLAGS"] == emitter
 
 
 def simulated(folder: Path, cache: Path, *options: str) -> tuple[bytes, str]:

@@ -16,7 +16,7 @@ from capsule_id.commands.capsule_options import (
     fitted_values,
     number,
 )
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_loop_option
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
 from capsule_id.commands.maps.sweep_output import prepare_store, publish_pair, remove_store
 from capsule_id.console import Progress, say
 from capsule_id.errors import InputError
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     values = capsule_values(args, FIG_6_DEFAULTS, free | _names_from_posterior(args))
     out = args.out if args.out is not None else _default_out(rig.name if rig is not None else None, axes)
     store = prepare_store(out, args.resume)
-    set_loop_option()
+    set_xla_options()
     if not args.no_cache:
         keep_programs()
     with Progress(not args.quiet, unit="point") as progress, _dask_client(args.scheduler) as client:
