@@ -109,6 +109,10 @@ def test_what_is_no_result_is_refused(fitted: Fit, tmp_path: Path) -> None:
 
 def test_it_shows_itself_in_short(fitted: Fit) -> None:
     assert len(repr(fitted)) < 250
+    assert len(repr(fitted.posterior)) < 150
+    assert repr(fitted.posterior).startswith("<Posterior: 4 ensembles of ")
+    assert repr(fitted.rig) == "<Rig lab: 1 motor_current, 1 support_spring>"
+    assert repr(fitted.rig.tables[0]).startswith("<motor_current motor_current: 8 rows of ")
     assert repr(fitted).startswith(f"<Fit of lab: {fitted.trust}; K = ")
     html = fitted._repr_html_()
     assert html.count("<tr>") == 1 + len(fitted.summary)

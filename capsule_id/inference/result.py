@@ -90,6 +90,11 @@ class Posterior:
     steps: int
     thin: int
 
+    def __repr__(self) -> str:
+        ensembles, draws, walkers, parameters = self.draws.shape
+        size = f"{ensembles} ensembles of {walkers} walkers with {draws} draws, {parameters} parameters"
+        return f"<Posterior: {size}; R-hat at most {self.rhat.max():.4f}, bulk ESS at least {self.ess_bulk.min():.0f}>"
+
 
 @dataclass(frozen=True)
 class Pointwise:

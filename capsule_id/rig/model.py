@@ -1,5 +1,6 @@
 """Frozen values of a rig folder: SI units, float64, read-only arrays."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,6 +133,10 @@ class Table(Generic[S]):
         """Values of column ``name``, (n,) SI."""
         return self.columns[name].values
 
+    def __repr__(self) -> str:
+        columns = ", ".join(f"{column.name} [{column.unit}]" for column in self.columns.values())
+        return f"<{self.kind} {self.label}: {len(self.rows)} rows of {columns}>"
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -160,6 +165,11 @@ class Rig:
     model: ModelChoices = ModelChoices()
     slope: Quantity | None = None
     N0: Quantity | None = None
+
+    def __repr__(self) -> str:
+        kinds = Counter(table.kind for table in self.tables)
+        tables = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+        return f"<Rig {self.name}{', synthetic' if self.synthetic else ''}: {tables}>"
 
     def mass(self, symbol: Literal["m1", "m2"]) -> float:
         """Stated mass, kg, for a kind whose ``masses`` contain ``symbol``.
