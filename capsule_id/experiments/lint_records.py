@@ -52,7 +52,7 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
     column, time = table.columns[name], table["time"]
     if len(time[used]) < 2 or np.ptp(column.values[used]) == 0.0:
         return
-    values = column.values[used] * column.to_display
+    values = column.values[used] * column.to_display if column.to_display != 1.0 else column.values[used]
     step = median_step(time[used])
     where = {"file": table.file, "column": name, "unit": column.unit}
     for clipped in clipped_samples(values, period / step):

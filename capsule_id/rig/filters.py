@@ -67,11 +67,11 @@ def savitzky_golay(
 
 
 def loudest_part(values: Record) -> slice:
-    """The part of ``PIECE`` samples with the largest variance; the whole record where it has less than two parts."""
-    count = len(values) // PIECE
-    if count < 2:
+    """The part of ``PIECE`` samples with the largest variance; the whole record where it has no more samples."""
+    last = len(values) - PIECE
+    if last <= 0:
         return slice(0, len(values))
-    first = PIECE * int(np.argmax([np.var(values[k * PIECE : (k + 1) * PIECE]) for k in range(count)]))
+    first = max((*range(0, last, PIECE), last), key=lambda k: float(np.var(values[k : k + PIECE])))
     return slice(first, first + PIECE)
 
 

@@ -48,7 +48,7 @@ class Repeated:
 
 def reading_step(values: np.ndarray) -> float:
     """Reading step of ``values`` (n,), in their unit: a power of ten, or the spacing of their levels; 0 without one."""
-    scale = float(np.max(np.abs(values), initial=0.0))
+    scale = _largest(values)
     if scale == 0.0:
         return 0.0
     values = thinned(values)
@@ -66,6 +66,11 @@ def reading_step(values: np.ndarray) -> float:
     return 0.0
 
 
+def _largest(values: np.ndarray) -> float:
+    """Largest magnitude; 0 without values."""
+    return max(float(np.max(values)), -float(np.min(values))) if len(values) else 0.0
+
+
 def chance_of_equality(readings: Readings) -> float:
     """Probability that two independent rows agree in all columns; 1 where the reading step hides the scatter."""
     chance = 1.0
@@ -74,7 +79,7 @@ def chance_of_equality(readings: Readings) -> float:
         if readings.record and len(values) >= SHORTEST_RECORD:
             width = WIDTH * noise_level(values)
         # A step of 0 is that of float64.
-        chance *= min(1.0, max(step, 4e-16 * float(np.max(np.abs(values)))) / width) if width > 0.0 else 1.0
+        chance *= min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
     return chance
 
 

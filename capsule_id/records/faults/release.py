@@ -89,9 +89,9 @@ def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
 
 def _shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Means of blocks of a long record, about ``PIECE`` of them and 32 or more in a period; a short record itself."""
-    part = loudest_part(values)
-    if len(time[part]) == len(time):
+    if len(time) < 2 * PIECE:
         return time, values
+    part = loudest_part(values)
     grid = np.linspace(time[part][0], time[part][-1], len(time[part]))
     period = 1.0 / dominant_frequency(grid, np.interp(grid, time[part], values[part]))
     size = max(1, min(len(time) // PIECE, int(period / (grid[1] - grid[0]) / 32.0)))

@@ -7,13 +7,13 @@ is below (omega W)^4/4320 for blocks of duration W, and 0.0026 (omega W)^2 of tw
 friction turns inside the block. At ``READINGS_PER_PERIOD`` these are 4e-7 and 1e-4.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.filters import dominant_frequency, loudest_part, median_step, sampling_step
+from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part, median_step, sampling_step
 
 #: Block means per period that replace a long record; with more, a decay's parameters gain less than 0.5 % in precision.
 READINGS_PER_PERIOD = 32
@@ -55,12 +55,20 @@ def block_means(time: np.ndarray, values: np.ndarray, size: int, by_sample: bool
     if size == 1:
         one = np.ones((len(time), 1))
         return Blocks(time, values, time, time, one[:, 0], time[:, None], one)
-    if is_even(time):
-        number = np.arange(len(time) // size * size) // size
-    else:
+    if not is_even(time):
         width = size * median_step(time)
         number = np.unique(((time - time[0]) // width).astype(int), return_inverse=True)[1]
-    time, values = time[: len(number)], values[: len(number)]
+        return _means(time, values, number, by_sample)
+    samples, step = len(time) // size * size, max(PIECE // size, 1) * size
+    parts = []
+    for first in range(0, samples, step):
+        part = slice(first, min(first + step, samples))
+        parts.append(_means(time[part], values[part], np.arange(part.stop - first) // size, by_sample))
+    return Blocks(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Blocks)))
+
+
+def _means(time: np.ndarray, values: np.ndarray, number: np.ndarray, by_sample: bool) -> Blocks:
+    """Means of the readings with each ``number`` (n,), which counts blocks from 0."""
     count = np.bincount(number).astype(float)
 
     def mean(x: np.ndarray) -> np.ndarray:
