@@ -13,22 +13,24 @@ from capsule_id.inference.sampling import ensembles as sampling
 from tests.inference.calibration import Outcome, study, summarise
 
 
-def test_ten_rigs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small version of the next test at a fixed seed: 100 numbers, of which 5 lie outside their intervals.
+@pytest.mark.parametrize("rigs", [4, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_few_rigs(rigs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small version of the next test at a fixed seed: ten numbers of each rig.
 
-    Walkers start near the posterior, so a quarter of the burn-in serves intervals of ten rigs.
+    Walkers start near the posterior, so a quarter of the burn-in serves intervals of so few rigs.
     """
     monkeypatch.setattr(sampling, "BURN_IN_IN_TAU", 5.0)
-    outcomes = list(study(tmp_path, range(10), budget=400))
+    outcomes = list(study(tmp_path, range(rigs), budget=400))
     found = summarise(outcomes)
     print(found.describe())
-    assert found.numbers == 100
-    # Two-sided 99.9 % of a binomial and of chi; the mean of ten rigs likewise.
-    low, high = stats.binom.ppf([0.0005, 0.9995], 100, 0.95) / 100
+    n = found.numbers
+    assert n == 10 * rigs
+    # Two-sided 99.9 % of a binomial, of chi and of a mean.
+    low, high = stats.binom.ppf([0.0005, 0.9995], n, 0.95) / n
     assert low <= found.coverage <= high
-    low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], 100) / 100)
+    low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], n) / n)
     assert low < found.sd < high
-    assert abs(found.mean) < 0.33
+    assert abs(found.mean) < stats.norm.ppf(0.9995) / np.sqrt(n)
     # The budget is short: chains may be found wanting, nothing else.
     assert {check for outcome in outcomes for check, _ in outcome.failed} <= {"chains converged"}
 

@@ -35,13 +35,14 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     return cast(Any, SimpleNamespace(rig=rig, registry=registry, posterior=posterior, observed=observed, fixed={}))
 
 
-def test_the_band_is_that_of_new_trials_in_new_sessions(result: Result, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("draws", "seeds"), [(500, 60), pytest.param(1500, 120, marks=pytest.mark.slow)])
+def test_the_band_is_that_of_new_trials_in_new_sessions(result: Result, tmp_path: Path, draws: int, seeds: int) -> None:
     path = tmp_path / "settings.csv"
     path.write_text(SETTINGS)
-    table = predict(result, path, draws=1500)
+    table = predict(result, path, draws=draws)
     assert list(table) == ["distance [mm]", "distance_lower [mm]", "distance_upper [mm]", "mean_velocity [mm/s]"]
     # The twin has no two sessions alike: its tables are new trials.
-    trials = np.array([robot_progression(seed, DESIGN)["distance [mm]"][::3] for seed in range(120)])
+    trials = np.array([robot_progression(seed, DESIGN)["distance [mm]"][::3] for seed in range(seeds)])
     inside = (trials >= table["distance_lower [mm]"].to_numpy()) & (trials <= table["distance_upper [mm]"].to_numpy())
     assert 0.90 <= inside.mean() <= 0.985
     np.testing.assert_allclose(
