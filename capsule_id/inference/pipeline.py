@@ -53,7 +53,7 @@ BAND_DRAWS, PRIOR_DRAWS = 200, 2000
 #: Largest number of stored pointwise log-likelihoods, and the draws at which they are stored.
 POINTWISE_SIZE, FEWEST_POINTWISE, MOST_POINTWISE = 2_000_000, 64, 256
 #: Packages whose versions the provenance records.
-PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "emcee", "pandas", "matplotlib", "xarray")
+PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
 AnyResult = TypeVar("AnyResult", bound=Result)
 

@@ -11,7 +11,7 @@ import pytest
 from capsule_id.cli import capsule_id, fit_params
 from tests.cli_tools import DATA, argv, environment, listing, run, small_rig
 
-HEAVY = ("jax", "matplotlib", "pandas", "emcee", "equinox", "xarray")
+HEAVY = ("jax", "matplotlib", "pandas", "emcee", "equinox", "optimistix", "xarray")
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str, program: str = "fit_params") -> str:

@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
+import optimistix as optx
 
 from capsule_id.inference.fit.covariance import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
 from capsule_id.inference.target.compiling import COMPILE, COMPILE_QUICKLY
@@ -24,16 +26,6 @@ require_float64()
 Residual = Callable[[jax.Array], jax.Array]
 #: A point (d,) -> residuals (n,) and their Jacobian (n, d).
 Linearise = Callable[[np.ndarray], tuple[Residuals, Jacobian]]
-
-LEAST_DECREASE, EXPECTED_DECREASE = 0.01, 0.99
-"""Parts of the decrease of the cost that the linear model predicts. A step with less than the first is rejected. A step
-with more than the second enlarges the trust region (Gould et al., *4OR* 3, 2005, 227)."""
-
-ENLARGED, REDUCED = 3.5, 0.25
-"""Factors of the trust region's size after such steps. The damping is the inverse of this size."""
-
-LARGEST_DAMPING = 1.0 / float(np.finfo(float).eps)
-"""Damping beside squared column norms of at most about 1, beyond which a step vanishes in rounding."""
 
 FIRST_DAMPING = 1e-6
 """Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
@@ -108,8 +100,8 @@ SOLVER = Solver()
 def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVER) -> LeastSquaresFit:
     """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
 
-    Only residuals and Jacobian are compiled, in one program. The steps are NumPy, because a second program that holds
-    the residuals takes as long to compile again.
+    Residuals and Jacobian are one compiled program, and Optimistix' step is another. A program that held both would
+    compile the residuals a second time, which takes longer than the fit.
 
     Damping and tolerance of Levenberg-Marquardt require parameters of comparable size. Each start is therefore solved
     in v_j = x_j / scale_j with scale_j = |start_j| (at zero: ``SMALLEST_EFFECT``). The residuals are divided by the
@@ -155,29 +147,28 @@ class _End(NamedTuple):
 
 def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
     """Levenberg-Marquardt from one start (d,)."""
-    x, (residuals, jacobian) = start, linearise(start)
+    residuals, jacobian = linearise(start)
     if not all_finite(jacobian, residuals):
-        return _End(x, residuals, jacobian, 1, "The residuals or their Jacobian are not finite: try another start.")
+        return _End(start, residuals, jacobian, 1, "The residuals or their Jacobian are not finite: try another start.")
     scale, unit = (_effects if solver.heavy else _scales)(jacobian, start)
-    damping, steps, converged = 1.0, 1, False
-    reduced = _reduced(jacobian * scale / unit, residuals / unit)
-    while not converged and steps < solver.max_steps and damping < LARGEST_DAMPING:
+    method = optx.LevenbergMarquardt(rtol=solver.tolerance, atol=solver.tolerance, linear_solver=lx.QR())
+    known, v = _Known(residuals / unit, jacobian * scale / unit), jnp.asarray(start / scale)
+    state, steps, converged = _FIRST(method, known, v), 0, False
+    while not converged and steps < solver.max_steps:
         stop_if_interrupted()
-        move, predicted = _damped_step(reduced, damping)
-        trial = x + move * scale
-        at_trial, slopes = linearise(trial)
+        v, state, trial, converged = _STEP(method, known, v, state)
         steps += 1
+        # A move that vanishes in rounding never converges.
+        if np.array_equal(trial, v):
+            break
+        at_trial, slopes = linearise(np.asarray(trial) * scale)
         with np.errstate(over="ignore", invalid="ignore"):
-            change = 0.5 * float(np.sum((at_trial / unit) ** 2) - np.sum((residuals / unit) ** 2))
-        if not (change <= LEAST_DECREASE * predicted and all_finite(slopes, at_trial)):
-            damping /= REDUCED
-            continue
-        damping /= ENLARGED if change < EXPECTED_DECREASE * predicted else 1.0
-        converged = _is_small(trial / scale, move, solver) and _is_small(
-            at_trial / unit, (at_trial - residuals) / unit, solver
-        )
-        x, residuals, jacobian = trial, at_trial, slopes
-        reduced = _reduced(jacobian * scale / unit, residuals / unit)
+            known = _Known(at_trial / unit, slopes * scale / unit)
+        if not all_finite(known.jacobian, known.residuals):
+            # Infinite residuals make the solver reject the trial.
+            known = _Known(np.full_like(at_trial, np.inf), np.zeros_like(slopes))
+    x = np.asarray(v) * scale
+    residuals, jacobian = linearise(x)
     if not converged and steps == solver.max_steps:
         return _End(x, residuals, jacobian, steps, "The maximum number of steps was reached: try another start.")
     # The solver tests step sizes only, and heavy damping makes steps small far from a minimum.
@@ -186,23 +177,38 @@ def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
     return _End(x, residuals, jacobian, steps, "" if stationary else reason)
 
 
-def _reduced(jacobian: Jacobian, residuals: Residuals) -> np.ndarray:
-    """(min(n, d + 1), d + 1) triangle of (J, r): |J v + r| is the same with its columns in the place of J and r."""
-    return np.asarray(np.linalg.qr(np.column_stack([jacobian, residuals]), mode="r"))
+class _Known(eqx.Module):
+    """Residuals (n,) whose value and Jacobian (n, d) are known at the only point where a solver's step asks for them."""
+
+    residuals: Any
+    jacobian: Any
+
+    def __call__(self, v: jax.Array, args: None) -> tuple[jax.Array, None]:
+        del args
+        value = jax.custom_jvp(lambda v: self.residuals + jnp.zeros_like(self.residuals, shape=()) * v[0])
+        value.defjvp(lambda primals, tangents: (self.residuals, self.jacobian @ tangents[0]))
+        return value(v), None
 
 
-def _damped_step(reduced: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
-    """Minimise |J v + r|² + damping |v|²: return v (d,) and the predicted change of ½ |r|²."""
-    jacobian, residuals = reduced[:, :-1], reduced[:, -1]
-    d = jacobian.shape[1]
-    damped = np.concatenate([jacobian, np.sqrt(damping) * np.eye(d)])
-    move = -np.linalg.lstsq(damped, np.concatenate([residuals, np.zeros(d)]))[0]
-    return move, 0.5 * float(np.sum((jacobian @ move + residuals) ** 2) - np.sum(residuals**2))
+def _state(method: optx.LevenbergMarquardt, known: _Known, v: jax.Array) -> Any:
+    """First state of the solver: arrays, and descriptions of functions that are new in every trace."""
+    return method.init(known, v, None, {}, jax.eval_shape(lambda: known.residuals), None, frozenset())
 
 
-def _is_small(values: np.ndarray, change: np.ndarray, solver: Solver) -> bool:
-    """Whether every change is below the tolerance times (1 + its value)."""
-    return bool(np.all(np.abs(change) < solver.tolerance * (1.0 + np.abs(values))))
+def _first(method: optx.LevenbergMarquardt, known: _Known, v: jax.Array) -> list[jax.Array]:
+    """Arrays of the first state."""
+    return jax.tree.leaves(eqx.filter(_state(method, known, v), eqx.is_array))
+
+
+def _step(
+    method: optx.LevenbergMarquardt, known: _Known, v: jax.Array, state: list[jax.Array]
+) -> tuple[jax.Array, list[jax.Array], jax.Array, jax.Array]:
+    """One step: return v, the arrays of the state, the next trial and whether v is the minimum."""
+    arrays, rest = eqx.partition(_state(method, known, v), eqx.is_array)
+    whole = eqx.combine(jax.tree.unflatten(jax.tree.structure(arrays), state), rest)
+    v, whole, _ = method.step(known, v, None, {}, whole, frozenset())
+    converged, _ = method.terminate(known, v, None, {}, whole, frozenset())
+    return v, jax.tree.leaves(eqx.filter(whole, eqx.is_array)), whole.y_eval, converged
 
 
 def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bool:
@@ -237,6 +243,11 @@ def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return value, jacobian
 
 
+#: Compiled first state and step of the solver.
+_FIRST, _STEP = (
+    eqx.filter_jit(function, compiler_options=dict(COMPILE_QUICKLY))  # pyright: ignore[reportCallIssue]
+    for function in (_first, _step)
+)
 #: Compiled ``_linearise``, indexed by whether the residuals are heavy.
 _PROGRAMS: dict[bool, Callable[..., Any]] = {
     # Equinox passes the options to jax.jit, but its annotations omit them.
