@@ -152,9 +152,15 @@ def test_what_is_no_text_is_located(content: bytes, place: str, value: str, monk
             TextFile(content, Path("f.csv"))
 
 
-def test_damaged_utf_16_is_an_error_line() -> None:
-    with pytest.raises(InputError, match=r"^f\.csv:1: the file must be text, no UTF-16"):
-        READERS[".csv"](codecs.BOM_UTF16_LE + b"a\0 \0[\0s\0]\0\n\0001", Path("f.csv"))
+@pytest.mark.parametrize("end", [b"1", b"1\0\x00\xdc2\0"])
+def test_damaged_utf_16_is_located(monkeypatch: pytest.MonkeyPatch, end: bytes) -> None:
+    content = codecs.BOM_UTF16_LE + "a [s]\r\n1\r\n2".encode("utf-16-le") + end
+    for size in (2, 5, 1 << 22):
+        monkeypatch.setattr(blocks, "BLOCK", size)
+        with pytest.raises(
+            InputError, match=r"^f\.csv:3:[23]: the file must be text, damaged UTF-16, save it as UTF-8"
+        ):
+            READERS[".csv"](content, Path("f.csv"))
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:

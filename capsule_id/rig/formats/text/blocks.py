@@ -50,7 +50,7 @@ class TextFile:
         """
         number = 0
         with self._open() as raw, io.TextIOWrapper(raw, _CODECS[self.encoding]) as file:
-            while text := self._block(file, number):
+            while text := _block(file):
                 lines = occurrences("\n", text)
                 if number + lines > first:
                     yield max(number, first), text.split(b"\n", first - number)[-1] if first > number else text
@@ -88,33 +88,23 @@ class TextFile:
                 yield offset, chunk
                 offset += len(chunk)
 
-    def _block(self, file: io.TextIOWrapper, number: int) -> bytes:
-        """The next block, b"" at the end; ``number`` is that of its first line."""
-        try:
-            text = file.read(BLOCK)
-            text += file.readline() if text else ""
-        except UnicodeError as error:
-            value, remedy = f"no UTF-16 ({error})", "save it as UTF-8"
-            raise InputError("the file must be text", value, remedy, self.path, number + 1) from None
-        return (text if not text or text.endswith("\n") else f"{text}\n").encode()
-
     def _find_encoding(self) -> str:
         """The encoding, by one pass through the file; Windows-1252 where it is no UTF-8 and begins with ASCII."""
-        decoder, fault, end = codecs.getincrementaldecoder("utf-8")(), None, 0
-        encoding = "UTF-8"
+        beginning = next(self._chunks(), (0, b""))[1]
+        marked = beginning.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        decoder, fault, end = codecs.getincrementaldecoder("utf-16" if marked else "utf-8")(), None, 0
         for offset, chunk in self._chunks():
-            if offset == 0 and chunk.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-                encoding = "UTF-16"
-            if encoding == "UTF-8" and (nul := chunk.find(b"\0")) >= 0:
+            if not marked and (nul := chunk.find(b"\0")) >= 0:
                 self._refuse(offset + nul, "the file must be text", "a binary file (NUL byte)", "export it as text")
             end = offset + len(chunk)
             waiting = len(decoder.getstate()[0])
-            if encoding == "UTF-8" and fault is None and (waiting or not chunk.isascii()):
+            if fault is None and (marked or waiting or not chunk.isascii()):
                 fault = _fault(decoder, chunk, offset - waiting)
-        waiting = len(decoder.getstate()[0])
-        if encoding == "UTF-8" and fault is None and waiting:
+        if fault is None and (waiting := len(decoder.getstate()[0])):
             fault = end - waiting
-        return encoding if fault is None else self._windows(fault)
+        if marked and fault is not None:
+            self._refuse(fault, "the file must be text", "damaged UTF-16", "save it as UTF-8", "utf-16")
+        return "UTF-16" if marked else "UTF-8" if fault is None else self._windows(fault)
 
     def _windows(self, fault: int) -> str:
         """Windows-1252, for a text that is ASCII before the byte ``fault``, which is no UTF-8."""
@@ -126,11 +116,18 @@ class TextFile:
                 self._refuse(wrong, "the file must be UTF-8 text", None, "save it as UTF-8")
         return WINDOWS
 
-    def _refuse(self, offset: int, rule: str, value: str | None, remedy: str) -> None:
-        """Raise at a byte; ``value`` None names the byte."""
+    def _refuse(self, offset: int, rule: str, value: str | None, remedy: str, codec: str = "utf-8") -> None:
+        """Raise at a byte; ``value`` None names the byte, ``codec`` decodes the bytes before it."""
         with self._open() as file:
             before, byte = file.read(offset), file.read(1)
-        raise InputError(rule, value or f"byte 0x{byte.hex()}", remedy, self.path, *place_of_byte(before))
+        raise InputError(rule, value or f"byte 0x{byte.hex()}", remedy, self.path, *place_of_byte(before, codec))
+
+
+def _block(file: io.TextIOWrapper) -> bytes:
+    """The next block, b"" at the end."""
+    text = file.read(BLOCK)
+    text += file.readline() if text else ""
+    return (text if not text or text.endswith("\n") else f"{text}\n").encode()
 
 
 def occurrences(mark: str, text: bytes) -> int:

@@ -26,7 +26,7 @@ def decode(content: bytes, path: Path) -> str:
         raise InputError("the file must be UTF-8 text", value, "save it as UTF-8", path, *place) from None
 
 
-def place_of_byte(before: bytes) -> tuple[int, int]:
-    """1-based line and character of a byte; the bytes ``before`` it on its line may be invalid too."""
-    lines = re.split(rb"\r\n?|\n", before)
-    return len(lines), len(lines[-1].decode("utf-8", "replace")) + 1
+def place_of_byte(before: bytes, codec: str = "utf-8") -> tuple[int, int]:
+    """1-based line and character of a byte; the bytes ``before`` it may be invalid too."""
+    lines = re.split(r"\r\n?|\n", before.decode(codec, "replace"))
+    return len(lines), len(lines[-1]) + 1
