@@ -41,6 +41,7 @@ class TextFile:
     def __init__(self, content: Content, path: Path) -> None:
         self._content, self.path = content, path
         self._compressed = path.suffix.lower() == COMPRESSED
+        self._has_feeds = False
         self.encoding = self._find_encoding()
 
     def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
@@ -49,12 +50,12 @@ class TextFile:
         Every line ends with a line feed, the last one too.
         """
         number = 0
-        with self._open() as raw, io.TextIOWrapper(raw, _CODECS[self.encoding]) as file:
-            while text := _block(file):
-                lines = occurrences("\n", text)
-                if number + lines > first:
-                    yield max(number, first), text.split(b"\n", first - number)[-1] if first > number else text
-                number += lines
+        for block in self._utf8() if self.encoding == "UTF-8" and self._has_feeds else self._decoded():
+            text = block if block.endswith(b"\n") else block + b"\n"
+            lines = occurrences("\n", text)
+            if number + lines > first:
+                yield max(number, first), text.split(b"\n", first - number)[-1] if first > number else text
+            number += lines
 
     def lines(self, first: int = 0) -> Iterator[str]:
         """The lines from line ``first`` on, counted from 0."""
@@ -88,6 +89,21 @@ class TextFile:
                 yield offset, chunk
                 offset += len(chunk)
 
+    def _utf8(self) -> Iterator[bytes]:
+        """Blocks that end with a line feed, but for the last one, of a text in UTF-8; it is not decoded."""
+        with self._open() as file:
+            if file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
+                file.seek(0)
+            while text := file.read(BLOCK):
+                text += file.readline()
+                yield text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+
+    def _decoded(self) -> Iterator[bytes]:
+        """Blocks of whole lines of a text in another encoding, or with carriage returns alone between its lines."""
+        with self._open() as raw, io.TextIOWrapper(raw, _CODECS[self.encoding]) as file:
+            while text := file.read(BLOCK):
+                yield (text + file.readline()).encode()
+
     def _find_encoding(self) -> str:
         """The encoding, by one pass through the file; Windows-1252 where it is no UTF-8 and begins with ASCII."""
         beginning = next(self._chunks(), (0, b""))[1]
@@ -96,7 +112,7 @@ class TextFile:
         for offset, chunk in self._chunks():
             if not marked and (nul := chunk.find(b"\0")) >= 0:
                 self._refuse(offset + nul, "the file must be text", "a binary file (NUL byte)", "export it as text")
-            end = offset + len(chunk)
+            end, self._has_feeds = offset + len(chunk), self._has_feeds or b"\n" in chunk
             waiting = len(decoder.getstate()[0])
             if fault is None and (marked or waiting or not chunk.isascii()):
                 fault = _fault(decoder, chunk, offset - waiting)
@@ -121,13 +137,6 @@ class TextFile:
         with self._open() as file:
             before, byte = file.read(offset), file.read(1)
         raise InputError(rule, value or f"byte 0x{byte.hex()}", remedy, self.path, *place_of_byte(before, codec))
-
-
-def _block(file: io.TextIOWrapper) -> bytes:
-    """The next block, b"" at the end."""
-    text = file.read(BLOCK)
-    text += file.readline() if text else ""
-    return (text if not text or text.endswith("\n") else f"{text}\n").encode()
 
 
 def occurrences(mark: str, text: bytes) -> int:
