@@ -25,7 +25,7 @@ from capsule_id.inference.sampling.diagnostics import (
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import Moves, block_move, other_moves
 from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
-from capsule_id.inference.sampling.refinement import refined
+from capsule_id.inference.sampling.refinement import NO_MASS, refined
 
 #: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
@@ -280,4 +280,4 @@ def _initial(target: Target, density: BlockProposal, random: np.random.RandomSta
         u = np.concatenate([u, drawn[np.all(np.isfinite(target.parts(drawn)), axis=1)]])
         if len(u) >= walkers:
             return initial_state(u[:walkers], random)
-    raise RuntimeError("no finite log-posterior near the point fit: the Laplace approximation does not hold there")
+    raise RuntimeError(NO_MASS)

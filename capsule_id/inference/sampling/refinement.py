@@ -14,6 +14,8 @@ from jaxtyping import Float
 from capsule_id.inference.sampling.coordinates import coordinates_of
 from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, concentric
 
+#: Message where the sampler has no point to start from.
+NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
 #: Draws of a round, and rounds with one component and with several.
 DRAWS, SINGLE, SEVERAL = 4096, 3, 9
 #: Number of components of a posterior that one component does not describe; components of less weight are dropped.
@@ -40,6 +42,11 @@ def refined(
     ----------
     parts : (n, d) -> (n, blocks), log-densities of the blocks
     prior : centre and width of the normal prior of u; NaN for a parameter with another prior
+
+    Raises
+    ------
+    RuntimeError
+        If no draw has a finite log-density.
     """
     proposal = first
     for i in range(SINGLE + SEVERAL):
@@ -47,6 +54,8 @@ def refined(
         inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in proposal.blocks], axis=1)
         u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
         log_weights = np.where(inside, parts(u) - proposal.log_density(u), -np.inf)
+        if not np.all(np.isfinite(np.max(log_weights, axis=0))):
+            raise RuntimeError(NO_MASS)
         mixtures = list(proposal.mixtures)
         for j, (block, own) in enumerate(zip(proposal.blocks, log_weights.T, strict=True)):
             if i == 0 or effective_size(own) < ENOUGH * DRAWS:

@@ -126,3 +126,9 @@ def test_refinement_finds_a_posterior_from_a_poor_start() -> None:
     better = refined(funnel, first, np.full((2, 5), np.nan), np.random.RandomState(0))
     assert share(first) < 0.01
     assert share(better) > 0.1
+
+
+def test_a_posterior_without_mass_near_the_start_is_said_so() -> None:
+    first = block_proposal([np.arange(2)], np.zeros(2), np.eye(2))
+    with pytest.raises(RuntimeError, match="no finite log-posterior near the point fit"):
+        refined(lambda u: np.full((len(u), 1), -np.inf), first, np.full((2, 2), np.nan), np.random.RandomState(0))
