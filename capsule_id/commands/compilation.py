@@ -11,13 +11,12 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
+from capsule_id.inference.target.compiling import HAS_EMITTER_OPTION
+
 # XLA then compiles each loop of an engine as one function: a single run is several times faster. CPU only.
 XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 # Without XLA's newer emitters of fused loops a program compiles in half the time, and runs no slower. CPU only.
-# XLA ends a process whose options it does not know; "" where jaxlib is newer than the versions that have this one.
-_JAXLIB_WITHOUT = (0, 11)
-_JAXLIB = tuple(int(part) for part in version("jaxlib").split(".")[:2])
-XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false" if _JAXLIB < _JAXLIB_WITHOUT else ""
+XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false" if HAS_EMITTER_OPTION else ""
 #: Programs that take longer than this to compile are kept, s.
 WORTH_KEEPING = 0.3
 #: Largest size of the cache, bytes; JAX removes the programs that were not used for the longest time.
