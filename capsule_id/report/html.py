@@ -17,7 +17,7 @@ from capsule_id.report.texts.advice import next_steps
 from capsule_id.report.texts.citation import AUTHORS, TITLE, bibtex, latex_table, methods_paragraph
 from capsule_id.report.texts.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.typography import MISSING, fixed, symbol_parts
-from capsule_id.views import Finding, Level, Message, ResultTable
+from capsule_id.views import Finding, Level, Message, ResultTable, counted
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
@@ -124,7 +124,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"symbol_parts": symbol_parts, "number": _number, "embed": _embed}
+    environment.filters |= {"symbol_parts": symbol_parts, "number": _number, "embed": _embed, "counted": counted}
     return environment
 
 

@@ -16,7 +16,7 @@ from capsule_id.report.columns import table_rows
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
 from capsule_id.report.texts.messages import finding_text, messages_of
-from capsule_id.views import Finding, Message, ResultTable, Text
+from capsule_id.views import Finding, Message, ResultTable, Text, counted
 from tests.report.conftest import OUTLIER
 
 EMPTY = {"meta", "img", "br"}
@@ -126,9 +126,12 @@ def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean:
     for row in table_rows(unclean.summary):
         assert row.plus_minus("value", "sd", row.decimals) in first
     assert "What would improve it Correct the whole fit. expected " in first
-    assert "Correct free_vibration_2." in first
+    assert "Correct experiment free_vibration_2." in first
+    assert "Quote trusted numbers only." in first
     clean = Page(page.partition("<nav")[0] + "</body></html>").text
-    assert "Verdict: trusted. No check failed." in clean
+    warned = sum(finding.level == "warn" for finding in result.findings)
+    below = f"; {counted(warned, 'warning')} below" if warned else ""
+    assert f"Verdict: trusted. No check failed{below}." in clean
     assert "Narrow v_s. v_s has the largest relative sd, 11 %." in clean
     assert 'class="untrusted"' not in page
 

@@ -29,7 +29,9 @@ def _faults(result: Result) -> Iterator[tuple[str, str]]:
 
 
 def _place(finding: Finding) -> str:
-    return finding.experiment or ", ".join(finding.parameters) or "the whole fit"
+    if finding.experiment:
+        return f"experiment {finding.experiment}"
+    return ", ".join(finding.parameters) or "the whole fit"
 
 
 def _missing(result: Result) -> Iterator[tuple[str, str]]:
