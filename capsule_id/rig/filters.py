@@ -24,6 +24,8 @@ TIMING_TOLERANCE = 0.01  # largest distance from an even grid, in sampling steps
 SMALLEST_GAIN = 0.99  # smallest gain of `choose_window` at the dominant frequency
 _HAMPEL_BLOCK = 2_000_000  # readings that are sorted at a time
 PIECE = 1 << 18  # samples that are looked at together of a record with twice as many or more
+#: Fewest periods in the loudest part of a record from which its frequency is read.
+FEWEST_PERIODS = 8.0
 _ZERO_PADDING = 8  # the frequency grid of the spectrum is 8 times finer than 1 / duration
 
 
@@ -202,7 +204,18 @@ def dominant_frequency(time: Record, values: Record) -> float:
         As ``sampling_step``.
     """
     step = sampling_step(time)
-    values = values[loudest_part(values)]
+    part = values[loudest_part(values)]
+    frequency = _highest_peak(part, step)
+    if len(part) < len(values) and frequency * step * len(part) < FEWEST_PERIODS:
+        # The part is too short for a frequency so low, and the whole record has samples to spare.
+        size = len(values) // PIECE + 1
+        means = np.mean(values[: len(values) // size * size].reshape(-1, size), axis=1)
+        frequency = _highest_peak(means, size * step)
+    return frequency
+
+
+def _highest_peak(values: Record, step: float) -> float:
+    """Frequency of the highest peak of the spectrum, Hz, of samples at distances of ``step``, s."""
     index = np.arange(len(values)) / len(values)
     residual = values - np.polyval(np.polyfit(index, values, 1), index)
     length = _ZERO_PADDING * len(values)

@@ -9,6 +9,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from capsule_id.parameters import Prior
+from capsule_id.views import counted
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class Table(Generic[S]):
 
     def __repr__(self) -> str:
         columns = ", ".join(f"{column.name} [{column.unit}]" for column in self.columns.values())
-        return f"<{self.kind} {self.label}: {len(self.rows)} rows of {columns}>"
+        return f"<{self.kind} {self.label}: {counted(len(self.rows), 'row')} of {columns}>"
 
 
 @dataclass(frozen=True)

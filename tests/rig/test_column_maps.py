@@ -303,3 +303,15 @@ def test_one_call_prints_the_first_error_of_each_experiment(tmp_path: Path, caps
         assert (len(lines), lines[-1]) == (21, "23 errors")
         assert all(str(tmp_path / "rig.toml") in line for line in lines[:-1])
     assert not out.exists()
+
+
+def test_a_longer_vector_of_the_file_gives_no_rows_to_a_table(tmp_path: Path) -> None:
+    """The rows are those of the mapped vectors, and a missing cell among them is left out."""
+    for missing in (False, True):
+        disp = DISP.copy()
+        disp[3] = np.nan if missing else disp[3]
+        np.savez(tmp_path / "x.npz", time=TIME, x=disp, temperature=np.arange(30.0))
+        maps = 'columns = { time = { from = "time", unit = "s" }, x_rel = { from = "x", unit = "mm" } }'
+        stated = '\nmissing = ["NaN"]' if missing else ""
+        (table,) = rig_of(tmp_path, {}, f'file = "x.npz"\n{maps}{stated}').tables
+        assert len(table.rows) == len(table["time"]) == 12 - missing

@@ -193,3 +193,10 @@ def test_filtered_records_understate_the_noise() -> None:
     # binomial standard error of 2000 at 95 %: 0.005
     assert covered["raw"] == pytest.approx(0.95, abs=0.015)
     assert covered["filtered"] < 0.6
+
+
+def test_a_low_frequency_is_read_from_the_whole_of_a_long_record() -> None:
+    """5 Hz at 1 MS/s: the loudest part holds 1.3 periods."""
+    time = np.arange(1_200_000) * 1e-6
+    values = np.exp(-0.3 * time) * np.cos(2.0 * np.pi * 5.0 * time)
+    assert dominant_frequency(time, values) == pytest.approx(5.0, rel=0.03)

@@ -6,6 +6,7 @@ must keep its own state between calls.
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 from typing import Any
 
 import emcee
@@ -37,8 +38,10 @@ class Ensemble:
 
         walkers, dimension = state.coords.shape
         self.state = state
+        # Ensembles run side by side, and emcee's moves keep numbers of the ensemble that they work for.
+        own = [(copy(move), weight) for move, weight in moves]
         self._sampler = emcee.EnsembleSampler(
-            walkers, dimension, log_density, vectorize=True, moves=moves, backend=backend
+            walkers, dimension, log_density, vectorize=True, moves=own, backend=backend
         )
 
     @property

@@ -103,7 +103,7 @@ def _adapted(
     wide = concentric(mean, covariance, coordinates=coordinates)
     if done < SINGLE:
         return wide
-    if done == SINGLE:
+    if len(mixture.weights) == len(wide.weights):
         centres = w[rng.choice(len(w), COMPONENTS, p=weights)]
         covariances = np.repeat(covariance[None], COMPONENTS, axis=0)
         return _with_wide(np.full(COMPONENTS, 1.0 / COMPONENTS), centres, covariances, wide)

@@ -107,7 +107,8 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
         return here.place(index, here.column)
 
     units = tuple(column_map.sources[name].unit for name in names)
-    rows = exports[0].lines[keep] if len(parts) == 1 else np.arange(1, len(columns[0]) + 1)
+    # Arrays of a file may have other lengths than those that the map names.
+    rows = exports[0].lines[: int(first_rows[-1])][keep] if len(parts) == 1 else np.arange(1, len(columns[0]) + 1)
     encoding = next((each.encoding for each in exports if each.encoding != UTF8), UTF8)
     raw = RawTable(names, units, columns, rows, place_of, encoding)
     return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)

@@ -1,5 +1,6 @@
 """Proposal densities against quadrature, and the posterior of two terms that replace each other."""
 
+import emcee
 import numpy as np
 import pytest
 from scipy import stats
@@ -7,6 +8,7 @@ from scipy import stats
 from capsule_id.inference.sampling import coordinates, refinement
 from capsule_id.inference.sampling.coordinates import Coordinates, coordinates_of
 from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time
+from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
 from capsule_id.inference.sampling.ensembles import pilot, sample
 from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, block_proposal, concentric
 from capsule_id.inference.sampling.refinement import effective_size, refined
@@ -132,3 +134,31 @@ def test_a_posterior_without_mass_near_the_start_is_said_so() -> None:
     first = block_proposal([np.arange(2)], np.zeros(2), np.eye(2))
     with pytest.raises(RuntimeError, match="no finite log-posterior near the point fit"):
         refined(lambda u: np.full((len(u), 1), -np.inf), first, np.full((2, 2), np.nan), np.random.RandomState(0))
+
+
+def test_a_block_that_needs_components_late_gets_them() -> None:
+    """A block that was good enough with one centre until the last round before several are tried."""
+    rng = np.random.RandomState(0)
+    first = concentric(np.zeros(1), np.eye(1))
+    u, weights = first.draw(rng, 4000), np.full(4000, 1.0 / 4000)
+    later = refinement._adapted(first, u, weights, np.full((2, 1), np.nan), refinement.SINGLE + 2, rng)
+    assert np.sum(later.weights) == pytest.approx(1.0, abs=1e-12)
+    assert len(later.weights) == refinement.COMPONENTS + len(first.weights)
+
+
+def test_ensembles_do_not_share_moves() -> None:
+    """emcee's moves keep numbers of the ensemble that they work for, and ensembles run side by side."""
+    used = list[int]()
+
+    class Recording(emcee.moves.StretchMove):
+        def propose(self, model: object, state: emcee.State) -> object:
+            used.append(id(self))
+            return super().propose(model, state)
+
+    moves = [(Recording(), 1.0)]
+    known = Gaussian(np.zeros(2), np.eye(2))
+    for seed in (0, 1):
+        rng = np.random.RandomState(seed)
+        Ensemble(known.parts, initial_state(rng.standard_normal((8, 2)), rng), moves).run(2)
+    assert len(set(used)) == 2
+    assert id(moves[0][0]) not in used

@@ -14,7 +14,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.text.blocks import Content, TextFile, lines_of
-from capsule_id.rig.formats.text.cells import BLANKS, bare, number_in, place_of_cell, shown_cell
+from capsule_id.rig.formats.text.cells import BLANKS, bare, cells_of, number_in, place_of_cell, shown_cell
 from capsule_id.rig.formats.text.rows import COMMENTS, Shape, any_rows, is_comment, plain_rows
 
 _MANY_ROWS = 50  # whose whole parts do not increase by chance
@@ -40,8 +40,9 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     first, row = len(head) - 1, head.pop()
     delimiter = delimiter_of(row, layout)
     _refuse_ambiguous_comma(file, first, delimiter, layout)
-    *cells, last = row.split(delimiter)
-    blank = bool(cells) and not last.strip(BLANKS)
+    _refuse_separator_in_quotes(file, first, row, delimiter)
+    *cells, last = (cell for cell, _ in cells_of(row, delimiter))
+    blank = bool(cells) and not last
     trailing = blank and all(_ends_blank(text, delimiter) for _, text in file.blocks(first))
     width = len(cells) + (not trailing)
     above = range((layout.data_from_line or first + 1) - 2, -1, -1)
@@ -72,7 +73,7 @@ def _is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[
 def _ends_blank(text: bytes, delimiter: str | None) -> bool:
     """Whether the last cell of every row in ``text`` is blank."""
     rows = (line for line in lines_of(text) if line.strip() and not is_comment(line))
-    return all(not line.split(delimiter)[-1].strip(BLANKS) for line in rows)
+    return all(not cells_of(line, delimiter)[-1][0] for line in rows)
 
 
 def _head(file: TextFile, layout: Layout) -> list[str]:
@@ -130,7 +131,7 @@ def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tu
 
 def _split(line: str, delimiter: str | None) -> list[str]:
     """The cells of a line without blanks and quotation marks around them."""
-    return [bare(cell) for cell in line.split(delimiter)]
+    return [bare(cell) for cell, _ in cells_of(line, delimiter)]
 
 
 def delimiter_of(line: str, layout: Layout) -> str | None:
@@ -138,7 +139,7 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
     for mark in "\t;":
         if mark in line:
             return mark
-    words = line.split()
+    words = [word for word, _ in cells_of(line, None)]
     if layout.decimal == ",":  # a tab separates nothing in a line with one cell
         return None if len(words) > 1 else "\t"
     if "," not in line:
@@ -146,6 +147,15 @@ def delimiter_of(line: str, layout: Layout) -> str | None:
     if all(_is_reading(cell, layout) for cell in _split(line, ",")):
         return ","
     return None if len(words) > 1 and all(_is_reading(word, layout) for word in words) else ","
+
+
+def _refuse_separator_in_quotes(file: TextFile, first: int, row: str, delimiter: str | None) -> None:
+    """Refuse rows such as ``"10,2","1,5"``: the separator would cut quoted numbers in two."""
+    for cell, position in cells_of(row, delimiter):
+        if cell.count('"') % 2:
+            rule = "a cell in quotation marks must not hold the separator of the cells"
+            remedy = "export with a decimal point, or with semicolons between the cells"
+            raise InputError(rule, shown_cell(row.strip()), remedy, file.path, first + 1, position)
 
 
 def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, layout: Layout) -> None:

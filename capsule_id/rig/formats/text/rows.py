@@ -11,7 +11,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.text.blocks import TextFile, lines_of, occurrences
-from capsule_id.rig.formats.text.cells import bare, decimal_mark, place_of_cell, read_column
+from capsule_id.rig.formats.text.cells import bare, cells_of, decimal_mark, place_of_cell, read_column
 from capsule_id.views import counted
 
 COMMENTS = ("#", "%")
@@ -205,7 +205,7 @@ def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     """The cells of a row, as many as the first row has."""
-    cells = text.split(shape.delimiter)
+    cells = [cell for cell, _ in cells_of(text, shape.delimiter)]
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
         rule = f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has"
