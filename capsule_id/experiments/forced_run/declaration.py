@@ -238,7 +238,8 @@ MESSAGES = {
     "runs.motion": Message(
         "Motion predicted and observed",
         caption=(
-            "Over the record, from its first sample to its last. The record's velocity rests on five samples at either end."
+            "Over the record. Model and record go through the same estimator of the mean velocity. The band is that of a "
+            "new record, its error included."
         ),
     ),
 }

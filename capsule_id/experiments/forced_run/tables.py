@@ -8,11 +8,15 @@ import pandas as pd
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import Fitted
-from capsule_id.records.label import measured_motion
+from capsule_id.records.label import MeasuredMotion, measured_motion
+from capsule_id.records.mean_velocity import fit_mean_velocity
 from capsule_id.views import ResultTable
 
 if TYPE_CHECKING:
     from capsule_id.experiments.forced_run.experiment import ForcedRun
+
+#: Draws at which velocities are computed, and errors of a record's velocity drawn for each.
+VELOCITY_DRAWS, ERRORS = 50, 200
 
 
 def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
@@ -51,12 +55,14 @@ def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
 
 
 def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
-    """Contacts and mean velocity of the capsule over the record: observed, point fit, 95 % credible interval."""
+    """Contacts and mean velocity of the capsule over the record: observed, point fit, 95 % interval of a new record.
+
+    Both velocities come from the estimator of ``capsule_id.records.mean_velocity``, the model's at the sample times.
+    """
     rows = {}
     for run in runs:
         best = run.motion(run.local(fit.values), np)
-        span = run.time[-1] - run.time[0]
-        local = [run.local(draw) for draw in fit.draws]
+        local = [run.local(draw) for draw in fit.draws[:VELOCITY_DRAWS]]
         stacked = {name: np.array([theta[name] for theta in local]) for name in (local[0] if local else {})}
         sample = run.motion(stacked, np) if local else None
         seen = measured_motion(run.table)
@@ -68,13 +74,34 @@ def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTab
         if sample is not None:
             low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
             row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"
-        row["mean velocity, model, mm/s"] = 1e3 * float(best.X2[-1]) / span
-        if sample is not None:
-            band = np.quantile(1e3 * np.asarray(sample.X2)[:, -1] / span, [0.025, 0.975])
-            row["95 % band, mm/s"] = f"{band[0]:.4g} to {band[1]:.4g}"
-        if "x_capsule" in run.channels:
-            place = run.values[run.channels.index("x_capsule")]
-            row["mean velocity, record, mm/s"] = 1e3 * float(np.mean(place[-5:]) - np.mean(place[:5])) / span
+        row |= _velocities(run, seen, np.asarray(best.X2), None if sample is None else np.asarray(sample.X2))
         rows[run.label] = row
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("run")
     return [ResultTable("runs.motion", frame)]
+
+
+def _velocities(
+    run: "ForcedRun", seen: MeasuredMotion, best: np.ndarray, sample: np.ndarray | None
+) -> dict[str, object]:
+    """Mean velocity of the model, band of a new record, and the record's own with its standard error.
+
+    Parameters
+    ----------
+    best, sample : X2 of the point fit (n,) and of the draws (draws, n), m
+    """
+    evidence = seen.evidence
+    period = evidence.repeat.period if evidence.repeat else None
+
+    def velocity(place: np.ndarray) -> float:
+        return 1e3 * fit_mean_velocity(run.time, place, 2.0 * np.pi / evidence.Omega, period).velocity
+
+    found = evidence.mean_velocity
+    sd = 0.0 if found is None or not np.isfinite(found.velocity_sd) else 1e3 * found.velocity_sd
+    row: dict[str, object] = {"mean velocity, model, mm/s": velocity(best)}
+    if sample is not None:
+        error = sd * np.random.default_rng(0).standard_normal((ERRORS, 1))
+        low, high = np.quantile(error + np.array([velocity(place) for place in sample]), [0.025, 0.975])
+        row["95 % band, mm/s"] = f"{low:.4g} to {high:.4g}"
+    if found is not None:
+        row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
+    return row
