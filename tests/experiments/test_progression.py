@@ -34,8 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def progression(folder: Path) -> Progression:
     (experiment,) = make_experiments(read_rig(folder))
-    assert isinstance(experiment, Progression)
-    return experiment
+    return cast(Progression, experiment)
 
 
 THETA = {**ROBOT, "g": 9.81, **SCATTERS}

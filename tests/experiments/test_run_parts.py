@@ -89,8 +89,7 @@ def test_a_creeping_start_is_told_from_rest_by_the_whole_record() -> None:
     run = make(0, samples=600).restarted(0.0)
     assert run.about.start == "stuck"
     wrong = moving | {"y_start": moving["y_start"] + moving["capsule_start"], "capsule_start": 0.0}
-    found = better_start(run, wrong)
-    assert found is not None
+    found = better_start(run, wrong) or {}
     # On a grid of speeds, each a half above the one before.
     assert found["capsule_start"] == pytest.approx(moving["capsule_start"], rel=0.3)
     assert found["x_start"] == pytest.approx(moving["x_start"], abs=5e-5)

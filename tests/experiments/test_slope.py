@@ -1,13 +1,13 @@
 """Experiments on a slope, with a pressing force: independent solutions, recovery of mu, starts at equilibrium."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
@@ -92,8 +92,8 @@ def test_points_of_the_paper_show_mu_without_the_weight_along_the_slope() -> Non
 def test_the_equilibrium_balances_the_weight(k_cubic: float) -> None:
     p = CapsuleParameters(**CAPSULE, k2=0.0, G=np.inf, slope=0.3, k_cubic=k_cubic)
     load = bench.M1 * bench.G * np.sin(0.3)
-    expected = brentq(lambda r: bench.K1 * r + k_cubic * r**3 + load, -1e-3, 0.0, xtol=1e-15)
-    assert isinstance(expected, float)
+    balance = root_scalar(lambda r: bench.K1 * r + k_cubic * r**3 + load, bracket=(-1e-3, 0.0), xtol=1e-15)
+    expected = balance.root
     assert equilibrium(p) == pytest.approx(expected, rel=1e-10)
     still = simulate(replace(p, mu=5.0), Excitation(0.0, 1.0), np.linspace(0.0, 0.5, 5), (expected, 0.0, 0.0, 0.0))
     assert np.allclose(still.x_rel, expected, atol=1e-12)
@@ -106,8 +106,8 @@ def test_a_progression_on_a_slope_starts_at_equilibrium() -> None:
         [bench.column(name, values) for name, values in columns.items()],
         drive="pulses", P_on=Quantity(6.0), **GROUND,
     )  # fmt: skip
-    (e,) = make_experiments(bench.rig(table))
-    assert isinstance(e, Progression)
+    (only,) = make_experiments(bench.rig(table))
+    e = cast(Progression, only)
     X2 = np.asarray(e.displacements(THETA, np.zeros(2), e.settings))
     p = CapsuleParameters(**CAPSULE, k2=0.0, G=np.inf, **GROUND)
     r0 = -bench.M1 * bench.G * np.sin(SLOPE) / bench.K1
@@ -133,8 +133,8 @@ def run_table(**settings: Any) -> Table:
 
 
 def test_a_forced_run_on_a_slope_is_that_of_simulate() -> None:
-    (run,) = make_experiments(bench.rig(run_table(**GROUND, start="stuck")))
-    assert isinstance(run, ForcedRun)
+    (only,) = make_experiments(bench.rig(run_table(**GROUND, start="stuck")))
+    run = cast(ForcedRun, only)
     theta = {**THETA, "phase": 0.4, "x_start": 2e-4, "y_start": 0.05}
     p = CapsuleParameters(**CAPSULE, k2=0.0, G=np.inf, **GROUND)
     drive = Excitation(4.0, 35.0, 0.4)
