@@ -17,6 +17,7 @@ import capsule_id as cid
 from capsule_id import cli
 from capsule_id.experiments.registry import default_registry
 from capsule_id.report.columns import COLUMNS
+from capsule_id.report.texts import citation
 from capsule_id.rig.choices import OPTIONAL
 from capsule_id.rig.model import ModelChoices
 from capsule_id.views import Trust
@@ -121,6 +122,24 @@ def test_a_record_of_ones_own_gives_k1(tmp_path: Path) -> None:
     assert abs(value - k1) < 3.0 * sd < 0.02 * k1
     (report,) = re.findall(r"`(results/my-rig/\S+)`", README)
     assert (tmp_path / report).is_file()
+
+
+def test_the_reference_is_the_same_everywhere() -> None:
+    """README, CITATION.cff, the report's methods and its BibTeX entry take the paper from one place."""
+    words = " ".join(README.split())
+    assert f"*{citation.TITLE}*, {citation.PUBLISHED}." in words
+    (entry,) = yaml_references((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    first, last = citation.PAGES
+    known = {"title": citation.TITLE, "journal": citation.JOURNAL, "volume": str(citation.VOLUME)}
+    assert entry == known | {"year": str(citation.YEAR), "start": str(first), "end": str(last), "type": "article"}
+
+
+def yaml_references(text: str) -> list[dict[str, str]]:
+    """The scalar fields of every reference of CITATION.cff."""
+    parts = text.split("references:\n", 1)[1].split("  - type: ")[1:]
+    return [
+        dict(re.findall(r'^    (\w+): "?(.*?)"?$', part, re.MULTILINE)) | {"type": part.split()[0]} for part in parts
+    ]
 
 
 def test_readme_and_the_pages_are_short() -> None:

@@ -83,7 +83,7 @@ def pictures(result: Result) -> tuple[Picture, ...]:
         drawing = Drawing("traces", "sample", "Traces", trace_caption, f"Traces of every physical parameter, {worst}")
         drawn.append(drawing.on(result, figure_of(traces(result))))
     fit = result.point_fit
-    starts_caption = "Where each start began and where it ended, in standard deviations of the Laplace approximation."
+    starts_caption = "Where each start began and where it ended, in posterior standard deviations from its curvature."
     ended = int(fit.at_other_maximum.sum())
     starts_alt = f"{counted(len(fit.starts), 'start')}; {ended} ended at another maximum than the best."
     drawing = Drawing("point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts_alt)

@@ -14,8 +14,9 @@ from capsule_id.report.columns import Output, columns_of, table_rows
 from capsule_id.report.console_table import verdict_text
 from capsule_id.report.gallery import Picture
 from capsule_id.report.texts.advice import next_steps
-from capsule_id.report.texts.citation import AUTHORS, TITLE, bibtex, latex_table, methods_paragraph
+from capsule_id.report.texts.citation import AUTHORS, PUBLISHED, TITLE, bibtex, latex_table, methods_paragraph
 from capsule_id.report.texts.messages import caption_of, finding_text, messages_of, title_of
+from capsule_id.report.texts.terms import OF_A_SAMPLE, TERMS
 from capsule_id.report.typography import MISSING, fixed, symbol_parts
 from capsule_id.views import Finding, Level, Message, ResultTable, counted
 
@@ -48,9 +49,11 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             failed=list(dict.fromkeys(titles[finding.code] for finding in result.findings if finding.level == "fail")),
             starts=_starts(result),
             notes=[_note(note, messages) for note in result.notes],
+            terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
             missing=MISSING,
             authors=AUTHORS,
             title=TITLE,
+            published=PUBLISHED,
             copies=(
                 ("methods", "Methods paragraph", methods_paragraph(result)),
                 ("bibtex", "BibTeX", bibtex(result)),
@@ -90,9 +93,12 @@ def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, 
     Experiments with a failure or a warning are open, as long as fewer than ``MOST_OPEN`` figures are.
     """
     measured = [picture for picture in pictures if picture.section == "measured"]
+    shared = {picture.group for picture in measured}.difference(table.label for table in result.rig.tables)
     named: dict[str, Level] = {}
     for level in reversed(_WORST_FIRST):
-        named |= {finding.experiment: level for finding in result.findings if finding.level == level}
+        found = [finding for finding in result.findings if finding.level == level]
+        named |= {label: level for label in (finding.code.partition(".")[0] for finding in found) if label in shared}
+        named |= {finding.experiment: level for finding in found}
     entries, shown = [], 0
     for group in dict.fromkeys(picture.group for picture in measured):
         own = sorted((picture for picture in measured if picture.group == group), key=lambda picture: picture.wide)

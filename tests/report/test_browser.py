@@ -24,7 +24,9 @@ const up = numbers();
 button.click();
 const down = numbers();
 const rows = JSON.stringify([up, down, document.documentElement.scrollWidth, innerWidth,
-  getComputedStyle(document.body).backgroundColor]);
+  getComputedStyle(document.body).backgroundColor,
+  [...document.querySelectorAll(".findings td.text")].filter(cell => cell.getBoundingClientRect().right > innerWidth).length,
+  [...document.images].filter(image => image.width > Number(image.getAttribute("width"))).length]);
 const paper = new Event("beforeprint");
 dispatchEvent(paper);
 document.title = rows + "|" + document.querySelectorAll("details:not([open])").length;
@@ -40,8 +42,8 @@ def browse(file: Path, *flags: str) -> tuple[str, list[str]]:
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
 
 
-def seen(document: str) -> tuple[list[float], list[float], int, int, str, int]:
-    """What ``PROBE`` has written into the title."""
+def seen(document: str) -> tuple[list[float], list[float], int, int, str, int, int, int]:
+    """What ``PROBE`` has written: sorted numbers, widths, background, cut findings, magnified figures, closed parts."""
     import html
     import json
 
@@ -55,11 +57,12 @@ def test_it_opens_without_a_message_and_sorts(result: Result, drawn: tuple[Pictu
     file.write_text(render(result, drawn).replace("</body>", PROBE + "</body>"), encoding="utf-8")
     document, messages = browse(file, "--blink-settings=preferredColorScheme=0")
     assert messages == []
-    up, down, *_, background, closed = seen(document)
+    up, down, _, _, background, _, magnified, closed = seen(document)
     assert up == sorted(up)
     assert down == up[::-1]
     assert len(up) == len(result.summary)
     assert background == "rgb(23, 24, 26)"  # the dark scheme
+    assert magnified == 0
     assert closed == 0  # all parts are open for the printer
 
 
@@ -74,9 +77,10 @@ def test_it_fits_a_phone(unclean: Result, drawn: tuple[Picture, ...], tmp_path: 
     )
     document, messages = browse(tmp_path / "report.html")
     assert messages == []
-    _, _, width, window, background, _ = seen(document)
+    _, _, width, window, background, cut, *_ = seen(document)
     assert (window, background) == (390, "rgb(255, 255, 255)")
     assert width <= window
+    assert cut == 0  # no text of a finding begins or ends outside
 
 
 def test_a_message_would_be_noticed(tmp_path: Path) -> None:

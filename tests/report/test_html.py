@@ -10,13 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from capsule_id.api import read_rig
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.columns import table_rows
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
+from capsule_id.report.texts.citation import methods_paragraph
 from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.report.texts.terms import TERMS
 from capsule_id.views import Finding, Message, ResultTable, Text, counted
+from tests.cli_tools import DATA
 from tests.report.conftest import OUTLIER
 
 EMPTY = {"meta", "img", "br"}
@@ -142,6 +146,30 @@ def test_a_number_that_must_not_be_quoted_is_named_in_the_verdict(unclean: Resul
     text = Page(render(replace(unclean, summary=summary), ())).text
     assert "Do not quote c; the other numbers stand as marked." in text
     assert "Do not quote" not in Page(render(unclean, ())).text
+
+
+def test_a_shared_panel_has_the_level_of_its_checks(result: Result, drawn: tuple[Picture, ...]) -> None:
+    """The friction panel belongs to no single table; a failed check of friction must not leave it marked ok."""
+    facts = {"labels": "s", "name": "eq. (1)", "factor": 165.0, "line": 'friction = "constant"'}
+    for level, word in (("fail", "✗ failed"), ("ok", "✓ ok")):
+        finding = Finding("friction.variants", level, facts | {"count": 3, "simplest": "eq. (1)"})
+        text = Page(render(replace(result, findings=(finding,)), drawn)).text
+        assert f"friction {word} 1 figure" in text
+
+
+def test_the_methods_paragraph_counts_the_fitted_experiments(result: Result) -> None:
+    fitted_bench = replace(result, rig=read_rig(DATA))
+    text = methods_paragraph(fitted_bench)
+    assert "3 x free vibration" in text
+    assert "forced run" not in text
+    everything = replace(fitted_bench, provenance=replace(fitted_bench.provenance, experiments="all"))
+    assert "4 x forced run" in methods_paragraph(everything)
+
+
+def test_terms_of_the_first_screen_are_explained(page: str) -> None:
+    assert '<a href="#terms">' in page.partition("<nav")[0]
+    assert "AR(1)" in TERMS["AR(1), ARMA"]
+    assert all(f"<dt>{term}</dt><dd>{meaning}</dd>" in html.unescape(page) for term, meaning in TERMS.items())
 
 
 def test_the_truth_of_a_synthetic_rig_stands_beside_the_estimate(result: Result) -> None:

@@ -120,7 +120,7 @@ def test_findings_in_json_name_their_experiment(result: Result) -> None:
     slip, white, errors = verdict["findings"]
     assert (slip["check"], slip["code"], slip["level"]) == ("free decay", "decays.slip", "fail")
     assert slip["text"].startswith("run_1: expected a free capsule at rest, |f| <= F_b = 3 N; the record reaches 4 N")
-    assert white["text"].startswith("run_1: expected white residuals")
+    assert white["text"].startswith("run_1: expected residuals without correlation in time (white)")
     assert white["text"].count("run_1") == 1
     assert errors["text"] == "stated reading errors explain the scatter"
 

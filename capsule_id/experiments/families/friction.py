@@ -35,8 +35,8 @@ MESSAGES = {
     "friction.variants": Message(
         "friction law",
         ok=(
-            "{name} is not told from the best of {count} friction laws (Bayes factor {factor:.2g}). The simplest law that "
-            "the readings do not tell from the best is {simplest}: {line} in [model]"
+            "{name} explains the readings as well as the best of {count} friction laws, which is {factor:.2g} times as "
+            "probable. The simplest law that does so is {simplest}: {line} in [model]"
         ),
         fail=(
             "{labels}: expected readings that {name} explains; found them {factor:.3g} times more probable under another "

@@ -17,7 +17,7 @@ DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 
 _EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
 _DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
-_NOISES = {"ar1": "AR(1) noise", "arma": "ARMA noise"}
+_NOISES = {"ar1": "coloured noise (AR(1))", "arma": "white and coloured noise (ARMA)"}
 
 
 @dataclass(frozen=True, kw_only=True)

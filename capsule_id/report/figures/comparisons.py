@@ -158,7 +158,7 @@ def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
     ax.axvline(0.0, color=GREY, lw=0.8, zorder=0)
     ax.set_yticks(rows, [plain_symbol(name) for name in fit.names], parse_math=False)
     ax.set_ylim(-0.8, d - 0.2)
-    set_text(ax, "distance from the best maximum [Laplace sd]", "", "Starts of the point fit")
+    set_text(ax, "distance from the best maximum [posterior sd]", "", "Starts of the point fit")
     set_legend(ax, place="above")
     return ax
 

@@ -1,5 +1,6 @@
 """What a paper or a thesis takes over from a result: methods paragraph, BibTeX entries, LaTeX table."""
 
+from capsule_id.experiments import select_tables
 from capsule_id.inference.result import Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report.columns import table_rows
@@ -8,6 +9,8 @@ from capsule_id.report.typography import MISSING
 #: The paper whose model and rig this package fits.
 AUTHORS = ("Yang Liu", "Ekaterina Pavlovskaia", "Marian Wiercigroch")
 TITLE = "Experimental verification of the vibro-impact capsule model"
+JOURNAL, VOLUME, YEAR, PAGES = "Nonlinear Dynamics", 83, 2016, (1029, 1041)
+PUBLISHED = f"{JOURNAL} {VOLUME} ({YEAR}) {PAGES[0]}–{PAGES[1]}"
 _ESCAPES = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"})
 
 
@@ -15,13 +18,13 @@ def methods_paragraph(result: Result) -> str:
     """The method in sentences, with the numbers of this fit."""
     version = result.provenance.versions.get("capsule-id", "")
     kinds: dict[str, int] = {}
-    for table in result.rig.tables:
+    for table in select_tables(result.rig, result.provenance.experiments):
         kinds[table.kind.replace("_", " ")] = kinds.get(table.kind.replace("_", " "), 0) + 1
     tests = ", ".join(f"{number} x {kind}" for kind, number in kinds.items()) or "the experiments listed in this report"
     data = "Synthetic data were used. " if result.rig.synthetic else ""
     sentences = [
-        f"{data}The parameters of the vibro-impact capsule model of {_names()} ({TITLE}) were identified with capsule-id "
-        f"{version} from {tests}.",
+        f"{data}The parameters of the vibro-impact capsule model of {_names()} ({TITLE}, {PUBLISHED}) were "
+        f"identified with capsule-id {version} from {tests}.",
         "All experiments share one set of parameters, with proper priors, and one likelihood of the raw readings.",
     ]
     if result.posterior is None:
@@ -47,7 +50,8 @@ def bibtex(result: Result) -> str:
     version = result.provenance.versions.get("capsule-id", "")
     authors = " and ".join(f"{name.rpartition(' ')[2]}, {name.rpartition(' ')[0]}" for name in AUTHORS)
     return (
-        f"@misc{{liu_capsule,\n  author = {{{authors}}},\n  title = {{{TITLE}}}\n}}\n\n"
+        f"@article{{liu_capsule,\n  author = {{{authors}}},\n  title = {{{TITLE}}},\n  journal = {{{JOURNAL}}},\n"
+        f"  volume = {{{VOLUME}}},\n  year = {{{YEAR}}},\n  pages = {{{PAGES[0]}--{PAGES[1]}}}\n}}\n\n"
         "@software{capsule_id,\n  author = {{The capsule-id developers}},\n"
         "  title = {capsule-id: system identification for the vibro-impact capsule},\n"
         f"  version = {{{version}}}\n}}"

@@ -69,14 +69,15 @@ def _listed(facts: Facts) -> str:
 def _coloured_residuals(facts: Facts) -> str:
     """The statistic, what drifts in the record, and the remedy of the model that predicts it."""
     seen = (
-        f"{facts['record']}: expected white residuals; found Ljung–Box Q = {facts['Q']:.0f} over {facts['lags']} lags "
+        f"{facts['record']}: expected residuals without correlation in time (white); found Ljung–Box "
+        f"Q = {facts['Q']:.0f} over {facts['lags']} lags "
         f"(p = {facts['p']:.1g}). The model lacks an effect or the noise is coloured, and the intervals are not to be "
         "trusted."
     )
     remedy = {
         "capsule": (
             "Look at the residuals and the phase portrait, check spring, gap and friction law, or state "
-            'noise = "ar1" where the sensor filters.'
+            'noise = "ar1" (coloured noise) where the sensor filters.'
         ),
         "decay": _decay_remedy(facts),
     }.get(facts.get("model", ""), "Look at the residuals.")
@@ -124,9 +125,17 @@ def _outliers(facts: Facts) -> str:
         for name, unit, value, without in facts["estimates"]
     )
     return (
-        f"{facts['file']} {where} {facts['score']:.3g} studentised residuals off the others (p = {facts['p']:.1g}).{more} "
+        f"{facts['file']} {where} {facts['score']:.3g} standard deviations off the others (p = {facts['p']:.1g}).{more} "
         f"{change}. Nothing was dropped: check the reading, then correct it or remove it yourself."
     )
+
+
+#: What a statistic of the residuals that is too large means.
+_STATISTICS: Mapping[str, str] = {
+    "sign runs": "too many neighbours have the same sign",
+    "largest": "one of them is too large",
+    "trend": "they change slowly from the first reading to the last",
+}
 
 
 def _largest_disagreement(facts: Facts) -> str:
@@ -166,10 +175,10 @@ FIT_MESSAGES: Mapping[str, Message] = {
     ),
     "residuals.statistics": Message(
         "residuals like noise",
-        ok="runs of signs, largest residual and trend of {number:# bench test} are those of noise",
-        warn=(
-            "expected residuals like those of noise through the same fit; their {statistic} is too large (p = {p:.1g}). A "
-            "fitted scatter cannot absorb this. Look at the residuals: a bend, a wrong model or a wrong reading."
+        ok="signs, largest residual and trend of {number:# bench test} are those of random noise",
+        warn=lambda facts: (
+            f"expected residuals like random noise; {_STATISTICS[facts['statistic']]} (p = {facts['p']:.1g}). A larger "
+            "scatter does not explain this. Look at the residuals: a bend, a wrong model or a wrong reading."
         ),
     ),
     "model.error": Message(

@@ -117,7 +117,7 @@ POSTERIOR_MESSAGES: Mapping[str, Message] = {
         warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
     ),
     "priors.conflict": Message(
-        "priors and data", ok="priors and weighings ({number}) agree with the rest of the data", fail=_conflict
+        "priors and data", ok="priors and weighings, {number} in all, agree with the rest of the data", fail=_conflict
     ),
     "priors.tails": Message(
         "boundary effects",
