@@ -19,6 +19,7 @@ import optimistix as optx
 from capsule_id.inference.fit.covariance import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
 from capsule_id.inference.target.compiling import COMPILE, COMPILE_QUICKLY
 from capsule_id.interruption import stop_if_interrupted
+from capsule_id.physics.batches import pool
 from capsule_id.precision import require_float64
 
 require_float64()
@@ -122,7 +123,9 @@ def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVE
     starts = np.asarray(starts, dtype=float)
     if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
         raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
-    ends = [_descend(partial(_linearised, residual, solver.heavy), start, solver) for start in starts]
+    descend = partial(_descend, partial(_linearised, residual, solver.heavy), solver=solver)
+    # The first start compiles the programs that all threads then call.
+    ends = [descend(starts[0]), *pool().map(descend, starts[1:])]
     x, residuals, jacobian, steps, message = zip(*ends, strict=True)
     return LeastSquaresFit(
         x=np.stack(x),

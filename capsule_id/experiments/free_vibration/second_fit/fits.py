@@ -16,6 +16,7 @@ from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, w
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.experiments.free_vibration.starts import first_turning_point
 from capsule_id.experiments.linear import LOG_2PI
+from capsule_id.interruption import stop_if_interrupted
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -219,6 +220,7 @@ class Screening:
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
+            stop_if_interrupted()
             sign = np.where(z > high - 2.0 * STEP, -1.0, 1.0)
             whole = np.tile(start, (len(NAMES) + 1, 1))
             whole[: len(free) + 1, free] = np.concatenate([z[None], z + STEP * np.diag(sign)])

@@ -20,6 +20,7 @@ from capsule_id.experiments.free_vibration.decay_models import rates
 from capsule_id.experiments.free_vibration.readings.blocks import block_size
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
 from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
+from capsule_id.physics.batches import pool
 from capsule_id.records.noise import noise_level
 from capsule_id.views import Finding
 
@@ -129,12 +130,15 @@ class Ranking:
 
 def rank(screenings: Sequence[Screening], models: Iterable[DecayModel], near: Ranking | None = None) -> list[Ranking]:
     """Fit every model to all records, from the values of ``near``; lowest BIC first."""
-    found = []
-    for model in models:
-        starts = [None] * len(screenings) if near is None else [z for _, z in near.fits]
+    starts = [None] * len(screenings) if near is None else [z for _, z in near.fits]
+
+    def fitted(model: DecayModel) -> Ranking:
         fits = tuple(one.fit(model, start) for one, start in zip(screenings, starts, strict=True))
-        found.append(Ranking(model, sum(screened.bic for screened, _ in fits), fits))
-    return sorted(found, key=lambda one: one.bic)
+        return Ranking(model, sum(screened.bic for screened, _ in fits), fits)
+
+    first, *others = models
+    # The first model compiles the programs that all threads then call.
+    return sorted([fitted(first), *pool().map(fitted, others)], key=lambda one: one.bic)
 
 
 def simplest(ranked: Sequence[Ranking]) -> Ranking:
