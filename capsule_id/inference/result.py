@@ -18,6 +18,9 @@ from capsule_id.views import Points as Points
 from capsule_id.views import ResultTable as ResultTable
 from capsule_id.views import Trust as Trust
 
+#: Begins the name of an input that is a reading with an sd in rig.toml, such as a weighing.
+STATED = "stated value of "
+
 
 @dataclass(frozen=True)
 class PointFit:
@@ -36,6 +39,7 @@ class PointFit:
     log_posterior : (s,) at the ends
     at_other_maximum : (s,) bool: this start ended at a maximum other than the best one
     stalled : (s,) bool: the solver reported no convergence from this start
+    shares : by parameter, the share of every table and every prior in its variance; see ``fit.variance_shares``
     """
 
     names: tuple[str, ...]
@@ -48,6 +52,7 @@ class PointFit:
     log_posterior: np.ndarray
     at_other_maximum: np.ndarray
     stalled: np.ndarray
+    shares: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def agree(self) -> bool:

@@ -24,6 +24,7 @@ from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares
 from capsule_id.inference.fit.point_fit import AGREEMENT
+from capsule_id.inference.fit.variance_shares import variance_shares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.interruption import stop_if_interrupted
@@ -121,6 +122,7 @@ def joint_fit(
         log_posterior=value,
         at_other_maximum=_at_another_maximum(u, value, spread),
         stalled=np.array([not end.converged for end in ends]),
+        shares=variance_shares(target, fit.jacobian[0], target.residual_owners(u[best])),
     )
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
+from capsule_id.experiments.base import Experiment
 from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.curvature import (
     BATCH,
@@ -23,6 +24,7 @@ from capsule_id.inference.fit.curvature import (
     value_and_gradient,
 )
 from capsule_id.inference.fit.least_squares import Solver, least_squares
+from capsule_id.inference.fit.variance_shares import variance_shares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.interruption import stop_if_interrupted
@@ -77,17 +79,19 @@ def point_fit(
     root = root_of_inverse(-hessian(target.batch, u[best], scale))
     spread = np.sqrt(np.sum(root**2, axis=1))
     theta = target.theta(u[best])
+    at_fit = residual_jacobian(target, u[best])[:, located]
     return PointFit(
         names=target.names,
         u=u[best],
         values=dict(zip(target.names, (float(v) for v in theta), strict=True)),
         covariance=root @ root.T,
-        standard_errors=_standard_errors(target, u[best], theta),
+        standard_errors=_standard_errors(target, at_fit, theta),
         starts=starts,
         ends=u,
         log_posterior=value,
         at_other_maximum=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
         stalled=~converged | ~np.isfinite(value),
+        shares=variance_shares(target, at_fit, _owners(target, theta)),
     )
 
 
@@ -149,14 +153,21 @@ def residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     return jacobian(target.plain_residuals, u, _steps(target))
 
 
-def _standard_errors(target: LogPosterior, u: np.ndarray, theta: np.ndarray) -> dict[str, float]:
-    """Standard errors from the Jacobian of the standardised residuals, scatters fixed; NaN for scatters; SI.
+def _owners(target: LogPosterior, theta: np.ndarray) -> list[Experiment | None]:
+    """Experiment of every entry of ``plain_residuals`` at theta (d,); None: a prior."""
+    values = target.mapping(theta)
+    sizes = [np.size(e.residuals(e.local(values), np)) for e in target.experiments]
+    owners = [e for e, size in zip(target.experiments, sizes, strict=True) for _ in range(size)]
+    return [*owners, *[None] * target.dimension]
+
+
+def _standard_errors(target: LogPosterior, at_fit: np.ndarray, theta: np.ndarray) -> dict[str, float]:
+    """Standard errors from the Jacobian ``at_fit`` (n, located) of the residuals; NaN for scatters; SI.
 
     The error of a parameter sampled through its logarithm is its relative error times its value.
     """
     located = ~target.scatter
-    at_fit = residual_jacobian(target, u)[:, located]
-    errors = np.full(len(u), np.nan)
+    errors = np.full(len(theta), np.nan)
     matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
     errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
     return dict(zip(target.names, (float(e) for e in errors), strict=True))

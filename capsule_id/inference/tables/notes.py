@@ -6,6 +6,7 @@ import pandas as pd
 
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.verdict import declared
+from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables.run_notes import precision_gained, smoothing_certificate
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.views import ResultTable
@@ -29,8 +30,20 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
     if any(not e.bench for e in sampled.experiments) and not kinked:
         gained = precision_gained(target, fit, sampled.posterior, sampled.bench)
         of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
-    tables = [*of_runs, *of_bench, prior_table(target)]
+    tables = [*of_runs, *of_bench, *([] if kinked else share_table(target, fit)), prior_table(target)]
     return [*tables, predictive_table(sampled, predictive)] if sampled.draws else tables
+
+
+def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
+    """The two largest inputs of the variance of every physical parameter; [] where the fit knows none."""
+    rows = {}
+    for name in (row.name for row in target.parameters if row.physical and row.name in fit.shares):
+        (first, share), (second, other), *_ = sorted(fit.shares[name].items(), key=lambda item: -item[1])
+        rows[name] = [first, share, second, other]
+    frame = pd.DataFrame.from_dict(
+        rows, orient="index", columns=["largest input", "share", "second input", "share of it"]
+    )
+    return [ResultTable("parameters.shares", frame.round(3).rename_axis("parameter"))] * bool(rows)
 
 
 def prior_table(target: LogPosterior) -> ResultTable:

@@ -223,6 +223,13 @@ FIT_MESSAGES: Mapping[str, Message] = {
             "{penetration:g} m) would shift the estimates by this much (u: logarithm)."
         ),
     ),
+    "parameters.shares": Message(
+        "Where the sd comes from",
+        caption=(
+            "Share of the two largest inputs in the variance of each parameter, from the curvature at the maximum: a table, a "
+            "stated value with its sd (a weighing), or a prior."
+        ),
+    ),
     "parameters.priors": Message(
         "Priors",
         caption=(

@@ -58,6 +58,18 @@ def test_starts_agree_and_the_truth_lies_within_the_errors() -> None:
     assert max(map(abs, z.values())) < 3.5, z
 
 
+def test_shares_of_the_variance_tell_run_and_priors_apart() -> None:
+    """The share of a prior is the ratio of variances, posterior over prior, where no other input reads the parameter."""
+    target, fit = fitted()
+    variance = dict(zip(target.names, np.diag(fit.covariance), strict=True))
+    for name in ("k1", "c"):
+        shares = fit.shares[name]
+        prior = variance[name] / target.prior_sd[target.names.index(name)] ** 2
+        assert shares[f"prior of {name}"] == pytest.approx(prior, rel=1e-3)
+        assert sum(shares.values()) == pytest.approx(1.0)
+    assert max(fit.shares["G[run_2]"].items(), key=lambda item: item[1])[0] == "run_2"
+
+
 def test_the_likeliest_candidates_about_a_wrong_bench_lead_to_the_maximum() -> None:
     """Friction 30 % too low; over whole records the descent from there ends elsewhere (test_run_studies.py)."""
     target, fit = fitted()
