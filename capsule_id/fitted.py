@@ -58,7 +58,7 @@ class Fit(Result):
 
     def __repr__(self) -> str:
         rows = [row for row in table_rows(self.summary) if row.name not in MASSES]
-        shown = [f"{row.name} = {row.plus_minus('value', 'sd', row.decimals)} {row.unit}" for row in rows]
+        shown = [f"{row.name} = {row.quoted} {row.unit}" for row in rows]
         more = f", and {len(shown) - SHOWN_PARAMETERS} more" if len(shown) > SHOWN_PARAMETERS else ""
         synthetic = ", synthetic" if self.rig.synthetic else ""
         return f"<Fit of {self.rig.name}{synthetic}: {self.trust}; {', '.join(shown[:SHOWN_PARAMETERS])}{more}>"

@@ -57,4 +57,5 @@ def _row(entry: dict[str, Any]) -> dict[str, Any]:
         "upper": float("nan") if upper is None else float(upper),
     }
     words = {key: entry[key] for key in ("unit", "basis", "trust", "informed")}
+    words["quote"] = entry.get("quote", "sd")
     return {**words, "meaning": "", "standard_error": float("nan"), **values, **bounds}

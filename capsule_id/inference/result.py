@@ -142,9 +142,9 @@ class Result:
     ----------
     registry : kinds of the rig's experiments, which declare the texts of their panels and checks
     summary : a row per physical parameter (index ``name``), SI, missing numbers NaN; columns unit, meaning, value, sd,
-        basis, trust, paper, map, standard_error, mean, median, lower, upper, ess, ess_bulk, ess_tail, rhat, informed.
+        quote, basis, trust, paper, map, standard_error, mean, median, lower, upper, ess, ess_bulk, ess_tail, rhat, informed.
         Quote value and sd: the median and sd of the sample (basis "sample"), or the maximum and its standard error
-        (basis "point")
+        (basis "point"). Where ``quote`` is "interval", quote value, lower and upper: the posterior is skewed
     nuisances : the same columns for scatters and noise
     fixed : constants by name, SI
     observed : (n,) readings that enter the likelihood, SI, by label

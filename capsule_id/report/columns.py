@@ -49,8 +49,36 @@ class Row:
         return f"{centre} ± {self.number(error, decimals)}" if known else centre
 
     @property
+    def skewed(self) -> bool:
+        """Whether the interval describes the value, and its sd does not."""
+        return self.values["quote"] == "interval"
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """The ends of the 95 % interval."""
+        return self._printed("lower"), self._printed("upper")
+
+    @property
+    def quoted(self) -> str:
+        """What to quote: ``1421.3 ± 3.1``, or ``5.8 (2.1 to 20.5)`` where the posterior is skewed."""
+        if not self.skewed:
+            return self.plus_minus("value", "sd", self.decimals)
+        return f"{self._printed('value')} ({' to '.join(self.ends)})"
+
+    def _printed(self, column: str) -> str:
+        """A number with the row's decimals; of a skewed posterior with two digits of the short arm and of itself."""
+        if not self.skewed:
+            return self.number(column)
+        value, lower, upper = (float(self.values[name]) * self.scale for name in ("value", "lower", "upper"))
+        least = decimals_for(min(value - lower, upper - value))
+        own = decimals_for(abs(float(self.values[column]) * self.scale))
+        return self.number(column, None if least is None or own is None else max(least, min(own, least + 2)))
+
+    @property
     def concise(self) -> str:
         """Value and sd as ``1422.4(27) N/m``: the digits in parentheses count in the last place of the value."""
+        if self.skewed:
+            return self.quoted if self.unit == "1" else f"{self.quoted} {self.unit}"
         places = self.decimals
         centre, sd = self.number("value"), float(self.values["sd"]) * self.scale
         if places is None or decimals_for(sd) is None:
@@ -69,6 +97,11 @@ def table_rows(frame: pd.DataFrame) -> list[Row]:
     return [_row(name, values, largest[symbol_of(name)]) for name, values in rows.items()]
 
 
+def skewed_names(frame: pd.DataFrame) -> list[str]:
+    """Names of the parameters whose interval is to be quoted."""
+    return [row.name for row in table_rows(frame) if row.skewed]
+
+
 def _row(name: str, values: Mapping[Hashable, Any], magnitude: float) -> Row:
     scale, unit = prefix_for(str(values["unit"]), magnitude)
     sample, point = (decimals_for(float(values[column]) * scale) for column in ("sd", "standard_error"))
@@ -77,8 +110,7 @@ def _row(name: str, values: Mapping[Hashable, Any], magnitude: float) -> Row:
 
 
 def _interval(row: Row) -> str:
-    ends = row.number("lower"), row.number("upper")
-    return MISSING if MISSING in ends else " to ".join(ends)
+    return MISSING if MISSING in row.ends else " to ".join(row.ends)
 
 
 def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | None:
@@ -125,12 +157,13 @@ class OutputColumn:
 COLUMNS = (
     OutputColumn("meaning", "meaning", lambda row: row.values["meaning"], outputs=frozenset({"csv", "html"}), numeric=False),
     OutputColumn("unit", "unit", lambda row: row.unit, numeric=False),
-    OutputColumn("value", "value ± sd", lambda row: row.plus_minus("value", "sd", row.decimals)),
+    OutputColumn("value", "value ± sd", lambda row: row.quoted),
     OutputColumn("sd", outputs=FILES),
     OutputColumn(
         "sd_unwidened", "sd without model error", lambda row: row.number("sd_unwidened"), outputs=EVERYWHERE - {"console"}
     ),
     OutputColumn("widening", outputs=FILES),
+    OutputColumn("quote", outputs=FILES),
     OutputColumn("basis", outputs=FILES),
     OutputColumn("trust", "trust", lambda row: str(row.values["trust"]), numeric=False),
     OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from capsule_id.report.columns import columns_of, table_rows
+from capsule_id.report.columns import columns_of, skewed_names, table_rows
 from capsule_id.views import Trust
 
 #: Width of the table where standard output is no terminal.
@@ -41,6 +41,9 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = No
     rule = "-" * max(map(len, lines))
     left_out = ", ".join(table[0][shown:])
     more = textwrap.wrap(f"in a wider terminal and in report.html: {left_out}", max(width, 20)) if left_out else []
+    if skewed := skewed_names(summary):
+        names = f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"
+        more = [*textwrap.wrap(names, max(width, 20)), *more]
     return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:], *more])
 
 

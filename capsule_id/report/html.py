@@ -10,7 +10,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from capsule_id.inference.result import Result
-from capsule_id.report.columns import Output, columns_of, table_rows
+from capsule_id.report.columns import Output, columns_of, skewed_names, table_rows
 from capsule_id.report.console_table import verdict_text
 from capsule_id.report.gallery import Picture
 from capsule_id.report.texts.advice import next_steps
@@ -39,6 +39,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             result=result,
             answers=_answers(result),
             steps=next_steps(result),
+            skewed=skewed_names(result.summary),
             experiments=_experiments(result, pictures),
             sections={name: _section(pictures, name) for name in ("sample", "point_fit")},
             parameters=_parameters(result.summary),
@@ -78,7 +79,7 @@ def _answers(result: Result) -> list[dict[str, str]]:
             {
                 "name": row.name,
                 "meaning": str(row.values["meaning"]),
-                "value": row.plus_minus("value", "sd", row.decimals) + unit,
+                "value": row.quoted + unit,
                 "interval": columns["ci95"].text(row) if "ci95" in columns else MISSING,
                 "trust": str(row.values["trust"]),
                 "truth": known,

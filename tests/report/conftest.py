@@ -48,8 +48,8 @@ def _frame(rows: dict[str, tuple[str, str, float, float, float]], rng: np.random
     for name, (unit, meaning, value, sd, paper) in rows.items():
         mean = value + 0.1 * sd * rng.normal()
         table[name] = {
-            "unit": unit, "meaning": meaning, "value": mean, "basis": "sample", "trust": "trusted", "paper": paper,
-            "map": value, "standard_error": 0.97 * sd, "mean": mean,
+            "unit": unit, "meaning": meaning, "value": mean, "quote": "sd", "basis": "sample", "trust": "trusted",
+            "paper": paper, "map": value, "standard_error": 0.97 * sd, "mean": mean,
             "sd": sd, "median": mean, "lower": mean - 1.96 * sd, "upper": mean + 1.96 * sd,
             "ess": 4100.0 + 100 * rng.normal(), "ess_bulk": 4050.0, "ess_tail": 4010.0, "rhat": 1.002, **NOT_WIDENED,
             "informed": name not in ("m1", "m2"),

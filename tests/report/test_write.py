@@ -85,13 +85,13 @@ def test_parameters_json_has_the_agreed_shape(folder: Path, result: Result) -> N
     assert list(content["parameters"]) == list(result.summary.index)
     assert content["trust"] == "trusted"
     keys = [
-        "unit", "value", "sd", "sd_unwidened", "widening", "basis", "trust", "ci95", "paper", "map", "mean", "median",
+        "unit", "value", "sd", "sd_unwidened", "widening", "quote", "basis", "trust", "ci95", "paper", "map", "mean", "median",
         "ci95_unwidened", "ess", "ess_bulk", "ess_tail", "rhat", "informed",
     ]  # fmt: skip
     for name, entry in content["parameters"].items():
         row = result.summary.loc[name]
         assert list(entry) == keys
-        for key in ("value", "sd", "basis", "trust", "map", "mean", "median", "ess", "rhat"):
+        for key in ("value", "sd", "quote", "basis", "trust", "map", "mean", "median", "ess", "rhat"):
             assert entry[key] == row[key]  # not one digit is lost
         assert entry["ci95"] == [row["lower"], row["upper"]]
         assert entry["unit"] == row["unit"]

@@ -1,7 +1,7 @@
 """The parameter table and the nuisance table of a result."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -16,10 +16,13 @@ from capsule_id.inference.result import Posterior
 from capsule_id.parameters import Parameter, parameter
 
 SUMMARY_COLUMNS = (
-    "unit", "meaning", "value", "sd", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
+    "unit", "meaning", "value", "sd", "quote", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
     "upper", "ess", "ess_bulk", "ess_tail", "rhat", "informed", "widening", "sd_unwidened", "lower_unwidened",
     "upper_unwidened",
 )  # fmt: skip
+#: Ratio of the arms of a 95 % interval about the median above which value ± sd does not describe it. A log-normal
+#: distribution has it at a relative sd of 0.35.
+LARGEST_SKEW = 2.0
 
 
 def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -45,13 +48,15 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "informed": bool(known[i]),
         }
         entry |= {} if posterior is None else _sample_columns(posterior, i)
-        rows.append((row, entry | _widened(entry, sampled.widened.get(row.name), row.positive)))
+        entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
+        rows.append((row, {**entry, "quote": quote(entry, row.positive)}))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
         exact = dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value)
         errors = {"standard_error": 0.0, "sd": 0.0}
         said = {
             "basis": "point" if posterior is None else "sample",
+            "quote": "sd",
             "trust": "not judged" if posterior is None else "trusted",
         }
         entry = {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact, **errors, **said}
@@ -80,6 +85,19 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
             moved = value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
             found |= {end: moved, f"{end}_unwidened": limit}
     return found
+
+
+def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]:
+    """What describes a value beside it: its sd, or the 95 % interval of a skewed posterior.
+
+    ± describes no posterior where 2 sd below a positive value are not positive, or where one arm of the interval is
+    more than ``LARGEST_SKEW`` times as long as the other. Without a sample there is no interval to quote.
+    """
+    if "lower" not in entry:
+        return "sd"
+    short, long = sorted((entry["value"] - entry["lower"], entry["upper"] - entry["value"]))
+    outside = positive and entry["value"] <= 2.0 * entry["sd"]
+    return "interval" if outside or long > LARGEST_SKEW * short else "sd"
 
 
 def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:

@@ -1,9 +1,11 @@
 """What a paper or a thesis takes over from a result: methods paragraph, BibTeX entries, LaTeX table."""
 
+import re
+
 from capsule_id.experiments import select_tables
 from capsule_id.inference.result import Result
 from capsule_id.parameters import symbol_of
-from capsule_id.report.columns import table_rows
+from capsule_id.report.columns import skewed_names, table_rows
 from capsule_id.report.typography import MISSING
 
 #: The paper whose model and rig this package fits.
@@ -33,7 +35,8 @@ def methods_paragraph(result: Result) -> str:
         ensembles, draws, walkers, _ = result.posterior.draws.shape
         sentences.append(
             f"The posterior was sampled by {ensembles} independent ensembles of {walkers} walkers (emcee; {draws} stored draws "
-            f"each, largest split R-hat {max(result.posterior.rhat):.3f}). Values are posterior medians and sds."
+            f"each, largest split R-hat {max(result.posterior.rhat):.3f}). Values are posterior medians and sds"
+            + ("; of skewed posteriors, medians and central 95 % intervals." if skewed_names(result.summary) else ".")
         )
     verdict = (
         "No check of the data failed." if result.clean else "At least one check of the data failed; see the findings."
@@ -65,7 +68,8 @@ def latex_table(result: Result) -> str:
         known = result.registry.parameters.get(symbol_of(row.name))
         label = row.name.partition("[")[2].removesuffix("]").translate(_ESCAPES)
         symbol = f"${known.latex}$" if known else row.name.partition("[")[0].translate(_ESCAPES)
-        number = row.plus_minus("value", "sd", row.decimals).replace("±", r"\pm").replace(MISSING, "-")
+        number = row.quoted.replace(MISSING, "-")
+        number = re.sub(r"[-+.e\d]*\d", r"$\g<0>$", number) if row.skewed else f"${number}$".replace("±", r"\pm")
         unit = row.unit.replace("µ", r"\textmu ").replace("²", "$^2$").replace("^2", "$^2$")
-        lines.append(rf"{symbol}{f' ({label})' if label else ''} & {unit} & ${number}$ & {row.values['trust']} \\")
+        lines.append(rf"{symbol}{f' ({label})' if label else ''} & {unit} & {number} & {row.values['trust']} \\")
     return "\n".join([*lines, r"\end{tabular}"])
