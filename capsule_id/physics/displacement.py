@@ -1,7 +1,8 @@
 """Displacement of the capsule after many periods of a drive, as a progression test measures it.
 
 A lane runs in blocks of periods. Once the motion repeats from period to period, the remaining periods add the same
-displacement each. Lanes are sorted by period and run in chunks, because lanes of one setting need as many steps.
+displacement each. After every block the lanes that go on are sorted by their steps per period and form new chunks, so
+that few lanes wait for slower ones.
 """
 
 from collections.abc import Callable
@@ -19,8 +20,8 @@ from capsule_id.physics.drive import Drive
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Status, simulate, without_absent
 
-#: Periods of a block.
-BLOCK = 6
+#: Periods of a block: short, because the motion is compared with its repetition only at the end of a block.
+BLOCK = 3
 #: The motion repeats where the state changes by less than this part of itself over one period, dimensionless.
 REPEATS = 1e-5
 #: Bound on the steps of a block, 150 per period. Plausible motions need 15 to 45 per period; a motion that needs far
@@ -36,12 +37,20 @@ class Displacement(NamedTuple):
 
 
 class _Lane(NamedTuple):
-    """A run in progress: periods done, state (X1, Y1, X2, Y2) then, whether it goes on, its status; (L,) each."""
+    """A run in progress; (L,) each.
+
+    Attributes
+    ----------
+    done, state : periods done, and (X1, Y1, X2, Y2) then
+    active, status : whether the lane goes on; ``Status`` code
+    effort : steps per period in the last block; before the first block the period, s, which orders lanes alike
+    """
 
     done: Any
     state: tuple[Any, ...]
     active: Any
     status: Any
+    effort: Any
 
 
 def displacement(
@@ -87,40 +96,46 @@ def _folding(structure: Any) -> Callable[..., Displacement]:
 
 
 def _in_chunks(structure: Any, leaves: tuple[Any, ...]) -> Displacement:
-    """Run lanes (L,) in chunks of ``CHUNK``, sorted by period."""
+    """Run lanes (L,), ``CHUNK`` at a time, until none goes on."""
     lanes = leaves[0].shape[0]
-    order = jnp.argsort(stop_gradient(jax.tree.unflatten(structure, leaves)[-2]))
-    index = jnp.concatenate([order, jnp.repeat(order[-1:], -lanes % CHUNK)])
-    chunks = [leaf[index].reshape(-1, CHUNK) for leaf in leaves]
-    out = jax.lax.map(lambda one: _run(*jax.tree.unflatten(structure, one)), chunks)
-    back = jnp.argsort(order)
-    return Displacement(*(x.reshape(-1)[:lanes][back] for x in out))
-
-
-def _run(p: CapsuleParameters, e: Drive, law: FrictionLaw, r0: Any, period: Any, count: Any) -> Displacement:
-    """One chunk of lanes."""
-    omega = 2.0 * np.pi / period
-
-    def block(lane: _Lane) -> _Lane:
-        ahead = jnp.where(lane.active, jnp.minimum(float(BLOCK), count - lane.done), 0.0)
-        begin, end = lane.done * period, (lane.done + ahead) * period
-        times = jnp.stack([begin, end - jnp.where(ahead > 1.0, period, 0.0), end], 1)
-        t = simulate(p, e, times, lane.state, friction=law, max_steps=BLOCK_STEPS)
-        ends = [(x[:, 1], x[:, 2]) for x in (t.X1, t.Y1, t.X2, t.Y2)]
-        before, after = (
-            jnp.stack([X1 - X2, (Y1 - Y2) / omega, Y2 / omega]) for X1, Y1, X2, Y2 in zip(*ends, strict=True)
-        )
-        change, size = (jnp.sum(stop_gradient(x) ** 2, axis=0) for x in (after - before, after))
-        repeats = (ahead > 1.0) & (change <= REPEATS**2 * size)
-        done = lane.done + ahead
-        left = jnp.where(repeats, count - done, 0.0) * (ends[2][1] - ends[2][0])
-        new = (ends[0][1] + left, ends[1][1], ends[2][1] + left, ends[3][1])
-        state = tuple(jnp.where(lane.active, x, y) for x, y in zip(new, lane.state, strict=True))
-        status = jnp.where(lane.active, jnp.maximum(lane.status, t.status), lane.status)
-        usable = status <= Status.GRAZING
-        return _Lane(done, state, lane.active & usable & ~repeats & (done < count), status)
-
+    *system, r0, period, count = jax.tree.unflatten(
+        structure, [jnp.pad(x, (0, -lanes % CHUNK), "edge") for x in leaves]
+    )
     zero = jnp.zeros_like(period)
-    first = _Lane(zero, (r0 + zero, zero, zero, zero), count > 0.0, jnp.zeros(period.shape, jnp.int32))
-    last = jax.lax.while_loop(lambda lane: jnp.any(lane.active), block, first)
-    return Displacement(jnp.where(last.status <= Status.GRAZING, last.state[2], jnp.nan), last.status)
+    active = (count > 0.0) & (jnp.arange(len(zero)) < lanes)
+    state = _Lane(zero, (r0 + zero, zero, zero, zero), active, jnp.zeros(zero.shape, jnp.int32), stop_gradient(period))
+
+    def advance(state: _Lane) -> _Lane:
+        """One block of every active lane; the lanes of a chunk need about as many steps each."""
+        order = jnp.argsort(jnp.where(state.active, state.effort, jnp.inf))
+
+        def chunk(i: Any, state: _Lane) -> _Lane:
+            index = jax.lax.dynamic_slice_in_dim(order, i * CHUNK, CHUNK)
+            part, own = jax.tree.map(lambda x: x[index], (state, (*system, period, count)))
+            return jax.tree.map(lambda x, new: x.at[index].set(new), state, _block(part, *own))
+
+        return jax.lax.fori_loop(0, -(-jnp.sum(state.active) // CHUNK), chunk, state)
+
+    last = jax.lax.while_loop(lambda state: jnp.any(state.active), advance, state)
+    X2 = jnp.where(last.status <= Status.GRAZING, last.state[2], jnp.nan)
+    return Displacement(X2[:lanes], last.status[:lanes])
+
+
+def _block(lane: _Lane, p: CapsuleParameters, e: Drive, law: FrictionLaw, period: Any, count: Any) -> _Lane:
+    """Run a chunk of lanes for a block of periods; lanes that are not active stay as they are."""
+    omega = 2.0 * np.pi / period
+    ahead = jnp.where(lane.active, jnp.minimum(float(BLOCK), count - lane.done), 0.0)
+    begin, end = lane.done * period, (lane.done + ahead) * period
+    times = jnp.stack([begin, end - jnp.where(ahead > 1.0, period, 0.0), end], 1)
+    t = simulate(p, e, times, lane.state, friction=law, max_steps=BLOCK_STEPS)
+    ends = [(x[:, 1], x[:, 2]) for x in (t.X1, t.Y1, t.X2, t.Y2)]
+    before, after = (jnp.stack([X1 - X2, (Y1 - Y2) / omega, Y2 / omega]) for X1, Y1, X2, Y2 in zip(*ends, strict=True))
+    change, size = (jnp.sum(stop_gradient(x) ** 2, axis=0) for x in (after - before, after))
+    repeats = (ahead > 1.0) & (change <= REPEATS**2 * size)
+    done = lane.done + ahead
+    left = jnp.where(repeats, count - done, 0.0) * (ends[2][1] - ends[2][0])
+    new = (ends[0][1] + left, ends[1][1], ends[2][1] + left, ends[3][1])
+    state = tuple(jnp.where(lane.active, x, y) for x, y in zip(new, lane.state, strict=True))
+    status = jnp.where(lane.active, jnp.maximum(lane.status, t.status), lane.status)
+    active = lane.active & (status <= Status.GRAZING) & ~repeats & (done < count)
+    return _Lane(done, state, active, status, t.steps / jnp.maximum(ahead, 1.0))

@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -13,6 +14,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.drives.pulses import Pulses
@@ -70,6 +72,29 @@ def test_the_likelihood_is_that_of_correlated_normal_readings(folder: Path) -> N
     assert e.profile(THETA)(SCATTERS) == pytest.approx(float(e.log_likelihood(THETA)), abs=1e-6)
     other = {**SCATTERS, "discrepancy": 1e-3}
     assert e.profile(THETA)(other) == pytest.approx(float(e.log_likelihood({**THETA, **other})), abs=1e-6)
+
+
+@pytest.mark.parametrize("sessions", [1, 2, 5])
+def test_sums_over_groups_give_the_density_of_the_trials(sessions: int) -> None:
+    """The trials of settings and sessions at random, in one component and in several, against SciPy."""
+    rng = np.random.default_rng(sessions)
+    n, settings, scatters = 23, 4, np.array([[1e-3, 0.02], [0.1, 1.0]])
+    b = np.concatenate([np.arange(settings), rng.integers(settings, size=n - settings)])
+    # Of five sessions the first setting has two of its own and each other setting one: four components.
+    j = rng.integers(sessions, size=n) if sessions < 5 else np.where(b == 0, rng.integers(2, size=n), 1 + b)
+    setting, session = np.eye(settings)[b], np.eye(sessions)[j]
+    distance, mean, per_sd, disc = rng.normal(size=n), *rng.normal(size=(2, settings)), 0.3 * np.ones(settings)
+    fixed = 0.01 + rng.uniform(size=settings) ** 2
+    groups = TrialGroups(distance, setting, session)
+    assert groups.count.shape[0] == (4 if sessions == 5 else 1)
+    shared = (b[:, None] == b) * 0.09 + (j[:, None] == j) * np.outer(per_sd[b], per_sd[b])
+    expected = [
+        [multivariate_normal(mean[b], shared + np.diag(fixed[b] + t**2)).logpdf(distance) for t in row]
+        for row in scatters
+    ]
+    for xp in (np, jnp):
+        found = TrialMisfit(groups, mean, per_sd, fixed, disc).log_density(scatters, xp)
+        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-11)
 
 
 def test_without_a_column_a_session_is_a_block_of_equal_settings(folder: Path, tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from capsule_id.experiments.progression.declaration import (
     TRIAL_SCATTER,
     TRIAL_SD,
 )
+from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.panels import progression_panels
 from capsule_id.experiments.progression.trials import sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -68,6 +69,7 @@ class Progression(CapsuleForward):
     settings: np.ndarray
     setting: np.ndarray
     session: np.ndarray
+    groups: TrialGroups
     time: np.ndarray
     reading_variance: float
     force: float
@@ -90,6 +92,7 @@ class Progression(CapsuleForward):
         self.settings, index = np.unique(rows, axis=0, return_inverse=True)
         self.setting, self.time = np.eye(len(self.settings))[index], self.settings[:, 0] * self.settings[:, 1]
         self.session = sessions_of(table, rows)
+        self.groups = TrialGroups(self.distance, self.setting, self.session)
         stated = {name: getattr(table.settings, name) for name in (AMPLITUDE[self.drive], "lag")}
         exact = {name: q.value if q is not None and q.sd == 0.0 else 0.0 for name, q in stated.items()}
         self.force, self.lag = exact[AMPLITUDE[self.drive]], exact["lag"]
@@ -187,6 +190,15 @@ class Progression(CapsuleForward):
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         return (self.misfit_of(theta, *self.responses(theta), xp),)
 
+    def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[TrialMisfit]:
+        return (self.trials_of(theta, *self.responses(theta), xp),)
+
+    def trials_of(self, theta: ValuesBySymbol, mean: Any, per_sd: Any, xp: ModuleType = jnp) -> TrialMisfit:
+        """Likelihood of the trials at the responses ``mean`` and ``per_sd`` of ``responses``."""
+        mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
+        variance = self.reading_variance + (theta["trial_scatter"] * mean) ** 2
+        return TrialMisfit(self.groups, mean, per_sd, variance, theta["discrepancy"] * self.time)
+
     def misfit_of(self, theta: ValuesBySymbol, mean: Any, per_sd: Any, xp: ModuleType = jnp) -> Misfit:
         """The misfit at the responses ``mean`` and ``per_sd`` of ``responses``."""
         mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
@@ -205,7 +217,7 @@ class Progression(CapsuleForward):
         def log_likelihood(scatters: ValuesBySymbol) -> float:
             own = {**theta, **scatters}
             scale = own["session_sd"] / theta["session_sd"]
-            return float(self.misfit_of(own, mean, scale * per_sd, np).log_density(own["trial_sd"], np))
+            return float(self.trials_of(own, mean, scale * per_sd, np).log_density(own["trial_sd"], np))
 
         return log_likelihood
 
