@@ -17,6 +17,7 @@ from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.model import CapsuleParameters, simulate
 from tests.rig.faults import fault_of
@@ -95,6 +96,19 @@ def test_sums_over_groups_give_the_density_of_the_trials(sessions: int) -> None:
     for xp in (np, jnp):
         found = TrialMisfit(groups, mean, per_sd, fixed, disc).log_density(scatters, xp)
         np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-11)
+
+
+def test_new_values_need_no_new_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    e, traced = progression(folder), []
+
+    def counted(*arguments: Any) -> Any:
+        traced.append(arguments)
+        return displacement(*arguments)
+
+    monkeypatch.setattr("capsule_id.experiments.progression.experiment.displacement", counted)
+    before, after = (e.responses({**THETA, "mu": mu})[0] for mu in (0.2, 0.3))
+    assert len(traced) == 1
+    assert np.all(np.asarray(before) != np.asarray(after))
 
 
 def test_without_a_column_a_session_is_a_block_of_equal_settings(folder: Path, tmp_path: Path) -> None:

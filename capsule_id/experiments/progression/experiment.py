@@ -173,7 +173,8 @@ class Progression(CapsuleForward):
 
     def displacements(self, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
         """X2, m, at rows of ``settings`` (rows, 4) with friction multiplied by exp(s), s (rows,)."""
-        return _displacements(self, theta, s, settings).X2
+        # Numbers that are no arrays would be constants of the program: each new point would compile it anew.
+        return _displacements(self, {name: jnp.asarray(x) for name, x in theta.items()}, s, settings).X2
 
     def displacements_of_draws(
         self, draws: Sequence[ValuesBySymbol], s: np.ndarray, settings: np.ndarray
