@@ -67,6 +67,27 @@ def test_the_line_that_names_the_release_makes_the_fit_clean(tmp_path: Path) -> 
     assert abs(c["map"] - bench.C) < 4.0 * c["standard_error"]
 
 
+def test_a_push_before_the_release_is_left_out(tmp_path: Path) -> None:
+    """A hand raises the rod for 25 ms, from 70 % of the deflection. Fitted too, that shifts c by many sds."""
+    time = np.arange(1000) / 2000.0
+    raised = 2e-3 * np.cos(np.linspace(-np.arccos(0.7), 0.0, 50, endpoint=False))
+    values = np.concatenate([raised + 2e-5 * np.random.default_rng(5).standard_normal(50), decay(time[:950], 1)])
+    rig = read_rig(write(tmp_path / "rig", time, values), KINDS)
+    (finding,) = found(rig, "decays.release")
+    assert finding.level == "warn"
+    assert "slow approach" in text(finding)
+    (line,) = re.findall(r"start = \{.*?\}", text(finding))
+    stated = read_rig(write(tmp_path / "stated", time, values, line), KINDS)
+    assert found(stated, "decays.release") == []
+    result = cid.fit(rig, budget=None)
+    assert result.clean
+    for name, true in (("k1", bench.K1), ("c", bench.C)):
+        assert abs(result.summary.loc[name, "map"] - true) < 4.0 * result.summary.loc[name, "standard_error"]
+    # Negative control: with the push, the record is not called clean.
+    kept = read_rig(write(tmp_path / "kept", time, values, 'start = { value = 0.0, unit = "s" }'), KINDS)
+    assert not cid.fit(kept, budget=None).clean
+
+
 def test_the_line_that_names_a_second_excitation_ends_the_decay_there(tmp_path: Path) -> None:
     time = np.arange(2000) / 2000.0
     values = np.concatenate([decay(time[:800], 1), decay(time[:1200], 2)])

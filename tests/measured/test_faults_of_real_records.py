@@ -38,7 +38,21 @@ def test_the_rest_before_the_release_of_the_ship_model_is_found(tmp_path: Path, 
     assert rest == set()
 
 
-@pytest.mark.parametrize("record", [1, 2, 3])
-def test_the_pendulum_has_no_fault_but_its_unit(tmp_path: Path, record: int) -> None:
-    """Radians, relabelled as metres: the magnitude is unusual, and nothing else is."""
-    assert codes(rig_of(tmp_path, pendulum(record), {})) == {"readings.magnitude"}
+@pytest.mark.parametrize(("record", "start"), [(1, 0.24), (2, None), (3, 0.124)])
+def test_the_pendulum_has_no_fault_but_its_unit_and_the_hand_that_raises_it(
+    tmp_path: Path, record: int, start: float | None
+) -> None:
+    """Radians, relabelled as metres: the magnitude is unusual.
+
+    Records 1 and 3 begin while a hand raises the pendulum: it approaches the first turning point at half the speed at
+    which it leaves it.
+    """
+    rig = rig_of(tmp_path / "whole", pendulum(record), {})
+    found = {f.code: f for f in lint(rig, KINDS, rig.tables) if f.level != "ok"}
+    if start is None:
+        assert set(found) == {"readings.magnitude"}
+        return
+    assert set(found) == {"readings.magnitude", "decays.release"}
+    assert found["decays.release"].facts["start"] == pytest.approx(start, abs=0.02)
+    cut = {"start": quantity(found["decays.release"].facts["start"], "s")}
+    assert codes(rig_of(tmp_path / "cut", pendulum(record), cut)) == {"readings.magnitude"}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
 from capsule_id.records.faults.phase import phase_jump
@@ -52,6 +53,14 @@ def test_clipped_tops_are_found_and_smooth_ones_are_not(make: object, level: flo
 def test_a_held_deflection_is_no_clipping() -> None:
     held = np.concatenate([np.full(400, 2.0), decay(noise=0.0)])
     assert clipped_samples(held, SAMPLES) == []
+
+
+def test_a_record_that_begins_on_its_coarsely_read_top_is_not_clipped() -> None:
+    """It holds the whole top, longer by some samples before the release, and the values below it of one side only."""
+    swing = 0.01 * np.round(200.0 * np.cos(0.2 * 2.0 * np.pi / PERIOD * TIME[:400]))
+    begun = np.concatenate([np.full(12, 2.0), swing])
+    assert clipped_samples(begun, 5.0 * SAMPLES) == []
+    assert len(clipped_samples(np.clip(begun, -2.0, 1.9), 5.0 * SAMPLES)) == 1
 
 
 def test_gaps_are_multiples_of_the_sampling_step() -> None:
@@ -151,6 +160,46 @@ def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
         found = find_free_decay(TIME, make())
         assert found is not None
         assert (found.start, found.rest, found.stop) == (0.0, 0.0, None)
+
+
+def pushed(slowing: float, release: float = 0.3 * PERIOD) -> np.ndarray:
+    """A decay (800,) after a push from 70 % of the first deflection to all of it; x slows down by this factor."""
+    rise = np.linspace(-np.arccos(0.7), 0.0, round(release * slowing * RATE), endpoint=False)
+    free = decay(time=TIME[: 800 - len(rise)])
+    return np.concatenate([2.0 * np.cos(rise) + 0.02 * np.random.default_rng(2).standard_normal(len(rise)), free])
+
+
+@pytest.mark.parametrize("slowing", [1.0, 1.4])
+def test_a_slow_push_to_the_first_turning_point_is_no_free_decay(slowing: float) -> None:
+    time, values = TIME[:800], pushed(slowing)
+    found = find_free_decay(time, values, displacement=True)
+    assert found is not None
+    assert found.pushed
+    assert found.rest == found.start == pytest.approx(0.3 * PERIOD * slowing, abs=0.05 * PERIOD)
+    inside = time >= found.start
+    again = find_free_decay(time[inside], values[inside], displacement=True)
+    assert again is not None
+    assert (again.pushed, again.rest) == (False, 0.0)
+    # Velocities and accelerations do not show it.
+    other = find_free_decay(time, values)
+    assert other is not None
+    assert not other.pushed
+
+
+def test_a_decay_recorded_from_any_phase_is_not_pushed() -> None:
+    """Viscous, dry, quadratic damping and cubic springs, in white and correlated noise."""
+    rng = np.random.default_rng(0)
+    time, found = np.arange(250) / 500.0, 0
+    for more in ({}, {"F_dry": 0.05 * K1 * 2e-3}, {"c_q": 20.0}, {"k_cubic": 0.3 * K1 / 4e-6}):
+        for _ in range(25):
+            forces = {"k1": K1, "c": rng.choice([0.3, 1.0]), "m1": M1, **more}
+            x = rubbed(time + rng.uniform(0.0, PERIOD), forces, 2e-3, 0.0, 40).x_rel
+            rho = rng.choice([0.0, 0.9, 0.98])
+            noise = signal.lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time)))
+            free = find_free_decay(time, np.asarray(x) + 4e-5 * noise, displacement=True)
+            assert free is not None
+            found += free.pushed
+    assert found == 0
 
 
 def test_a_drift_of_the_zero_is_no_rest() -> None:

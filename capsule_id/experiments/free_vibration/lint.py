@@ -39,7 +39,7 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         return
     channels = [name for name in table.columns if name != "time"]
     time = table["time"]
-    decay = find_free_decay(time[used], table[channels[0]][used])
+    decay = find_free_decay(time[used], table[channels[0]][used], displacement=channels[0] == "x_rel")
     period = np.inf if decay is None else decay.period
     faults = [found for name in channels for found in lint_channel(table, name, used, period)]
     if decay is not None:
@@ -121,7 +121,8 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
     """Report rest before the release, and a second excitation; a ``faulty`` record may feign the latter."""
     start, stop = release_time(decay), decay.stop
     if decay.rest > 0.0:
-        facts = {"file": table.file, "rest": decay.rest, "start": start, "found": decay.start}
+        before = "slow approach to the first turning point" if decay.pushed else "rest or excitation"
+        facts = {"file": table.file, "rest": decay.rest, "start": start, "found": decay.start, "before": before}
         yield Finding("decays.release", "warn" if table.settings.start is None else "fail", facts, table.label)
     if stop is not None and not faulty:
         digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
@@ -187,13 +188,13 @@ MESSAGES = {
     "decays.release": Message(
         "release of a decay",
         warn=(
-            "a free decay must begin with its release; found {rest:.4g} s of rest or excitation before it. The fit leaves "
-            "them out. To confirm that, add this line to the experiment in rig.toml: "
+            "a free decay must begin with its release; found {rest:.4g} s of {before} before it. The fit leaves "
+            "that out. To confirm that, add this line to the experiment in rig.toml: "
             + _line("start")
             + ". To keep a longer part, state an earlier start."
         ),
         fail=(
-            "a free decay must begin with its release; found {rest:.4g} s of rest or excitation after the stated start. "
+            "a free decay must begin with its release; found {rest:.4g} s of {before} after the stated start. "
             "Write this line in the experiment in rig.toml: " + _line("start")
         ),
     ),

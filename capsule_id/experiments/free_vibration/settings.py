@@ -153,7 +153,7 @@ def cut_at_release(table: Table[DecaySettings]) -> Table[DecaySettings]:
     settings = table.settings
     if settings.start is not None or settings.samples != "record":
         return table
-    decay = find_free_decay(*decay_window(table))
+    decay = find_free_decay(*decay_window(table), displacement=channel_of(table) == "x_rel")
     if decay is None or decay.rest == 0.0:
         return table
     return replace(table, settings=replace(settings, start=release_time(decay)))

@@ -62,6 +62,8 @@ def _at_limit(
         found.append(part.start + np.flatnonzero(depth <= tolerance))
         near += int(np.sum(depth <= (NEIGHBOURS + 0.25) * step)) - len(found[-1]) if step > 0.0 else 0
     rows = np.concatenate(found)
+    # A record that begins at its limit lacks the neighbouring values of one side.
+    near *= 2 if len(rows) and rows[0] == 0 else 1
     if len(rows) < FEWEST_CLIPPED + EXCESS * near / NEIGHBOURS:
         return rows[:0]
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)

@@ -1,4 +1,4 @@
-"""Finds the free decay inside a record: rest before the release, and a second excitation after it."""
+"""Finds the free decay inside a record: rest or a push before the release, and a second excitation after it."""
 
 import itertools
 from dataclasses import dataclass
@@ -23,6 +23,12 @@ DEPARTURE = 0.05
 FIRST_HEIGHT = 0.9
 #: A release from a held deflection: the deflection is at least this fraction of the largest half cycle.
 HELD_HEIGHT = 0.8
+#: Fractions of the first turning point's height between which the motion before it is compared with that after it.
+LOW_HEIGHT, HIGH_HEIGHT = 0.6, 0.95
+#: A free decay is faster before a turning point than after it. From this ratio of durations on, a push has slowed it.
+PUSHED = 1.2
+#: Standard errors of a duration that noise explains.
+DURATION_ERRORS = 4.0
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class FreeDecay:
         record begins with free decay
     stop : time at which another excitation begins, s; None where there is none
     rest : duration of rest and excitation before ``start``, s; 0 where the record begins with the free decay
+    pushed : whether the record begins with a push towards its first turning point, ``start``
     period : of the oscillation, s
     """
 
@@ -42,15 +49,17 @@ class FreeDecay:
     stop: float | None
     rest: float
     period: float
+    pushed: bool = False
 
 
-def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
+def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = False) -> FreeDecay | None:
     """Return the free decay inside a record; None where fewer than four half cycles exceed the noise.
 
     Parameters
     ----------
     time : (n,) s, increasing, evenly or unevenly spaced
     values : (n,) displacement, velocity or acceleration
+    displacement : whether they are displacements; only these show a push before the first turning point
     """
     time, values = _shortened(time, values)
     even = np.linspace(time[0], time[-1], len(time))
@@ -74,8 +83,10 @@ def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
     largest = 0 if begins else int(np.argmax(heights >= FIRST_HEIGHT * np.max(heights)))
     held = abs(float(np.median(on_grid[: moves + 1])) - level) >= HELD_HEIGHT * heights[largest]
     start = float(moving_time[0]) if held else float(times[largest])
+    pushed = displacement and largest == 0 and _pushed(even, on_grid - level, float(times[0]), period, noise)
+    start = float(times[0]) if pushed else start
     before = start - float(time[0])
-    starts_at_once = before < SHORTEST_REST * period
+    starts_at_once = before < SHORTEST_REST * period and not pushed
     later, height = times[largest:], heights[largest:]
     floor = max(NOISE_HEIGHT * noise, 0.25 * REST_HEIGHT * height[0])
     # The energy of a free decay never grows. Two half cycles must show it, so that one disturbed reading does not.
@@ -84,7 +95,38 @@ def find_free_decay(time: np.ndarray, values: np.ndarray) -> FreeDecay | None:
     grown = (height > GROWTH * lowest + floor) & (height > 2.0 * floor)
     twice = np.flatnonzero(grown[1:] & grown[:-1])
     stop = float(later[max(twice[0] - 1, 0)]) if len(twice) else None
-    return FreeDecay(float(time[0]) if starts_at_once else start, stop, 0.0 if starts_at_once else before, period)
+    start, before = (float(time[0]), 0.0) if starts_at_once else (start, before)
+    return FreeDecay(start, stop, before, period, pushed)
+
+
+def _pushed(time: np.ndarray, values: np.ndarray, turning: float, period: float, noise: float) -> bool:
+    """Whether the record approaches its first turning point more slowly than it leaves it.
+
+    At every displacement a free rod has more kinetic energy before the turning point than after it, whatever its spring
+    and its damping. So it takes no longer from one displacement to the other.
+
+    Parameters
+    ----------
+    time, values : (n,) s, evenly spaced, and displacements from the rest position
+    turning : time of the turning point, s
+    noise : sd of a reading
+    """
+    step = time[1] - time[0]
+    width = max(1, int(period / step / 16.0))
+    smooth = np.convolve(values, np.full(width, 1.0 / width), mode="valid")
+    top = int(np.clip(round((turning - time[0]) / step) - width // 2, 0, len(smooth) - 1))
+    size = abs(float(smooth[top]))
+    height = np.sign(smooth[top]) * smooth / size
+    low = max(LOW_HEIGHT, float(height[0]))
+    falls = [np.flatnonzero(height[top:] < level) for level in (HIGH_HEIGHT, low)]
+    if low >= HIGH_HEIGHT or not all(len(fall) for fall in falls):
+        return False
+    rise = int(np.argmax(height >= HIGH_HEIGHT)) - int(np.argmax(height >= low))
+    fall = int(falls[1][0] - falls[0][0])
+    # The slope of the height is least at the high level; two crossings have errors on each side.
+    slope = 2.0 * np.pi / period * np.sqrt(1.0 - HIGH_HEIGHT**2)
+    error = 2.0 * noise / np.sqrt(width) / size / slope
+    return bool((rise - PUSHED * fall) * step > DURATION_ERRORS * error + step)
 
 
 def _shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
