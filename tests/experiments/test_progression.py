@@ -106,8 +106,10 @@ def test_new_values_need_no_new_program(folder: Path, monkeypatch: pytest.Monkey
         return displacement(*arguments)
 
     monkeypatch.setattr("capsule_id.experiments.progression.experiment.displacement", counted)
-    before, after = (e.responses({**THETA, "mu": mu})[0] for mu in (0.2, 0.3))
-    assert len(traced) == 1
+    before = e.responses({**THETA, "mu": 0.2})[0]
+    traced.clear()  # The first program may be older than this test.
+    after = e.responses({**THETA, "mu": 0.3})[0]
+    assert not traced
     assert np.all(np.asarray(before) != np.asarray(after))
 
 
