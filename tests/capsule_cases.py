@@ -1,12 +1,14 @@
 """The reference cases as data: made by another program, checked against SciPy to 2e-12 m."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from capsule_id.inference.target.compiling import COMPILE_QUICKLY
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 
 PARAMETERS = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g")
@@ -49,6 +51,11 @@ def read_cases() -> Cases:
         np.array([case["states_at_period_ends"] for case in raw]),
         np.array([case["contacts_in_10_periods"] for case in raw]),
     )
+
+
+def jit_quickly(function: Callable) -> Callable:
+    """``jax.jit`` without optimisation: for derivatives of short runs, which compile for longer than they run."""
+    return jax.jit(function, compiler_options=dict(COMPILE_QUICKLY))
 
 
 def states_of(t: Trajectory) -> np.ndarray:

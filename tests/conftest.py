@@ -4,6 +4,7 @@ Compiled programs are kept in one cache. Arrays of different ranks are not broad
 The shapes and types that ``CHECKED`` modules annotate hold for every call.
 """
 
+import gc
 import os
 import shutil
 import tempfile
@@ -13,10 +14,17 @@ import pytest
 from jaxtyping import install_import_hook
 
 from capsule_id.commands.compilation import XLA_EMITTER_OPTION
+from capsule_id.inference.target.compiling import HAS_EMITTER_OPTION
 from tests.capsule_cases import Cases, read_cases
 
 #: Programs that take longer than this to compile, s, are kept.
 WORTH_KEEPING = "0.3"
+
+#: A program in one part costs a tenth less CPU time to compile than one that is compiled by several threads.
+XLA_ONE_PART = "--xla_cpu_parallel_codegen_split_count=1" if HAS_EMITTER_OPTION else ""
+
+#: Files that take longest, first: the workers then end at the same time.
+FIRST = ("test_project.py", "test_notebooks.py", "test_notebooks_even.py", "test_foreign_law.py", "test_smooth.py")
 
 #: Modules whose annotations are checked at run time; the hook must stand before their first import.
 CHECKED = (
@@ -43,13 +51,23 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # As the commands do; benchmarks time the options that their caller sets.
     if config.getoption("markexpr") != "benchmark":
-        os.environ.setdefault("XLA_FLAGS", XLA_EMITTER_OPTION)
+        os.environ.setdefault("XLA_FLAGS", f"{XLA_EMITTER_OPTION} {XLA_ONE_PART}".strip())
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     folder = tempfile.mkdtemp(prefix="capsule-id-compiled-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = WORTH_KEEPING
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage less often, and not what was imported: traces are large trees, and each pass walks them all."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 @pytest.fixture(scope="session")

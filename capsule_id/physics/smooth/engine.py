@@ -204,7 +204,8 @@ def kernel(
 ) -> Callable[..., Trajectory]:
     """The smoothed engine on lanes: ``(p, e, law, initial, times) -> Trajectory``, see ``model.simulate``.
 
-    smoothing : widths, default the certified ones; they are traced, so that new widths need no compilation
+    smoothing : widths, default the certified ones; they are traced, all as float64: new widths need no compilation
     max_steps : bound on the steps that a lane may try
     """
-    return partial(_compiled(semantics, max_steps), smoothing or Smoothing())
+    widths = jax.tree.map(lambda width: jnp.asarray(width, float), smoothing or Smoothing())
+    return partial(_compiled(semantics, max_steps), widths)
