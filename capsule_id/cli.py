@@ -80,6 +80,21 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
 
 def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], arguments: Sequence[str] | None) -> int:
     """Parse and act. Every end gives an exit code and at most one line on standard error."""
+    try:
+        return _act(program, make_parser, arguments)
+    except console.OutputError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return INTERNAL
+
+
+def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], arguments: Sequence[str] | None) -> int:
+    """Parse and act.
+
+    Raises
+    ------
+    OutputError
+        If standard output takes no more text.
+    """
     console.prepare()
     interrupted = f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}"
     try:
@@ -88,6 +103,8 @@ def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
             args = make_parser(program).parse_args(arguments)
             warnings.showwarning = partial(_show_warning, program)
             return args.run(args)
+    except console.OutputError:
+        raise
     except SystemExit as stop:  # of the parser
         console.finish()
         return int(stop.code or 0)

@@ -47,11 +47,21 @@ def finish() -> None:
         _discard(error)
 
 
+class OutputError(Exception):
+    """Standard output takes no more text, for instance on a full disk. The message is one line."""
+
+
 def _discard(error: OSError) -> None:
-    """Discard what follows if ``error`` is a closed pipe, which Windows calls an invalid argument."""
-    if error.errno not in (errno.EPIPE, errno.EINVAL):
-        raise error
+    """Discard what follows; a closed pipe, which Windows calls an invalid argument, is no error.
+
+    Raises
+    ------
+    OutputError
+        For any other error.
+    """
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if error.errno not in (errno.EPIPE, errno.EINVAL):
+        raise OutputError(f"standard output cannot be written: {error.strerror}; direct it elsewhere") from error
 
 
 class Progress:

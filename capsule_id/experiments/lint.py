@@ -29,9 +29,11 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     findings += lint_rig_quantities(rig)
     for table in tables:
         findings += lint_magnitudes(table, kinds[table.kind])
-        if table.encoding == WINDOWS:
-            facts = {"file": table.file, "encoding": table.encoding}
-            findings.append(Finding("readings.encoding", "ok", facts, table.label))
+        windows = {file: encoding for file, encoding in table.encodings.items() if encoding == WINDOWS}
+        findings += [
+            Finding("readings.encoding", "ok", {"file": file, "encoding": encoding}, table.label)
+            for file, encoding in windows.items()
+        ]
         if table.missing:
             facts = {"file": table.file, "rows": table.missing, "used": len(table.rows)}
             findings.append(Finding("readings.missing", "warn", facts, table.label))

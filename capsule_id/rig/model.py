@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
@@ -115,7 +115,7 @@ class Table(Generic[S]):
     bench : its kind is a bench test; else a forced run
     missing, other : rows of the files that a column map drops: for a missing cell, and outside ``where``
     rejected : rows dropped as outliers, by the rule ``reject``
-    encoding : of a text
+    encodings : of its texts, by file
     """
 
     kind: str
@@ -128,7 +128,7 @@ class Table(Generic[S]):
     missing: int = 0
     other: int = 0
     rejected: int = 0
-    encoding: str = "UTF-8"
+    encodings: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""

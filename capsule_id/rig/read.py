@@ -1,6 +1,7 @@
 """Reads a rig folder into a ``Rig``: ``rig.toml`` by the rules of the kinds, tables in SI, rules between tables."""
 
 import hashlib
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -194,7 +195,7 @@ def _default_labels(entries: Sequence[Any]) -> list[str]:
         stated = {} if not isinstance(entry, dict) or "label" in entry else entry
         files = stated.get("files")
         name = files[0] if isinstance(files, list) and files else stated.get("file")
-        paths.append(Path(name) if isinstance(name, str) else Path())
+        paths.append(Path(os.path.normpath(name)) if isinstance(name, str) else Path())
     folders = {path.stem: {other.parent for other in paths if other.stem == path.stem} for path in paths}
     return ["_".join((*path.parent.parts, path.stem)) if len(folders[path.stem]) > 1 else path.stem for path in paths]
 
@@ -224,7 +225,7 @@ def _read_experiment(
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else label
     columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
     _refuse_reading_errors_without_column(document, path, entry, errors, file)
-    dropped = file.missing, file.other, file.rejected, file.raw.encoding
+    dropped = file.missing, file.other, file.rejected, file.encodings
     table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows, kind.bench, *dropped)
     for rule in kind.rules:
         rule(Entry(table, document, path, file))

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -42,6 +42,7 @@ class TableFile:
     file_of : (row index or None for the header, column index) -> the file, for error lines
     missing, other : rows that a column map drops: for a missing cell, and outside ``where``
     rejected : rows dropped as outliers
+    encodings : of the texts, by name in ``rig.toml``
     """
 
     sha256: Mapping[str, str]
@@ -51,6 +52,7 @@ class TableFile:
     missing: int = 0
     other: int = 0
     rejected: int = 0
+    encodings: Mapping[str, str] = field(default_factory=dict)
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""
@@ -117,10 +119,11 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
     else:
         _check_map_names(document, path, column_map, kind, plateaus)
         layout = column_map.layout
-        mapped = apply_map(
-            document, path, [EXPORTS[suffix_of(file)](file, file, layout) for file in files.values()], column_map
-        )
-        table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other)
+        exports = {name: EXPORTS[suffix_of(file)](file, file, layout) for name, file in files.items()}
+        mapped = apply_map(document, path, list(exports.values()), column_map)
+        encodings = {name: export.encoding for name, export in exports.items()}
+        del exports
+        table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other, encodings=encodings)
     if (clock := read_clock(document, path, entry)) is not None:
         table = replace(table, raw=on_reference(document, path, table.raw, clock))
     if rejection is not None:
@@ -178,7 +181,7 @@ def _read_plain(
         raise document.error(place, f"a {suffix} file needs a column map", "no columns", remedy)
     try:
         raw = READERS[suffix](file, file)
-        table = TableFile(hashes, raw, {}, lambda row, column: file)
+        table = TableFile(hashes, raw, {}, lambda row, column: file, encodings={next(iter(hashes)): raw.encoding})
         _check_names(raw.names, kind, lambda name, *text: table.error(None, name, *text))
     except InputError as error:
         if error.line != 1:
@@ -214,7 +217,6 @@ def _without_outliers(document: TomlDocument, path: KeyPath, table: TableFile, r
         tuple(column[keep] for column in raw.columns),
         raw.rows[keep],
         lambda row, column: raw.place(None if row is None else int(keep[row]), column),
-        raw.encoding,
     )
     return replace(_with_rows(table, kept, keep), rejected=len(raw.rows) - len(keep))
 

@@ -226,3 +226,19 @@ check.run = act
     assert (done.returncode, done.stdout) == (0, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith("capsule-id: warning: RuntimeWarning: overflow encountered (")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
+@pytest.mark.parametrize("words", [("check", str(DATA)), ("init", "rig")])
+def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, words: tuple[str, ...]) -> None:
+    """Before: an internal failure with a traceback."""
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            argv(*words, name="capsule_id"), cwd=tmp_path, env=environment(), stdout=full, stderr=subprocess.PIPE,
+            text=True, timeout=120, check=False,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert (
+        done.stderr == "capsule-id: standard output cannot be written: No space left on device; direct it elsewhere\n"
+    )
+    assert (tmp_path / "rig").is_dir() == (words[0] == "init")  # what was asked for is done

@@ -1,5 +1,7 @@
 """Detectors of faulty readings: each finds its fault in a decay, and finds nothing without it."""
 
+from time import process_time
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -123,6 +125,19 @@ def test_few_lost_samples_show_in_a_quiet_record() -> None:
     jump = phase_jump(values, SAMPLES)
     assert jump is not None
     assert abs(jump.row - 80) <= 5
+
+
+def test_a_jump_of_an_oversampled_record_is_found_in_a_second() -> None:
+    """2 Hz at 100 kHz, 10 s: the sums of products of 12,500 samples at every place took minutes of CPU time."""
+    period, lost = 50_000.0, 600_000
+    time = np.arange(1_000_000) / period
+    x = np.exp(-time / 8.0) * np.cos(2.0 * np.pi * time) + 1e-3 * np.random.default_rng(0).standard_normal(time.size)
+    began = process_time()
+    assert phase_jump(x, period) is None
+    jump = phase_jump(np.delete(x, slice(lost, lost + 4000)), period)
+    assert jump is not None
+    assert abs(jump.row - lost) < 0.1 * period
+    assert process_time() - began < 20.0
 
 
 @pytest.mark.parametrize("correlation", [0.5, 0.7, 0.95, 0.98])

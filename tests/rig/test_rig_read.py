@@ -184,6 +184,17 @@ def test_files_of_one_name_in_several_folders_have_labels_of_their_own(tmp_path:
         read_rig(tmp_path)
 
 
+def test_a_label_has_no_dots_of_a_path(tmp_path: Path) -> None:
+    """``a/../b/tilt.csv`` had the label ``a_.._b_tilt``."""
+    (tmp_path / "rig.toml").write_text('[rig]\nname = "r"\n', encoding="utf-8")
+    with (tmp_path / "rig.toml").open("a", encoding="utf-8") as file:
+        for number, name in enumerate(["a/tilt.csv", "a/../b/tilt.csv", "./slow.csv"]):
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(f"angle [deg]\n{30 + number}\n31\n", encoding="utf-8")
+            file.write(f'[[experiment]]\nkind = "static_friction"\nfile = "{name}"\n')
+    assert [table.label for table in read_rig(tmp_path).tables] == ["a_tilt", "b_tilt", "slow"]
+
+
 def test_the_same_file_may_be_used_under_two_labels(tmp_path: Path) -> None:
     twice = '\n[[experiment]]\nkind = "static_friction"\nfile = "static_friction.csv"\n'
     with pytest.raises(InputError, match="labels must be unique"):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import polynomial
-from scipy import ndimage
+from scipy import ndimage, signal
 
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.noise import noise_level
@@ -59,8 +59,10 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
     # Value and slope half a sample beyond the end of ``side`` samples, as weights of the samples.
     design = polynomial.polyvander(np.arange(side) + 0.5, ORDER)
     value, slope = np.linalg.pinv(design)[:2]
-    after = [np.correlate(values, weights, "valid")[side:] for weights in (value, slope)]
-    before = [np.correlate(values, weights[::-1], "valid")[:-side] for weights in (value, -slope)]
+    # By FFT where the sides are long. A constant has no effect on the jumps, and would only add rounding.
+    centred = values - np.mean(values)
+    after = [signal.correlate(centred, weights, "valid")[side:] for weights in (value, slope)]
+    before = [signal.correlate(centred, weights[::-1], "valid")[:-side] for weights in (value, -slope)]
     jumps = np.stack([one - other for one, other in zip(after, before, strict=True)])
     weights = np.stack([np.concatenate([value, -value[::-1]]), np.concatenate([slope, slope[::-1]])])
     precision = np.linalg.inv(weights @ weights.T * max(noise, 1e-300) ** 2)

@@ -14,7 +14,6 @@ from capsule_id.rig.toml_values import closest, shown
 
 #: Relative difference below which a column that several files hold is the same.
 ROUNDING = 1e-9
-UTF8 = "UTF-8"
 _MOST_VALUES = 6  # shown of a column where no row has the value wanted
 
 
@@ -109,8 +108,7 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     units = tuple(column_map.sources[name].unit for name in names)
     # Arrays of a file may have other lengths than those that the map names.
     rows = exports[0].lines[: int(first_rows[-1])][keep] if len(parts) == 1 else np.arange(1, len(columns[0]) + 1)
-    encoding = next((each.encoding for each in exports if each.encoding != UTF8), UTF8)
-    raw = RawTable(names, units, columns, rows, place_of, encoding)
+    raw = RawTable(names, units, columns, rows, place_of)
     return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)
 
 

@@ -123,7 +123,7 @@ def readings_of_plateaus(
     def cell(row: int | None, column: int) -> tuple[int, int]:
         return raw.place(None if row is None else int(starts[row]), channels[min(column, len(channels) - 1)])
 
-    return RawTable(names, units, (*means.T, plateaus.levels), raw.rows[starts], cell, raw.encoding), starts
+    return RawTable(names, units, (*means.T, plateaus.levels), raw.rows[starts], cell), starts
 
 
 def _check_order(document: TomlDocument, place: KeyPath, levels: np.ndarray, means: np.ndarray) -> None:

@@ -132,6 +132,33 @@ def test_encodings_of_laboratories(
     assert said == (encoding == "cp1252")
 
 
+def test_every_file_in_another_encoding_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of several files put one below the other, the finding named the first, whichever it was."""
+    rows = "".join(f"{k / 10:g};{k}\n" for k in range(8))
+    for name, encoding in (("a.txt", "utf-8"), ("b.txt", "cp1252"), ("c.txt", "cp1252")):
+        (tmp_path / name).write_bytes(f"Weg (µm);Kraft (N)\n{rows}".encode(encoding))
+    (tmp_path / "rig.toml").write_text(
+        '[rig]\nname = "d"\n[[experiment]]\nkind = "support_spring"\nspring = "s"\nfiles = ["a.txt", "b.txt", "c.txt"]\n'
+        'columns = { deflection = { from = "Weg (µm)", unit = "um" }, force = { from = "Kraft (N)", unit = "N" } }\n',
+        encoding="utf-8",
+    )
+    capsule_id(["check", str(tmp_path)])
+    said = capsys.readouterr().out
+    assert [name for name in "abc" if f"{name}.txt is read as Windows-1252" in said] == ["b", "c"]
+
+
+@pytest.mark.parametrize("blanks", ["\t\t", "\t", " \t"])
+@pytest.mark.parametrize("row", [0, 2])
+def test_blanks_behind_a_row_count_as_cells_in_the_last_row_too(tmp_path: Path, blanks: str, row: int) -> None:
+    rows = ["0.0\t0.0", "0.1\t1.0", "0.2\t2.0"]
+    rows[row] += blanks
+    path = tmp_path / "d.csv"
+    path.write_text("\n".join(["deflection [mm]\tforce [N]", *rows, " ", ""]), encoding="utf-8")
+    with pytest.raises(InputError, match="a row must have 2 cells") as caught:
+        READERS[".csv"](path, path)
+    assert caught.value.line == row + 2
+
+
 @pytest.mark.parametrize(
     ("content", "place", "value"),
     [

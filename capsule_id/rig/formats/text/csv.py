@@ -68,7 +68,9 @@ def _plain_columns(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...] | Non
     """The columns of a table of numbers alone, with blank lines at its end or none; None for any other table."""
     columns, ended = tuple(Growing() for _ in range(shape.width)), False
     for _, text in file.blocks(shape.first):
-        rows = text.rstrip(f"{BLANKS}\n".encode())
+        size = len(text.rstrip(f"{BLANKS}\n".encode()))
+        # Blanks behind the last row may be cells.
+        rows = text[: text.index(b"\n", size)] if size else b""
         if ended and rows:
             return None
         ended = len(rows) + 1 < len(text)
