@@ -1,15 +1,16 @@
-"""Velocity and acceleration records of free decays, and halves of records."""
+"""Velocity and acceleration records of free decays, halves of records, and errors of position."""
 
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.refit import refit
-from capsule_id.experiments.free_vibration.checks import check_halves
+from capsule_id.experiments.free_vibration.checks import check_halves, check_positions, whitened
 from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings.channels import CHANNELS
@@ -137,3 +138,60 @@ def test_halves_of_a_decay_with_dry_friction_name_the_damping() -> None:
     (finding,) = halves(DRY, 1)
     assert (finding.level, finding.facts["name"]) == ("fail", "c")
     assert finding.facts["second"] > finding.facts["first"]
+
+
+def sensor_error(x: np.ndarray, size: float) -> np.ndarray:
+    """A sensor that reads ``size`` too low below a quarter of the deflection."""
+    return x - size * (x < -0.25 * RELEASE)
+
+
+def positions(values: np.ndarray, first: int = 0) -> list[Finding]:
+    """Findings of the check at the true values, from the sample ``first`` on."""
+    columns = [bench.column("time", TIME[first:]), bench.column("x_rel", values[first:])]
+    table = bench.table("free_vibration", columns, "decay")
+    fit = SimpleNamespace(values={**VISCOUS, "noise_sd[decay]": 1e-5})
+    return check_positions([FreeVibration(table, bench.rig(table))], fit)  # type: ignore[arg-type]  # pyright: ignore
+
+
+def test_a_sensor_error_is_named_and_smaller_amplitudes_are_free_of_it() -> None:
+    x = np.asarray(decay(TIME, VISCOUS, RELEASE, 0.0, 30).x_rel)
+    noise = 1e-5 * np.random.default_rng(2).standard_normal(len(x))
+    (clear,) = positions(x + noise)
+    assert clear.level == "ok"
+    faulty = sensor_error(x, 2e-5) + noise
+    (found,) = positions(faulty)
+    assert (found.code, found.level, found.experiment) == ("decays.position", "fail", "decay")
+    assert found.facts["low"] < -0.25 * RELEASE
+    # The remedy: a start from which the rod no longer gets there.
+    later = int(np.flatnonzero(x < -0.25 * RELEASE)[-1]) + 1
+    (mended,) = positions(faulty, later)
+    assert mended.level == "ok"
+
+
+def test_positions_of_true_models_have_uniform_p_values() -> None:
+    x = np.asarray(decay(TIME, VISCOUS, RELEASE, 0.0, 30).x_rel)
+    rng = np.random.default_rng(6)
+    p = [positions(x + 1e-5 * rng.standard_normal(len(x)))[0].facts["p"] for _ in range(60)]
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+
+
+@pytest.mark.parametrize(
+    "model",
+    [DecayModel(drift="gp"), DecayModel(noise="ar1"), DecayModel(drift="gp", noise="arma")],
+    ids=lambda m: m.name,
+)
+def test_values_of_a_screening_are_those_of_the_record_it_starts(model: DecayModel) -> None:
+    """The record's own whitening at these values gives the deviance of the screening."""
+    x = np.asarray(decay(TIME, VISCOUS, RELEASE, 0.0, 30).x_rel)
+    drift = 1e-4 * np.sin(8.0 * TIME) + 1e-5 * np.random.default_rng(7).standard_normal(len(x))
+    columns = [bench.column("time", TIME), bench.column("x_rel", x + drift)]
+    table = bench.table("free_vibration", columns, "decay")
+    own = FreeVibration(table, bench.rig(table))
+    found = Screening(own).fit(model)[0]
+    again = own.with_model(model, found)
+    raw, design = again.unwhitened(found.values, np)
+    white, basis = (whitened(again, found.values, columns) for columns in (raw, design))
+    left = white - basis @ np.linalg.lstsq(basis, white, rcond=None)[0]
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(found.noise, rel=2e-3)
+    if model.drift == "gp":
+        assert again.starts()["drift_ratio[decay]"].centre == found.values["drift_ratio"]

@@ -1,5 +1,6 @@
-"""Checks of free decays: equal stiffness at every amplitude, equal halves, no slip and no contact."""
+"""Checks of free decays: equal stiffness at every amplitude, equal halves, no slip, no contact, no error of position."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.free_vibration.decrement import equilibrium
+from capsule_id.experiments.free_vibration.readings.noise import whiten
 from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.settings import decay_window
 from capsule_id.parameters import parameter
@@ -20,6 +22,12 @@ from capsule_id.views import Finding
 HALVES_DISAGREE, HALVES_FAIL = 3.0, 4.0
 #: Fewest readings and half cycles of a half.
 FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
+#: Intervals of position in each direction of the motion, and fewest readings per interval.
+INTERVALS, READINGS_PER_INTERVAL = 12, 5
+#: Step of difference quotients, in natural units of each parameter.
+STEP = 1e-5
+#: Directions of the offsets that are shorter than this, relative to the longest one, are combinations of the others.
+UNSEEN = 1e-8
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -83,6 +91,77 @@ def check_halves(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Findin
     if compared and not findings:
         findings.append(Finding("decays.halves", "ok", {"labels": ", ".join(compared)}))
     return findings
+
+
+def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """Check that the residuals do not depend on the position of the rod and the direction of its motion."""
+    compared, findings = [], []
+    for e in records:
+        if e.order == 2 and "dry" in e.model.damping:
+            continue  # the acceleration jumps where the rod turns
+        p, low, high = position_test(e, e.local(fit.values))
+        compared.append((p, low, high, e))
+    for p, low, high, e in compared:
+        if p * len(compared) < LEVEL:
+            unit, scale = e.column.unit, e.column.to_display
+            facts = {"label": e.label, "p": p, "low": low * scale, "high": high * scale, "unit": unit}
+            findings.append(Finding("decays.position", "fail", facts, e.label))
+    if compared and not findings:
+        facts = {"labels": ", ".join(e.label for *_, e in compared), "p": min(p for p, *_ in compared)}
+        findings.append(Finding("decays.position", "ok", facts))
+    return findings
+
+
+def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float]:
+    """p-value of the F test for offsets of the readings by interval of position and direction of the motion.
+
+    Columns and residuals are whitened by the fitted noise, and the effects of the fitted parameters are projected out.
+    The interval with the largest offset is returned too: lower and upper limit, SI.
+    """
+    raw, design = e.unwhitened(theta, np)
+    nuisances = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
+    left = raw - design @ nuisances
+    # Rounding of a rod at rest depends on the residuals.
+    curve = np.round((e.values - left) / np.ptp(e.values), 9) * np.ptp(e.values)
+    offsets, limits = [], []
+    number = min(INTERVALS, len(curve) // (2 * READINGS_PER_INTERVAL))
+    for ahead in (np.gradient(curve, e.time) > 0.0, np.gradient(curve, e.time) <= 0.0):
+        edges = np.quantile(curve[ahead], np.linspace(0.0, 1.0, number + 1))
+        place = np.clip(np.searchsorted(edges, curve, side="right") - 1, 0, number - 1)
+        offsets += [ahead & (place == i) for i in range(number)]
+        limits += list(itertools.pairwise(edges))
+    size, k1, m1 = e.largest_deflection, theta["k1"], theta["m1"]
+    units = {"k1": k1, "c": theta["c"], "F_dry": k1 * size, "c_q": m1 / size, "k_cubic": k1 / size**2}
+    units |= {"amplitude": size, "turning_time": float(np.sqrt(m1 / k1))}
+    moved = []
+    for name in ("k1", "c", *e.model.symbols, *(() if e.closed else ("amplitude", "turning_time"))):
+        other, basis = e.unwhitened({**theta, name: theta[name] + STEP * units[name]}, np)
+        moved.append((other - basis @ nuisances - left) / STEP)
+    known = whitened(e, theta, np.column_stack([design, *moved]))
+    known = known[:, np.linalg.norm(known, axis=0) > 0.0]
+    known = np.linalg.qr(known / np.linalg.norm(known, axis=0))[0]
+    own, columns = (
+        x - known @ (known.T @ x) for x in (whitened(e, theta, left), whitened(e, theta, np.stack(offsets, axis=1)))
+    )
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    basis = basis[:, sizes > UNSEEN * sizes[0]]
+    rank, freedom = basis.shape[1], len(own) - known.shape[1] - basis.shape[1]
+    if freedom < rank:
+        return 1.0, np.nan, np.nan
+    explained = float(np.sum((basis.T @ own) ** 2))
+    p = float(stats.f.sf(explained / rank * freedom / (float(own @ own) - explained), rank, freedom))
+    largest = np.argmax(np.abs(columns.T @ own) / np.maximum(np.linalg.norm(columns, axis=0), UNSEEN))
+    return p, *(float(limit) for limit in limits[largest])
+
+
+def whitened(e: "FreeVibration", theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
+    """Columns (n,) or (n, q) in the coordinates where noise and drift of ``e`` are white."""
+    table = np.reshape(columns, (e.n, -1))
+    if e.model.whitened:
+        table = np.asarray(whiten(e.times, table, e.model, theta))
+    else:
+        table = table / np.reshape(e.relative_sd, (-1, 1))
+    return np.reshape(table, columns.shape)
 
 
 def _halves(e: "FreeVibration") -> "list[FreeVibration]":

@@ -12,7 +12,12 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label, band
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
-from capsule_id.experiments.free_vibration.checks import check_free_decay, check_halves, check_stiffness
+from capsule_id.experiments.free_vibration.checks import (
+    check_free_decay,
+    check_halves,
+    check_positions,
+    check_stiffness,
+)
 from capsule_id.experiments.free_vibration.decay_models import (
     decay,
     decay_moments,
@@ -97,7 +102,7 @@ class FreeVibration(SurfaceExperiment):
     order: int = eqx.field(static=True)
 
     time_series = True
-    checks = (check_stiffness, check_free_decay, check_halves)
+    checks = (check_stiffness, check_free_decay, check_halves, check_positions)
     tables = (decay_table, damping_table, second_fit_table)
 
     def __init__(

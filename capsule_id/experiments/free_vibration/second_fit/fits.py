@@ -134,6 +134,8 @@ class Screening:
         """Values by symbol, SI, of scaled unknowns (..., names)."""
         own = dict(zip(NAMES, np.moveaxis(z, -1, 0), strict=True))
         k1 = self.k1 * np.exp(own["k1"])
+        # A drift counts in units of the noise, which is white where the ratio is beyond its bounds.
+        unit = np.where(own["white_ratio"] > BOUNDS["white_ratio"][1], WHITE, 1.0)
         return {
             "m1": np.broadcast_to(self.m1, k1.shape),
             "k1": k1,
@@ -145,7 +147,9 @@ class Screening:
             "turning_time": self.turning_time + own["turning_time"] / self.omega,
             "noise_time": self.noise_time * np.exp(own["noise_time"]),
             "white_ratio": np.where(own["white_ratio"] < BOUNDS["white_ratio"][0], 0.0, np.exp(own["white_ratio"])),
-            "drift_ratio": np.where(own["drift_ratio"] < BOUNDS["drift_ratio"][0], 0.0, np.exp(own["drift_ratio"])),
+            "drift_ratio": np.where(
+                own["drift_ratio"] < BOUNDS["drift_ratio"][0], 0.0, unit * np.exp(own["drift_ratio"])
+            ),
             "drift_time": self.drift_time * np.exp(own["drift_time"]),
         }
 
@@ -278,5 +282,8 @@ class Screening:
         errors = {
             name: float(abs(moved[name][name] - values[name]) / STEP * own) for name, own in zip(moved, sd, strict=True)
         }
+        if model.noise == "white":
+            for each in (values, errors):
+                each["drift_ratio"] = each.get("drift_ratio", 0.0) / WHITE
         noise = float(np.sqrt(2.0 * found.cost / n)) * unit
         return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun)
