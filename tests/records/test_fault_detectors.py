@@ -210,7 +210,7 @@ def test_a_decay_recorded_from_any_phase_is_not_pushed() -> None:
             forces = {"k1": K1, "c": rng.choice([0.3, 1.0]), "m1": M1, **more}
             x = rubbed(time + rng.uniform(0.0, PERIOD), forces, 2e-3, 0.0, 40).x_rel
             rho = rng.choice([0.0, 0.9, 0.98])
-            noise = signal.lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time)))
+            noise = np.asarray(signal.lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time))))
             free = find_free_decay(time, np.asarray(x) + 4e-5 * noise, displacement=True)
             assert free is not None
             found += free.pushed

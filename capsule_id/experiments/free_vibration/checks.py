@@ -151,7 +151,8 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
     explained = float(np.sum((basis.T @ own) ** 2))
     p = float(stats.f.sf(explained / rank * freedom / (float(own @ own) - explained), rank, freedom))
     largest = np.argmax(np.abs(columns.T @ own) / np.maximum(np.linalg.norm(columns, axis=0), UNSEEN))
-    return p, *(float(limit) for limit in limits[largest])
+    low, high = limits[largest]
+    return p, float(low), float(high)
 
 
 def whitened(e: "FreeVibration", theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:

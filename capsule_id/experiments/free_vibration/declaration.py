@@ -281,15 +281,6 @@ MESSAGES = {
         warn=_halves,
         fail=_halves,
     ),
-    "decays.position": Message(
-        "position of a decay",
-        ok="{labels}: the residuals do not depend on position and direction (p = {p:.2g})",
-        fail=(
-            "{label}: expected residuals that do not depend on the position of the rod; they do (p = {p:.1g}), most from "
-            "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, or a force lacks in the model. Calibrate the "
-            "sensor, or state a later start, for smaller amplitudes."
-        ),
-    ),
     "decays.damping": Message(
         "Damping parameters",
         caption=(

@@ -1,4 +1,4 @@
-"""Findings on the readings of a free decay: release, aliasing, sampling, length, and those of any record."""
+"""Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any record."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -196,6 +196,15 @@ MESSAGES = {
         fail=(
             "a free decay must begin with its release; found {rest:.4g} s of {before} after the stated start. "
             "Write this line in the experiment in rig.toml: " + _line("start")
+        ),
+    ),
+    "decays.position": Message(
+        "position of a decay",
+        ok="{labels}: the residuals do not depend on position and direction (p = {p:.2g})",
+        fail=(
+            "{label}: expected residuals that do not depend on the position of the rod; they do (p = {p:.1g}), most from "
+            "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, or a force lacks in the model. Calibrate the "
+            "sensor, or state a later start, for smaller amplitudes."
         ),
     ),
     "decays.thinned": Message(
