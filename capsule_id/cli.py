@@ -49,7 +49,11 @@ def _parser(program: str, text: str) -> _Parser:
 def _fit_parser(program: str) -> argparse.ArgumentParser:
     from capsule_id.commands import fit
 
-    parser = _parser(program, "Fit the vibro-impact capsule to a folder of rig measurements.")
+    text = (
+        "Fit the vibro-impact capsule to a folder of rig measurements. Prints value, sd and trust of every parameter, and "
+        "writes report.html. capsule-id init makes such a folder, capsule-id check examines it. Exit code 3: a check failed."
+    )
+    parser = _parser(program, text)
     fit.add_arguments(parser)
     parser.set_defaults(run=fit.run)
     return parser

@@ -20,13 +20,13 @@ DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 4000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add DATA and the options."""
-    parser.add_argument("data", metavar="DATA", help="rig folder, with its rig.toml")
+    parser.add_argument("data", metavar="DATA", help="rig folder: rig.toml and the tables that it names")
     parser.add_argument("--out", type=Path, metavar="DIR", help="result directory (default results/<rig name>)")
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="random seed (default 0); the same seed gives the same numbers"
     )
     parser.add_argument("--experiments", choices=CHOICES, default="all", help="experiments to fit (default all)")
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted run")
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted fit")
     parser.add_argument("--no-sample", action="store_true", help="point fit only: no posterior, no intervals")
     parser.add_argument(
         "--max-steps",
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=DEFAULT_ESS,
         metavar="N",
-        help=f"stop at this bulk and tail effective sample size of every parameter (default {DEFAULT_ESS})",
+        help=f"draw so many effectively independent samples of every parameter (default {DEFAULT_ESS})",
     )
     parser.add_argument("--json", action="store_true", help="print parameters.json instead of the table")
     parser.add_argument(

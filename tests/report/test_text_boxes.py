@@ -12,7 +12,7 @@ from matplotlib.text import Text
 from capsule_id.inference.result import Result
 from capsule_id.report.figures import comparisons
 from capsule_id.report.figures.corner import corner
-from capsule_id.report.figures.style import figure_of
+from capsule_id.report.figures.style import figure_of, make_room, own_axes, set_legend
 from capsule_id.report.figures.traces import traces
 
 #: Boxes may share this much, pixels: a renderer rounds.
@@ -97,3 +97,23 @@ def test_overlaps_and_clipped_texts_would_be_found() -> None:
     found = " ".join(faults(figure))
     for fault in ("'a long label' lies on 'another label'", "'time' leaves the figure", "'one' lies on 'two'"):
         assert fault in found
+
+
+@pytest.mark.parametrize("entries", [1, 3, 5])
+@pytest.mark.parametrize("height", [4.4, 5.6])
+def test_a_legend_over_a_record_hides_no_sample(entries: int, height: float) -> None:
+    """Three entries over a forced run lay on its last peaks: the space did not depend on their number."""
+    ax = own_axes(None, height=height)
+    t = np.linspace(0.0, 1.0, 400)
+    for number in range(entries):
+        ax.plot(t, np.sin(60.0 * t), label=f"curve {number}")
+    below = make_room(ax)
+    set_legend(ax, place="upper right")
+    figure = figure_of(ax)
+    FigureCanvasAgg(figure).draw()
+    legend = ax.get_legend()
+    assert legend is not None
+    top = ax.transData.transform((0.0, 1.0))[1]
+    texts = [text.get_window_extent() for text in legend.get_texts()]
+    assert min(box.y0 for box in texts) > top
+    assert ax.transAxes.transform((0.0, below))[1] < min(box.y0 for box in texts)

@@ -190,8 +190,8 @@ MESSAGES = {
     "runs.sampling": Message(
         "feasible",
         warn=(
-            "a contact lasts about pi sqrt(m*/k2) = {contact_ms:.2g} ms, {samples:.2g} samples, and {wanted} or more are "
-            "wanted; sample at {rate:.2g} Hz or more"
+            "a contact lasts about {contact_ms:.2g} ms, which is {samples:.2g} samples; {wanted} or more are wanted. Sample "
+            "at {rate:.0f} Hz or more"
         ),
     ),
     "runs.length": Message(

@@ -12,7 +12,6 @@ from capsule_id.report.figures.style import (
     BLUE,
     GREEN,
     GREY,
-    HEADROOM,
     PURPLE,
     VERMILION,
     make_room,
@@ -39,12 +38,11 @@ def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
     # At the ends of the record the derivative is that of a polynomial's edge, and mostly noise.
     inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
     ax.plot(_MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
-    below_legend = 1.0 / (1.0 + HEADROOM)
+    lines = []
     if np.isfinite(view.gap):
-        ax.axvline(_MM * view.gap, ymax=below_legend, color=VERMILION, ls="--", lw=1.2, label="gap as stated")
+        lines.append(ax.axvline(_MM * view.gap, color=VERMILION, ls="--", lw=1.2, label="gap as stated"))
     if view.gap_seen is not None:
-        line = _MM * view.gap_seen
-        ax.axvline(line, ymax=below_legend, color=VERMILION, ls=":", lw=1.6, label="contacts begin")
+        lines.append(ax.axvline(_MM * view.gap_seen, color=VERMILION, ls=":", lw=1.6, label="contacts begin"))
     ax.plot(
         _MM * view.section_x_rel,
         view.section_rate,
@@ -55,8 +53,10 @@ def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
         zorder=3,
         label="once a period",
     )
-    set_text(ax, "X1 - X2, mm", "rate of X1 - X2, m/s", view.label)
-    make_room(ax)
+    set_text(ax, "X1 - X2, mm", "rate of X1 - X2, m/s", f"motion: {view.label}")
+    below_legend = make_room(ax)
+    for line in lines:
+        line.set_ydata([0.0, below_legend])
     set_legend(ax, place="upper right")
     return ax
 
@@ -75,7 +75,7 @@ def force_on_rod(view: RecordView, ax: Axes | None = None, model: tuple[np.ndarr
     ax.plot(view.time, view.force, color=PURPLE, lw=1.0, label="K times current")
     if model is not None:
         ax.plot(*model, color=BLACK, ls="--", lw=1.2, label="model")
-    set_text(ax, "time, s", "force on the rod, N", view.label)
+    set_text(ax, "time, s", "force on the rod, N", f"motion: {view.label}")
     make_room(ax)
     set_legend(ax, place="upper right")
     return ax

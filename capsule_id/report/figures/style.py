@@ -23,8 +23,8 @@ DPI = 150
 _PALETTE, _NEARLY_WHITE = 128, 253
 # Readable at half of the printed size: 11 pt at a width of 6.4 in.
 TEXT, SMALL = 11.0, 9.5
-#: Of the curves' height, for a legend.
-HEADROOM = 0.3
+#: Heights of an entry of a legend and of its margins, and the largest part of the panel for both.
+_ENTRY, _MARGINS, _MOST_ROOM = 1.5 * SMALL, 2.0 * SMALL, 0.5
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -80,10 +80,13 @@ def set_legend(ax: Axes, place: Literal["best", "upper right", "lower right", "a
         text.set_parse_math(False)
 
 
-def make_room(ax: Axes) -> None:
-    """Space over the curves for a legend."""
+def make_room(ax: Axes) -> float:
+    """Space over the curves for a legend of all labelled artists; return the part of the panel's height below it."""
+    height = 72.0 / figure_of(ax).dpi * ax.get_window_extent().height
+    room = min((len(ax.get_legend_handles_labels()[1]) * _ENTRY + _MARGINS) / height, _MOST_ROOM)
     low, high = ax.get_ylim()
-    ax.set_ylim(low, high + HEADROOM * (high - low))
+    ax.set_ylim(low, low + (high - low) / (1.0 - room))
+    return 1.0 - room
 
 
 def mark(figure: Figure, text: str) -> None:
