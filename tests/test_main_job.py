@@ -1,8 +1,9 @@
-"""``fit-params data/`` as in README; its files are read back and checked."""
+"""The installed ``fit-params data/`` as in README; its files are read back and checked."""
 
 import json
 import re
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.synthetic import Truth
-from tests.cli_tools import DATA, ROOT, argv, environment
+from tests.cli_tools import DATA, ROOT, environment
 
 MAX_RHAT, MIN_ESS, MAX_Z = 1.01, 400.0, 3.5
 WALKER = ("chain", "draw")
@@ -26,10 +27,8 @@ class Job:
 
     def __init__(self, folder: Path) -> None:
         (folder / "data").symlink_to(DATA)
-        words = ("data/", "--experiments", "bench", "--quiet")
-        self.done = subprocess.run(
-            argv(*words), cwd=folder, env=environment(), capture_output=True, text=True, check=False
-        )
+        words = [str(Path(sys.executable).parent / "fit-params"), "data/", "--experiments", "bench", "--quiet"]
+        self.done = subprocess.run(words, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
         self.directory = folder / "results" / "twin"
         self.parameters = json.loads((self.directory / "parameters.json").read_text(encoding="utf-8"))
         self.idata: Any = arviz.from_netcdf(self.directory / "posterior.nc")
@@ -58,6 +57,7 @@ def test_it_ends_clean_and_quiet(job: Job) -> None:
     assert "SYNTHETIC" in job.done.stdout.splitlines()[0]
     report, verdict = job.done.stdout.splitlines()[-2:]
     assert report == f"report: {Path('results/twin/report.html')}"
+    assert "`results/twin/report.html`" in (ROOT / "README.md").read_text(encoding="utf-8")
     assert verdict == "verdict: trusted; no check failed"
     entries = {path.name for path in job.directory.iterdir()}
     assert entries == {"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"}

@@ -3,8 +3,6 @@
 import argparse
 import re
 import shlex
-import subprocess
-import sys
 import tomllib
 from dataclasses import fields
 from pathlib import Path
@@ -21,7 +19,7 @@ from capsule_id.report.texts import citation
 from capsule_id.rig.choices import OPTIONAL
 from capsule_id.rig.model import ModelChoices
 from capsule_id.views import Trust
-from tests.cli_tools import DATA, ROOT, environment, run
+from tests.cli_tools import ROOT, run
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 GUIDE_FOLDER = ROOT / "capsule_id" / "guide"
@@ -65,23 +63,6 @@ def test_the_two_commands_set_up_and_run() -> None:
     assert test == [venv, ".venv/bin/pip install '.[test]'", ".venv/bin/python -m pytest"]
     assert "fit-params" in PROJECT["scripts"]
     assert "test" in PROJECT["optional-dependencies"]
-
-
-def test_the_installed_command_reads_the_folder_that_readme_names(tmp_path: Path) -> None:
-    """Tests the entry point; the main job tests its numbers."""
-    (tmp_path / "data").symlink_to(DATA)
-    command = set_up_commands()[0][-1].replace(".venv/bin", str(Path(sys.executable).parent))
-    done = subprocess.run(
-        [*command.split(), "--experiments", "bench", "--no-sample", "--quiet"],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    report = re.findall(r"`(results/\S+/report\.html)`", README)[0]
-    assert (tmp_path / report).is_file()
 
 
 def test_a_record_of_ones_own_gives_k1(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from capsule_id.experiments.free_vibration.decay_models import (
     uniform_step,
     viscous_basis,
 )
+from tests.capsule_cases import jit_quickly
 from tests.scipy_decay import scipy_decay
 
 TIME = np.arange(900) / 2000.0
@@ -105,7 +106,7 @@ def test_forward_derivatives_of_a_decay(extra: dict[str, float]) -> None:
             time, {name: values[name] for name in forces}, values["amplitude"], values["turning_time"], 20
         ).x_rel
 
-    found = np.asarray(jax.jacfwd(model)(np.array(list(place.values()))))
+    found = np.asarray(jit_quickly(jax.jacfwd(model))(np.array(list(place.values()))))
     for column, (name, value) in enumerate(place.items()):
         step = 1e-4 * value
         ends = []

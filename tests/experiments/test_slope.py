@@ -18,6 +18,7 @@ from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.forces import equilibrium
 from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.rig.model import Quantity, Table
+from tests.capsule_cases import jit_quickly
 from tests.experiments import bench
 
 SLOPE, N0 = np.deg2rad(6.0), 1.5
@@ -61,7 +62,7 @@ def readings(direction: str, rng: np.random.Generator, **ground: float) -> list[
 def posterior_of_mu(experiment: Experiment) -> tuple[float, float]:
     """Mean and sd of mu, all other values known, on a grid."""
     grid = np.linspace(0.1, 1.2, 1101)
-    value = np.asarray(jax.jit(jax.vmap(lambda mu: experiment.log_likelihood({**THETA, "mu": mu})))(grid))
+    value = np.asarray(jit_quickly(jax.vmap(lambda mu: experiment.log_likelihood({**THETA, "mu": mu})))(grid))
     weight = np.exp(value - value.max())
     mean = float(np.average(grid, weights=weight))
     return mean, float(np.sqrt(np.average((grid - mean) ** 2, weights=weight)))

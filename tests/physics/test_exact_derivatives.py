@@ -12,7 +12,7 @@ from capsule_id.physics.exact.events import GAP, NONE, VELOCITY
 from capsule_id.physics.exact.taylor import CapsuleState, Constants, Mode, StepSeries
 from capsule_id.physics.friction import friction_law
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, without_absent
-from tests.capsule_cases import Cases, states_of
+from tests.capsule_cases import Cases, jit_quickly, states_of
 
 LEAVES = ("m1", "m2", "k1", "k2", "c", "mu", "v_s", "G", "g", "P_d", "Omega", "phase", "X1", "Y1", "X2", "Y2")
 # Sizes of the leaves that have none of their own: a radian, a centimetre, metres per second.
@@ -96,9 +96,9 @@ def test_without_the_event_correction_the_friction_derivative_is_wrong(
     point = jnp.array([0.66, 59410.0])
     states = jax.jit(at_rest)
     states(point)
-    right = np.asarray(jax.jit(jax.jacfwd(at_rest))(point))
+    right = np.asarray(jit_quickly(jax.jacfwd(at_rest))(point))
     monkeypatch.setattr(exact, "correct", uncorrected)
-    wrong = np.asarray(jax.jit(jax.jacfwd(lambda x: at_rest(x)))(point))
+    wrong = np.asarray(jit_quickly(jax.jacfwd(lambda x: at_rest(x)))(point))
     h = 1e-6 * np.asarray(point)
     differences = np.stack(
         [np.asarray(states(point + dx) - states(point - dx)) / (2.0 * dx.sum()) for dx in np.diag(h)], axis=-1
@@ -114,8 +114,8 @@ def test_transformations_agree(cases: Cases) -> None:
     theta, times = thetas(cases)[:3], np.linspace(0.0, 0.2, 5)
     direction = np.zeros_like(theta)
     direction[:, [3, 5]] = theta[:, [3, 5]]
-    whole = jax.jit(lambda x, v: jax.jvp(lambda x: run(x.T, times)[0], (x,), (v,)))
-    lane = jax.jit(jax.vmap(lambda x, v: jax.jvp(lambda x: run(x, times)[0], (x,), (v,))))
+    whole = jit_quickly(lambda x, v: jax.jvp(lambda x: run(x.T, times)[0], (x,), (v,)))
+    lane = jit_quickly(jax.vmap(lambda x, v: jax.jvp(lambda x: run(x, times)[0], (x,), (v,))))
     (states, rates), (mapped_states, mapped_rates) = whole(theta, direction), lane(theta, direction)
     np.testing.assert_allclose(mapped_states, states, rtol=0.0, atol=1e-13)
     np.testing.assert_allclose(mapped_rates, rates, rtol=1e-9, atol=1e-13)
@@ -129,25 +129,25 @@ def test_samples_move_with_their_time(cases: Cases) -> None:
     def rod(shift: jax.Array) -> jax.Array:
         return simulate(p, e, times + shift * np.array([0.0, 1.0, 1.0, 1.0])).X1
 
-    rate = jax.jit(lambda shift: jax.jvp(rod, (shift,), (1.0,))[1])(0.0)
+    rate = jit_quickly(lambda shift: jax.jvp(rod, (shift,), (1.0,))[1])(0.0)
     np.testing.assert_allclose(rate[1:], states_of(simulate(p, e, times))[1:, 1], rtol=1e-7)
 
 
 def test_grazing_is_flagged_and_its_derivative_stays_finite() -> None:
     """An undamped rod on a capsule that cannot move swings just beyond the gap: the flag tells how closely."""
     m1, k1, G = 0.1, 1000.0, 1e-3
+
+    def motion(k1: jax.Array | float, start: tuple[float, ...]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        p = CapsuleParameters(m1=m1, m2=0.5, k1=k1, k2=1e4, c=0.0, mu=1.0, v_s=0.3, G=G)
+        t = simulate(p, Excitation(0.0, 1.0), np.linspace(0.0, 0.006, 4), start)
+        return t.X1, (t.status, t.contacts)
+
+    grazed = jit_quickly(lambda k1, start: jax.jvp(lambda k1: motion(k1, start), (k1,), (1.0,), has_aux=True))
     flags = []
     for overshoot in (1e-6, 1e-13):
         amplitude, X1 = G * (1.0 + overshoot), 0.95 * G
         start = (X1, np.sqrt(k1 / m1 * (amplitude**2 - X1**2)), 0.0, 0.0)
-
-        def motion(k1: jax.Array | float, start: tuple[float, ...] = start) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-            p = CapsuleParameters(m1=m1, m2=0.5, k1=k1, k2=1e4, c=0.0, mu=1.0, v_s=0.3, G=G)
-            t = simulate(p, Excitation(0.0, 1.0), np.linspace(0.0, 0.006, 4), start)
-            return t.X1, (t.status, t.contacts)
-
-        grazed = jax.jit(lambda k1, motion=motion: jax.jvp(motion, (k1,), (1.0,), has_aux=True))
-        _, tangent, (status, contacts) = grazed(k1)
+        _, tangent, (status, contacts) = grazed(k1, start)
         assert np.isfinite(tangent).all()
         assert int(contacts) == 1
         flags.append(int(status))

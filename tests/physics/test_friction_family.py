@@ -9,7 +9,7 @@ import pytest
 
 from capsule_id.physics.friction import CoulombStribeck, friction_law, slide_distance
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
-from tests.capsule_cases import assert_both_ways_as_scipy, states_of
+from tests.capsule_cases import assert_both_ways_as_scipy, jit_quickly, states_of
 from tests.scipy_capsule import simulate_scipy
 
 PAPER = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
@@ -58,7 +58,7 @@ def test_mu_back_is_as_mu_by_default_and_a_number_of_its_own_otherwise() -> None
         return simulate(replace(PAPER, mu=mu, mu_back=mu_back), E, TIMES[[0, -1]]).X2[-1]
 
     mu, one, zero = jnp.asarray(0.66), jnp.asarray(1.0), jnp.asarray(0.0)
-    both, alone, back = jax.jit(
+    both, alone, back = jit_quickly(
         lambda mu: (
             jax.jvp(lambda m: end(m, None), (mu,), (one,)),
             jax.jvp(end, (mu, mu), (one, zero)),

@@ -11,6 +11,7 @@ import pytest
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.drives.recorded import RecordedDrive, RodMotion
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from tests.capsule_cases import jit_quickly
 
 #: Every term acts, and both contacts close.
 P = CapsuleParameters(
@@ -68,7 +69,7 @@ def test_every_leaf_against_central_differences(kind: str) -> None:
         t = simulate(p, e, TIMES, START)
         return jnp.stack([t.X1, t.Y1, t.X2, t.Y2]), (t.status, t.contacts, t.contacts_back)
 
-    tangent = jax.jit(lambda a, b: jax.jvp(states, a, b, has_aux=True))
+    tangent = jit_quickly(lambda a, b: jax.jvp(states, a, b, has_aux=True))
     motion, derivative, (status, contacts, back) = tangent((p, drive), (d_p, d_e))
     derivative = np.asarray(derivative)
     np.testing.assert_array_equal(status, Status.OK)

@@ -11,7 +11,7 @@ import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.physics import batches
 from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
-from tests.capsule_cases import Cases, states_of
+from tests.capsule_cases import Cases, jit_quickly, states_of
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
 E = Excitation(P_d=4.0, Omega=34.56)
@@ -78,10 +78,10 @@ def test_a_lane_is_the_same_to_the_last_bit_wherever_it_stands(monkeypatch: pyte
 def test_jit_and_vmap_give_the_same_motion(cases: Cases) -> None:
     p = spread(3)
     plain = states_of(simulate(p, E, TIMES))
-    jitted = jax.jit(lambda p: simulate(p, E, TIMES))(p)
+    jitted = jit_quickly(lambda p: simulate(p, E, TIMES))(p)
     np.testing.assert_allclose(states_of(jitted), plain, rtol=0.0, atol=1e-13)
     axes = CapsuleParameters(*[0 if np.ndim(x) else None for x in vars(p).values()])
-    mapped = jax.jit(jax.vmap(lambda p: simulate(p, E, TIMES), in_axes=(axes,)))(p)
+    mapped = jit_quickly(jax.vmap(lambda p: simulate(p, E, TIMES), in_axes=(axes,)))(p)
     np.testing.assert_allclose(states_of(mapped), plain, rtol=0.0, atol=1e-13)
     np.testing.assert_array_equal(mapped.contacts, jitted.contacts)
 

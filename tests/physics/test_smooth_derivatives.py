@@ -11,7 +11,7 @@ import pytest
 
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
-from tests.capsule_cases import Cases
+from tests.capsule_cases import Cases, jit_quickly
 
 WEIGHTS = np.random.default_rng(5).standard_normal((4, 12)) * np.array([[1e3], [1.0], [1e3], [1.0]])
 
@@ -23,7 +23,7 @@ def _score(inputs: Any) -> jax.Array:
     return jnp.sum(jnp.asarray(WEIGHTS) * jnp.stack([t.X1, t.Y1, t.X2, t.Y2]))
 
 
-_value, _grad, _jacfwd = jax.jit(_score), jax.jit(jax.grad(_score)), jax.jit(jax.jacfwd(_score))
+_value, _grad, _jacfwd = jax.jit(_score), jit_quickly(jax.grad(_score)), jit_quickly(jax.jacfwd(_score))
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +90,10 @@ def test_derivatives_tend_to_those_of_the_exact_model(cases: Cases) -> None:
         widths = Smoothing(velocity, 1e-6, 0.02, 1e-7)
         return simulate(replace(p, mu=mu), e, times, model="smooth", smoothing=widths).X2[-1]
 
-    slope = jax.jit(jax.grad(advance))
-    exact = jax.jvp(lambda mu: simulate(replace(p, mu=mu), e, times).X2[-1], (0.66,), (1.0,))[1]
+    def exact_advance(mu: jax.Array) -> jax.Array:
+        return simulate(replace(p, mu=mu), e, times).X2[-1]
+
+    slope, exact = jit_quickly(jax.grad(advance)), jit_quickly(jax.jacfwd(exact_advance))(0.66)
     error = [abs(float(slope(jnp.asarray(0.66), jnp.asarray(w))) / float(exact) - 1.0) for w in (1e-2, 1e-4)]
     assert error[1] < 0.01
     assert error[1] < 0.3 * error[0]
@@ -139,8 +141,10 @@ def test_second_derivatives_are_refused(cases: Cases) -> None:
 
 def test_frictionless_rest_has_finite_derivatives() -> None:
     p = CapsuleParameters(0.11, 0.53, 1420.0, 18960.0, 3.89, 0.0, 0.3, 1e-3)
-    t, tangent = jax.jvp(
-        lambda mu: simulate(replace(p, mu=mu), Excitation(1.0, 30.0), [0.0, 0.05], model="smooth"), (0.0,), (1.0,)
-    )
+
+    def motion(mu: jax.Array) -> Trajectory:
+        return simulate(replace(p, mu=mu), Excitation(1.0, 30.0), [0.0, 0.05], model="smooth")
+
+    t, tangent = jit_quickly(lambda mu: jax.jvp(motion, (mu,), (1.0,)))(0.0)
     assert int(t.status) == Status.OK
     assert np.isfinite(tangent.X2).all()
