@@ -92,16 +92,15 @@ def test_a_viscous_swing_is_not_taken_for_a_dry_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_record_whose_damping_terms_replace_each_other_is_sampled_to_the_end(tmp_path: Path) -> None:
-    """The whole of record 3, as a new user enters it: dry and viscous damping are not told apart well, and sd says so."""
+def test_the_whole_record_is_cut_at_its_release_and_its_sensor_error_is_named(tmp_path: Path) -> None:
+    """As a new user enters it. The encoder reads 0.8 deg too low below -35 deg, which a start at small angles avoids."""
     time, angle = pendulum(3)
     entry = Entry("free_vibration", "swing", {"time [s]": time, "x_rel [m]": angle}, {})
     fit = cid.fit(make_rig(tmp_path, entry, head={"m1": quantity(1.0, "kg")}))
     assert fit.posterior is not None
     assert fit.posterior.converged
+    assert {f.code for f in fit.findings if f.level == "fail"} == {"decays.position"}
+    assert "decays.release" in {f.code for f in fit.findings if f.level == "warn"}
+    # Beside the hand's push before the release, k_cubic came out 30 % off and trusted.
     rows = fit.summary
-    assert rows.loc["k1", "value"] == pytest.approx(122.5, abs=3.0 * rows.loc["k1", "sd"])
-    # The point fit's standard errors are too small by 1.3, because one of the terms may be nearly absent.
-    assert rows.loc["F_dry", "sd"] > 1.2 * rows.loc["F_dry", "standard_error"]
-    draws = fit.posterior.draws[..., fit.posterior.names.index("c")]
-    assert np.quantile(draws, 0.025) < 0.3 * rows.loc["c", "value"]
+    assert rows.loc["k_cubic", "value"] == pytest.approx(-rows.loc["k1", "value"] / 6.0, rel=0.05)
