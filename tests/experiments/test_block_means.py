@@ -16,6 +16,7 @@ from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.readings.blocks import Blocks, block_mean, block_means, default_block_size
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, averaged_process, whiten_by_shape
 from capsule_id.experiments.free_vibration.settings import DecayModel
+from tests.capsule_cases import jit_quickly
 from tests.experiments import bench
 
 #: s; 4000 samples of 0.5 s, about 9 periods of 440 samples each.
@@ -88,16 +89,16 @@ def test_whitened_means_have_the_density_of_the_averaged_noise() -> None:
 def test_predicted_means_of_a_rod_with_dry_friction() -> None:
     """Within the bounds of the module, which depend on the block's duration W; the rod turns inside some blocks."""
     forces = {"k1": bench.K1, "c": C, "m1": bench.M1, "F_dry": 0.1}
-    path = half_cycles(forces, RELEASE, -1e-3, 30)
-    exact = np.asarray(interpolate(path, TIME).x_rel)
+    x_rel = jit_quickly(lambda time: interpolate(half_cycles(forces, RELEASE, -1e-3, 30), time).x_rel)
+    exact = np.asarray(x_rel(TIME))
     for size in (13, 52):
         blocks = block_means(TIME, exact, size)
-        found = block_mean(np.asarray(interpolate(path, blocks.nodes.ravel()).x_rel), blocks.weights, np)
+        found = block_mean(np.asarray(x_rel(blocks.nodes.ravel())), blocks.weights, np)
         angle = np.sqrt(bench.K1 / bench.M1) * size / 8000.0
         bound = RELEASE * angle**4 / 4320.0 + 0.0026 * angle**2 * 2.0 * 0.1 / bench.K1
         error = np.max(np.abs(found - blocks.values))
         # Negative control: the values at the middles miss the bound by far.
-        assert error < bound < 0.1 * np.max(np.abs(np.asarray(interpolate(path, blocks.time).x_rel) - blocks.values))
+        assert error < bound < 0.1 * np.max(np.abs(np.asarray(x_rel(blocks.time)) - blocks.values))
 
 
 def noise(kind: str, n: int) -> np.ndarray:

@@ -29,6 +29,7 @@ from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig, Table
 from capsule_id.synthetic import synthesize
 from capsule_id.views import Comparison, Finding, ResultTable
+from tests.capsule_cases import jit_quickly
 from tests.experiments import bench
 from tests.forced_runs import make, theta
 
@@ -49,7 +50,7 @@ def stacked(experiments: Sequence[Experiment]) -> Any:
 
 def test_experiments_that_differ_in_numbers_and_label_are_computed_together() -> None:
     for members, values in (([decay(1), decay(2)], VALUES), ([make(2), make(3)], theta(2))):
-        together = jax.vmap(lambda e, values=values: e.log_likelihood(values))(stacked(members))
+        together = jit_quickly(jax.vmap(lambda e, values=values: e.log_likelihood(values)))(stacked(members))
         alone = [float(e.log_likelihood(values, np)) for e in members]
         np.testing.assert_allclose(together, alone, rtol=1e-10)
         assert members[0].label != members[1].label

@@ -10,6 +10,7 @@ from capsule_id.experiments.forced_run.start_state.rough import rough_start
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.model import simulate
 from capsule_id.rig.model import Quantity
+from tests.capsule_cases import jit_quickly
 from tests.experiments import bench
 from tests.forced_runs import NOISE, SAMPLES, channels, make, recorded, table, theta
 
@@ -89,7 +90,7 @@ def test_runs_of_both_kinds_of_start_are_one_group_and_add_up() -> None:
     u = u + 1e-3 * np.abs(u) * rng.standard_normal(len(u))
     values = target.mapping(target.theta(u))
     expected = sum(float(run.log_likelihood(run.local(values), np)) for run in runs)
-    assert float(target.log_likelihood(u)) == pytest.approx(expected, rel=1e-10)
+    assert float(jit_quickly(lambda u: target.log_likelihood(u))(u)) == pytest.approx(expected, rel=1e-10)
 
 
 def test_a_settled_run_starts_on_the_motion_that_it_settles_on_from_rest() -> None:

@@ -20,6 +20,7 @@ from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.model import CapsuleParameters, simulate
+from tests.capsule_cases import jit_quickly
 from tests.rig.faults import fault_of
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
@@ -69,10 +70,11 @@ def test_the_likelihood_is_that_of_correlated_normal_readings(folder: Path) -> N
     covariance = np.diag(noise) + same_session * np.outer(slope, slope)
     covariance += same_setting * SCATTERS["discrepancy"] ** 2 * np.outer(time, time)
     expected = multivariate_normal(mean, covariance).logpdf(table["distance"])
-    assert float(e.log_likelihood(THETA)) == pytest.approx(expected, abs=0.02)
-    assert e.profile(THETA)(SCATTERS) == pytest.approx(float(e.log_likelihood(THETA)), abs=1e-6)
+    log_likelihood = jit_quickly(e.log_likelihood)
+    assert float(log_likelihood(THETA)) == pytest.approx(expected, abs=0.02)
+    assert e.profile(THETA)(SCATTERS) == pytest.approx(float(log_likelihood(THETA)), abs=1e-6)
     other = {**SCATTERS, "discrepancy": 1e-3}
-    assert e.profile(THETA)(other) == pytest.approx(float(e.log_likelihood({**THETA, **other})), abs=1e-6)
+    assert e.profile(THETA)(other) == pytest.approx(float(log_likelihood({**THETA, **other})), abs=1e-6)
 
 
 @pytest.mark.parametrize("sessions", [1, 2, 5])

@@ -1,6 +1,5 @@
 """The exact engine against solutions of two other programs."""
 
-import jax
 import numpy as np
 import pytest
 
@@ -8,7 +7,7 @@ from capsule_id.physics.exact import engine as exact
 from capsule_id.physics.exact import taylor
 from capsule_id.physics.friction import friction_law
 from capsule_id.physics.model import Status, simulate, without_absent
-from tests.capsule_cases import Cases, states_of
+from tests.capsule_cases import Cases, jit_quickly, states_of
 from tests.scipy_capsule import simulate_scipy
 
 
@@ -35,7 +34,7 @@ def test_single_run_agrees_with_its_lane_of_the_batch(cases: Cases) -> None:
 def test_error_is_within_ten_tolerances(cases: Cases, monkeypatch: pytest.MonkeyPatch, tolerance: float) -> None:
     monkeypatch.setattr(taylor, "SERIES_TOLERANCE", tolerance)
     at_rest, bound = tuple(np.zeros((4, len(cases.T)))), np.full(len(cases.T), 100_000)
-    run = jax.jit(lambda *lanes: exact.run(*lanes))
+    run = jit_quickly(lambda *lanes: exact.run(*lanes))
     p, e = without_absent(cases.p, cases.e)
     t = run(p, e, friction_law(p), at_rest, cases.times, cases.times[:, -1], bound)
     # In units of the motion: the rod's travel in mm, and the rate that goes with it at the drive's frequency.

@@ -11,7 +11,7 @@ from capsule_id.errors import InputError
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.drives.recorded import RecordedDrive, RodMotion
 from capsule_id.physics.model import CapsuleParameters, Status, Trajectory, simulate
-from tests.capsule_cases import states_of
+from tests.capsule_cases import jit_quickly, states_of
 
 BOUND = 2_000
 WEIGHT = 0.64 * 9.81
@@ -54,7 +54,7 @@ def random_record(rng: np.random.Generator, period: np.ndarray, points: int) -> 
     return times, rng.standard_normal((n, points)) * 10.0 ** rng.uniform(-1, 2, n)[:, None]
 
 
-@jax.jit
+@jit_quickly
 def run(p: CapsuleParameters, e: Any, times: jax.Array) -> Trajectory:
     """The motion of traced lanes: bad values give a status."""
     return simulate(p, e, times, max_steps=BOUND)
