@@ -111,4 +111,4 @@ def test_energy_of_a_batch_and_of_a_run_that_ends_early(cases: Cases) -> None:
     assert balance.drive.shape == cases.T.shape
     assert (balance.relative_residual < 1e-9).all()
     with pytest.raises(InputError, match="TOO_MANY_STEPS"):
-        energy_balance(cases.p, cases.e, (0.0, 0.5), max_steps=20)
+        energy_balance(cases.p, cases.e, (0.0, 500.0), max_steps=2000)
