@@ -76,9 +76,11 @@ def fit(
     Raises
     ------
     InputError
-        If the rig holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or ``ess`` is out of range, or
-        ``friction`` cannot be fitted.
+        If ``rig`` is not from ``read_rig`` or holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or
+        ``ess`` is out of range, or ``friction`` cannot be fitted.
     """
+    if not isinstance(rig, Rig):
+        raise InputError("the rig must be one that read_rig returns", repr(rig), "call fit(read_rig(folder))")
     if not isinstance(seed, int) or seed < 0:
         raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
     if budget is not None and budget < 1:

@@ -55,6 +55,12 @@ def test_a_rig_is_named_by_a_path(folder: object) -> None:
         capsule_id.read_rig(folder)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("rig", ["data", Path("data"), None])
+def test_what_is_fitted_is_a_rig(rig: object) -> None:
+    with pytest.raises(InputError, match=r"the rig must be one that read_rig returns.*fit\(read_rig\(folder\)\)"):
+        capsule_id.fit(rig)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("seed", [-1, 1.5, "1", None])
 def test_a_seed_is_a_whole_number(seed: object) -> None:
     rig = capsule_id.read_rig(Path(__file__).parents[2] / "data")
