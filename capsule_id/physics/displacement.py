@@ -24,9 +24,9 @@ from capsule_id.physics.model import CapsuleParameters, Status, simulate, withou
 BLOCK = 3
 #: The motion repeats where the state changes by less than this part of itself over one period, dimensionless.
 REPEATS = 1e-5
-#: Bound on the steps of a block, 150 per period. Plausible motions need 15 to 45 per period; a motion that needs far
+#: Bound on the steps of a block, 300 per period. Plausible motions need 15 to 45 per period; a motion that needs far
 #: more keeps its whole chunk waiting.
-BLOCK_STEPS = 150 * BLOCK
+BLOCK_STEPS = 300 * BLOCK
 
 
 class Displacement(NamedTuple):

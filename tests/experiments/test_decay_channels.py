@@ -145,9 +145,9 @@ def sensor_error(x: np.ndarray, size: float) -> np.ndarray:
     return x - size * (x < -0.25 * RELEASE)
 
 
-def positions(values: np.ndarray, first: int = 0) -> list[Finding]:
-    """Findings of the check at the true values, from the sample ``first`` on."""
-    columns = [bench.column("time", TIME[first:]), bench.column("x_rel", values[first:])]
+def positions(values: np.ndarray, first: int = 0, last: int = len(TIME)) -> list[Finding]:
+    """Findings of the check at the true values, from the sample ``first`` to ``last``."""
+    columns = [bench.column("time", TIME[first:last]), bench.column("x_rel", values[first:last])]
     table = bench.table("free_vibration", columns, "decay")
     fit = SimpleNamespace(values={**VISCOUS, "noise_sd[decay]": 1e-5})
     return check_positions([FreeVibration(table, bench.rig(table))], fit)  # type: ignore[arg-type]  # pyright: ignore
@@ -166,6 +166,15 @@ def test_a_sensor_error_is_named_and_smaller_amplitudes_are_free_of_it() -> None
     later = int(np.flatnonzero(x < -0.25 * RELEASE)[-1]) + 1
     (mended,) = positions(faulty, later)
     assert mended.level == "ok"
+
+
+@pytest.mark.parametrize(("samples", "levels"), [(5, []), (9, []), (13, ["ok"])])
+def test_a_few_readings_of_a_rod_that_has_not_turned(samples: int, levels: list[str]) -> None:
+    """Too few for an interval of position are not tested; readings of one direction do not end in a failure."""
+    x = np.asarray(decay(TIME, VISCOUS, RELEASE, 0.0, 30).x_rel)
+    assert samples * TIME[1] < np.pi * np.sqrt(bench.M1 / bench.K1)
+    noisy = x + 1e-5 * np.random.default_rng(3).standard_normal(len(x))
+    assert [found.level for found in positions(noisy, last=samples)] == levels
 
 
 def test_positions_of_true_models_have_uniform_p_values() -> None:

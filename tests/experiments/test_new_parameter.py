@@ -22,11 +22,9 @@ PLACES: dict[str, list[tuple[str, str]]] = {
             '        Parameter(\n            "viscous", ',
         )
     ],
-    "physics/model.py": [
-        ("    viscous: NumberOrBatch = 0.0\n", "    viscous: NumberOrBatch = 0.0\n    rise: NumberOrBatch = 0.0\n")
-    ],
+    "physics/model.py": [FIELD],
     "physics/friction.py": [
-        ("    viscous: NumberOrBatch = 0.0\n", "    viscous: NumberOrBatch = 0.0\n    rise: NumberOrBatch = 0.0\n"),
+        FIELD,
         ('        TABLE["viscous"],\n', '        TABLE["viscous"],\n        TABLE["rise"],\n'),
         ("* weakening + self.viscous * speed", "* (weakening + self.rise * speed / self.v_s) + self.viscous * speed"),
         (

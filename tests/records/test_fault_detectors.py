@@ -65,6 +65,16 @@ def test_a_record_that_begins_on_its_coarsely_read_top_is_not_clipped() -> None:
     assert len(clipped_samples(np.clip(begun, -2.0, 1.9), 5.0 * SAMPLES)) == 1
 
 
+@pytest.mark.parametrize(("step", "limit"), [(0.005, 0.9), (0.01, 0.8), (0.02, 0.7)])
+@pytest.mark.parametrize("begin", [0, 40])
+def test_a_record_that_begins_saturated_is_clipped(step: float, limit: float, begin: int) -> None:
+    sample = np.arange(begin, 1600)
+    swing = np.exp(-sample / 1500.0) * np.cos(2.0 * np.pi * sample / 200.0)
+    found = clipped_samples(step * np.round(np.clip(swing, -limit, limit) / step), 200.0)
+    assert {one.side for one in found} >= ({"lower"} if begin and limit > 0.85 else {"lower", "upper"})
+    assert clipped_samples(step * np.round(swing / step), 200.0) == []
+
+
 def test_gaps_are_multiples_of_the_sampling_step() -> None:
     kept = np.delete(TIME, [*range(300, 310), 700])
     gaps = find_gaps(kept)
@@ -127,7 +137,7 @@ def test_few_lost_samples_show_in_a_quiet_record() -> None:
     assert abs(jump.row - 80) <= 5
 
 
-def test_a_jump_of_an_oversampled_record_is_found_in_a_second() -> None:
+def test_a_jump_of_an_oversampled_record_is_found_by_fft() -> None:
     """2 Hz at 100 kHz, 10 s: the sums of products of 12,500 samples at every place took minutes of CPU time."""
     period, lost = 50_000.0, 600_000
     time = np.arange(1_000_000) / period

@@ -99,8 +99,8 @@ def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
     for e in records:
         if e.order == 2 and "dry" in e.model.damping:
             continue  # the acceleration jumps where the rod turns
-        p, low, high = position_test(e, e.local(fit.values))
-        compared.append((p, low, high, e))
+        if (found := position_test(e, e.local(fit.values))) is not None:
+            compared.append((*found, e))
     for p, low, high, e in compared:
         if p * len(compared) < LEVEL:
             unit, scale = e.column.unit, e.column.to_display
@@ -112,12 +112,14 @@ def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
     return findings
 
 
-def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float]:
+def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float] | None:
     """p-value of the F test for offsets of the readings by interval of position and direction of the motion.
 
     Columns and residuals are whitened by the fitted noise, and the effects of the fitted parameters are projected out.
-    The interval with the largest offset is returned too: lower and upper limit, SI.
+    The interval with the largest offset is returned too: lower and upper limit, SI. None for too few readings.
     """
+    if e.n < 2 * READINGS_PER_INTERVAL:
+        return None
     raw, design = e.unwhitened(theta, np)
     nuisances = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
     left = raw - design @ nuisances
@@ -126,6 +128,8 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
     offsets, limits = [], []
     number = min(INTERVALS, len(curve) // (2 * READINGS_PER_INTERVAL))
     for ahead in (np.gradient(curve, e.time) > 0.0, np.gradient(curve, e.time) <= 0.0):
+        if not ahead.any():
+            continue
         edges = np.quantile(curve[ahead], np.linspace(0.0, 1.0, number + 1))
         place = np.clip(np.searchsorted(edges, curve, side="right") - 1, 0, number - 1)
         offsets += [ahead & (place == i) for i in range(number)]
@@ -147,7 +151,7 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
     basis = basis[:, sizes > UNSEEN * sizes[0]]
     rank, freedom = basis.shape[1], len(own) - known.shape[1] - basis.shape[1]
     if freedom < rank:
-        return 1.0, np.nan, np.nan
+        return None
     explained = float(np.sum((basis.T @ own) ** 2))
     p = float(stats.f.sf(explained / rank * freedom / (float(own @ own) - explained), rank, freedom))
     largest = np.argmax(np.abs(columns.T @ own) / np.maximum(np.linalg.norm(columns, axis=0), UNSEEN))

@@ -122,7 +122,9 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
     start, stop = release_time(decay), decay.stop
     if decay.rest > 0.0:
         before = "slow approach to the first turning point" if decay.pushed else "rest or excitation"
+        longer = "" if decay.pushed else ". To keep a longer part, state an earlier start."
         facts = {"file": table.file, "rest": decay.rest, "start": start, "found": decay.start, "before": before}
+        facts |= {"longer": longer}
         yield Finding("decays.release", "warn" if table.settings.start is None else "fail", facts, table.label)
     if stop is not None and not faulty:
         digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
@@ -189,9 +191,7 @@ MESSAGES = {
         "release of a decay",
         warn=(
             "a free decay must begin with its release; found {rest:.4g} s of {before} before it. The fit leaves "
-            "that out. To confirm that, add this line to the experiment in rig.toml: "
-            + _line("start")
-            + ". To keep a longer part, state an earlier start."
+            "that out. To confirm that, add this line to the experiment in rig.toml: " + _line("start") + "{longer}"
         ),
         fail=(
             "a free decay must begin with its release; found {rest:.4g} s of {before} after the stated start. "
@@ -202,9 +202,9 @@ MESSAGES = {
         "position of a decay",
         ok="{labels}: the residuals do not depend on position and direction (p = {p:.2g})",
         fail=(
-            "{label}: expected residuals that do not depend on the position of the rod; they do (p = {p:.1g}), most from "
-            "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, or a force lacks in the model. Calibrate the "
-            "sensor, or state a later start, for smaller amplitudes."
+            "{label}: the residuals must not depend on the position of the rod, but they do (p = {p:.1g}), most from "
+            "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, it reads in coarse steps, or the model lacks "
+            "a force. Calibrate the sensor, record with a finer resolution, or state a later start, for smaller amplitudes."
         ),
     ),
     "decays.thinned": Message(

@@ -7,6 +7,7 @@ seconds to compile and only milliseconds to run.
 """
 
 import os
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import jax.numpy as jnp
@@ -71,7 +72,9 @@ def point_fit(
     scale = _information(target, ends[rough.best]) ** -0.5
     whitening = root_of_inverse(-hessian(target.batch, ends[rough.best], scale))
     # Every batch runs in the pool of threads, so the starts need their own.
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
+        # SciPy hides this warning itself, but its way is not safe in threads.
+        warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
         polished = list(threads.map(lambda end: _polish(target, end, whitening), ends))
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))

@@ -60,10 +60,13 @@ def _at_limit(
     for part in pieces(len(values)):
         depth = sign * (level - values[part])
         found.append(part.start + np.flatnonzero(depth <= tolerance))
-        near += int(np.sum(depth <= (NEIGHBOURS + 0.25) * step)) - len(found[-1]) if step > 0.0 else 0
+        beside = (depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step)
+        near += int(np.sum(beside))
+        if part.start == 0 and depth[0] <= tolerance:
+            # A record that begins at its limit lacks one side of its first peak: the other side counts twice.
+            peak = np.flatnonzero(np.append(depth > (NEIGHBOURS + 0.25) * step, True))[0]
+            near += int(np.sum(beside[:peak]))
     rows = np.concatenate(found)
-    # A record that begins at its limit lacks the neighbouring values of one side.
-    near *= 2 if len(rows) and rows[0] == 0 else 1
     if len(rows) < FEWEST_CLIPPED + EXCESS * near / NEIGHBOURS:
         return rows[:0]
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)

@@ -64,7 +64,7 @@ def _inputs(result: Result) -> Iterator[tuple[str, str]]:
         yield (
             f"{'Weigh' if stated in _WEIGHED else 'Measure'} {stated} more precisely",
             f"The sd of {', '.join(factors)} comes mainly from the stated sd of {stated}. With an exact {stated} it would be "
-            f"at least {', '.join(factors.values())} times smaller; more readings of the tests do not help.",
+            f"at least {', '.join(factors.values())} times smaller; more readings of the tests help little.",
         )
 
 

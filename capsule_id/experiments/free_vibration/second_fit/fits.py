@@ -284,6 +284,7 @@ class Screening:
         }
         if model.noise == "white":
             for each in (values, errors):
-                each["drift_ratio"] = each.get("drift_ratio", 0.0) / WHITE
+                if "drift_ratio" in each:
+                    each["drift_ratio"] /= WHITE
         noise = float(np.sqrt(2.0 * found.cost / n)) * unit
         return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun)
