@@ -98,7 +98,7 @@ def test_a_clean_rig_fails_nothing(clean: list[Finding]) -> None:
     ("fault", "code", "experiment", "words"),
     [
         (outlier, "outliers", "support_spring_medium", "support_spring_medium.csv line 7"),
-        (dry_friction, "residuals.white", "free_vibration_2", "white residuals"),
+        (dry_friction, "residuals.white", "free_vibration_2", "without correlation in time (white)"),
         (bent_line, "lines.straight", "motor_current", "straight line"),
         (other_surface, "friction.one_surface", "static_friction", "one surface"),
     ],

@@ -91,8 +91,17 @@ def test_a_maximum_away_from_the_sample_fails_and_names_both(tmp_path: Path) -> 
     found = [f for f in check_maximum(before) if f.level == "fail"]
     assert {f.facts["name"] for f in found} >= {"mu"}
     assert "at the maximum" in finding_text(found[0], FIT_MESSAGES)
-    # With both maxima in hand and the sample to judge them the starts fail no longer.
-    assert [f.level for f in check_starts(sampled.fit, point.target, sampled.posterior)] == ["warn"]
+    # With both maxima in hand and the sample to judge them the starts fail no longer; without the sample they do.
+    both = replace(
+        sampled.fit,
+        **{
+            name: np.concatenate([getattr(sampled.fit, name), getattr(point.fit, name)[:1]])
+            for name in ("starts", "ends", "log_posterior", "stalled")
+        },
+        at_other_maximum=np.append(sampled.fit.at_other_maximum, True),
+    )
+    assert [f.level for f in check_starts(both, point.target, sampled.posterior)] == ["warn"]
+    assert [f.level for f in check_starts(both)] == ["fail"]
     assert [f.level for f in check_starts(sampled.fit)] == ["fail"]
 
 
