@@ -102,7 +102,6 @@ def test_a_maximum_away_from_the_sample_fails_and_names_both(tmp_path: Path) -> 
     )
     assert [f.level for f in check_starts(both, point.target, sampled.posterior)] == ["warn"]
     assert [f.level for f in check_starts(both)] == ["fail"]
-    assert [f.level for f in check_starts(sampled.fit)] == ["fail"]
 
 
 def test_two_modes_fail_with_their_weights(tmp_path: Path) -> None:
