@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from scipy import stats
@@ -64,9 +65,8 @@ def normal_score(posterior: Posterior, name: str, truth: float) -> float:
 
 def outcome_of(result: Result, truth: Truth) -> Outcome:
     """Scores of all physical parameters that were sampled, and the checks that failed."""
-    assert result.posterior is not None
-    known = truth.flat()
-    z = {name: normal_score(result.posterior, name, known[name]) for name in result.summary.index}
+    known, posterior = truth.flat(), cast(Posterior, result.posterior)
+    z = {name: normal_score(posterior, name, known[name]) for name in result.summary.index}
     return Outcome(z, tuple((f.code, f.experiment) for f in result.findings if f.level == "fail"))
 
 

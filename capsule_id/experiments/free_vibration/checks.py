@@ -123,7 +123,7 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
     raw, design = e.unwhitened(theta, np)
     nuisances = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
     left = raw - design @ nuisances
-    # Rounding of a rod at rest depends on the residuals.
+    # At rest the last digits of this difference depend on the residuals, and must not choose the interval.
     curve = np.round((e.values - left) / np.ptp(e.values), 9) * np.ptp(e.values)
     offsets, limits = [], []
     number = min(INTERVALS, len(curve) // (2 * READINGS_PER_INTERVAL))

@@ -35,7 +35,7 @@ def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> l
 
 
 def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
-    """The two largest inputs of the variance of every physical parameter; [] where the fit knows none."""
+    """The two largest inputs of the variance of every physical parameter; [] for a fit without shares."""
     rows = {}
     for name in (row.name for row in target.parameters if row.physical and row.name in fit.shares):
         (first, share), (second, other), *_ = sorted(fit.shares[name].items(), key=lambda item: -item[1])

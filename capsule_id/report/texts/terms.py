@@ -11,7 +11,7 @@ TERMS: Mapping[str, str] = {
     "residual": "Measured value minus value of the model, in units of its sd.",
     "white": "Residuals are white where neighbours in time are not correlated. Coloured noise is not white.",
     "AR(1), ARMA": "Models of coloured noise. AR(1): the correlation of two samples falls exponentially with their distance.",
-    "p": "Probability of a deviation at least as large by chance alone. A small p speaks against chance.",
+    "p": "Probability of a deviation at least as large by chance alone. If p is small, chance is an unlikely cause.",
     "point fit, MAP": "Parameters at the maximum of the posterior.",
     "log-posterior": "Logarithm of the posterior density. A difference of 3 means that a point is 20 times less probable.",
     "R-hat": "Compares independent runs of the sampler. 1 is perfect; above 1.01 they do not agree yet.",

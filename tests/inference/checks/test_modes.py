@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.pipeline import higher_maximum, sample_posterior, stage_seeds
+from capsule_id.inference.result import Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import Rig
@@ -84,9 +86,9 @@ def test_a_maximum_away_from_the_sample_fails_and_names_both(tmp_path: Path) -> 
     kinds, seeds = default_registry(), stage_seeds(0)
     point = fit_points(LogPosterior(rig, make_experiments(rig)), kinds, seeds.starts, sampled=True)
     sampled = sample_posterior(point, seeds.walkers)
-    assert sampled.posterior is not None
+    sample = cast(Posterior, sampled.posterior)
     assert {f.level for f in check_maximum(sampled)} == {"ok"}
-    assert np.max(higher_maximum(point, sampled.posterior).log_posterior) > np.max(point.fit.log_posterior) + 3.0
+    assert np.max(higher_maximum(point, sample).log_posterior) > np.max(point.fit.log_posterior) + 3.0
     before = replace(sampled, fit=point.fit, values={**point.target.fixed, **point.fit.values})
     found = [f for f in check_maximum(before) if f.level == "fail"]
     assert {f.facts["name"] for f in found} >= {"mu"}
@@ -100,7 +102,7 @@ def test_a_maximum_away_from_the_sample_fails_and_names_both(tmp_path: Path) -> 
         },
         at_other_maximum=np.append(sampled.fit.at_other_maximum, True),
     )
-    assert [f.level for f in check_starts(both, point.target, sampled.posterior)] == ["warn"]
+    assert [f.level for f in check_starts(both, point.target, sample)] == ["warn"]
     assert [f.level for f in check_starts(both)] == ["fail"]
 
 
@@ -109,10 +111,9 @@ def test_two_modes_fail_with_their_weights(tmp_path: Path) -> None:
     target = LogPosterior(rig, make_experiments(rig))
     fit = point_fit(target, 0, 2)
     fitted = sample_posterior(fit_points(target, default_registry(), 0, sampled=True), 0, budget=200)
-    assert fitted.posterior is not None
     draws = np.exp(fit.u + 0.1 * np.random.default_rng(0).standard_normal((2, 500, 4, target.dimension)))
     draws[..., :2, target.names.index("mu")] *= 3.0
-    posterior = replace(fitted.posterior, draws=draws, ess=np.full(target.dimension, 1000.0))
+    posterior = replace(cast(Posterior, fitted.posterior), draws=draws, ess=np.full(target.dimension, 1000.0))
     (found,) = check_maximum(SampledFit(target, fit, posterior, {**target.fixed, **fit.values}))
     assert (found.code, found.level, found.parameters[0]) == ("sample.modes", "fail", "mu")
     assert finding_text(found, FIT_MESSAGES).count("with weight 0.50") == 2

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -97,11 +98,8 @@ def test_a_failed_check_widens_the_parameters_of_its_run(known: SampledFit) -> N
 
 
 def test_parts_are_whole_periods_and_phases(known: SampledFit) -> None:
-    run = known.experiments[0]
-    assert isinstance(run, BaseRun)
-    time, phase = by_time(run), by_phase(run)
-    assert time is not None
-    assert phase is not None
+    run = cast(BaseRun, known.experiments[0])
+    time, phase = (cast(np.ndarray, parts(run)) for parts in (by_time, by_phase))
     assert np.array_equal(np.unique(time), np.arange(4))  # 2 s at 2 Hz
     assert np.array_equal(np.bincount(time), [50, 50, 50, 50])
     assert np.mean(phase[:50] == phase[50:100]) > 0.95  # a sample on an edge

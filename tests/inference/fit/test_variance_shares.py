@@ -23,8 +23,7 @@ def targets() -> dict[float, LogPosterior]:
     """Some bench tests of data/, with two sds of the weighing of m1, kg."""
     rig = cid.read_rig(DATA)
     rig = replace(rig, tables=tuple(table for table in rig.tables if table.label in TABLES))
-    assert rig.m1 is not None
-    rigs = {sd: replace(rig, m1=Quantity(rig.m1.value, sd)) for sd in (2e-4, 2e-6)}
+    rigs = {sd: replace(rig, m1=Quantity(rig.mass("m1"), sd)) for sd in (2e-4, 2e-6)}
     return {sd: LogPosterior(one, make_experiments(one)) for sd, one in rigs.items()}
 
 
