@@ -52,6 +52,7 @@ def test_the_line_that_names_the_release_makes_the_fit_clean(tmp_path: Path) -> 
     rig = read_rig(write(tmp_path / "rig", time, values), KINDS)
     (finding,) = found(rig, "decays.release")
     assert finding.level == "warn"
+    assert "state an earlier start" in text(finding)
     (line,) = re.findall(r"start = \{.*?\}", text(finding))
     uncut = cid.fit(rig, budget=None)
     result = cid.fit(read_rig(write(tmp_path / "rig", time, values, line), KINDS), budget=None)
@@ -76,6 +77,7 @@ def test_a_push_before_the_release_is_left_out(tmp_path: Path) -> None:
     (finding,) = found(rig, "decays.release")
     assert finding.level == "warn"
     assert "slow approach" in text(finding)
+    assert "earlier start" not in text(finding)
     (line,) = re.findall(r"start = \{.*?\}", text(finding))
     stated = read_rig(write(tmp_path / "stated", time, values, line), KINDS)
     assert found(stated, "decays.release") == []

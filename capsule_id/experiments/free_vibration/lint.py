@@ -203,8 +203,8 @@ MESSAGES = {
         ok="{labels}: the residuals do not depend on position and direction (p = {p:.2g})",
         fail=(
             "{label}: the residuals must not depend on the position of the rod, but they do (p = {p:.1g}), most from "
-            "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, it reads in coarse steps, or the model lacks "
-            "a force. Calibrate the sensor, record with a finer resolution, or state a later start, for smaller amplitudes."
+            "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the "
+            "sensor, or state a later start, for smaller amplitudes."
         ),
     ),
     "decays.thinned": Message(
