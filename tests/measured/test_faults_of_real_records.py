@@ -56,3 +56,10 @@ def test_the_pendulum_has_no_fault_but_its_unit_and_the_hand_that_raises_it(
     assert found["decays.release"].facts["start"] == pytest.approx(start, abs=0.02)
     cut = {"start": quantity(found["decays.release"].facts["start"], "s")}
     assert codes(rig_of(tmp_path / "cut", pendulum(record), cut)) == {"readings.magnitude"}
+
+
+@pytest.mark.parametrize(("record", "start"), [(1, 3.2), (2, 2.3), (3, 2.0)])
+def test_a_later_start_of_the_pendulum_shows_no_clipping(tmp_path: Path, record: int, start: float) -> None:
+    """Few levels repeat in a short record; record 3 sticks for 20 ms where it turns at -32.6 deg."""
+    rig = rig_of(tmp_path, pendulum(record), {"start": quantity(start, "s")})
+    assert codes(rig) == {"readings.magnitude"}

@@ -75,6 +75,31 @@ def test_a_record_that_begins_saturated_is_clipped(step: float, limit: float, be
     assert clipped_samples(step * np.round(swing / step), 200.0) == []
 
 
+def coarse_encoder(clip: float = np.inf) -> np.ndarray:
+    """A swing of 1.4 rad whose encoder has steps of 0.09 or 0.1 degrees in two decimals; most levels are read once."""
+    angle = np.rad2deg(1.4) * np.exp(-TIME / 4.0) * np.cos(2.0 * np.pi * 1.7 * TIME)
+    return np.round(np.round(np.clip(angle, -clip, clip) * 4000.0 / 360.0) * 360.0 / 4000.0 + 0.003, 2)
+
+
+def test_the_levels_of_a_swing_are_its_steps_though_most_are_read_once() -> None:
+    values = coarse_encoder()
+    assert len(np.unique(values)) > 0.5 * len(values)
+    assert reading_step(values) == pytest.approx(0.09)
+    assert clipped_samples(values, RATE / 1.7) == []
+    for level in (0.95, 0.85):
+        clipped = clipped_samples(coarse_encoder(level * np.rad2deg(1.4)), RATE / 1.7)
+        assert {one.side for one in clipped} >= {"upper"}
+
+
+def test_a_peak_that_sticks_is_not_clipped() -> None:
+    """The rod approaches its turning point smoothly, stays there, and leaves at once."""
+    rise = -(np.arange(60, 0, -1) ** 2) / 300.0
+    stuck = np.round(np.concatenate([np.full(60, -30.0), rise, np.zeros(28), -np.arange(1.0, 40.0)]))
+    assert clipped_samples(stuck, 600.0) == []
+    abrupt = np.concatenate([np.arange(-39.0, 0.0), np.zeros(28), -np.arange(1.0, 40.0)])
+    assert [one.side for one in clipped_samples(abrupt, 600.0)] == ["upper"]
+
+
 def test_gaps_are_multiples_of_the_sampling_step() -> None:
     kept = np.delete(TIME, [*range(300, 310), 700])
     gaps = find_gaps(kept)

@@ -1,5 +1,6 @@
 """Finds clipped records: flat tops, samples that share exactly the largest or smallest value."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -56,18 +57,20 @@ def _at_limit(
     limit : largest value and 1, or smallest value and -1
     resolution : distance at which values count as equal, and reading step
     """
-    (level, sign), (tolerance, step), found, near = limit, resolution, [], 0
-    for part in pieces(len(values)):
-        depth = sign * (level - values[part])
-        found.append(part.start + np.flatnonzero(depth <= tolerance))
-        beside = (depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step)
-        near += int(np.sum(beside))
-        if part.start == 0 and depth[0] <= tolerance:
-            # A record that begins at its limit lacks one side of its first peak: the other side counts twice.
-            peak = np.flatnonzero(np.append(depth > (NEIGHBOURS + 0.25) * step, True))[0]
-            near += int(np.sum(beside[:peak]))
-    rows = np.concatenate(found)
-    if len(rows) < FEWEST_CLIPPED + EXCESS * near / NEIGHBOURS:
+    (level, sign), (tolerance, step) = limit, resolution
+
+    def within(closest: float, farthest: float) -> Iterator[np.ndarray]:
+        """Indices of the samples at a distance from the limit above ``closest`` and up to ``farthest``."""
+        for part in pieces(len(values)):
+            depth = sign * (level - values[part])
+            yield part.start + np.flatnonzero((depth > closest) & (depth <= farthest))
+
+    rows = np.concatenate(list(within(-np.inf, tolerance)))
+    beside = tolerance, (NEIGHBOURS + 0.25) * step
+    if len(rows) < FEWEST_CLIPPED + EXCESS * sum(len(near) for near in within(*beside)) / NEIGHBOURS:
+        return rows[:0]
+    near = np.concatenate(list(within(*beside)))
+    if len(rows) < FEWEST_CLIPPED + EXCESS * (len(near) + _one_sided(near, rows)) / NEIGHBOURS:
         return rows[:0]
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
     if runs[0][0] == 0 and len(runs[0]) > LONGEST_HOLD * period:
@@ -75,3 +78,17 @@ def _at_limit(
     # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours.
     runs = [run for run in runs if len(run) > 1]
     return np.concatenate(runs) if sum(map(len, runs)) >= FEWEST_CLIPPED else rows[:0]
+
+
+def _one_sided(near: np.ndarray, rows: np.ndarray) -> int:
+    """Surplus of samples ``near`` the limit on one side of the peaks with samples at it, ``rows``; indices.
+
+    A clipped peak begins and ends abruptly. A peak that sticks, or begins the record, has one gradual side.
+    """
+    together = np.concatenate([near, rows])
+    order = np.argsort(together, kind="stable")
+    surplus = 0
+    for peak in np.split(order, np.flatnonzero(np.diff(together[order]) > 1) + 1):
+        at_limit = np.flatnonzero(peak >= len(near))
+        surplus += len(peak) - 1 - at_limit[-1] - at_limit[0] if len(at_limit) else 0
+    return abs(int(surplus))

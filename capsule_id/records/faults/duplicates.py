@@ -24,6 +24,8 @@ COMPARED = 4096
 MOST_DECIMALS = 15
 #: Distance of a level from an even spacing, in spacings; share of the levels that must be within it.
 LEVEL_TOLERANCE, REGULAR_LEVELS = 0.2, 0.9
+#: Largest number of levels per reading of a table and of a record: at a high amplitude most levels are read once.
+MOST_LEVELS, MOST_LEVELS_OF_RECORD = 0.5, 0.9
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ def reading_step(values: np.ndarray) -> float:
     levels = np.unique(values)
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * scale]
-    if 2 < len(gaps) < 0.5 * len(values):
+    most = MOST_LEVELS if len(values) < SHORTEST_RECORD else MOST_LEVELS_OF_RECORD
+    if 2 < len(gaps) < most * len(values):
         spacing = float(np.median(gaps[gaps < 1.5 * np.min(gaps)]))
         if np.mean(np.abs(gaps / spacing - np.round(gaps / spacing)) < LEVEL_TOLERANCE) > REGULAR_LEVELS:
             return spacing
