@@ -9,6 +9,7 @@ import numpy as np
 from capsule_id.experiments.kind import Estimate, Kind
 from capsule_id.experiments.lint_magnitudes import lint_magnitudes, lint_rig_quantities
 from capsule_id.records.faults.duplicates import Readings, repeated_blocks
+from capsule_id.rig.formats.columns import release
 from capsule_id.rig.formats.text.blocks import WINDOWS
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Finding
@@ -29,6 +30,7 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     findings += lint_rig_quantities(rig)
     for table in tables:
         findings += lint_magnitudes(table, kinds[table.kind])
+        _release(table)
         windows = {file: encoding for file, encoding in table.encodings.items() if encoding == WINDOWS}
         findings += [
             Finding("readings.encoding", "ok", {"file": file, "encoding": encoding}, table.label)
@@ -40,8 +42,15 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
         if table.rejected:
             facts = {"file": table.file, "rows": table.rejected, "used": len(table.rows)}
             findings.append(Finding("readings.rejected", "warn", facts, table.label))
-        findings += [found for lint_table in kinds[table.kind].lint for found in lint_table(table, rig)]
+        for lint_table in kinds[table.kind].lint:
+            findings += lint_table(table, rig)
+            _release(table)
     return (*findings, *_same_files(rig, tables), *_repeated_blocks(rig, tables))
+
+
+def _release(table: Table[Any]) -> None:
+    """Give back the memory of a long table that lies in files."""
+    release(*(column.values for column in table.columns.values()))
 
 
 def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tuple[Finding, ...]:
@@ -63,8 +72,10 @@ def _same_files(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
 
 def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
     """Equal for two tables with the same readings of the same file; column maps may read different ones."""
-    columns = table.columns.items()
-    readings = ((name, hashlib.sha256(np.ascontiguousarray(column.values).data).digest()) for name, column in columns)
+    readings = []
+    for name, column in table.columns.items():
+        readings.append((name, hashlib.sha256(np.ascontiguousarray(column.values).data).digest()))
+        _release(table)
     return rig.files.get(table.file, table.label), *readings
 
 

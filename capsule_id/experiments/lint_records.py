@@ -9,6 +9,7 @@ from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.phase import phase_jump
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
 from capsule_id.rig.filters import TIMING_TOLERANCE, largest_offset, median_step
+from capsule_id.rig.formats.columns import in_blocks
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
@@ -50,9 +51,10 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
     period : of the oscillation, s; infinite where it is unknown
     """
     column, time = table.columns[name], table["time"]
-    if len(time[used]) < 2 or np.ptp(column.values[used]) == 0.0:
+    values, unit = column.values[used], column.to_display
+    if len(time[used]) < 2 or np.ptp(values) == 0.0:
         return
-    values = column.values[used] * column.to_display if column.to_display != 1.0 else column.values[used]
+    values = in_blocks(lambda part: part * unit, values) if unit != 1.0 else values
     step = median_step(time[used])
     where = {"file": table.file, "column": name, "unit": column.unit}
     for clipped in clipped_samples(values, period / step):

@@ -15,6 +15,7 @@ from jaxtyping import Float, Num
 from numpy.polynomial import legendre
 
 from capsule_id.errors import InputError
+from capsule_id.rig.formats.columns import release
 from capsule_id.views import counted
 
 #: Samples of one channel, or their times.
@@ -74,6 +75,7 @@ def loudest_part(values: Record) -> slice:
     if last <= 0:
         return slice(0, len(values))
     first = max((*range(0, last, PIECE), last), key=lambda k: float(np.var(values[k : k + PIECE])))
+    release(values)
     return slice(first, first + PIECE)
 
 
@@ -94,13 +96,17 @@ def median_step(time: Record) -> float:
     if len(time) < 2 * PIECE:
         return float(np.median(np.diff(time)))
     first = np.arange(0, len(time) - 1, len(time) // PIECE)
-    return float(np.median(time[first + 1] - time[first]))
+    steps = time[first + 1] - time[first]
+    release(time)
+    return float(np.median(steps))
 
 
 def largest_offset(time: Record, step: float) -> float:
     """Largest distance of the times from an even grid with ``step`` that begins at the first one, s."""
     grid = ((part, np.arange(part.start, part.stop)) for part in pieces(len(time)))
-    return float(np.max([np.max(np.abs(time[part] - time[0] - step * index)) for part, index in grid]))
+    largest = float(np.max([np.max(np.abs(time[part] - time[0] - step * index)) for part, index in grid]))
+    release(time)
+    return largest
 
 
 def sampling_step(time: Record) -> float:

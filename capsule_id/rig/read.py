@@ -253,8 +253,10 @@ def _with_reading_error(
     for suffix in _READING_ERRORS:
         key, si = column.name + suffix, kind.columns[column.name].si
         stated[suffix] = read_quantity(document, (*path, key), entry[key], si).value if key in entry else None
-        smallest = SMALLEST_RELATIVE_ERROR * float(np.max(np.abs(column.values), initial=0.0))
-        if (size := stated[suffix]) is not None and size < smallest:
+        if (size := stated[suffix]) is None:
+            continue
+        smallest = SMALLEST_RELATIVE_ERROR * max(np.max(column.values), -np.min(column.values))
+        if size < smallest:
             rule = f"{key} must not be below {SMALLEST_RELATIVE_ERROR:g} of the largest reading ({smallest:.1g} in SI units)"
             raise document.error((*path, key), rule, f"{size:g}", "correct the value or its unit, or remove it")
     return Column(column.name, column.unit, column.to_display, column.values, stated["_sd"], stated["_resolution"])

@@ -13,6 +13,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
+from capsule_id.rig.formats.columns import IN_MEMORY, in_blocks, release
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.maps.clock import on_reference, read_clock
@@ -26,8 +27,6 @@ from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_string, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
-
-_BLOCK = 1 << 20  # rows that are checked at a time
 
 
 @dataclass(frozen=True)
@@ -278,7 +277,7 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
         raise table.error(None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
     written = table.raw.columns[index]
     with np.errstate(over="ignore"):
-        values = written if factor == 1.0 else scale(written, factor)
+        values = written if factor == 1.0 else in_blocks(lambda part: scale(part, factor), written)
     _check_values(table, index, rule, values)
     if rule.varies and len(values) > 1 and np.ptp(values) == 0.0:
         value = f"{written[0]:g} {unit} in every row"
@@ -286,6 +285,7 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
     if rule.varies and len(values) == 1:
         raise table.error(0, name, f"{name} must vary over the rows", "one row", "add rows")
     values.flags.writeable = False
+    release(values, written)
     return Column(name, unit, 1.0 / factor, values)
 
 
@@ -302,12 +302,12 @@ def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.nda
         (is_plausible, magnitude, "correct the value or the unit of the column"),
     ]
     for holds, text, remedy in checks:
-        for first in range(0, len(values), _BLOCK):
-            _raise_at_first_false(table, index, holds(values[first : first + _BLOCK]), (text, remedy), first)
+        for first in range(0, len(values), IN_MEMORY):
+            _raise_at_first_false(table, index, holds(values[first : first + IN_MEMORY]), (text, remedy), first)
     if rule.increasing:
         text, remedy = f"{name} must increase from row to row", "sort the rows and delete repeated ones"
-        for first in range(0, len(values) - 1, _BLOCK):
-            rises = np.diff(values[first : first + _BLOCK + 1]) > 0.0
+        for first in range(0, len(values) - 1, IN_MEMORY):
+            rises = np.diff(values[first : first + IN_MEMORY + 1]) > 0.0
             _raise_at_first_false(table, index, rises, (text, remedy), first + 1)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.records.noise import NORMAL_QUARTILE
 from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part
+from capsule_id.rig.formats.columns import release
 
 #: Half cycles whose height is below this fraction of the largest one belong to the rest before the release.
 REST_HEIGHT = 0.2
@@ -140,6 +141,7 @@ def _shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
     count = len(time) // size
     means, readings = (x[: count * size].reshape(count, size).mean(axis=1) for x in (time, values))
     means[[0, -1]] = time[[0, -1]]
+    release(time, values)
     return means, readings
 
 

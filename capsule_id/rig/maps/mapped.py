@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from capsule_id.rig.filters import pieces
+from capsule_id.rig.formats.columns import in_blocks, joined, release, whole_numbers
 from capsule_id.rig.formats.export import Export
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.maps.declared import ColumnMap, Header, Source
@@ -89,11 +91,11 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     first_rows = np.cumsum([0, *(part.rows for part in parts)])
     keep, missing, other = _kept(document, path, values, where, column_map.where)
     for name, source in column_map.sources.items():
-        if source.rate is not None:
-            values[name] = np.arange(first_rows[-1]) / source.rate
+        if (rate := source.rate) is not None:
+            values[name] = in_blocks(lambda part, rate=rate: part / rate, whole_numbers(0, int(first_rows[-1])))
     names = tuple(column_map.sources)
-    columns = tuple(values.pop(name)[keep] for name in names)
-    origin = None if isinstance(keep, slice) else np.flatnonzero(keep)
+    columns = tuple(_selected(values.pop(name), keep) for name in names)
+    origin = None if keep is None else _selected(np.arange(len(keep)), keep)
 
     def cell(row: int | None, column: int) -> tuple[_Cell, int | None]:
         index = 0 if row is None else row if origin is None else int(origin[row])
@@ -107,14 +109,22 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
 
     units = tuple(column_map.sources[name].unit for name in names)
     # Arrays of a file may have other lengths than those that the map names.
-    rows = exports[0].lines[: int(first_rows[-1])][keep] if len(parts) == 1 else np.arange(1, len(columns[0]) + 1)
+    lines = exports[0].lines[: int(first_rows[-1])]
+    rows = _selected(lines, keep) if len(parts) == 1 else whole_numbers(1, len(columns[0]))
     raw = RawTable(names, units, columns, rows, place_of)
     return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)
 
 
 def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
     """Columns put one below the other; a single one is not copied."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    return parts[0] if len(parts) == 1 else joined(parts)
+
+
+def _selected(values: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
+    """The rows ``keep`` of a column; None: all, without a copy."""
+    if keep is None:
+        return values
+    return joined((values[part][keep[part]] for part in pieces(len(values))), values.dtype.type)
 
 
 class _Part:
@@ -193,11 +203,11 @@ def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.nd
     """The values of a column in its stated unit."""
     values = found.values
     if source.minus is not None:
-        values = values - part.find((*place, "minus"), source.minus).values
+        values = in_blocks(np.subtract, values, part.find((*place, "minus"), source.minus).values)
     if source.scale == 1.0 and source.offset == 0.0:
         return values
     with np.errstate(over="ignore"):
-        return values * source.scale + source.offset
+        return in_blocks(lambda own: own * source.scale + source.offset, values)
 
 
 def _kept(
@@ -206,8 +216,10 @@ def _kept(
     values: Mapping[str, np.ndarray],
     where: Mapping[str, np.ndarray],
     wanted: Mapping[str, float],
-) -> tuple[np.ndarray | slice, int, int]:
-    """Which rows are used (all as a slice), and how many are dropped: for a missing cell, and outside ``where``."""
+) -> tuple[np.ndarray | None, int, int]:
+    """Which rows are used (None: all), and how many are dropped: for a missing cell, and outside ``where``."""
+    if not where and not any(_blank(column).any() for column in values.values()):
+        return None, 0, 0
     unknown = np.any([np.isnan(column) for column in where.values()], axis=0) if where else np.array(False)
     inside = np.ones(next(iter(values.values())).size, bool)
     for key, column in where.items():
@@ -222,12 +234,19 @@ def _kept(
         inside &= same
     empty = np.zeros_like(inside)
     for column in values.values():
-        empty |= np.isnan(column)
+        empty |= _blank(column)
     keep = inside & ~empty
     if not keep.any():
         remedy = "correct where, or map another column"
         raise document.error((*path, "columns"), "a table must have rows", "none is left", remedy)
     if keep.all():
-        return slice(None), 0, 0
+        return None, 0, 0
     missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
     return keep, missing, inside.size - int(np.sum(keep)) - missing
+
+
+def _blank(column: np.ndarray) -> np.ndarray:
+    """Whether each cell holds a missing marker, (n,)."""
+    blank = joined((np.isnan(column[part]) for part in pieces(len(column))), np.bool_)
+    release(column)
+    return blank

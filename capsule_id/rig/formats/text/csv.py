@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.rig.formats.columns import Growing, whole_numbers
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.formats.text.blocks import Content, TextFile
 from capsule_id.rig.formats.text.cells import BLANKS, cells_of, read_number, shown_cell
-from capsule_id.rig.formats.text.rows import Growing, Shape, plain_block
+from capsule_id.rig.formats.text.rows import Shape, plain_block
 from capsule_id.views import counted
 
 _HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
@@ -51,8 +52,7 @@ def read_csv(content: Content, path: Path) -> RawTable:
         line = 0 if row is None else row + 1
         return line + 1, cells_of(file.line(line), delimiter)[column][1]
 
-    rows = np.arange(2, len(columns[0]) + 2, dtype=np.int32)
-    return RawTable(names, units, columns, rows, place, file.encoding)
+    return RawTable(names, units, columns, whole_numbers(2, len(columns[0])), place, file.encoding)
 
 
 def _refuse_blank(file: TextFile) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.rig.formats.columns import Growing
 from capsule_id.rig.formats.text.blocks import TextFile, lines_of, occurrences
 from capsule_id.rig.formats.text.cells import bare, cells_of, decimal_mark, place_of_cell, read_column
 from capsule_id.views import counted
@@ -37,19 +38,6 @@ class Shape:
     width: int
     decimal: str | None
     trailing: bool = False
-
-
-class Growing:
-    """A column of numbers that grows block by block, without a second copy."""
-
-    def __init__(self, dtype: type[np.generic] = np.float64) -> None:
-        self.values = np.empty(0, dtype)
-
-    def extend(self, more: np.ndarray) -> None:
-        """Append numbers."""
-        size = len(self.values)
-        self.values.resize(size + len(more), refcheck=False)
-        self.values[size:] = more
 
 
 class Rows:

@@ -1,0 +1,99 @@
+"""Columns of any length: long ones lie in a temporary file, so that the memory of a record does not grow with it.
+
+The operating system keeps those parts of the file in memory that are in use. It removes the file with its last array.
+"""
+
+import mmap
+import tempfile
+from collections.abc import Callable, Iterable
+from typing import IO, Any
+
+import numpy as np
+
+from capsule_id.errors import InputError
+
+#: Longest column that lies in memory, and numbers of a longer one that are worked on at a time.
+IN_MEMORY = 1 << 20
+
+
+class Growing:
+    """A column of numbers that grows block by block."""
+
+    def __init__(self, dtype: type[np.generic] = np.float64) -> None:
+        self._values, self._dtype = np.empty(0, dtype), dtype
+        self._file: IO[bytes] | None = None
+
+    def __del__(self) -> None:
+        """Close the file; arrays keep their part of it."""
+        if self._file is not None:
+            self._file.close()
+
+    def extend(self, more: np.ndarray) -> None:
+        """Append numbers.
+
+        Raises
+        ------
+        InputError
+            If the directory of temporary files has no room.
+        """
+        size = len(self._values)
+        if self._file is None and size + len(more) <= IN_MEMORY:
+            self._values.resize(size + len(more), refcheck=False)
+            self._values[size:] = more
+            return
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="capsule-id-")  # noqa: SIM115  (the column closes it)
+                self._file.write(self._values.data)
+            self._file.write(np.ascontiguousarray(more, self._dtype).data)
+            self._file.flush()
+        except OSError as error:
+            rule, remedy = "a long record needs room for temporary files", "set TMPDIR to a directory with room"
+            raise InputError(rule, str(error), remedy) from None
+        self._values = self._values[:0]
+
+    @property
+    def values(self) -> np.ndarray:
+        """The numbers, (n,)."""
+        if self._file is not None and not len(self._values):
+            self._values = np.asarray(np.memmap(self._file, self._dtype, "r+"))
+        return self._values
+
+
+def joined(parts: Iterable[np.ndarray], dtype: type[np.generic] = np.float64) -> np.ndarray:
+    """Arrays put one below the other."""
+    column = Growing(dtype)
+    for part in parts:
+        column.extend(part)
+    return column.values
+
+
+def in_blocks(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
+    """``function`` of arrays (n,), element by element; of long ones block by block."""
+    rows = len(arrays[0])
+    if rows <= IN_MEMORY:
+        return function(*arrays)
+    return joined(_blocks(function, arrays, rows))
+
+
+def _blocks(function: Callable[..., np.ndarray], arrays: tuple[np.ndarray, ...], rows: int) -> Iterable[np.ndarray]:
+    """``function`` of each block."""
+    for first in range(0, rows, IN_MEMORY):
+        yield function(*(array[first : first + IN_MEMORY] for array in arrays))
+        release(*arrays)
+
+
+def whole_numbers(first: int, count: int) -> np.ndarray:
+    """``count`` whole numbers from ``first`` on, such as lines of a file."""
+    parts = range(first, first + count, IN_MEMORY)
+    return joined((np.arange(part, min(part + IN_MEMORY, first + count)) for part in parts), np.int32)
+
+
+def release(*arrays: np.ndarray) -> None:
+    """Give back the memory of columns that lie in files; their numbers are read again where they are used."""
+    for array in arrays:
+        base: Any = array
+        while base is not None and not isinstance(base, mmap.mmap):
+            base = getattr(base, "base", None)
+        if base is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+            base.madvise(mmap.MADV_DONTNEED)
