@@ -96,6 +96,8 @@ def _adapted(
     prior : see ``refined``
     """
     coordinates = mixture.coordinates
+    used = weights > 0.0  # the theta of the others may overflow
+    u, weights = u[used], weights[used]
     if done < SINGLE:
         coordinates = coordinates_of(u[rng.choice(len(u), len(u), p=weights)], prior)
     w = coordinates.w(u)

@@ -52,9 +52,10 @@ class TwoTerms(Gaussian):
 
 
 def mixture(linear: bool = True) -> Mixture:
-    """Components in theta and in u, and one that draws the first parameter from its prior."""
+    """Components in theta and in u, and one that draws the first parameter from its prior; the second follows it."""
+    shear = np.array([[0.0, 0.0], [0.4, 0.0]])
     shape = Coordinates(
-        np.array([linear, False]), (0,), np.array([-1.0, 0.0]), np.array([2.0, 1.0]), np.array([0.5, 0.0])
+        np.array([linear, False]), (0,), np.array([-1.0, 0.0]), np.array([2.0, 1.0]), np.array([0.5, 0.0]), shear
     )
     if linear:
         return concentric(np.array([0.6, 0.3]), np.array([[0.04, 0.05], [0.05, 0.25]]), coordinates=shape)
@@ -111,6 +112,39 @@ def test_coordinates_are_those_closest_to_normal() -> None:
     assert np.all(coordinates_of(sample_of, prior).linear)
     assert not np.any(coordinates_of(0.5 * rng.standard_normal((4000, 2)), prior).linear)
     assert not np.any(coordinates_of(sample_of, np.full((2, 2), np.nan)).linear)
+
+
+#: Changes of five logarithms with a term that may be absent, and their sds beside it.
+FOLLOW, BESIDE = np.array([-1.0, 0.5, -0.2, 0.1, 2.0]), 0.01
+
+
+def absent_term(u: np.ndarray) -> np.ndarray:
+    """Log-density (n, 1) of the logarithm of a term that may be absent, and of five that change with the term itself."""
+    theta = np.exp(np.minimum(u[:, :1], 50.0))
+    others = np.sum(stats.norm.logpdf(u[:, 1:], theta * FOLLOW, BESIDE), axis=1, keepdims=True)
+    return stats.norm.logpdf(u[:, :1], -4.0, 2.5) + stats.norm.logpdf(theta, 0.0, 0.3) + others
+
+
+def test_others_follow_the_theta_of_a_term_that_may_be_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: without the slopes on theta the largest waiting time is more than ten times as long."""
+    rng = np.random.default_rng(0)
+    first = -4.0 + 2.5 * rng.standard_normal((20_000, 1))
+    first = first[rng.uniform(size=first.shape) < np.exp(-0.5 * (np.exp(np.minimum(first, 50.0)) / 0.3) ** 2)][:, None]
+    others = np.exp(first) * FOLLOW + BESIDE * rng.standard_normal((len(first), 5))
+    exact = np.concatenate([first, others], axis=1)
+    prior = np.full((2, 6), np.nan)
+    prior[:, 0] = -4.0, 2.5
+    assert coordinates_of(exact, prior).shear[1:, 0] == pytest.approx(FOLLOW, abs=0.01)
+
+    def longest_wait() -> float:
+        start = block_proposal([np.arange(6)], np.append(-4.0, np.zeros(5)), np.diag([4.0, *[0.01] * 5]))
+        proposal = refined(absent_term, start, prior, np.random.RandomState(0))
+        return float(np.max(absent_term(exact) - proposal.log_density(exact)))
+
+    good = longest_wait()
+    monkeypatch.setattr(coordinates, "_shear", lambda values, weak: np.zeros((values.shape[1], weak.shape[1])))
+    poor = longest_wait()
+    assert poor > good + np.log(10.0), (poor, good)
 
 
 def test_refinement_finds_a_posterior_from_a_poor_start() -> None:
