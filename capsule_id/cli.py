@@ -1,6 +1,7 @@
 """Entry points of the two commands ``fit-params`` and ``capsule-id``: parse, call, exit code."""
 
 import argparse
+import gc
 import sys
 import tempfile
 import traceback
@@ -19,6 +20,8 @@ from capsule_id.interruption import INTERRUPTED, interruptible
 BAD_INPUT, INTERNAL = 2, 1
 _RESUME = "; --resume continues from the saved state"
 _LONGEST_MESSAGE = 300  # characters of an exception's message in the error line
+#: Objects until a collection of garbage: imports and traces make large trees, and each collection walks them all.
+_GARBAGE = (50_000, 20, 20)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -100,6 +103,7 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         If standard output takes no more text.
     """
     console.prepare()
+    gc.set_threshold(*_GARBAGE)
     interrupted = f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}"
     try:
         # The parsers load NumPy: an interruption must count from before that.

@@ -8,6 +8,7 @@ import gc
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 
 import jax
 import pytest
@@ -26,6 +27,29 @@ XLA_ONE_PART = "--xla_cpu_parallel_codegen_split_count=1" if HAS_EMITTER_OPTION 
 #: Files that take longest, first: the workers then end at the same time.
 FIRST = ("test_project.py", "test_notebooks.py", "test_notebooks_even.py", "test_foreign_law.py", "test_smooth.py")
 
+#: Files that compile large programs and run them for milliseconds: their programs are not optimised. Numbers of the
+#: commands, fits, maps and reference cases come from optimised programs.
+NOT_OPTIMISED = {
+    "test_block_means.py",
+    "test_decay_channels.py",
+    "test_decays.py",
+    "test_forced_run.py",
+    "test_forces.py",
+    "test_foreign_law.py",
+    "test_friction_family.py",
+    "test_friction_laws.py",
+    "test_general_derivatives.py",
+    "test_general_faults.py",
+    "test_general_reference.py",
+    "test_likelihoods.py",
+    "test_misfit.py",
+    "test_progression.py",
+    "test_simulate.py",
+    "test_slope.py",
+    "test_smooth.py",
+    "test_smooth_derivatives.py",
+}
+
 #: Modules whose annotations are checked at run time; the hook must stand before their first import.
 CHECKED = (
     "capsule_id.inference.fit.covariance",
@@ -38,6 +62,8 @@ CHECKED = (
     "capsule_id.rig.filters",
 )
 install_import_hook(CHECKED, "beartype.beartype")
+# Imports make no garbage, see pytest_collection_finish.
+gc.disable()
 
 # The variable reaches the processes that tests start; this process has imported JAX already.
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
@@ -65,9 +91,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage less often, and not what was imported: traces are large trees, and each pass walks them all."""
+    """Collect garbage again, less often, and not what was imported: each pass walks all modules and traces."""
+    gc.enable()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _optimisation(request: pytest.FixtureRequest) -> Iterator[None]:
+    jax.config.update("jax_disable_most_optimizations", request.path.name in NOT_OPTIMISED)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="session")

@@ -6,12 +6,15 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import nbformat
-import pytest
+from jupyter_client.manager import AsyncKernelManager
+from jupyter_core.utils import run_sync
 from nbclient import NotebookClient
 from nbformat import NotebookNode
+from nbformat.v4 import new_code_cell
 
 import capsule_id as cid
 from tests.cli_tools import ROOT
@@ -32,6 +35,14 @@ SHORT = {
     "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
     "08": "DRAWS, POINTS = 24, 16",
 }
+#: First cell in a kernel that has run another notebook.
+CLEAN = """%reset -f
+%cd -q {folder}
+import matplotlib.pyplot as plt
+plt.close("all")
+plt.rcdefaults()
+%matplotlib inline
+del plt"""
 LONGEST_CELL = 25  # lines
 #: What notebooks import besides the standard library. Of this package they import its public names.
 LIBRARIES = {"numpy", "scipy", "pandas", "matplotlib.pyplot", "jax", "emcee", "arviz"}
@@ -96,34 +107,57 @@ def shorten(notebook: NotebookNode, values: str) -> None:
     cell.source = values
 
 
-def execute(notebook: NotebookNode, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run a notebook in a copy of ``notebooks/`` beside a copy of ``data/``, as a checkout has them."""
+def execute(notebook: NotebookNode, folder: Path, kernel: AsyncKernelManager) -> None:
+    """Run a notebook in a copy of ``notebooks/`` beside a copy of ``data/``, as a checkout has them.
+
+    The kernel may have run other notebooks: names and figures of theirs are removed first.
+    """
     for part in ("notebooks", "data"):
         shutil.copytree(ROOT / part, folder / part)
     for cell in code(notebook):
         cell.outputs, cell.execution_count = [], None
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("IPYTHONDIR", str(folder / "ipython"))
-    where = {"metadata": {"path": str(folder / "notebooks")}}
-    NotebookClient(notebook, kernel_name="python3", timeout=SECONDS, resources=where).execute()
+    notebook.cells.insert(0, new_code_cell(CLEAN.format(folder=str(folder / "notebooks"))))
+    client = NotebookClient(notebook, kernel, timeout=SECONDS)
+    try:
+        client.execute()
+    finally:
+        if client.kc is not None:
+            client.kc.stop_channels()
+        del notebook.cells[0]
 
 
-def run_short(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@contextmanager
+def running_kernel(folder: Path) -> Iterator[AsyncKernelManager]:
+    """A kernel that takes the package from this checkout; ``folder`` receives IPython's own files."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    manager = AsyncKernelManager(kernel_name="python3")
+    run_sync(manager.start_kernel)(env={**os.environ, "PYTHONPATH": path, "IPYTHONDIR": str(folder)})
+    try:
+        yield manager
+    finally:
+        run_sync(manager.shutdown_kernel)(now=True)
+
+
+def run_short(name: str, folder: Path, kernel: AsyncKernelManager) -> None:
     """A notebook with a smaller study runs to the end, with all figures and without warnings."""
     notebook = read(name)
     if name[:2] in SHORT:
         shorten(notebook, SHORT[name[:2]])
     kept = figures(notebook)
-    execute(notebook, folder, monkeypatch)
+    execute(notebook, folder, kernel)
     assert figures(notebook) == kept
     assert [out.text for out in outputs(notebook, "stream") if out.name != "stdout"] == []
 
 
-def compare_with_kept(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At full size the text is the same, and the numbers differ only in the last digits between machines."""
+def compare_with_kept(name: str, folder: Path) -> None:
+    """In a kernel of its own, at full size, the text is the same.
+
+    The numbers differ only in the last digits between machines.
+    """
     notebook = read(name)
     expected = printed(notebook)
-    execute(notebook, folder, monkeypatch)
+    with running_kernel(folder / "ipython") as kernel:
+        execute(notebook, folder, kernel)
     assert NUMBER.sub("#", printed(notebook)) == NUMBER.sub("#", expected)
     pairs = zip(NUMBER.findall(printed(notebook)), NUMBER.findall(expected), strict=True)
     # Differences of rounding (a balance of 1e-11, a disagreement of 1e-7) may be anything of that size.

@@ -3,9 +3,11 @@
 The chapters of odd number run here, the others in ``test_notebooks_even.py``.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from jupyter_client.manager import AsyncKernelManager
 from nbclient.exceptions import CellExecutionError
 
 from tests.notebook_tools import (
@@ -22,9 +24,17 @@ from tests.notebook_tools import (
     outputs,
     read,
     run_short,
+    running_kernel,
 )
 
 LARGEST, LARGEST_TOGETHER = 600_000, 3_000_000  # bytes
+
+
+@pytest.fixture(scope="module")
+def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AsyncKernelManager]:
+    """One kernel for all chapters of this file: to start it and load JAX takes longer than most chapters."""
+    with running_kernel(tmp_path_factory.mktemp("ipython")) as manager:
+        yield manager
 
 
 def test_the_chapters_are_numbered_and_small() -> None:
@@ -71,17 +81,17 @@ def test_what_is_not_public_would_be_noticed(line: str, found: str) -> None:
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_a_notebook_runs_from_a_clean_copy(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_short(name, tmp_path, monkeypatch)
+def test_a_notebook_runs_from_a_clean_copy(name: str, tmp_path: Path, kernel: AsyncKernelManager) -> None:
+    run_short(name, tmp_path, kernel)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ODD)
-def test_kept_outputs_are_what_the_code_prints(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    compare_with_kept(name, tmp_path, monkeypatch)
+def test_kept_outputs_are_what_the_code_prints(name: str, tmp_path: Path) -> None:
+    compare_with_kept(name, tmp_path)
 
 
-def test_a_wrong_headline_would_be_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_headline_would_be_noticed(tmp_path: Path, kernel: AsyncKernelManager) -> None:
     """Negative control: the assertion of the last cell fails for another number."""
     notebook = read(next(name for name in NAMES if name.startswith("01")))
     first, last = notebook.cells[0], code(notebook)[-1]
@@ -89,6 +99,6 @@ def test_a_wrong_headline_would_be_noticed(tmp_path: Path, monkeypatch: pytest.M
     last.source = 'coverage = {"raw": 0.95, "filtered": 0.95}\n' + last.source
     notebook.cells = [first, last]
     with pytest.raises(CellExecutionError, match="AssertionError"):
-        execute(notebook, tmp_path, monkeypatch)
+        execute(notebook, tmp_path, kernel)
     last.source = last.source.replace("assert ", "bool")
     assert not ends_with_an_assertion(notebook)

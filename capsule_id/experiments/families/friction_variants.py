@@ -180,14 +180,29 @@ def sequential_monte_carlo(
         )
         position = (rng.random() + np.arange(particles)) / particles * np.sum(weight)
         chosen = np.minimum(np.searchsorted(np.cumsum(weight), position), particles - 1)
-        z, value = z[chosen], value[chosen]
-        for scale in np.geomspace(1.0, 0.1, MOVES):
-            proposed = z + scale * 2.38 / np.sqrt(dimension) * rng.standard_normal(z.shape) @ root.T
-            new = density(proposed)
-            change = power * (new - value) - 0.5 * np.sum(proposed**2 - z**2, axis=1)
-            accepted = np.log(rng.random(particles)) < change
-            z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
+        z, value = _metropolis(density, (z[chosen], value[chosen]), power, root, rng)
     return z, value, evidence
+
+
+def _metropolis(
+    density: Callable[[np.ndarray], np.ndarray],
+    particles: tuple[np.ndarray, np.ndarray],
+    power: float,
+    root: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move ``particles``, z (s, d) with their log-likelihoods (s,), by ``MOVES`` steps of the Metropolis rule.
+
+    root : (d, d) Cholesky factor of the covariance of z
+    """
+    z, value = particles
+    for scale in np.geomspace(1.0, 0.1, MOVES):
+        proposed = z + scale * 2.38 / np.sqrt(z.shape[1]) * rng.standard_normal(z.shape) @ root.T
+        new = density(proposed)
+        change = power * (new - value) - 0.5 * np.sum(proposed**2 - z**2, axis=1)
+        accepted = np.log(rng.random(len(z))) < change
+        z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
+    return z, value
 
 
 def order_p(residuals: np.ndarray, rng: np.random.Generator) -> float:
