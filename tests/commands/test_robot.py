@@ -8,7 +8,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.cli import capsule_id, fit_params
-from capsule_id.inference.sampling import ensembles
+from capsule_id.inference.sampling import ensembles, refinement
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
 SETTINGS = "period [ms],duty [%],periods [1]\n70,30,20\n90,30,20\n"
@@ -17,8 +17,12 @@ SETTINGS = "period [ms],duty [%],periods [1]\n70,30,20\n90,30,20\n"
 @pytest.mark.slow
 def test_a_robot_is_fitted_sampled_and_predicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # The default pilot takes minutes on a loaded machine; its moves are not what is tested.
-    for name, value in {"PILOT_BURN_IN": 40, "PILOT_STEPS": 40, "LONG_PILOT_STEPS": 40, "ADAPTING_STEPS": 60}.items():
-        monkeypatch.setattr(ensembles, name, value)
+    for module, name, value in (
+        (ensembles, "PILOT_STEPS", 40),
+        (ensembles, "LONG_PILOT_STEPS", 40),
+        (refinement, "DRAWS", 256),
+    ):
+        monkeypatch.setattr(module, name, value)
     folder, out = tmp_path / "robot", tmp_path / "result"
     cid.synthesize_robot(folder, 1, cid.RobotDesign(PERIODS, np.full(3, 0.3), sessions=3))
     code = fit_params([str(folder), "--out", str(out), "--max-steps", "120", "--quiet"])

@@ -56,7 +56,7 @@ class Gaussian:
         self.precisions = [np.linalg.inv(sigma[np.ix_(block, block)]) for block in self.blocks]
         self.centre = mean + self.OFF * np.sqrt(np.diag(sigma))
         self.covariance = self.WIDE**2 * sigma
-        self.kinked, self.normal_priors = False, np.full((2, len(mean)), np.nan)
+        self.normal_priors = np.full((2, len(mean)), np.nan)
 
     def parts(self, v: np.ndarray) -> np.ndarray:
         """(w, d) -> (w, blocks)."""

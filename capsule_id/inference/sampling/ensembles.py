@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Protocol
 
@@ -40,14 +41,13 @@ DEFAULT_ESS = 4000.0
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks.
 FIRST_CHECK, CHECK_EVERY = 120, 30
-#: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well.
+#: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well, so that
+#: the Laplace approximation is tried as it is.
 LARGE = 9
-#: Smallest ratio of pilot sd to Laplace sd at which a large block's proposal is widened. Smaller ratios may be noise
-#: of a short pilot.
-WIDER = 1.1
-#: Burn-in of every ensemble before its first stored draw, in autocorrelation times of the pilot.
-BURN_IN_IN_TAU = 8.0
-#: Spread of the initial walkers relative to the approximate posterior, dimensionless.
+#: Burn-in of every ensemble before its first stored draw, in autocorrelation times of the pilot. The first walkers come
+#: from a proposal that is close to the posterior already.
+BURN_IN_IN_TAU = 4.0
+#: Spread of the first draws of other blocks relative to the Laplace approximation, dimensionless.
 OVERDISPERSION = 1.2
 #: Ensembles that advance side by side.
 CORES = min(ENSEMBLES, os.cpu_count() or 1)
@@ -58,21 +58,19 @@ DEFAULT_BUDGET = 20_000
 #: Stored draws per autocorrelation time of the pilot, and the largest number of steps per stored draw. The limit is
 #: needed because a short pilot estimates the autocorrelation time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
-#: Steps of the pilot's burn-in, half of which determines the block proposal, and steps of each measured move (short, long).
-PILOT_BURN_IN, PILOT_STEPS, LONG_PILOT_STEPS = 100, 100, 300
+#: Steps of each measured move (short, long).
+PILOT_STEPS, LONG_PILOT_STEPS = 100, 300
 #: Name of the first move.
 FIRST = "block independence + differential evolution"
-#: Name of the move that the pilot adapts to its own sample, largest number of adaptations, and steps of each.
-ADAPTED, ADAPTATIONS, ADAPTING_STEPS = "adapted block independence + differential evolution", 4, 200
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
-#: Other kinds of moves are tried only where every block proposal stays above this, in steps.
-FAIR_TAU = 40.0
+#: Other kinds of moves are tried only where the block proposal stays above this, in steps.
+FAIR_TAU = 100.0
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """First walkers, move, thinning and burn-in of the recorded run, chosen by the pilot run."""
+    """Density of the first walkers, move, thinning and burn-in of the recorded run, chosen by the pilot run."""
 
     start: BlockProposal
     move: str
@@ -91,7 +89,6 @@ class Target(Protocol):
     centre: np.ndarray
     covariance: np.ndarray
     normal_priors: np.ndarray
-    kinked: bool
 
     @property
     def fingerprint(self) -> str:
@@ -175,19 +172,18 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
 def pilot(target: Target, seed: int) -> Schedule:
     """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
     random = np.random.RandomState(seed)
-    start, proposal = _by_short_chain(target, random) if target.kinked else _by_importance(target, random)
-    ensemble = Ensemble(target.parts, _initial(target, start, random), block_move(proposal))
+    large = [len(block) >= LARGE for block in target.blocks]
+    narrow = np.isin(np.arange(target.dimension), np.concatenate([[], *compress(target.blocks, large)]))
+    laplace = np.where(np.outer(narrow, narrow), target.covariance, OVERDISPERSION**2 * target.covariance)
+    first = block_proposal(target.blocks, target.centre, laplace, large)
+    proposal = refined(target.parts, first, target.normal_priors, random, large)
+    ensemble = Ensemble(target.parts, _initial(target, proposal, random), block_move(proposal))
     moves, measured = {FIRST: block_move(proposal), **other_moves()}, dict[str, float]()
-    # The most promising move runs first, briefly, then longer. Where the density has kinks, moves adapted to the sample
-    # follow. All other moves come last, because they are slow.
-    plan = [(FIRST, PILOT_STEPS), (FIRST, LONG_PILOT_STEPS), *[(ADAPTED, ADAPTING_STEPS)] * ADAPTATIONS * target.kinked]
-    for name, steps in [*plan, *((name, LONG_PILOT_STEPS) for name in other_moves())]:
+    # The most promising move runs first, briefly, then longer. The other moves come last, because they are slow.
+    plan = [(FIRST, PILOT_STEPS), (FIRST, LONG_PILOT_STEPS), *((name, LONG_PILOT_STEPS) for name in other_moves())]
+    for name, steps in plan:
         if name in other_moves() and min(measured.values()) < FAIR_TAU:
             break
-        if name == ADAPTED:
-            found = ensemble.chain.reshape(-1, target.dimension)
-            covariance = np.atleast_2d(np.cov(found.T))
-            moves[name] = block_move(_concentric(target, np.mean(found, axis=0), covariance))
         ensemble = Ensemble(target.parts, ensemble.state, moves[name]).run(steps)
         measured[name] = float(np.max(ensemble_time(ensemble.chain[None])))
         if measured[name] < GOOD_TAU:
@@ -195,45 +191,7 @@ def pilot(target: Target, seed: int) -> Schedule:
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
-    return Schedule(start, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
-
-
-def _by_importance(target: Target, random: np.random.RandomState) -> tuple[BlockProposal, BlockProposal]:
-    """Density of the first walkers and proposal of their moves, by importance sampling; it is wide enough for both."""
-    laplace = OVERDISPERSION**2 * target.covariance
-    proposal = refined(
-        target.parts, block_proposal(target.blocks, target.centre, laplace), target.normal_priors, random
-    )
-    return proposal, proposal
-
-
-def _by_short_chain(target: Target, random: np.random.RandomState) -> tuple[BlockProposal, BlockProposal]:
-    """Density of the first walkers and proposal of their moves, from a short chain.
-
-    The correlations of large blocks come from the Laplace approximation, because a short chain estimates them badly.
-    Their widths come from the chain where it finds larger ones.
-    """
-    wider, large = OVERDISPERSION**2 * target.covariance, _large(target)
-    start = block_proposal(target.blocks, target.centre, wider)
-    # In 30 dimensions a proposal that is 20 % too wide is almost never accepted: large blocks are not widened.
-    rough = _concentric(target, target.centre, np.where(np.outer(large, large), target.covariance, wider))
-    ensemble = Ensemble(target.parts, _initial(target, start, random), block_move(rough)).run(PILOT_BURN_IN)
-    sample = ensemble.chain[PILOT_BURN_IN // 2 :].reshape(-1, target.dimension)
-    covariance = np.atleast_2d(np.cov(sample.T))
-    ratio = np.sqrt(np.diag(covariance) / np.diag(target.covariance))
-    factors = np.where(ratio > WIDER, ratio, 1.0)
-    covariance = np.where(np.outer(large, large), target.covariance * np.outer(factors, factors), covariance)
-    return start, _concentric(target, np.where(large, target.centre, np.median(sample, axis=0)), covariance)
-
-
-def _large(target: Target) -> np.ndarray:
-    """(d,) parameters of large blocks."""
-    return np.isin(np.arange(target.dimension), [i for block in target.blocks if len(block) >= LARGE for i in block])
-
-
-def _concentric(target: Target, centre: np.ndarray, covariance: np.ndarray) -> BlockProposal:
-    """Proposals of one centre for each block; narrow for large blocks."""
-    return block_proposal(target.blocks, centre, covariance, [len(block) >= LARGE for block in target.blocks])
+    return Schedule(proposal, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
 
 
 def _checks(done: int, last: int) -> Iterator[int]:

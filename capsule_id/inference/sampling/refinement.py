@@ -1,12 +1,12 @@
-"""Adapt a proposal to the posterior by population Monte Carlo (Cappé et al. 2008), before any chain starts.
+"""Adapt a proposal to the posterior by adaptive multiple importance sampling (Cornuet et al. 2012), before any chain.
 
 A short chain from the Laplace approximation misses tails where the width of the posterior depends on one parameter, as
 on the correlation time of noise, or where two terms replace each other, as viscous and dry damping do. Weighted draws
-from a wide proposal find them. Each round draws from the mixture of the round before and updates it by one step of
-expectation maximisation.
+from a wide proposal find them. Each round draws from the mixture of the round before. The draws of all rounds are
+weighted by the mean of the densities of all rounds, and determine the next mixture by expectation maximisation.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -17,10 +17,12 @@ from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, conce
 #: Message where the sampler has no point to start from.
 NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
 #: Draws of a round, and rounds with one component and with several.
-DRAWS, SINGLE, SEVERAL = 4096, 3, 9
+DRAWS, SINGLE, SEVERAL = 2048, 3, 13
 #: Number of components of a posterior that one component does not describe; components of less weight are dropped.
 COMPONENTS, LEAST_WEIGHT = 8, 0.01
-#: Rounds end where the effective sample size of every block is this share of the draws.
+#: Steps of expectation maximisation after each round with several components.
+STEPS = 5
+#: Rounds end where the effective sample size of every block is this share of the draws of a round.
 ENOUGH = 0.3
 #: Weights are tempered, w^a, where their effective sample size is below this number per parameter; exponents a to try.
 LEAST_SIZE, TEMPERS = 20.0, 0.8 ** np.arange(30)
@@ -30,11 +32,52 @@ FLOOR = 1e-3
 DEFENSIVE = 0.2
 
 
+class _Rounds:
+    """Draws of one block of d parameters in all rounds, and the mixture that each round drew from."""
+
+    def __init__(self, first: Mixture, prior: Float[np.ndarray, "2 d"]) -> None:
+        self.mixtures, self._prior = [first], prior
+        self._u = np.empty((0, prior.shape[1]))
+        self._log_posterior = self._log_drawn = np.empty(0)
+
+    def add(self, u: Float[np.ndarray, "n d"], log_posterior: Float[np.ndarray, " n"]) -> float:
+        """Add the draws of the newest mixture; return their effective sample size.
+
+        Raises
+        ------
+        RuntimeError
+            If no draw has a finite log-posterior.
+        """
+        if not np.any(np.isfinite(log_posterior)):
+            raise RuntimeError(NO_MASS)
+        densities = [mixture.log_density(u) for mixture in self.mixtures]
+        earlier = np.logaddexp(self._log_drawn, self.mixtures[-1].log_density(self._u))
+        self._u = np.concatenate([self._u, u])
+        self._log_posterior = np.concatenate([self._log_posterior, log_posterior])
+        self._log_drawn = np.concatenate([earlier, np.logaddexp.reduce(densities, axis=0)])
+        return effective_size(log_posterior - densities[-1])
+
+    @property
+    def log_weights(self) -> Float[np.ndarray, " n"]:
+        """Logarithms of the weights of the draws of all rounds, without a common constant."""
+        return self._log_posterior - self._log_drawn
+
+    def next(self, good: bool, rng: np.random.RandomState) -> None:
+        """Add the mixture of the next round: the same where it is ``good``, else that which all draws determine."""
+        if good:
+            self.mixtures.append(self.mixtures[-1])
+            return
+        weights = tempered(self.log_weights, LEAST_SIZE * self._u.shape[1])
+        done = len(self.mixtures) - 1
+        self.mixtures.append(_adapted(self.mixtures[-1], self._u, weights, self._prior, done, rng))
+
+
 def refined(
     parts: Callable[[np.ndarray], np.ndarray],
     first: BlockProposal,
     prior: Float[np.ndarray, "2 d"],
     rng: np.random.RandomState,
+    kept: Sequence[bool],
 ) -> BlockProposal:
     """Proposal adapted to a posterior, from the proposal ``first``.
 
@@ -42,28 +85,27 @@ def refined(
     ----------
     parts : (n, d) -> (n, blocks), log-densities of the blocks
     prior : centre and width of the normal prior of u; NaN for a parameter with another prior
+    kept : for each block whether its ``first`` mixture stays where it is good enough
 
     Raises
     ------
     RuntimeError
         If no draw has a finite log-density.
     """
+    rounds = [_Rounds(mixture, prior[:, block]) for block, mixture in zip(first.blocks, first.mixtures, strict=True)]
     proposal = first
     for i in range(SINGLE + SEVERAL):
         u = proposal.draw(rng, DRAWS)
-        inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in proposal.blocks], axis=1)
+        inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in first.blocks], axis=1)
         u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
-        log_weights = np.where(inside, parts(u) - proposal.log_density(u), -np.inf)
-        if not np.all(np.isfinite(np.max(log_weights, axis=0))):
-            raise RuntimeError(NO_MASS)
-        mixtures = list(proposal.mixtures)
-        for j, (block, own) in enumerate(zip(proposal.blocks, log_weights.T, strict=True)):
-            if i == 0 or effective_size(own) < ENOUGH * DRAWS:
-                weights = tempered(own, LEAST_SIZE * len(block))
-                mixtures[j] = _adapted(mixtures[j], u[:, block], weights, prior[:, block], i, rng)
-        if all(new is old for new, old in zip(mixtures, proposal.mixtures, strict=True)):
+        log_parts = np.where(inside, parts(u), -np.inf)
+        for j, own in enumerate(rounds):
+            size = own.add(u[:, first.blocks[j]], log_parts[:, j])
+            own.next(size >= ENOUGH * DRAWS and (i > 0 or kept[j]), rng)
+        newest = [own.mixtures[-1] for own in rounds]
+        if all(new is old for new, old in zip(newest, proposal.mixtures, strict=True)):
             break
-        proposal = BlockProposal(proposal.blocks, mixtures)
+        proposal = BlockProposal(first.blocks, newest)
     return proposal
 
 
@@ -109,8 +151,10 @@ def _adapted(
         centres = w[rng.choice(len(w), COMPONENTS, p=weights)]
         covariances = np.repeat(covariance[None], COMPONENTS, axis=0)
         return _with_wide(np.full(COMPONENTS, 1.0 / COMPONENTS), centres, covariances, wide)
-    local = slice(0, len(mixture.weights) - len(wide.weights))
-    return _with_wide(*maximised(mixture, u, weights, local, FLOOR * np.diag(np.diag(covariance))), wide)
+    for _ in range(STEPS):
+        local = slice(0, len(mixture.weights) - len(wide.weights))
+        mixture = _with_wide(*maximised(mixture, u, weights, local, FLOOR * np.diag(np.diag(covariance))), wide)
+    return mixture
 
 
 def _with_wide(

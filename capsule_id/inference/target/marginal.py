@@ -63,7 +63,6 @@ class MarginalPosterior:
     blocks : indices, among the located parameters, of each factor of the posterior
     centre, covariance : (dimension,), (dimension, dimension) Laplace approximation of u
     normal_priors : (2, dimension) centre and width of the prior of u where it is normal; NaN elsewhere
-    kinked : whether an experiment has events in time, so that the density has kinks
     """
 
     def __init__(self, target: LogPosterior, fit: PointFit) -> None:
@@ -74,7 +73,6 @@ class MarginalPosterior:
         self.centre, self.covariance = fit.u[self._located], fit.covariance[np.ix_(self._located, self._located)]
         priors = target.priors.at(self._located, np)
         self.normal_priors = np.where(priors.lognormal, np.stack([priors.centre, priors.width]), np.nan)
-        self.kinked = any(e.event_driven for e in target.experiments)
         own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
         self.blocks = [block for block in own if len(block)]
         self.grid = choose_grid(self._terms, fit.u[self._scatter], self._label[self._scatter], self._probes())

@@ -11,7 +11,7 @@ from capsule_id.inference.sampling.diagnostics import effective_sample_size, ens
 from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
 from capsule_id.inference.sampling.ensembles import pilot, sample
 from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, block_proposal, concentric
-from capsule_id.inference.sampling.refinement import effective_size, refined
+from capsule_id.inference.sampling.refinement import _Rounds, effective_size, refined
 from tests.inference.stub import Gaussian
 
 #: Normal prior of the logarithms of both terms: centre, width.
@@ -159,15 +159,48 @@ def test_refinement_finds_a_posterior_from_a_poor_start() -> None:
         return effective_size((funnel(u) - proposal.log_density(u))[:, 0]) / 20_000
 
     first = block_proposal([np.arange(5)], np.full(5, 0.8), 0.05 * np.eye(5))
-    better = refined(funnel, first, np.full((2, 5), np.nan), np.random.RandomState(0))
+    better = refined(funnel, first, np.full((2, 5), np.nan), np.random.RandomState(0), [False])
     assert share(first) < 0.01
     assert share(better) > 0.1
 
 
+def test_draws_of_all_rounds_are_weighted_by_the_densities_of_all_rounds() -> None:
+    """Weights of a normalised density average to 1. Negative control: weighted by the density of the last round alone."""
+
+    def log_density(u: np.ndarray) -> np.ndarray:
+        return stats.multivariate_normal.logpdf(u, np.full(2, 1.5), np.diag([1.0, 0.3]))
+
+    rng, number = np.random.RandomState(0), 20_000
+    rounds = _Rounds(concentric(np.zeros(2), np.eye(2)), np.full((2, 2), np.nan))
+    for _ in range(3):
+        u = rounds.mixtures[-1].draw(rng, number)
+        rounds.add(u, log_density(u))
+        rounds.next(False, rng)
+    mean = np.exp(rounds.log_weights)
+    assert abs(np.mean(mean) * 3 - 1.0) < 4.0 * 3 * np.std(mean) / np.sqrt(3 * number)
+    first = rounds.mixtures[0].draw(rng, number)
+    alone = np.exp(log_density(first) - rounds.mixtures[2].log_density(first))
+    assert abs(np.mean(alone) - 1.0) > 0.1
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_first_proposal_that_is_good_enough_is_kept_on_request(kept: bool) -> None:
+    first = block_proposal([np.arange(2)], np.zeros(2), np.eye(2), [True])
+    found = refined(
+        lambda u: stats.multivariate_normal.logpdf(u, np.zeros(2), np.eye(2))[:, None],
+        first,
+        np.full((2, 2), np.nan),
+        np.random.RandomState(0),
+        [kept],
+    )
+    assert (found.mixtures[0] is first.mixtures[0]) == kept
+
+
 def test_a_posterior_without_mass_near_the_start_is_said_so() -> None:
     first = block_proposal([np.arange(2)], np.zeros(2), np.eye(2))
+    prior, rng = np.full((2, 2), np.nan), np.random.RandomState(0)
     with pytest.raises(RuntimeError, match="no finite log-posterior near the point fit"):
-        refined(lambda u: np.full((len(u), 1), -np.inf), first, np.full((2, 2), np.nan), np.random.RandomState(0))
+        refined(lambda u: np.full((len(u), 1), -np.inf), first, prior, rng, [False])
 
 
 def test_a_block_that_needs_components_late_gets_them() -> None:
