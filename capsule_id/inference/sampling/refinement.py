@@ -17,13 +17,14 @@ from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, conce
 #: Message where the sampler has no point to start from.
 NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
 #: Draws of a round, and rounds with one component and with several.
-DRAWS, SINGLE, SEVERAL = 2048, 3, 13
+DRAWS, SINGLE, SEVERAL = 2048, 4, 12
 #: Number of components of a posterior that one component does not describe; components of less weight are dropped.
 COMPONENTS, LEAST_WEIGHT = 8, 0.01
 #: Steps of expectation maximisation after each round with several components.
 STEPS = 5
-#: Rounds end where the effective sample size of every block is this share of the draws of a round.
-ENOUGH = 0.3
+#: Rounds end where the effective sample size of every block is this share of the draws of a round: after all rounds with
+#: one component, and before. Early rounds may miss a tail, and their effective sample size does not show it.
+ENOUGH, EXCELLENT = 0.3, 0.6
 #: Weights are tempered, w^a, where their effective sample size is below this number per parameter; exponents a to try.
 LEAST_SIZE, TEMPERS = 20.0, 0.8 ** np.arange(30)
 #: Covariances of components grow by this share of the variances of all draws, so that none collapses.
@@ -36,7 +37,7 @@ class _Rounds:
     """Draws of one block of d parameters in all rounds, and the mixture that each round drew from."""
 
     def __init__(self, first: Mixture, prior: Float[np.ndarray, "2 d"]) -> None:
-        self.mixtures, self._prior = [first], prior
+        self.mixtures, self._prior, self._several = [first], prior, False
         self._u = np.empty((0, prior.shape[1]))
         self._log_posterior = self._log_drawn = np.empty(0)
 
@@ -68,8 +69,10 @@ class _Rounds:
             self.mixtures.append(self.mixtures[-1])
             return
         weights = tempered(self.log_weights, LEAST_SIZE * self._u.shape[1])
-        done = len(self.mixtures) - 1
-        self.mixtures.append(_adapted(self.mixtures[-1], self._u, weights, self._prior, done, rng))
+        used = weights > 0.0  # the theta of the others may overflow
+        before = self.mixtures[-1] if self._several else None
+        self._several = len(self.mixtures) > SINGLE
+        self.mixtures.append(_adapted(before, self._u[used], weights[used], self._prior, self._several, rng))
 
 
 def refined(
@@ -101,7 +104,8 @@ def refined(
         log_parts = np.where(inside, parts(u), -np.inf)
         for j, own in enumerate(rounds):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
-            own.next(size >= ENOUGH * DRAWS and (i > 0 or kept[j]), rng)
+            settled = i >= SINGLE or (i == 0 and kept[j])
+            own.next(size >= (ENOUGH if settled else EXCELLENT) * DRAWS and (i > 0 or kept[j]), rng)
         newest = [own.mixtures[-1] for own in rounds]
         if all(new is old for new, old in zip(newest, proposal.mixtures, strict=True)):
             break
@@ -123,34 +127,32 @@ def tempered(log_weights: Float[np.ndarray, " w"], least: float) -> Float[np.nda
 
 
 def _adapted(
-    mixture: Mixture,
+    before: Mixture | None,
     u: Float[np.ndarray, "n d"],
     weights: Float[np.ndarray, " n"],
     prior: Float[np.ndarray, "2 d"],
-    done: int,
+    several: bool,
     rng: np.random.RandomState,
 ) -> Mixture:
-    """Mixture of one block after ``done`` rounds.
+    """Mixture of one block with one component or ``several``.
 
     Parameters
     ----------
-    u, weights : draws and their normalised weights
+    before : mixture with several components of the round before; None: there is none
+    u, weights : draws and their normalised weights, above 0
     prior : see ``refined``
     """
-    coordinates = mixture.coordinates
-    used = weights > 0.0  # the theta of the others may overflow
-    u, weights = u[used], weights[used]
-    if done < SINGLE:
-        coordinates = coordinates_of(u[rng.choice(len(u), len(u), p=weights)], prior)
+    coordinates = before.coordinates if before else coordinates_of(u[rng.choice(len(u), len(u), p=weights)], prior)
     w = coordinates.w(u)
     mean, covariance = np.average(w, axis=0, weights=weights), np.atleast_2d(np.cov(w.T, aweights=weights))
     wide = concentric(mean, covariance, coordinates=coordinates)
-    if done < SINGLE:
+    if not several:
         return wide
-    if len(mixture.weights) == len(wide.weights):
+    if before is None:
         centres = w[rng.choice(len(w), COMPONENTS, p=weights)]
         covariances = np.repeat(covariance[None], COMPONENTS, axis=0)
         return _with_wide(np.full(COMPONENTS, 1.0 / COMPONENTS), centres, covariances, wide)
+    mixture = before
     for _ in range(STEPS):
         local = slice(0, len(mixture.weights) - len(wide.weights))
         mixture = _with_wide(*maximised(mixture, u, weights, local, FLOOR * np.diag(np.diag(covariance))), wide)

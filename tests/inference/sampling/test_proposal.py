@@ -138,7 +138,7 @@ def test_others_follow_the_theta_of_a_term_that_may_be_absent(monkeypatch: pytes
 
     def longest_wait() -> float:
         start = block_proposal([np.arange(6)], np.append(-4.0, np.zeros(5)), np.diag([4.0, *[0.01] * 5]))
-        proposal = refined(absent_term, start, prior, np.random.RandomState(0))
+        proposal = refined(absent_term, start, prior, np.random.RandomState(0), [False])
         return float(np.max(absent_term(exact) - proposal.log_density(exact)))
 
     good = longest_wait()
@@ -207,10 +207,15 @@ def test_a_block_that_needs_components_late_gets_them() -> None:
     """A block that was good enough with one centre until the last round before several are tried."""
     rng = np.random.RandomState(0)
     first = concentric(np.zeros(1), np.eye(1))
-    u, weights = first.draw(rng, 4000), np.full(4000, 1.0 / 4000)
-    later = refinement._adapted(first, u, weights, np.full((2, 1), np.nan), refinement.SINGLE + 2, rng)
-    assert np.sum(later.weights) == pytest.approx(1.0, abs=1e-12)
-    assert len(later.weights) == refinement.COMPONENTS + len(first.weights)
+    rounds = _Rounds(first, np.full((2, 1), np.nan))
+    for good in [True] * (refinement.SINGLE + 1) + [False] * 2:
+        u = rounds.mixtures[-1].draw(rng, 1000)
+        rounds.add(u, stats.norm.logpdf(u[:, 0]))
+        rounds.next(good, rng)
+    for later in rounds.mixtures[-2:]:
+        assert np.sum(later.weights) == pytest.approx(1.0, abs=1e-12)
+        assert len(later.weights) > len(first.weights)
+    assert len(rounds.mixtures[-2].weights) == refinement.COMPONENTS + len(first.weights)
 
 
 def test_ensembles_do_not_share_moves() -> None:
