@@ -18,6 +18,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.result import Result
 from capsule_id.report.netcdf import read_sample
+from capsule_id.rig.formats.columns import release
 
 #: The file in the directory of a result, and the sample beside it.
 SAVED, SAMPLE = Path("figures") / "data.npz", "posterior.nc"
@@ -33,7 +34,11 @@ def save(result: Result, directory: Path) -> None:
     kept = {field.name: getattr(light, field.name) for field in fields(Result) if field.name != "registry"}
     text = json.dumps(_encode(kept, arrays)).encode("utf-8")
     arrays[_TREE] = np.frombuffer(text, np.uint8)
-    np.savez_compressed(directory / SAVED, allow_pickle=False, **arrays)
+    with zipfile.ZipFile(directory / SAVED, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, values in arrays.items():
+            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
+            release(values)
 
 
 def load(directory: Path, registry: Registry) -> dict[str, Any]:

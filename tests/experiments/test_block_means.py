@@ -16,6 +16,7 @@ from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.readings.blocks import Blocks, block_mean, block_means, default_block_size
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, averaged_process, whiten_by_shape
 from capsule_id.experiments.free_vibration.settings import DecayModel
+from capsule_id.records.faults import release
 from tests.capsule_cases import jit_quickly
 from tests.experiments import bench
 
@@ -159,6 +160,27 @@ def test_long_records_are_thinned_and_the_finding_says_so() -> None:
     assert FreeVibration(whole, bench.rig(whole)).model == DecayModel()
     assert [f for f in lint_decay(whole, bench.rig(whole)) if f.code == "decays.thinned"] == []
     assert default_block_size(TIME[:2000], columns[1].values[:2000]) == 1
+
+
+def test_the_estimate_of_a_long_record_is_that_of_its_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = bench.released(TIME, RELEASE, c=C) + 0.1 * NOISE * noise("white", 4000)
+    table = bench.table("free_vibration", [bench.column("time", TIME), bench.column("x_rel", values)], "decay")
+    record = FreeVibration(table, bench.rig(table))
+    whole = record.paper_decrement()
+    monkeypatch.setattr(release, "PIECE", 1000)
+    means = record.paper_decrement()
+    assert len(record.whole[0]) == 1000
+    assert record.even
+    assert whole is not None
+    assert means is not None
+    assert means.k1 != whole.k1
+    assert means.k1 == pytest.approx(whole.k1, rel=2e-3)
+    assert means.c == pytest.approx(whole.c, rel=1e-2)
+    # Negative control: with four means a period the estimate is off.
+    every = "capsule_id.experiments.free_vibration.experiment.shortened"
+    monkeypatch.setattr(every, lambda time, x: (time[::110], x[::110]))
+    coarse = record.paper_decrement()
+    assert coarse is None or abs(coarse.k1 / whole.k1 - 1.0) > 2e-3
 
 
 def test_blocks_that_lose_the_oscillation_are_refused(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from capsule_id.experiments.free_vibration.settings import (
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.kind import Kind, Values, made_by
 from capsule_id.parameters import Parameter, Prior, nuisance, scatter
+from capsule_id.records.faults.release import shortened
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import median_step
 from capsule_id.rig.model import Rig, Table
@@ -122,7 +123,7 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         At the first such table.
     """
     for table in tables:
-        values = decay_window(table)[1]
+        values = shortened(*decay_window(table))[1]
         size = (values - equilibrium(values)) / np.ptp(values)
         sides = np.sign(size[np.abs(size) > SMALLEST_SWING])
         swings = int(np.count_nonzero(np.diff(sides)))

@@ -44,8 +44,10 @@ from capsule_id.experiments.free_vibration.tables import damping_table, decay_ta
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.records.faults.release import shortened
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import choose_window, savitzky_golay
+from capsule_id.rig.formats.columns import in_blocks
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Facts, Finding, Points
 
@@ -118,7 +120,8 @@ class FreeVibration(SurfaceExperiment):
         self.model = model or stated_model(table)
         self.order = CHANNELS[channel_of(table)].order
         time, values = decay_window(table)
-        blocks = block_means(time - float(time[0]), values, self.model.thin, by_sample=channel_of(table) != "x_rel")
+        elapsed = in_blocks(lambda part: part - float(time[0]), time)
+        blocks = block_means(elapsed, values, self.model.thin, by_sample=channel_of(table) != "x_rel")
         self.time, self.values, self.nodes, self.weights = blocks.time, blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)
         self.relative_sd = np.squeeze(1.0 / np.sqrt(self.times.count))
@@ -250,8 +253,8 @@ class FreeVibration(SurfaceExperiment):
 
     @property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
-        """Time, s from the first sample, and the channel, SI, of every sample, thinned or not."""
-        time, values = decay_window(self.table)
+        """Time, s from the first sample, and the channel, SI, of every sample, thinned or not; of a long record means."""
+        time, values = shortened(*decay_window(self.table))
         return time - time[0], values
 
     @property

@@ -11,6 +11,7 @@ import numpy as np
 
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import PIECE, thinned
+from capsule_id.rig.formats.columns import release
 
 #: Expected number of blocks that agree by chance, below which a block counts as repeated.
 CHANCE = 1e-6
@@ -154,7 +155,8 @@ def _equal_windows(earlier: np.ndarray, later: np.ndarray, length: int, same: bo
     stride = 1 if len(earlier) < 2 * PIECE else length
     # The first window of a piece whose row is a multiple of the stride is -begin % stride rows after its first one.
     hashes = np.concatenate([found[-begin % stride :: stride] for begin, found in _hashes(earlier, length)])
-    known, index = np.unique(hashes, return_index=True)
+    index = np.argsort(hashes, kind="stable")
+    known = hashes[index]
     for begin, found in _hashes(later, length):
         place = np.minimum(np.searchsorted(known, found), len(known) - 1)
         where, start = stride * index[place], begin + np.arange(len(found))
@@ -167,6 +169,7 @@ def _hashes(values: np.ndarray, length: int) -> Iterable[tuple[int, np.ndarray]]
     factors = np.random.default_rng(0).integers(1, 1 << 62, (length, values.shape[1]), dtype=np.uint64)
     for begin in range(0, len(values) - length + 1, PIECE):
         rows = (values[begin : begin + PIECE + length - 1] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
+        release(values)
         rows ^= rows >> np.uint64(29)
         total = np.zeros(len(rows) - length + 1, np.uint64)
         for offset, factor in enumerate(factors):

@@ -9,6 +9,7 @@ from scipy import ndimage, signal
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import pieces
+from capsule_id.rig.formats.columns import release
 
 #: Order of the polynomials on both sides of a sample; their length, periods, with the smallest jump, rad, that they show
 #: beyond their own error. Long ones see through noise, short ones show small jumps of quiet records. A jump above LARGE
@@ -44,9 +45,11 @@ def phase_jump(values: np.ndarray, period: float) -> Jump | None:
     noise = max(noise_level(values), reading_step(values))
     for share, smallest in SIDES:
         side = round(share * period)
-        parts = [(part.start, values[part]) for part in pieces(len(values), 2 * side)]
-        found = [(first, _jump(own, period, side, smallest, noise)) for first, own in parts]
-        jumps = [Jump(first + jump.row, jump.size) for first, jump in found if jump is not None]
+        jumps = []
+        for part in pieces(len(values), 2 * side):
+            jump = _jump(values[part], period, side, smallest, noise)
+            jumps += [] if jump is None else [Jump(part.start + jump.row, jump.size)]
+            release(values)
         if jumps:
             return max(jumps, key=lambda jump: jump.size)
     return None

@@ -62,7 +62,9 @@ def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = F
     values : (n,) displacement, velocity or acceleration
     displacement : whether they are displacements; only these show a push before the first turning point
     """
-    time, values = _shortened(time, values)
+    whole, (time, values) = time, shortened(time, values)
+    if len(time) < len(whole):
+        time[[0, -1]] = whole[[0, -1]]
     even = np.linspace(time[0], time[-1], len(time))
     on_grid = np.interp(even, time, values)
     noise = _noise(on_grid)
@@ -130,8 +132,13 @@ def _pushed(time: np.ndarray, values: np.ndarray, turning: float, period: float,
     return bool((rise - PUSHED * fall) * step > DURATION_ERRORS * error + step)
 
 
-def _shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of blocks of a long record, about ``PIECE`` of them and 32 or more in a period; a short record itself."""
+def shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of blocks of a long record, about ``PIECE`` of them and 32 or more in a period; a short record itself.
+
+    Parameters
+    ----------
+    time, values : (n,) s, increasing, and readings
+    """
     if len(time) < 2 * PIECE:
         return time, values
     part = loudest_part(values)
@@ -139,10 +146,11 @@ def _shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
     period = 1.0 / dominant_frequency(grid, np.interp(grid, time[part], values[part]))
     size = max(1, min(len(time) // PIECE, int(period / (grid[1] - grid[0]) / 32.0)))
     count = len(time) // size
-    means, readings = (x[: count * size].reshape(count, size).mean(axis=1) for x in (time, values))
-    means[[0, -1]] = time[[0, -1]]
-    release(time, values)
-    return means, readings
+    means = []
+    for column in (time, values):
+        means.append(column[: count * size].reshape(count, size).mean(axis=1))
+        release(column)
+    return means[0], means[1]
 
 
 def _departure(values: np.ndarray, noise: float) -> int:

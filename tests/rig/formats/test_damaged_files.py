@@ -14,7 +14,7 @@ import pytest
 from capsule_id.errors import InputError
 from capsule_id.rig.formats import EXPORTS, limits
 from capsule_id.rig.formats.export import Layout
-from tests.rig.formats.writers import WRITERS, hdf5, lvm, mat_73, npz, tdms, xlsx
+from tests.rig.formats.writers import WRITERS, hdf5, lvm, mat_73, npz, parquet_file, tdms, xlsx
 
 TIME = np.arange(6) * 0.25
 COLUMNS = {"t": TIME, "x": np.round(np.cos(TIME), 3)}
@@ -87,6 +87,17 @@ def workbook_with(sheet: bytes) -> bytes:
     return content.getvalue()
 
 
+def with_rows(content: bytes, rows: int) -> bytes:
+    """A Parquet file of six rows whose row group states ``rows``, as a varint of Thrift."""
+    size = int.from_bytes(content[-8:-4], "little")
+    before, footer = content[: -8 - size], content[-8 - size : -8]
+    place, number, coded = footer.rindex(b"\x16\x0c"), 2 * rows, b""
+    while number > 127:
+        coded, number = coded + bytes([number & 127 | 128]), number >> 7
+    footer = footer[: place + 1] + coded + bytes([number]) + footer[place + 2 :]
+    return before + footer + len(footer).to_bytes(4, "little") + content[-4:]
+
+
 _SHEET = b'<worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main">%s</worksheet>'
 _ROWS = b"<sheetData>%s</sheetData>"
 _CELL = b'<row r="1"><c r="A1"><v>1</v></c></row>'
@@ -121,6 +132,11 @@ HOSTILE = {
         ".tdms",
         lambda: tdms(COLUMNS).replace(b"Scales\x07\0\0\0\x01\0\0\0", b"Scales\x07\0\0\0\xff\xff\xff\x7f"),
         "2147483647 scales",
+    ),
+    "4. rows of a row group": (
+        ".parquet",
+        lambda: with_rows(parquet_file(COLUMNS), 88157910655),
+        "row groups of 88157910655 rows in a table of 6",
     ),
 }  # fmt: skip
 
