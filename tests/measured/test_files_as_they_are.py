@@ -15,12 +15,13 @@ from capsule_id.rig.model import Table
 from tests.measured import sources
 
 
-def read(folder: Path, kind: str, names: list[str], lines: str) -> Table:
-    """The table that ``lines`` of rig.toml make of the measured files ``names``."""
+def read(folder: Path, kind: str, names: list[str], lines: str, *masses: str) -> Table:
+    """The table that ``lines`` of rig.toml make of the measured files ``names``; ``masses`` default to m1."""
     for name in names:
         shutil.copy(sources.measured_file(name), folder)
     files = ", ".join(f'"{Path(name).name}"' for name in names)
-    head = '[rig]\nname = "measured"\nm1 = { value = 1, unit = "kg" }\n'
+    stated = "".join(f'{mass} = {{ value = 1, unit = "kg" }}\n' for mass in masses or ("m1",))
+    head = f'[rig]\nname = "measured"\n{stated}'
     entry = f'[[experiment]]\nkind = "{kind}"\nfiles = [{files}]\n{lines}\n'
     (folder / "rig.toml").write_text(head + entry, encoding="utf-8")
     rig = read_rig(folder)
@@ -81,6 +82,29 @@ def test_frame_in_two_files(tmp_path: Path, load: str) -> None:
     )
     time, storey, base = sources.frame(load)
     assert_record(table, time, storey - base)
+
+
+@pytest.mark.parametrize("load", ["350g", "450g"])
+def test_frame_as_a_run_with_a_prescribed_base(tmp_path: Path, load: str) -> None:
+    names = [f"frame_marino/s_b_{load}_{axis}.mat" for axis in "xy"]
+    sources_of = {"time": ("t", "s"), "x_base": ("y", "mm"), "x_capsule": ("x", "mm")}
+    maps = ", ".join(f'{name} = {{ from = "{own}", unit = "{unit}" }}' for name, (own, unit) in sources_of.items())
+    table = read(tmp_path, "forced_run", names, f'drive = "base"\ncolumns = {{ {maps} }}', "m2")
+    time, storey, base = sources.frame(load)
+    for name, values in {"time": time, "x_base": base, "x_capsule": storey}.items():
+        np.testing.assert_allclose(table[name], values, rtol=1e-12, atol=1e-15)
+
+
+def test_capsule_robot_as_a_progression(tmp_path: Path) -> None:
+    sources_of = {"period": (1, "ms"), "duty": (2, "%"), "periods": ("n", "1"), "distance": ("x", "cm")}
+    maps = ", ".join(f"{name} = {{ from = {own!r}, unit = '{unit}' }}" for name, (own, unit) in sources_of.items())
+    lines = f'drive = "pulses"\nP_on = {{ value = 0, sd = 2, unit = "N" }}\ndata_from_line = 3\ncolumns = {{ {maps} }}'
+    table = read(tmp_path, "progression", ["capsubot_pulse/exp_data_tau30.csv"], lines, "m1", "m2")
+    text = (tmp_path / "exp_data_tau30.csv").read_text(encoding="utf-8").replace(",", ".")
+    rows = np.array([[row.split(";")[k] for k in (0, 1)] for row in text.splitlines()[2:]], float)
+    assert len(table.rows) == 75
+    np.testing.assert_allclose(np.stack([table["period"], table["duty"]], axis=1), rows * [1e-3, 1e-2], rtol=1e-12)
+    assert table["distance"].max() > 0.01
 
 
 def test_capsule_robot_with_units_row_and_missing_markers(tmp_path: Path) -> None:
