@@ -125,8 +125,7 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
     for table in tables:
         values = shortened(*decay_window(table))[1]
         size = (values - equilibrium(values)) / np.ptp(values)
-        sides = np.sign(size[np.abs(size) > SMALLEST_SWING])
-        swings = int(np.count_nonzero(np.diff(sides)))
+        swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > SMALLEST_SWING]))))
         stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SMALLEST_SWING
         if table.settings.samples == "record" and swings < FEWEST_SWINGS:
             rule = f"{channel_of(table)} must pass its rest position at least {FEWEST_SWINGS} times"

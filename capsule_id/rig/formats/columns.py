@@ -92,8 +92,9 @@ def whole_numbers(first: int, count: int) -> np.ndarray:
 def release(*arrays: np.ndarray) -> None:
     """Give back the memory of columns that lie in files; their numbers are read again where they are used."""
     for array in arrays:
-        base: Any = array
-        while base is not None and not isinstance(base, mmap.mmap):
-            base = getattr(base, "base", None)
-        if base is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
-            base.madvise(mmap.MADV_DONTNEED)
+        owner: Any = array
+        while owner is not None and not isinstance(owner, np.memmap):
+            owner = getattr(owner, "base", None)
+        # A map of another mode would lose what was written to it. Windows has no MADV_DONTNEED.
+        if owner is not None and owner.mode == "r+" and hasattr(mmap, "MADV_DONTNEED"):
+            owner.base.madvise(mmap.MADV_DONTNEED)

@@ -131,3 +131,11 @@ def test_released_columns_leave_the_memory() -> None:
     columns.release(numbers[5:], np.arange(3))
     assert used - resident() > 25.0
     assert int(numbers.sum()) == total == (8 << 20) * ((8 << 20) - 1) // 2
+
+
+def test_a_private_map_keeps_what_was_written(tmp_path: Path) -> None:
+    np.arange(4096.0).tofile(tmp_path / "numbers")
+    private = np.memmap(tmp_path / "numbers", float, "c")
+    private[:] = 7.0
+    columns.release(private[1:])
+    assert np.all(private == 7.0)
