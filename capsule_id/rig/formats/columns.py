@@ -97,4 +97,5 @@ def release(*arrays: np.ndarray) -> None:
             owner = getattr(owner, "base", None)
         # A map of another mode would lose what was written to it. Windows has no MADV_DONTNEED.
         if owner is not None and owner.mode == "r+" and hasattr(mmap, "MADV_DONTNEED"):
-            owner.base.madvise(mmap.MADV_DONTNEED)
+            memory: Any = owner.base
+            memory.madvise(mmap.MADV_DONTNEED)
