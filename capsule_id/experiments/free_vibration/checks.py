@@ -12,7 +12,7 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.free_vibration.decrement import equilibrium
-from capsule_id.experiments.free_vibration.readings.noise import whiten
+from capsule_id.experiments.free_vibration.readings.noise import drift_by_shape, whiten
 from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.settings import decay_window
 from capsule_id.parameters import parameter
@@ -26,6 +26,8 @@ FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
 #: Step of difference quotients, in natural units of each parameter.
 STEP = 1e-5
+#: Largest part of a drift that is as fast as the motion, relative to the motion.
+FAST_DRIFT = 0.01
 #: Directions of the offsets that are shorter than this, relative to the longest one, are combinations of the others.
 UNSEEN = 1e-8
 
@@ -110,6 +112,36 @@ def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
         facts = {"labels": ", ".join(e.label for *_, e in compared), "p": min(p for p, *_ in compared)}
         findings.append(Finding("decays.position", "ok", facts))
     return findings
+
+
+def check_drift(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """Check that a Gaussian-process drift is slow: its part at the frequency of the decay hides errors of the model."""
+    findings = []
+    for e in records:
+        if e.model.drift == "gp":
+            drift, motion, noise = fast_parts(e, e.local(fit.values))
+            level = "fail" if drift > max(FAST_DRIFT * motion, noise) else "ok"
+            facts = {"label": e.label, "share": drift / max(motion, noise)}
+            findings.append(Finding("decays.drift", level, facts, e.label))
+    return findings
+
+
+def fast_parts(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float]:
+    """Rms of drift and motion at the frequency of the motion, and rms of the residuals left; SI."""
+    raw, design = e.unwhitened(theta, np)
+    residuals = raw - design @ np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
+    shape = {symbol: theta[symbol] for symbol in e.model.shapes}
+    drift = np.asarray(drift_by_shape(e.times, np.asarray(residuals), e.model.noise, shape))
+    half = np.pi * np.sqrt(theta["m1"] / theta["k1"])
+    inside = (e.time > e.time[0] + 2.0 * half) & (e.time < e.time[-1] - 2.0 * half)
+
+    def fast(values: np.ndarray) -> float:
+        for _ in range(2):
+            beside = [np.interp(e.time + shift, e.time, values) for shift in (-half, half)]
+            values = values - 0.5 * (beside[0] + beside[1])
+        return float(np.sqrt(np.mean(values[inside] ** 2))) if inside.any() else 0.0
+
+    return fast(drift), fast(e.values - residuals), float(np.std(residuals - drift))
 
 
 def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float] | None:

@@ -17,8 +17,9 @@ from capsule_id.views import Facts
 
 #: Smallest peak in standard deviations of the noise.
 PEAK_NOISE_RATIO = 4.0
-#: Smallest peak as a fraction of the record's range, which excludes a noiseless tail.
-PEAK_RANGE_RATIO = 0.005
+#: Smallest peak as a fraction of the record's range, which excludes a noiseless tail. Smoothing rounds the jumps of an
+#: acceleration where dry friction turns, so that small peaks remain after the rod sticks.
+PEAK_RANGE_RATIO, PEAK_RANGE_RATIO_OF_JUMPS = 0.005, 0.05
 #: The end of a record still oscillates where its range exceeds this fraction of the whole record's range.
 SWINGING_RATIO = 0.05
 #: Smallest reported drift, in standard errors; the limit is high because neighbouring peaks are correlated.
@@ -76,19 +77,18 @@ def equilibrium(values: np.ndarray) -> float:
 
 
 def half_cycle_extremes(
-    time: np.ndarray, guide: np.ndarray, values: np.ndarray, noise: float
+    time: np.ndarray, guide: np.ndarray, values: np.ndarray, lowest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time and signed value of the extremum of ``values`` in every half cycle of ``guide``, (p,) each.
 
     ``guide`` (smoothed, about its equilibrium) only locates the half cycles. They count from the start of the record
-    until the first peak below the limits. The first and the last may be incomplete, so an extremum at an end of the
+    until the first peak below ``lowest``. The first and the last may be incomplete, so an extremum at an end of the
     record does not count.
     """
-    threshold = max(PEAK_NOISE_RATIO * noise, PEAK_RANGE_RATIO * float(np.ptp(guide)))
     edges = np.concatenate([[0], np.flatnonzero(np.diff(np.signbit(guide))) + 1, [len(guide)]])
     times, peaks = [], []
     for left, right in itertools.pairwise(edges):
-        if np.max(np.abs(guide[left:right])) < threshold:
+        if np.max(np.abs(guide[left:right])) < lowest:
             if times:
                 break
             continue
@@ -100,7 +100,11 @@ def half_cycle_extremes(
 
 
 def logarithmic_decrement(
-    time: np.ndarray, values: np.ndarray, m1: float, smoothed: np.ndarray | None = None
+    time: np.ndarray,
+    values: np.ndarray,
+    m1: float,
+    smoothed: np.ndarray | None = None,
+    smallest: float = PEAK_RANGE_RATIO,
 ) -> Decrement | None:
     """Apply the paper's estimator to ``values``; None where fewer than three half cycles exceed the limits.
 
@@ -109,10 +113,12 @@ def logarithmic_decrement(
     time, values : (n,) s and m
     m1 : mass of the rod, kg
     smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles (default: ``values``)
+    smallest : smallest peak as a fraction of the record's range
     """
     rest = equilibrium(values)
     guide = (values if smoothed is None else smoothed) - rest
-    times, peaks = half_cycle_extremes(time, guide, values - rest, noise_level(values))
+    lowest = max(PEAK_NOISE_RATIO * noise_level(values), smallest * float(np.ptp(guide)))
+    times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
     if len(times) < 3:
         return None
     index = np.arange(len(times))

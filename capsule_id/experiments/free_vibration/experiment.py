@@ -13,6 +13,7 @@ from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.free_vibration.checks import (
+    check_drift,
     check_free_decay,
     check_halves,
     check_positions,
@@ -28,6 +29,8 @@ from capsule_id.experiments.free_vibration.decay_models import (
 )
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import (
+    PEAK_RANGE_RATIO,
+    PEAK_RANGE_RATIO_OF_JUMPS,
     Decrement,
     crossing_decrement,
     damping_of_peaks,
@@ -104,7 +107,7 @@ class FreeVibration(SurfaceExperiment):
     order: int = eqx.field(static=True)
 
     time_series = True
-    checks = (check_stiffness, check_free_decay, check_halves, check_positions)
+    checks = (check_stiffness, check_free_decay, check_halves, check_positions, check_drift)
     tables = (decay_table, damping_table, second_fit_table)
 
     def __init__(
@@ -275,7 +278,8 @@ class FreeVibration(SurfaceExperiment):
     def decrement(self, smooth: bool = True) -> Decrement | None:
         """Return peaks and logarithmic decrement, from the smoothed or the raw record; None with too few peaks."""
         (time, values), smoothed = self.whole, self.smoothed()
-        return logarithmic_decrement(time, smoothed if smooth else values, self.mass, smoothed)
+        smallest = PEAK_RANGE_RATIO_OF_JUMPS if self.order == 2 else PEAK_RANGE_RATIO
+        return logarithmic_decrement(time, smoothed if smooth else values, self.mass, smoothed, smallest)
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
         """Estimate k1 and c of this record as in the paper; None also for a record sampled unevenly."""

@@ -47,7 +47,9 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         inside = time[used]
         last = len(inside) if decay.stop is None else int(np.searchsorted(inside, decay.stop, side="right"))
         used = slice(used.start + int(np.searchsorted(inside, decay.start)), used.start + last)
-        faults = faults or [found for name in channels for found in lint_smooth(table, name, used, period)]
+        # Dry friction makes an acceleration jump where the rod turns.
+        smooth = [name for name in channels if name != "acceleration"]
+        faults = faults or [found for name in smooth for found in lint_smooth(table, name, used, period)]
     yield from faults
     window = time[used], table[channels[0]][used]
     yield from _thinned(table, *window)
@@ -205,6 +207,14 @@ MESSAGES = {
             "{label}: the residuals must not depend on the position of the rod, but they do (p = {p:.1g}), most from "
             "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the "
             "sensor, or state a later start, for smaller amplitudes."
+        ),
+    ),
+    "decays.drift": Message(
+        "drift of a decay",
+        ok="{label}: the fitted drift of the zero is slower than the motion ({share:.1%} of it at its frequency)",
+        fail=(
+            "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at "
+            "its frequency. It hides an error of the model. State a later start, for smaller amplitudes."
         ),
     ),
     "decays.thinned": Message(

@@ -78,14 +78,26 @@ def whiten(times: ReadingTimes, columns: Any, model: DecayModel, theta: ValuesBy
 @partial(jax.jit, static_argnames="noise")
 def whiten_by_shape(times: ReadingTimes, columns: Any, noise: str, shape: ValuesBySymbol) -> Any:
     """Whiten as ``whiten``, with the shape parameters of ``noise`` and, where it has some, of the drift."""
+    factor = _covariance(times, noise, shape)[0].cholesky()
+    return factor.solve(columns) * jnp.exp(jnp.mean(jnp.log(factor.diag.d)))
+
+
+@partial(jax.jit, static_argnames="noise")
+def drift_by_shape(times: ReadingTimes, residuals: Any, noise: str, shape: ValuesBySymbol) -> Any:
+    """Expectation (n,) of a Gaussian-process drift, given the ``residuals`` (n,) that it is a part of."""
+    total, drift = _covariance(times, noise, shape)
+    factor = total.cholesky()
+    return drift @ factor.transpose().solve(factor.solve(residuals[:, None]))[:, 0]
+
+
+def _covariance(times: ReadingTimes, noise: str, shape: ValuesBySymbol) -> tuple[Any, Any]:
+    """Covariances of all noise with the drift, and of the drift alone; of unit innovation variance."""
     parts: list[Any] = [averaged_process(times, shape["noise_time"])] if noise != "white" else []
     if "drift_time" in shape:
         parts.append(Matern32(scale=shape["drift_time"], sigma=shape["drift_ratio"]).to_symm_qsm(times.time))
     white = {"white": 1.0, "ar1": 0.0, "arma": shape.get("white_ratio", 0.0) ** 2}[noise] / times.count
-    covariance: Any = sum(parts[1:], parts[0])
-    covariance = covariance + DiagQSM(d=jnp.broadcast_to(white, times.time.shape))
-    factor = covariance.cholesky()
-    return factor.solve(columns) * jnp.exp(jnp.mean(jnp.log(factor.diag.d)))
+    correlated: Any = sum(parts[1:], parts[0])
+    return correlated + DiagQSM(d=jnp.broadcast_to(white, times.time.shape)), parts[-1]
 
 
 def averaged_process(times: ReadingTimes, correlation_time: Any) -> SymmQSM:
