@@ -73,6 +73,25 @@ def test_a_matrix_of_load_cells(tmp_path: Path) -> None:
     assert len(table.rows) == 2046
 
 
+@pytest.mark.parametrize(
+    ("name", "time", "reading", "slope"),
+    [
+        ("LoadCellCalibrationData.txt", 'from = 1, unit = "ms"', "11", 997.1),
+        ("loadCellCalData.mat", 'rate = { value = 10, unit = "Hz" }', '"acquiredData(:,4)"', 993.3),
+    ],
+)
+def test_load_cells_as_a_transducer(tmp_path: Path, name: str, time: str, reading: str, slope: float) -> None:
+    """The trace with drop-outs becomes one reading per load; slopes in counts/lbf, the first one published."""
+    levels = [0, 10, 20, 30, 40, 30, 20, 10, 0]
+    lines = (
+        f'columns = {{ time = {{ {time} }}, reading = {{ from = {reading}, unit = "1" }} }}\n'
+        'reject = { rule = "hampel", window = "1 s", n_sd = 8 }\n'
+        f'plateaus = {{ levels = {levels}, unit = "lbf", guard = "2 s" }}'
+    )
+    table = read(tmp_path, "transducer", [f"loadcell_cie324/{name}"], lines)
+    assert np.polyfit(levels, table["reading"], 1)[0] == pytest.approx(slope, abs=0.5)
+
+
 @pytest.mark.parametrize("load", ["350g", "450g"])
 def test_frame_in_two_files(tmp_path: Path, load: str) -> None:
     names = [f"frame_marino/s_b_{load}_{axis}.mat" for axis in "xy"]
