@@ -9,6 +9,7 @@ residuals are small. The likelihood has local maxima (one contact more or less),
 """
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -22,8 +23,8 @@ from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.inference.fit import difference_descent
 from capsule_id.inference.fit.covariance import covariance
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
-from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares
-from capsule_id.inference.fit.point_fit import AGREEMENT
+from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares, linearised
+from capsule_id.inference.fit.point_fit import AGREEMENT, dispersed_starts
 from capsule_id.inference.fit.variance_shares import variance_shares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
@@ -81,7 +82,7 @@ def joint_fit(
     first : values by name that replace those of ``known`` in the first starting point
     starts : (s, d) u of the starting points, instead of the best candidates
     """
-    starts = choose_starts(target, known, seed, first or {}) if starts is None else starts
+    starts = _choose_starts(target, known, seed, first or {}) if starts is None else starts
     ends: list[_End] = []
     for start in starts:
         if len(ends) >= STARTS and sum(not _has_excess_noise(target, end.u) for end in ends) > 1:
@@ -124,6 +125,24 @@ def joint_fit(
         stalled=np.array([not end.converged for end in ends]),
         shares=variance_shares(target, fit.jacobian[0], target.residual_owners(u[best])),
     )
+
+
+def _choose_starts(
+    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float]
+) -> np.ndarray:
+    """``choose_starts``, while another thread compiles the derivatives; an error occurs again where they are used."""
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(_compile_descent, target)
+        return choose_starts(target, known, seed, first)
+
+
+def _compile_descent(target: LogPosterior) -> None:
+    """Compile what ``_descend`` computes at a point."""
+    u = dispersed_starts(target, 0, 1)
+    if any(e.has_joint_scatters for e in target.experiments):
+        difference_descent.rows_of(target, u)
+    else:
+        linearised(HeldResiduals(target, jnp.asarray(u[0])), u[0, target.located])
 
 
 def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:

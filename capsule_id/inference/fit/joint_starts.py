@@ -9,14 +9,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from capsule_id.inference.fit.curvature import BATCH, in_batches
 from capsule_id.inference.fit.point_fit import dispersed_starts
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.physics.batches import pool
+from capsule_id.inference.target.marginal import density_of
 
 #: Number of starting points that are always tried (the bench estimate included), and the largest number.
 STARTS, MAX_STARTS = 3, 8
-#: Number of candidates, and rows of a batch of log-posteriors.
-CANDIDATES, ROWS_OF_A_BATCH = 1024, 64
+#: Number of candidates.
+CANDIDATES = 1024
 #: Perturb a random half of the parameters, by a log-sd that is log-uniform between these two.
 PROBABILITY_TO_PERTURB, SMALLEST_LOG_SD, LARGEST_LOG_SD = 0.5, 3e-3, 0.3
 
@@ -54,9 +55,7 @@ def choose_starts(
 
 def weigh(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """(n,) log-posterior of u (n, d), one compiled batch for any n; -inf where it is not finite."""
-    rows = np.concatenate([u, np.repeat(u[-1:], -len(u) % ROWS_OF_A_BATCH, axis=0)])
-    first, *rest = np.split(rows, len(rows) // ROWS_OF_A_BATCH)
+    density = density_of(target)
     # The first batch compiles the program that all threads then call.
-    parts = [np.asarray(target.batch(first)), *pool().map(lambda part: np.asarray(target.batch(part)), rest)]
-    value = np.concatenate(parts)[: len(u)]
-    return np.where(np.isfinite(value), value, -np.inf)
+    first, rest = in_batches(density, u[:BATCH]), u[BATCH:]
+    return np.concatenate([first, in_batches(density, rest)]) if len(rest) else first

@@ -8,6 +8,7 @@ seconds to compile and only milliseconds to run.
 
 import os
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import jax.numpy as jnp
@@ -28,6 +29,7 @@ from capsule_id.inference.fit.least_squares import Solver, least_squares
 from capsule_id.inference.fit.variance_shares import variance_shares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
+from capsule_id.inference.target.marginal import density_of
 from capsule_id.interruption import stop_if_interrupted
 
 #: Default number of starting points.
@@ -61,25 +63,25 @@ def point_fit(
     starts = dispersed_starts(target, seed, number_of_starts)
     if further is not None:
         starts = np.concatenate([starts, further[None]])
-    located = target.located
+    located, density = target.located, density_of(target)
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
-        compiled = pool.submit(target.batch, np.repeat(starts[:1], BATCH, axis=0))
+        compiled = pool.submit(density, np.repeat(starts[:1], BATCH, axis=0))
         rough = least_squares(HeldResiduals(target, jnp.asarray(starts[0])), starts[:, located], BASIN_SOLVER)
         compiled.result()
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
     scale = _information(target, ends[rough.best]) ** -0.5
-    whitening = root_of_inverse(-hessian(target.batch, ends[rough.best], scale))
+    whitening = root_of_inverse(-hessian(density, ends[rough.best], scale))
     # Every batch runs in the pool of threads, so the starts need their own.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
         # SciPy hides this warning itself, but its way is not safe in threads.
         warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
-        polished = list(threads.map(lambda end: _polish(target, end, whitening), ends))
+        polished = list(threads.map(lambda end: _polish(density, end, whitening), ends))
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     scale = _information(target, u[best]) ** -0.5
-    root = root_of_inverse(-hessian(target.batch, u[best], scale))
+    root = root_of_inverse(-hessian(density, u[best], scale))
     spread = np.sqrt(np.sum(root**2, axis=1))
     theta = target.theta(u[best])
     at_fit = residual_jacobian(target, u[best])[:, located]
@@ -111,12 +113,14 @@ def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray
     return centre + spread * z
 
 
-def _polish(target: LogPosterior, end: np.ndarray, whitening: np.ndarray) -> tuple[np.ndarray, float, bool]:
+def _polish(
+    density: Callable[[np.ndarray], np.ndarray], end: np.ndarray, whitening: np.ndarray
+) -> tuple[np.ndarray, float, bool]:
     """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged."""
 
     def negative(v: np.ndarray) -> np.ndarray:
         """Negative log-posterior (m,) at whitened v (m, d)."""
-        value = in_batches(target.batch, end + v @ whitening.T)
+        value = in_batches(density, end + v @ whitening.T)
         return -np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR)
 
     stop_if_interrupted()

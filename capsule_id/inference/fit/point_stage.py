@@ -4,8 +4,6 @@ experiments -> fit of the bench tests in closed form -> divide runs that amplify
 """
 
 from collections.abc import Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass
 
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
@@ -16,7 +14,7 @@ from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import sample
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior, compile_ahead
+from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.views import Finding
 
 #: emcee steps of the bench sample, which measures the precision gained from runs and their agreement.
@@ -54,33 +52,30 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
     ----------
     registry : kinds of experiments of the rig, for rough values from bench tests that are not fitted
     seed : seed of the starting points and of the bench sample
-    sampled : whether a sample follows: then compile it in advance and sample the bench tests alone too
+    sampled : whether a sample follows: then sample the bench tests alone too
     """
     closed = [e for e in target.experiments if not e.event_driven]
-    with ThreadPoolExecutor(1) if sampled else nullcontext() as pool:
-        if len(closed) == len(target.experiments):
-            _compile(pool, target)
-            return PointStage(target, point_fit(target, seed), BenchFit(), seed)
-        bench = BenchFit()
-        if not closed:
-            known = _paper_values(target, registry)
-        else:
-            alone = LogPosterior(target.rig, closed)
-            fit = point_fit(alone, seed)
-            own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
-            bench, known = BenchFit(fit, own), dict(fit.values)
-        target, findings = cut_unpredictable(target, known)
-        target, joint, wavering = _fit_with_right_starts(target, known, seed, pool)
+    if len(closed) == len(target.experiments):
+        return PointStage(target, point_fit(target, seed), BenchFit(), seed)
+    bench = BenchFit()
+    if not closed:
+        known = _paper_values(target, registry)
+    else:
+        alone = LogPosterior(target.rig, closed)
+        fit = point_fit(alone, seed)
+        own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
+        bench, known = BenchFit(fit, own), dict(fit.values)
+    target, findings = cut_unpredictable(target, known)
+    target, joint, wavering = _fit_with_right_starts(target, known, seed)
     return PointStage(target, joint, bench, seed, (*findings, *wavering))
 
 
 def _fit_with_right_starts(
-    target: LogPosterior, known: Mapping[str, float], seed: int, pool: Executor | None
+    target: LogPosterior, known: Mapping[str, float], seed: int
 ) -> tuple[LogPosterior, PointFit, list[Finding]]:
     """Repeat the joint fit while it contradicts the kind of initial state of a run; report what remains."""
     first = None
     for remaining in reversed(range(ROUNDS)):
-        _compile(pool, target)
         joint = joint_fit(target, known, seed, first)
         corrected = correct_starts(target, joint)
         if corrected is None:
@@ -90,12 +85,6 @@ def _fit_with_right_starts(
     doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
     facts = {"labels": ", ".join(doubtful), "rounds": ROUNDS}
     return target, joint, [Finding("runs.start", "fail", facts, doubtful[0])]
-
-
-def _compile(pool: Executor | None, target: LogPosterior) -> None:
-    """Compile in another thread; any error occurs again where the compiled function is used."""
-    if pool is not None:
-        pool.submit(compile_ahead, target)
 
 
 def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:

@@ -176,7 +176,7 @@ class LogPosterior(eqx.Module):
         return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
     def batch(self, u: Any) -> Any:
-        """Compiled log-posterior of a batch, (w, d) -> (w,)."""
+        """Compiled log-posterior of a batch, (w, d) -> (w,). Fits use ``marginal.density_of``."""
         return _batch(self, u)
 
     def residuals(self, u: Any) -> Any:

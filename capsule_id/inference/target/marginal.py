@@ -7,7 +7,7 @@ drawn exactly from their conditional distributions: a node, drawn by weight, of 
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -158,11 +158,22 @@ class MarginalPosterior:
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
 
 
-def compile_ahead(target: LogPosterior) -> None:
-    """Compile the functions of a ``MarginalPosterior`` of ``target`` in advance, in parallel to the point fit."""
+def density_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the log-posterior of ``target``, scatters not integrated out: u (w, d) -> (w,), -inf where not finite.
+
+    It is the sampler's program with every scatter at its first node, so that the fit compiles no program of its own.
+    """
     layout = _layout(target)
-    v, nodes = np.zeros((BATCH, len(layout.located))), np.ones((BATCH, len(layout.scatter)))
-    conditional(layout, target, v, nodes, nodes, nodes[0])
+    located, scatter = np.array(layout.located), np.array(layout.scatter, dtype=int)
+    straight = np.full(len(scatter), -np.inf)
+
+    def density(u: np.ndarray) -> np.ndarray:
+        start = u[:, scatter]
+        known, terms, _ = conditional(layout, target, u[:, located], start, np.ones(start.shape), straight)
+        total = np.sum(np.asarray(known), axis=1) + np.sum(np.asarray(terms)[:, :, 0], axis=1)
+        return np.where(np.isfinite(total), total, -np.inf)
+
+    return density
 
 
 def _layout(target: LogPosterior) -> Layout:

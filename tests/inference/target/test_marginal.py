@@ -14,10 +14,10 @@ import tests.experiments.bench as bench
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.fit.curvature import hessian, root_of_inverse
+from capsule_id.inference.fit.curvature import BATCH, hessian, root_of_inverse
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior, conditional
+from capsule_id.inference.target.marginal import MarginalPosterior, conditional, density_of
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import Truth, synthesize
@@ -187,6 +187,21 @@ def test_restored_scatters_follow_their_conditional_density(marginal: MarginalPo
         # Negative control: one twentieth of an sd off.
         off = np.interp(u[:, j] + 0.1 * np.std(u[:, j]), fine, cumulated / cumulated[-1])
         assert stats.kstest(off, "uniform").pvalue < 1e-3, target.names[j]
+
+
+def test_the_density_of_the_fit_is_the_plain_one_and_compiles_nothing(marginal: MarginalPosterior) -> None:
+    """In batches as large as the sampler's the program of the integrated posterior serves."""
+    target, v = marginal.target, walkers(marginal, BATCH)
+    u, density = marginal.restore(v, 5)[0], density_of(target)
+    programs = conditional._cache_size()
+    found = density(u)
+    assert conditional._cache_size() == programs
+    np.testing.assert_allclose(found, np.asarray(target.batch(jnp.asarray(u))), rtol=0.0, atol=LIMIT)
+    # Negative control: scatters in another order.
+    u[:, target.scatter] = u[:, target.scatter][:, ::-1]
+    assert np.max(np.abs(density(u) - found)) > 100.0 * LIMIT
+    u[:, target.names.index("c")] = np.log(30.0)
+    assert np.all(density(u) == -np.inf)
 
 
 def test_blocks_add_up(marginal: MarginalPosterior) -> None:
