@@ -6,6 +6,7 @@ rad²/s², c twice the rate of decay, 1/s, and F_dry the dry moment over the ine
 """
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.signal import find_peaks
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.free_vibration.checks import check_drift
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.second_fit.screening import second_models
 from capsule_id.rig.model import Rig
@@ -105,3 +107,18 @@ def test_the_whole_record_is_cut_at_its_release_and_its_sensor_error_is_named(tm
     # another program, is 2 % below -k1/6: a sine has further terms.
     rows = fit.summary
     assert rows.loc["k_cubic", "value"] == pytest.approx(-rows.loc["k1", "value"] / 6.0, rel=0.05)
+
+
+def test_the_drift_of_the_highest_swing_is_no_drift(tmp_path: Path) -> None:
+    """Record 1 swings from 135 deg, where no cubic spring is a pendulum. Its twin is in test_decay_channels."""
+    time, angle = pendulum(1)
+    entry = Entry("free_vibration", "swing", {"time [s]": time, "x_rel [m]": angle}, {})
+    rig = make_rig(tmp_path, entry, head={"m1": quantity(1.0, "kg")})
+    ((record,), _) = second_models(cast(list[FreeVibration], make_experiments(rig)))
+    assert record.model.drift == "gp"
+    assert record.about.screened is not None
+    found = record.about.screened
+    values = {row.name: found.values.get(row.symbol, found.noise) for row in record.parameters}
+    fit = SimpleNamespace(values={"m1": 1.0, **values})
+    (finding,) = check_drift([record], fit)  # type: ignore[arg-type]  # pyright: ignore
+    assert (finding.level, finding.experiment) == ("fail", "swing")
