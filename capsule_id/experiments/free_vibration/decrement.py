@@ -104,7 +104,7 @@ def logarithmic_decrement(
     values: np.ndarray,
     m1: float,
     smoothed: np.ndarray | None = None,
-    smallest: float = PEAK_RANGE_RATIO,
+    jumps: bool = False,
 ) -> Decrement | None:
     """Apply the paper's estimator to ``values``; None where fewer than three half cycles exceed the limits.
 
@@ -113,10 +113,11 @@ def logarithmic_decrement(
     time, values : (n,) s and m
     m1 : mass of the rod, kg
     smoothed : (n,) the record after Savitzky–Golay, which locates the half cycles (default: ``values``)
-    smallest : smallest peak as a fraction of the record's range
+    jumps : whether the readings may jump where the rod turns, as an acceleration does
     """
     rest = equilibrium(values)
     guide = (values if smoothed is None else smoothed) - rest
+    smallest = PEAK_RANGE_RATIO_OF_JUMPS if jumps else PEAK_RANGE_RATIO
     lowest = max(PEAK_NOISE_RATIO * noise_level(values), smallest * float(np.ptp(guide)))
     times, peaks = half_cycle_extremes(time, guide, values - rest, lowest)
     if len(times) < 3:

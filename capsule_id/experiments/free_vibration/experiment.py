@@ -29,8 +29,6 @@ from capsule_id.experiments.free_vibration.decay_models import (
 )
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import (
-    PEAK_RANGE_RATIO,
-    PEAK_RANGE_RATIO_OF_JUMPS,
     Decrement,
     crossing_decrement,
     damping_of_peaks,
@@ -278,8 +276,7 @@ class FreeVibration(SurfaceExperiment):
     def decrement(self, smooth: bool = True) -> Decrement | None:
         """Return peaks and logarithmic decrement, from the smoothed or the raw record; None with too few peaks."""
         (time, values), smoothed = self.whole, self.smoothed()
-        smallest = PEAK_RANGE_RATIO_OF_JUMPS if self.order == 2 else PEAK_RANGE_RATIO
-        return logarithmic_decrement(time, smoothed if smooth else values, self.mass, smoothed, smallest)
+        return logarithmic_decrement(time, smoothed if smooth else values, self.mass, smoothed, jumps=self.order == 2)
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
         """Estimate k1 and c of this record as in the paper; None also for a record sampled unevenly."""
