@@ -45,6 +45,15 @@ def ensemble_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
     return np.take_along_axis(sums, np.argmax(enough, axis=1)[:, None], axis=1)[:, 0]
 
 
+def pooled_time(draws: Draws) -> Float[np.ndarray, " d"]:
+    """(d,) integrated autocorrelation time as in ``ensemble_time``, over the walkers of all ensembles together.
+
+    Covariances are about the mean of all ensembles: where they disagree, the time is long.
+    """
+    ensembles, number, walkers, d = draws.shape
+    return ensemble_time(np.moveaxis(draws, 0, 1).reshape(1, number, ensembles * walkers, d))[0]
+
+
 def split_rhat(draws: Draws) -> Float[np.ndarray, " d"]:
     """(d,) split R-hat (Gelman et al., Bayesian Data Analysis, section 11.4) across independent ensembles.
 

@@ -21,6 +21,7 @@ from capsule_id.inference.sampling.diagnostics import (
     effective_sample_size,
     ensemble_time,
     integrated_time,
+    pooled_time,
     split_rhat,
 )
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
@@ -33,7 +34,8 @@ ENSEMBLES = 4
 #: Smallest number of walkers of an ensemble: one batch of the log-posterior. There are at least two per parameter.
 MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
 #: Convergence requires more draws than this many autocorrelation times for every parameter. The time is an average
-#: over the walkers of an ensemble, 32 or more. Its standard error at this length is 20 % or less (Sokal 1997, eq. 3.19).
+#: over the walkers of all ensembles, 128 or more. Its standard error at this length is 10 % or less (Sokal 1997,
+#: eq. 3.19).
 LENGTH_IN_TAU = 20.0
 #: Convergence requires this bulk and tail effective sample size for every parameter, unless stated.
 DEFAULT_ESS = 4000.0
@@ -149,7 +151,7 @@ def sample(
         draws=theta,
         lp=lp,
         acceptance=acceptance,
-        tau=np.max(ensemble_time(draws), axis=0),
+        tau=pooled_time(draws),
         rhat=split_rhat(theta),
         ess=effective_sample_size(draws, integrated_time(theta)),
         ess_bulk=bulk,
@@ -164,7 +166,7 @@ def sample(
 
 def _converged(draws: np.ndarray, ess: float) -> bool:
     """Whether draws (ensemble, draw, walker, d) are long enough and their ensembles agree."""
-    tau, rhat = ensemble_time(draws), split_rhat(draws)
+    tau, rhat = pooled_time(draws), split_rhat(draws)
     long_enough = np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT)
     return bool(long_enough and np.all(bulk_and_tail_size(draws) >= ess))
 

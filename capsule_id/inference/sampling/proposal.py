@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,6 +18,14 @@ WIDE, NARROW = (6.0, (1.0, 2.0, 4.0)), (200.0, (1.0, 1.15, 1.4))
 WEIGHTS = np.array([0.85, 0.1, 0.05])
 #: Share of proposals that draw parameters that may be absent from their priors, and the largest number of these at once.
 FROM_PRIOR, MOST_DRAWN = 0.4, 2
+
+
+class Density(Protocol):
+    """Proposal of one block of d parameters."""
+
+    def log_density(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]: ...
+
+    def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]: ...
 
 
 class Mixture:
@@ -118,7 +127,7 @@ def concentric(
 
 @dataclass(frozen=True)
 class BlockProposal:
-    """One mixture for each block.
+    """One proposal for each block.
 
     Attributes
     ----------
@@ -126,25 +135,25 @@ class BlockProposal:
     """
 
     blocks: Sequence[np.ndarray]
-    mixtures: Sequence[Mixture]
+    densities: Sequence[Density]
 
     def log_density(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n blocks"]:
         """Log-density of the parameters of each block."""
-        pairs = zip(self.blocks, self.mixtures, strict=True)
-        return np.stack([mixture.log_density(u[:, block]) for block, mixture in pairs], axis=1)
+        pairs = zip(self.blocks, self.densities, strict=True)
+        return np.stack([density.log_density(u[:, block]) for block, density in pairs], axis=1)
 
     def draw(self, rng: np.random.RandomState, size: int) -> Float[np.ndarray, "{size} d"]:
         """Draw u; NaN for a parameter in theta that is not positive."""
         u = np.empty((size, sum(map(len, self.blocks))))
-        for block, mixture in zip(self.blocks, self.mixtures, strict=True):
-            u[:, block] = mixture.draw(rng, size)
+        for block, density in zip(self.blocks, self.densities, strict=True):
+            u[:, block] = density.draw(rng, size)
         return u
 
 
 def block_proposal(
     blocks: Sequence[np.ndarray], centre: Vector, covariance: Matrix, narrow: Sequence[bool] | None = None
 ) -> BlockProposal:
-    """Concentric mixtures in u.
+    """Concentric mixtures in u for all blocks.
 
     Parameters
     ----------

@@ -3,7 +3,8 @@
 A short chain from the Laplace approximation misses tails where the width of the posterior depends on one parameter, as
 on the correlation time of noise, or where two terms replace each other, as viscous and dry damping do. Weighted draws
 from a wide proposal find them. Each round draws from the mixture of the round before. The draws of all rounds are
-weighted by the mean of the densities of all rounds, and determine the next mixture by expectation maximisation.
+weighted by the mean of the densities of all rounds. They determine the next proposal: a mixture, by expectation
+maximisation; in a large block a map.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from capsule_id.inference.sampling.coordinates import coordinates_of
-from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, concentric
+from capsule_id.inference.sampling.proposal import BlockProposal, Density, Mixture, concentric
+from capsule_id.inference.sampling.transport import Transported
 
 #: Message where the sampler has no point to start from.
 NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
@@ -34,15 +36,16 @@ DEFENSIVE = 0.2
 
 
 class _Rounds:
-    """Draws of one block of d parameters in all rounds, and the mixture that each round drew from."""
+    """Draws of one block of d parameters in all rounds, and the proposal that each round drew from."""
 
-    def __init__(self, first: Mixture, prior: Float[np.ndarray, "2 d"]) -> None:
-        self.mixtures, self._prior, self._several = [first], prior, False
+    def __init__(self, first: Density, prior: Float[np.ndarray, "2 d"], large: bool) -> None:
+        self.proposals, self._prior, self._large = [first], prior, large
+        self._several: Mixture | None = None
         self._u = np.empty((0, prior.shape[1]))
         self._log_posterior = self._log_drawn = np.empty(0)
 
     def add(self, u: Float[np.ndarray, "n d"], log_posterior: Float[np.ndarray, " n"]) -> float:
-        """Add the draws of the newest mixture; return their effective sample size.
+        """Add the draws of the newest proposal; return their effective sample size.
 
         Raises
         ------
@@ -51,8 +54,8 @@ class _Rounds:
         """
         if not np.any(np.isfinite(log_posterior)):
             raise RuntimeError(NO_MASS)
-        densities = [mixture.log_density(u) for mixture in self.mixtures]
-        earlier = np.logaddexp(self._log_drawn, self.mixtures[-1].log_density(self._u))
+        densities = [proposal.log_density(u) for proposal in self.proposals]
+        earlier = np.logaddexp(self._log_drawn, self.proposals[-1].log_density(self._u))
         self._u = np.concatenate([self._u, u])
         self._log_posterior = np.concatenate([self._log_posterior, log_posterior])
         self._log_drawn = np.concatenate([earlier, np.logaddexp.reduce(densities, axis=0)])
@@ -64,15 +67,19 @@ class _Rounds:
         return self._log_posterior - self._log_drawn
 
     def next(self, good: bool, rng: np.random.RandomState) -> None:
-        """Add the mixture of the next round: the same where it is ``good``, else that which all draws determine."""
-        if good:
-            self.mixtures.append(self.mixtures[-1])
-            return
+        """Add the proposal of the next round: the same where it is ``good``, else that which all draws determine."""
+        self.proposals.append(self.proposals[-1] if good else self._adapted(rng))
+
+    def _adapted(self, rng: np.random.RandomState) -> Density:
         weights = tempered(self.log_weights, LEAST_SIZE * self._u.shape[1])
         used = weights > 0.0  # the theta of the others may overflow
-        before = self.mixtures[-1] if self._several else None
-        self._several = len(self.mixtures) > SINGLE
-        self.mixtures.append(_adapted(before, self._u[used], weights[used], self._prior, self._several, rng))
+        u, weights = self._u[used], weights[used]
+        if self._large:
+            return Transported(u, weights)
+        several = len(self.proposals) > SINGLE
+        mixture = _adapted(self._several, u, weights, self._prior, several, rng)
+        self._several = mixture if several else None
+        return mixture
 
 
 def refined(
@@ -80,7 +87,7 @@ def refined(
     first: BlockProposal,
     prior: Float[np.ndarray, "2 d"],
     rng: np.random.RandomState,
-    kept: Sequence[bool],
+    large: Sequence[bool],
 ) -> BlockProposal:
     """Proposal adapted to a posterior, from the proposal ``first``.
 
@@ -88,26 +95,28 @@ def refined(
     ----------
     parts : (n, d) -> (n, blocks), log-densities of the blocks
     prior : centre and width of the normal prior of u; NaN for a parameter with another prior
-    kept : for each block whether its ``first`` mixture stays where it is good enough
+    large : for each block whether its first proposal stays where it is good enough, and becomes a map where it is not
 
     Raises
     ------
     RuntimeError
         If no draw has a finite log-density.
     """
-    rounds = [_Rounds(mixture, prior[:, block]) for block, mixture in zip(first.blocks, first.mixtures, strict=True)]
+    pairs = zip(first.blocks, first.densities, large, strict=True)
+    rounds = [_Rounds(mixture, prior[:, block], own) for block, mixture, own in pairs]
     proposal = first
     for i in range(SINGLE + SEVERAL):
         u = proposal.draw(rng, DRAWS)
         inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in first.blocks], axis=1)
         u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
-        log_parts = np.where(inside, parts(u), -np.inf)
+        found = parts(u)
+        log_parts = np.where(inside & ~np.isnan(found), found, -np.inf)
         for j, own in enumerate(rounds):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
-            settled = i >= SINGLE or (i == 0 and kept[j])
-            own.next(size >= (ENOUGH if settled else EXCELLENT) * DRAWS and (i > 0 or kept[j]), rng)
-        newest = [own.mixtures[-1] for own in rounds]
-        if all(new is old for new, old in zip(newest, proposal.mixtures, strict=True)):
+            settled = i >= SINGLE or (i == 0 and large[j])
+            own.next(size >= (ENOUGH if settled else EXCELLENT) * DRAWS and (i > 0 or large[j]), rng)
+        newest = [own.proposals[-1] for own in rounds]
+        if all(new is old for new, old in zip(newest, proposal.densities, strict=True)):
             break
         proposal = BlockProposal(first.blocks, newest)
     return proposal
@@ -120,9 +129,16 @@ def effective_size(log_weights: Float[np.ndarray, " w"]) -> float:
 
 
 def tempered(log_weights: Float[np.ndarray, " w"], least: float) -> Float[np.ndarray, " w"]:
-    """Normalised weights to the largest power of ``TEMPERS`` whose effective sample size is at least ``least``."""
-    power = next((a for a in TEMPERS if effective_size(a * log_weights) >= least), TEMPERS[-1])
-    weights = np.exp(power * (log_weights - np.max(log_weights)))
+    """Normalised weights to the largest power of ``TEMPERS`` whose effective sample size is at least ``least``.
+
+    Where there is none, the largest weights count alike and the others not at all (Koblents & Míguez 2015).
+    """
+    powers = [a for a in TEMPERS if effective_size(a * log_weights) >= least]
+    if powers:
+        weights = np.exp(powers[0] * (log_weights - np.max(log_weights)))
+    else:
+        number = min(int(np.ceil(least)), len(log_weights))
+        weights = np.asarray(log_weights >= np.partition(log_weights, -number)[-number], dtype=float)
     return weights / np.sum(weights)
 
 

@@ -11,7 +11,8 @@ from capsule_id.inference.sampling.diagnostics import effective_sample_size, ens
 from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
 from capsule_id.inference.sampling.ensembles import pilot, sample
 from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, block_proposal, concentric
-from capsule_id.inference.sampling.refinement import _Rounds, effective_size, refined
+from capsule_id.inference.sampling.refinement import _Rounds, effective_size, refined, tempered
+from capsule_id.inference.sampling.transport import Transported
 from tests.inference.stub import Gaussian
 
 #: Normal prior of the logarithms of both terms: centre, width.
@@ -171,15 +172,15 @@ def test_draws_of_all_rounds_are_weighted_by_the_densities_of_all_rounds() -> No
         return stats.multivariate_normal.logpdf(u, np.full(2, 1.5), np.diag([1.0, 0.3]))
 
     rng, number = np.random.RandomState(0), 20_000
-    rounds = _Rounds(concentric(np.zeros(2), np.eye(2)), np.full((2, 2), np.nan))
+    rounds = _Rounds(concentric(np.zeros(2), np.eye(2)), np.full((2, 2), np.nan), False)
     for _ in range(3):
-        u = rounds.mixtures[-1].draw(rng, number)
+        u = rounds.proposals[-1].draw(rng, number)
         rounds.add(u, log_density(u))
         rounds.next(False, rng)
     mean = np.exp(rounds.log_weights)
     assert abs(np.mean(mean) * 3 - 1.0) < 4.0 * 3 * np.std(mean) / np.sqrt(3 * number)
-    first = rounds.mixtures[0].draw(rng, number)
-    alone = np.exp(log_density(first) - rounds.mixtures[2].log_density(first))
+    first = rounds.proposals[0].draw(rng, number)
+    alone = np.exp(log_density(first) - rounds.proposals[2].log_density(first))
     assert abs(np.mean(alone) - 1.0) > 0.1
 
 
@@ -193,7 +194,51 @@ def test_a_first_proposal_that_is_good_enough_is_kept_on_request(kept: bool) -> 
         np.random.RandomState(0),
         [kept],
     )
-    assert (found.mixtures[0] is first.mixtures[0]) == kept
+    assert (found.densities[0] is first.densities[0]) == kept
+
+
+#: Correlations of ten parameters.
+MIXED = np.eye(10) + 0.3 * np.random.default_rng(0).standard_normal((10, 10))
+
+
+def bent(u: np.ndarray) -> np.ndarray:
+    """Log-density (n, 1), normalised: every second of ten coordinates bends and widens with the one before."""
+    z = u @ np.linalg.inv(MIXED)
+    location, scale = np.zeros_like(z), np.ones_like(z)
+    location[:, 1::2], scale[:, 1::2] = 0.4 * (z[:, ::2] ** 2 - 1.0), np.exp(0.2 * z[:, ::2])
+    parts = stats.norm.logpdf(z, location, scale)
+    return np.sum(parts, axis=1, keepdims=True) - np.linalg.slogdet(MIXED)[1]
+
+
+def test_a_map_describes_a_bent_block() -> None:
+    """Five bends at once, from exact draws. Negative control: the same Student densities without the map."""
+    z = np.random.default_rng(1).standard_normal((20_000, 10))
+    z[:, 1::2] = 0.4 * (z[:, ::2] ** 2 - 1.0) + np.exp(0.2 * z[:, ::2]) * z[:, 1::2]
+    exact, share = z @ MIXED, {}
+    straight = concentric(np.mean(exact, axis=0), np.cov(exact.T))
+    for name, found in {"map": Transported(exact, np.full(len(z), 1.0 / len(z))), "straight": straight}.items():
+        u = found.draw(np.random.RandomState(1), 50_000)
+        weights = np.exp(bent(u)[:, 0] - found.log_density(u))
+        assert np.mean(weights) == pytest.approx(1.0, abs=4.0 * np.std(weights) / np.sqrt(len(u)))
+        share[name] = np.mean(weights) ** 2 / np.mean(weights**2)
+    assert share["map"] > 0.4, share
+    assert share["straight"] < 0.5 * share["map"], share
+
+
+def test_a_large_block_that_its_first_proposal_misses_gets_a_map() -> None:
+    first = block_proposal([np.arange(10)], np.zeros(10), 0.4 * MIXED.T @ MIXED, [True])
+    found = refined(bent, first, np.full((2, 10), np.nan), np.random.RandomState(0), [True])
+    u = found.draw(np.random.RandomState(1), 20_000)
+    assert isinstance(found.densities[0], Transported)
+    assert effective_size((bent(u) - found.log_density(u))[:, 0]) > 0.1 * len(u)
+
+
+def test_weights_of_a_hopeless_start_are_cut_to_the_best_draws() -> None:
+    log_weights = -1e9 * np.random.default_rng(0).uniform(size=1000)
+    weights = tempered(log_weights, 40.0)
+    assert np.sum(weights > 0.0) == 40
+    assert np.min(log_weights[weights > 0.0]) > np.max(log_weights[weights == 0.0])
+    assert effective_size(np.log(np.maximum(weights, 1e-300))) == pytest.approx(40.0)
 
 
 def test_a_posterior_without_mass_near_the_start_is_said_so() -> None:
@@ -207,15 +252,15 @@ def test_a_block_that_needs_components_late_gets_them() -> None:
     """A block that was good enough with one centre until the last round before several are tried."""
     rng = np.random.RandomState(0)
     first = concentric(np.zeros(1), np.eye(1))
-    rounds = _Rounds(first, np.full((2, 1), np.nan))
+    rounds = _Rounds(first, np.full((2, 1), np.nan), False)
     for good in [True] * (refinement.SINGLE + 1) + [False] * 2:
-        u = rounds.mixtures[-1].draw(rng, 1000)
+        u = rounds.proposals[-1].draw(rng, 1000)
         rounds.add(u, stats.norm.logpdf(u[:, 0]))
         rounds.next(good, rng)
-    for later in rounds.mixtures[-2:]:
+    for later in rounds.proposals[-2:]:
         assert np.sum(later.weights) == pytest.approx(1.0, abs=1e-12)
         assert len(later.weights) > len(first.weights)
-    assert len(rounds.mixtures[-2].weights) == refinement.COMPONENTS + len(first.weights)
+    assert len(rounds.proposals[-2].weights) == refinement.COMPONENTS + len(first.weights)
 
 
 def test_ensembles_do_not_share_moves() -> None:
