@@ -10,6 +10,7 @@ import pytest
 
 from capsule_id.experiments.forced_run.base_run import BaseRun
 from capsule_id.inference.checks.model_error.run_widening import (
+    PRIORS,
     by_phase,
     by_time,
     parts_of_residuals,
@@ -104,3 +105,16 @@ def test_parts_are_whole_periods_and_phases(known: SampledFit) -> None:
     assert np.array_equal(np.bincount(time), [50, 50, 50, 50])
     assert np.mean(phase[:50] == phase[50:100]) > 0.95  # a sample on an edge
     assert np.all(np.abs(np.bincount(phase) - 200 / 6) < 4)
+
+
+def test_a_parameter_that_only_its_prior_determines_does_not_widen_another() -> None:
+    """As the damping of a run on a shaken table does. Negative control: the priors as one more part."""
+    rng = np.random.default_rng(0)
+    jacobian = np.concatenate([rng.standard_normal((60, 2)) * [1.0, 1e-6], np.eye(2)])
+    jacobian[:60, 1] += 1e-6 * jacobian[:60, 0]
+    residuals = np.append(rng.standard_normal(60), [0.0, 0.0])
+    residuals -= jacobian @ np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
+    part = np.append(np.repeat(np.arange(6), 10), [PRIORS, PRIORS])
+    assert widening(steps_of_parts(jacobian, residuals, 0, part)).factor < 2.0
+    shared = np.where(part == PRIORS, -1, part)
+    assert widening(steps_of_parts(jacobian, residuals, 0, shared)).factor > 4.0

@@ -26,6 +26,8 @@ from capsule_id.inference.fit.point_fit import residual_jacobian
 
 #: Parts of an excitation period. They are long beside most waves of a misfit, so that their steps are independent.
 PHASES = 6
+#: Number of the priors, which every part meets. Without them the step of a parameter that the data leave open has no end.
+PRIORS = -2
 #: Numbers of the parts of the n samples of a record; None where it cannot be divided in this way.
 Division = Callable[[CapsuleForward], Int[np.ndarray, " n"] | None]
 
@@ -74,7 +76,7 @@ def by_phase(run: CapsuleForward) -> Int[np.ndarray, " n"] | None:
 
 
 def parts_of_residuals(s: SampledFit, runs: Sequence[CapsuleForward], division: Division) -> Int[np.ndarray, " m"]:
-    """Part of each of ``LogPosterior.plain_residuals``; -1, one more part, where no record of ``runs`` gives it."""
+    """Part of each of ``LogPosterior.plain_residuals``; -1, one more part, for other experiments; ``PRIORS`` for priors."""
     parts, used = [], 0
     for e in s.experiments:
         own = np.full(len(e.residuals(e.local(s.values), np)), -1)
@@ -84,7 +86,7 @@ def parts_of_residuals(s: SampledFit, runs: Sequence[CapsuleForward], division: 
             own[: channels * len(numbers)] = used + np.tile(numbers, channels)
             used += int(np.max(numbers)) + 1
         parts.append(own)
-    return np.concatenate([*parts, np.full(s.target.dimension, -1)])
+    return np.concatenate([*parts, np.full(s.target.dimension, PRIORS)])
 
 
 def steps_of_parts(
@@ -100,7 +102,7 @@ def steps_of_parts(
     others = np.linalg.qr(np.delete(jacobian, k, axis=1))[0]
     own = jacobian[:, k] - others @ (others.T @ jacobian[:, k])
     pairs = []
-    for number in np.unique(part):
+    for number in np.unique(part[part != PRIORS]):
         rows, rest = part == number, part != number
         information = float(np.sum(own[rows] ** 2))
         if information == 0.0 or np.linalg.matrix_rank(jacobian[rest]) < jacobian.shape[1]:
