@@ -3,6 +3,7 @@
 The operating system keeps those parts of the file in memory that are in use. It removes the file with its last array.
 """
 
+import errno
 import mmap
 import tempfile
 from collections.abc import Callable, Iterable
@@ -34,7 +35,7 @@ class Growing:
         Raises
         ------
         InputError
-            If the directory of temporary files has no room.
+            If the directory of temporary files has no room, or too many files are open.
         """
         size = len(self._values)
         if self._file is None and size + len(more) <= IN_MEMORY:
@@ -48,16 +49,34 @@ class Growing:
             self._file.write(np.ascontiguousarray(more, self._dtype).data)
             self._file.flush()
         except OSError as error:
-            rule, remedy = "a long record needs room for temporary files", "set TMPDIR to a directory with room"
-            raise InputError(rule, str(error), remedy) from None
+            raise _fault(error) from None
         self._values = self._values[:0]
 
     @property
     def values(self) -> np.ndarray:
-        """The numbers, (n,)."""
+        """The numbers, (n,).
+
+        Raises
+        ------
+        InputError
+            If too many files are open: a column in a file holds one file open as long as it is used.
+        """
         if self._file is not None and not len(self._values):
-            self._values = np.asarray(np.memmap(self._file, self._dtype, "r+"))
+            try:
+                self._values = np.asarray(np.memmap(self._file, self._dtype, "r+"))
+            except OSError as error:
+                raise _fault(error) from None
         return self._values
+
+
+def _fault(error: OSError) -> InputError:
+    """The error of a temporary file that cannot be made, with its remedy."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        rule = "each column of a long record needs an open temporary file"
+        remedy = "fit fewer records at once, or raise the limit of open files: ulimit -n"
+    else:
+        rule, remedy = "a long record needs room for temporary files", "set TMPDIR to a directory with room"
+    return InputError(rule, str(error), remedy)
 
 
 def joined(parts: Iterable[np.ndarray], dtype: type[np.generic] = np.float64) -> np.ndarray:

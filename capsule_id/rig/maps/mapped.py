@@ -1,6 +1,6 @@
 """Applies a column map: selects, combines and scales the columns of one file or several."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,7 +95,7 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
             values[name] = in_blocks(lambda part, rate=rate: part / rate, whole_numbers(0, int(first_rows[-1])))
     names = tuple(column_map.sources)
     columns = tuple(_selected(values.pop(name), keep) for name in names)
-    origin = None if keep is None else _selected(np.arange(len(keep)), keep)
+    origin = None if keep is None else _selected(whole_numbers(0, len(keep)), keep)
 
     def cell(row: int | None, column: int) -> tuple[_Cell, int | None]:
         index = 0 if row is None else row if origin is None else int(origin[row])
@@ -124,7 +124,14 @@ def _selected(values: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
     """The rows ``keep`` of a column; None: all, without a copy."""
     if keep is None:
         return values
-    return joined((values[part][keep[part]] for part in pieces(len(values))), values.dtype.type)
+    return joined(_selected_pieces(values, keep), values.dtype.type)
+
+
+def _selected_pieces(values: np.ndarray, keep: np.ndarray) -> Iterable[np.ndarray]:
+    """The rows ``keep`` of each piece of a column."""
+    for part in pieces(len(values)):
+        yield values[part][keep[part]]
+        release(values)
 
 
 class _Part:

@@ -1,6 +1,9 @@
 """Long columns lie in temporary files: the same numbers and the same errors as in memory."""
 
+import errno
 import mmap
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +110,54 @@ def test_a_full_disk_is_an_error_with_a_remedy(tmp_path: Path, short_memory: pyt
     short_memory.setattr(columns.tempfile, "TemporaryFile", lambda prefix: Path("/dev/full").open("r+b", 0))  # noqa: SIM115
     with pytest.raises(InputError, match=r"room for temporary files.*No space left.*TMPDIR"):
         table(tmp_path, text(), MAP)
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [(errno.EMFILE, "ulimit -n"), (errno.ENFILE, "ulimit -n"), (errno.ENOSPC, "TMPDIR"), (errno.ENOMEM, "TMPDIR")],
+)
+def test_a_column_that_cannot_be_mapped_is_an_error_with_a_remedy(
+    number: int, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError(number, "refused")
+
+    column = columns.Growing()
+    column.extend(np.zeros(columns.IN_MEMORY + 1))
+    monkeypatch.setattr(columns.np, "memmap", refused)
+    with pytest.raises(InputError, match=rf"temporary file.*refused.*{remedy}"):
+        _ = column.values
+
+
+_OPEN_FILES = """
+import resource
+import tempfile
+import numpy as np
+from capsule_id.errors import InputError
+from capsule_id.rig.formats import columns
+
+tempfile.gettempdir()
+columns.IN_MEMORY = 8
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+held = []
+try:
+    for _ in range(64):
+        column = columns.Growing()
+        column.extend(np.zeros(9))
+        held.append({held})
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the system has no limit of open files to lower")
+@pytest.mark.parametrize("held", ["column", "column.values"])
+def test_too_many_open_files_are_an_error_with_a_remedy(held: str) -> None:
+    command = [sys.executable, "-c", _OPEN_FILES.replace("{held}", held)]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "each column of a long record needs an open temporary file" in run.stdout
+    assert "Too many open files" in run.stdout
+    assert "fit fewer records at once, or raise the limit of open files: ulimit -n" in run.stdout
 
 
 def test_columns_grow_after_they_were_read() -> None:
