@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.refit import refit
-from capsule_id.experiments.free_vibration.checks import check_drift, check_halves, check_positions, whitened
+from capsule_id.experiments.free_vibration.checks import check_drift, check_halves, check_positions, fast_rms, whitened
 from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
@@ -189,26 +189,43 @@ def pendulum(release: float) -> np.ndarray:
     return found.y[0] + 2e-3 * np.random.default_rng(9).standard_normal(len(TIME))
 
 
-def drift_finding(angle: np.ndarray, damping: tuple[str, ...], cubic: bool) -> Finding:
-    """Finding on the drift of a record, fitted with a Gaussian process."""
-    table = bench.table("free_vibration", [bench.column("time", TIME), bench.column("x_rel", angle)], "decay")
+def drift_findings(angle: np.ndarray, damping: tuple[str, ...], cubic: bool) -> list[Finding]:
+    """Findings on the drift of a record, fitted with a Gaussian process."""
+    time = TIME[: len(angle)]
+    table = bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", angle)], "decay")
     own = FreeVibration(table, bench.rig(table))
     model = DecayModel(damping, cubic=cubic, drift="gp")
     found = Screening(own).fit(model)[0]
     again = own.with_model(model, found)
     values = {row.name: found.values.get(row.symbol, found.noise) for row in again.parameters}
     fit = SimpleNamespace(values={"m1": bench.M1, **values})
-    (finding,) = check_drift([again], fit)  # type: ignore[arg-type]  # pyright: ignore
-    return finding
+    return check_drift([again], fit)  # type: ignore[arg-type]  # pyright: ignore
 
 
 def test_a_drift_that_swings_with_the_rod_fails() -> None:
     """A pendulum at large angles is no cubic spring. Its twin at small angles, and true drifts, pass."""
-    large = drift_finding(pendulum(2.4), ("dry",), True)
+    (large,) = drift_findings(pendulum(2.4), ("dry",), True)
     assert (large.code, large.level) == ("decays.drift", "fail")
-    assert drift_finding(pendulum(0.4), ("dry",), True).level == "ok"
+    assert [found.level for found in drift_findings(pendulum(0.4), ("dry",), True)] == ["ok"]
     for seed in (101, 106):
-        assert drift_finding(twin("drift", seed), (), False).level == "ok"
+        assert [found.level for found in drift_findings(twin("drift", seed), (), False)] == ["ok"]
+
+
+@pytest.mark.parametrize(("half_cycles", "levels"), [(3.5, []), (5.5, []), (6.5, ["ok"])])
+def test_a_drift_is_tested_over_one_period_or_more(half_cycles: float, levels: list[str]) -> None:
+    """The filter reads one period to each side, so a record of fewer than six half cycles gives no finding."""
+    samples = round(half_cycles * np.pi * np.sqrt(bench.M1 / bench.K1) / TIME[1])
+    assert [found.level for found in drift_findings(twin("drift", 101)[:samples], (), False)] == levels
+
+
+def test_the_rms_at_the_frequency_of_the_motion() -> None:
+    """The gain is 1 for a sine of that frequency, 0 for a straight line and 0.52 for white noise."""
+    half, time = 0.05, np.arange(40_000) / 2000.0
+    sine = 3.0 * np.sin(np.pi * time / half)
+    assert fast_rms(time, sine, half) == pytest.approx(3.0 / np.sqrt(2.0), rel=1e-3)
+    assert fast_rms(time, 2.0 + 5.0 * time, half) == pytest.approx(0.0, abs=1e-9)
+    noise = np.random.default_rng(4).standard_normal(time.size)
+    assert fast_rms(time, noise, half) == pytest.approx(np.sqrt(4.375) / 4.0, rel=0.03)
 
 
 @pytest.mark.parametrize(("samples", "levels"), [(5, []), (9, []), (13, ["ok"])])

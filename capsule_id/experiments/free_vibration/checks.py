@@ -28,6 +28,8 @@ INTERVALS, READINGS_PER_INTERVAL = 12, 5
 STEP = 1e-5
 #: Largest part of a drift that is as fast as the motion, relative to the motion.
 FAST_DRIFT = 0.01
+#: Largest part of a drift that is as fast as the motion, relative to the residuals left: about half of what white noise gives.
+FAST_NOISE = 0.25
 #: Directions of the offsets that are shorter than this, relative to the longest one, are combinations of the others.
 UNSEEN = 1e-8
 
@@ -118,30 +120,38 @@ def check_drift(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding
     """Check that a Gaussian-process drift is slow: its part at the frequency of the decay hides errors of the model."""
     findings = []
     for e in records:
-        if e.model.drift == "gp":
-            drift, motion, noise = fast_parts(e, e.local(fit.values))
-            level = "fail" if drift > max(FAST_DRIFT * motion, noise) else "ok"
-            facts = {"label": e.label, "share": drift / max(motion, noise)}
+        if e.model.drift == "gp" and (parts := fast_parts(e, e.local(fit.values))) is not None:
+            drift, motion, noise = parts
+            level = "fail" if drift > max(FAST_DRIFT * motion, FAST_NOISE * noise) else "ok"
+            facts = {"label": e.label, "share": drift / max(motion, FAST_NOISE * noise)}
             findings.append(Finding("decays.drift", level, facts, e.label))
     return findings
 
 
-def fast_parts(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float]:
-    """Rms of drift and motion at the frequency of the motion, and rms of the residuals left; SI."""
+def fast_parts(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float] | None:
+    """Rms of drift and motion at the frequency of the motion, and rms of the residuals left; SI. None for a short record."""
+    half = np.pi * np.sqrt(theta["m1"] / theta["k1"])
     raw, design = e.unwhitened(theta, np)
     residuals = raw - design @ np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
     shape = {symbol: theta[symbol] for symbol in e.model.shapes}
     drift = np.asarray(drift_by_shape(e.times, np.asarray(residuals), e.model.noise, shape))
-    half = np.pi * np.sqrt(theta["m1"] / theta["k1"])
-    inside = (e.time > e.time[0] + 2.0 * half) & (e.time < e.time[-1] - 2.0 * half)
+    fast, motion = fast_rms(e.time, drift, half), fast_rms(e.time, e.values - residuals, half)
+    return None if fast is None or motion is None else (fast, motion, float(np.std(residuals - drift)))
 
-    def fast(values: np.ndarray) -> float:
-        for _ in range(2):
-            beside = [np.interp(e.time + shift, e.time, values) for shift in (-half, half)]
-            values = values - 0.5 * (beside[0] + beside[1])
-        return float(np.sqrt(np.mean(values[inside] ** 2))) if inside.any() else 0.0
 
-    return fast(drift), fast(e.values - residuals), float(np.std(residuals - drift))
+def fast_rms(time: np.ndarray, values: np.ndarray, half: float) -> float | None:
+    """Rms of the part of ``values`` that turns its sign every ``half`` seconds.
+
+    A filter with gain 1 there and 0 for a straight line reads one period to each side of a sample. None where the samples
+    with both sides cover less than one period.
+    """
+    inside = (time > time[0] + 2.0 * half) & (time < time[-1] - 2.0 * half)
+    if not inside.any() or np.ptp(time[inside]) < 2.0 * half:
+        return None
+    for _ in range(2):
+        before, after = (np.interp(time + shift, time, values) for shift in (-half, half))
+        values = 0.5 * (values - 0.5 * (before + after))
+    return float(np.sqrt(np.mean(values[inside] ** 2)))
 
 
 def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float] | None:
