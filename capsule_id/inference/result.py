@@ -70,7 +70,7 @@ class Posterior:
     draws : (ensemble, draw, walker, d) constrained, SI
     lp : (ensemble, draw, walker) log-posterior density in the unconstrained space
     acceptance : (ensemble, walker)
-    tau : (d,) largest integrated autocorrelation time over the ensembles, in stored draws
+    tau : (d,) integrated autocorrelation time over the walkers of all ensembles, in stored draws
     rhat : (d,) split R-hat of the ensembles
     ess : (d,) draws over emcee's autocorrelation time; too large for short chains
     ess_bulk, ess_tail : (d,) effective sample sizes for the stopping rule, see ``diagnostics.bulk_and_tail_size``

@@ -15,6 +15,7 @@ from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.readings.blocks import Blocks, block_mean, block_means, default_block_size
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, averaged_process, whiten_by_shape
+from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.records.faults import release
 from tests.capsule_cases import jit_quickly
@@ -169,7 +170,10 @@ def test_the_estimate_of_a_long_record_is_that_of_its_means(monkeypatch: pytest.
     whole = record.paper_decrement()
     monkeypatch.setattr(release, "PIECE", 1000)
     means = record.paper_decrement()
-    assert len(record.whole[0]) == 1000
+    assert len(record.condensed[0]) == 1000
+    # The second fit takes its readings from every sample, as the record does.
+    assert len(record.whole[0]) == 4000
+    assert len(Screening(record).values) == record.n
     assert record.even
     assert whole is not None
     assert means is not None

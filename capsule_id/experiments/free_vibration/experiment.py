@@ -250,32 +250,34 @@ class FreeVibration(SurfaceExperiment):
         variance = (self.reading_sd * self.relative_sd) ** 2
         return (Moments(yy, self.width * ay, self.width**2 * aa, self.n, variance, self.relative_sd),)
 
-    # -- the paper's estimator and starts ---------------------------------------------------------------------------
-
     @property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
-        """Time, s from the first sample, and the channel, SI, of every sample, thinned or not; of a long record means."""
+        """Time, s from the first sample, and the channel, SI, of every sample, thinned or not."""
+        time, values = decay_window(self.table)
+        return time - time[0], values
+
+    @property
+    def condensed(self) -> tuple[np.ndarray, np.ndarray]:
+        """As ``whole``; of a long record block means, for the paper's estimate. Their times start at the first mean."""
         time, values = shortened(*decay_window(self.table))
         return time - time[0], values
 
     @property
     def even(self) -> bool:
         """Whether the record is evenly sampled, as the paper's filter requires."""
-        return is_even(self.whole[0])
+        return is_even(self.condensed[0])
 
     def smoothed(self) -> np.ndarray:
-        """The whole record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
-        time, values = self.whole
+        """The condensed record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
+        time, values = self.condensed
         if not self.even:
             return values
-        window = self.table.settings.smoothing_window
-        if window is None:
-            window = choose_window(time, values, SMOOTHING_ORDER)
+        window = self.table.settings.smoothing_window or choose_window(time, values, SMOOTHING_ORDER)
         return savitzky_golay(time, values, window, SMOOTHING_ORDER)
 
     def decrement(self, smooth: bool = True) -> Decrement | None:
         """Return peaks and logarithmic decrement, from the smoothed or the raw record; None with too few peaks."""
-        (time, values), smoothed = self.whole, self.smoothed()
+        (time, values), smoothed = self.condensed, self.smoothed()
         return logarithmic_decrement(time, smoothed if smooth else values, self.mass, smoothed, jumps=self.order == 2)
 
     def paper_decrement(self, smooth: bool = True) -> Decrement | None:
@@ -290,9 +292,8 @@ class FreeVibration(SurfaceExperiment):
     def rough_decrement(self) -> Decrement:
         """The paper's estimate, or one from the first zero crossings where there are too few peaks."""
         decrement = self.decrement()
-        if decrement is not None and decrement.delta > 0.0:
-            return decrement
-        return crossing_decrement(self.time, self.values, self.mass)
+        found = decrement if decrement is not None and decrement.delta > 0.0 else None
+        return found or crossing_decrement(self.time, self.values, self.mass)
 
     def rough_damping(self, symbols: Sequence[str]) -> dict[str, float]:
         """Rough c, and those of F_dry and c_q in ``symbols``, SI, from the peaks; {} with too few of them."""
@@ -320,7 +321,7 @@ class FreeVibration(SurfaceExperiment):
         if self.order > 0:
             return float(theta["k1"]) * self.largest_deflection
         x = self.smoothed() - equilibrium(self.values)
-        return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.whole[0]))))
+        return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.condensed[0]))))
 
     def noise_facts(self) -> Facts:
         facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}

@@ -15,12 +15,12 @@ class BlockMove(emcee.moves.Move):
     """Independence Metropolis–Hastings of all blocks of parameters in every step, each accepted separately.
 
     The posterior is a product over blocks. emcee stores its factors as blobs, so that one evaluation suffices for all
-    blocks. Each block has its own mixture density. The mixture is fixed before the recorded chain starts,
+    blocks. Each block has its own proposal. It is fixed before the recorded chain starts,
     so that detailed balance holds.
 
     Parameters
     ----------
-    proposal : mixture density of every block, in the order of the factors
+    proposal : density of every block, in the order of the factors
     """
 
     def __init__(self, proposal: BlockProposal) -> None:

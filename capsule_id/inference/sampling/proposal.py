@@ -1,4 +1,4 @@
-"""Proposals of independence steps: one mixture of Student densities for each block of parameters."""
+"""Proposals of independence steps: one density for each block of parameters, as a mixture of Student densities."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

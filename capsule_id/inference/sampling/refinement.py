@@ -4,7 +4,7 @@ A short chain from the Laplace approximation misses tails where the width of the
 on the correlation time of noise, or where two terms replace each other, as viscous and dry damping do. Weighted draws
 from a wide proposal find them. Each round draws from the mixture of the round before. The draws of all rounds are
 weighted by the mean of the densities of all rounds. They determine the next proposal: a mixture, by expectation
-maximisation; in a large block a map.
+maximisation; in a large block a triangular map.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from capsule_id.inference.sampling.coordinates import coordinates_of
 from capsule_id.inference.sampling.proposal import BlockProposal, Density, Mixture, concentric
-from capsule_id.inference.sampling.transport import Transported
+from capsule_id.inference.sampling.transport import LARGEST_MAP, Transported
 
 #: Message where the sampler has no point to start from.
 NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
@@ -29,6 +29,8 @@ STEPS = 5
 ENOUGH, EXCELLENT = 0.3, 0.6
 #: Weights are tempered, w^a, where their effective sample size is below this number per parameter; exponents a to try.
 LEAST_SIZE, TEMPERS = 20.0, 0.8 ** np.arange(30)
+#: Fewest draws per parameter that determine a covariance.
+FEWEST = 2
 #: Covariances of components grow by this share of the variances of all draws, so that none collapses.
 FLOOR = 1e-3
 #: Share of the components about the mean of all draws where there are several others.
@@ -67,14 +69,19 @@ class _Rounds:
         return self._log_posterior - self._log_drawn
 
     def next(self, good: bool, rng: np.random.RandomState) -> None:
-        """Add the proposal of the next round: the same where it is ``good``, else that which all draws determine."""
+        """Add the proposal of the next round: the same where it is ``good``, else that which all draws determine.
+
+        It also stays where few draws have a density: those of more rounds together determine the next one.
+        """
         self.proposals.append(self.proposals[-1] if good else self._adapted(rng))
 
     def _adapted(self, rng: np.random.RandomState) -> Density:
         weights = tempered(self.log_weights, LEAST_SIZE * self._u.shape[1])
         used = weights > 0.0  # the theta of the others may overflow
         u, weights = self._u[used], weights[used]
-        if self._large:
+        if len(u) < FEWEST * u.shape[1]:
+            return self.proposals[-1]
+        if self._large and u.shape[1] <= LARGEST_MAP:
             return Transported(u, weights)
         several = len(self.proposals) > SINGLE
         mixture = _adapted(self._several, u, weights, self._prior, several, rng)
@@ -111,14 +118,16 @@ def refined(
         u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
         found = parts(u)
         log_parts = np.where(inside & ~np.isnan(found), found, -np.inf)
+        good = list[bool]()
         for j, own in enumerate(rounds):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
             settled = i >= SINGLE or (i == 0 and large[j])
-            own.next(size >= (ENOUGH if settled else EXCELLENT) * DRAWS and (i > 0 or large[j]), rng)
-        newest = [own.proposals[-1] for own in rounds]
-        if all(new is old for new, old in zip(newest, proposal.densities, strict=True)):
+            good.append(size >= (ENOUGH if settled else EXCELLENT) * DRAWS and (i > 0 or large[j]))
+            own.next(good[j], rng)
+        if all(good):
             break
-        proposal = BlockProposal(first.blocks, newest)
+        # The newest proposal knows the draws of all rounds, so that it misses the fewest tails.
+        proposal = BlockProposal(first.blocks, [own.proposals[-1] for own in rounds])
     return proposal
 
 
@@ -138,7 +147,8 @@ def tempered(log_weights: Float[np.ndarray, " w"], least: float) -> Float[np.nda
         weights = np.exp(powers[0] * (log_weights - np.max(log_weights)))
     else:
         number = min(int(np.ceil(least)), len(log_weights))
-        weights = np.asarray(log_weights >= np.partition(log_weights, -number)[-number], dtype=float)
+        best = log_weights >= np.partition(log_weights, -number)[-number]
+        weights = np.asarray(best & np.isfinite(log_weights), dtype=float)
     return weights / np.sum(weights)
 
 

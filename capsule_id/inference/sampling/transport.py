@@ -10,6 +10,8 @@ from jaxtyping import Float
 from capsule_id.inference.fit.curvature import Matrix, Vector
 from capsule_id.inference.sampling.proposal import Mixture, concentric
 
+#: Parameters of the largest block with a map: the time of its least squares grows with their fourth power.
+LARGEST_MAP = 15
 #: The map follows coordinates up to this many sds from their mean; beyond, it stays the same.
 FARTHEST = 3.0
 #: Ridge penalty of the coefficients times the effective sample size: coefficients below 0.2 sd are shrunk.

@@ -9,6 +9,7 @@ from capsule_id.inference.sampling.diagnostics import (
     bulk_and_tail_size,
     effective_sample_size,
     ensemble_time,
+    pooled_time,
     split_rhat,
 )
 
@@ -118,3 +119,12 @@ def test_ess_predicts_the_error_of_a_mean() -> None:
     seen = np.std(means)
     assert seen == pytest.approx(np.mean(promised), rel=4.0 / np.sqrt(2 * 400))
     assert seen > 2.5 / np.sqrt(x.size)
+
+
+def test_ensembles_that_disagree_have_a_long_pooled_time() -> None:
+    """White draws about four means. Negative control: about one mean, and each ensemble alone."""
+    draws = np.random.default_rng(0).standard_normal((4, 200, 32, 1))
+    apart = draws + 2.0 * np.arange(4)[:, None, None, None]
+    assert pooled_time(draws)[0] < 1.5
+    assert np.max(ensemble_time(apart)) < 1.5
+    assert 20.0 * pooled_time(apart)[0] > draws.shape[1]

@@ -241,6 +241,24 @@ def test_weights_of_a_hopeless_start_are_cut_to_the_best_draws() -> None:
     assert np.sum(weights > 0.0) == 40
     assert np.min(log_weights[weights > 0.0]) > np.max(log_weights[weights == 0.0])
     assert effective_size(np.log(np.maximum(weights, 1e-300))) == pytest.approx(40.0)
+    # Draws without a density never count.
+    few = np.where(np.arange(1000) < 10, log_weights, -np.inf)
+    assert np.array_equal(np.flatnonzero(tempered(few, 40.0)), np.arange(10))
+
+
+def test_a_start_with_hardly_a_draw_inside_the_domain_waits_for_more() -> None:
+    """Hardly a draw of the first round has a density."""
+
+    def corner(u: np.ndarray) -> np.ndarray:
+        inside = np.all(u > 1.2, axis=1, keepdims=True)
+        return np.where(inside, np.sum(stats.norm.logpdf(u, 2.0, 0.3), axis=1, keepdims=True), -np.inf)
+
+    first = block_proposal([np.arange(3)], np.zeros(3), 0.6 * np.eye(3))
+    drawn = first.draw(np.random.RandomState(0), refinement.DRAWS)
+    assert 0 < np.sum(np.isfinite(corner(drawn))) < 0.02 * refinement.DRAWS
+    found = refined(corner, first, np.full((2, 3), np.nan), np.random.RandomState(0), [False])
+    u = found.draw(np.random.RandomState(1), 20_000)
+    assert effective_size((corner(u) - found.log_density(u))[:, 0]) > 0.3 * len(u)
 
 
 def test_a_posterior_without_mass_near_the_start_is_said_so() -> None:
