@@ -84,7 +84,7 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
             return
 
 
-def lint_smooth(table: Table[Any], name: str, used: slice, period: float) -> Iterable[Finding]:
+def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone: bool = False) -> Iterable[Finding]:
     """Report samples of a smooth oscillation that were lost without a gap in the times.
 
     Parameters
@@ -92,12 +92,13 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float) -> Ite
     name : of the column
     used : the rows of the oscillation
     period : of the oscillation, s
+    alone : leave out jumps that recur every half period
     """
     time = table["time"][used]
     step = median_step(time)
     if largest_offset(time, step) > TIMING_TOLERANCE * step:
         return
-    jump = phase_jump(table[name][used], period / step)
+    jump = phase_jump(table[name][used], period / step, alone)
     if jump is not None:
         row = used.start + jump.row
         facts = {

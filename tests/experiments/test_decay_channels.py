@@ -99,6 +99,32 @@ def test_a_second_fit_of_an_acceleration_finds_dry_friction(fraction: float) -> 
     assert abs(second.about.screened.values["F_dry"] - force) < 3.0 * second.about.screened.errors["F_dry"]
 
 
+def jumps(forces: dict[str, float], seed: int, lost: slice) -> list[Finding]:
+    """Findings on samples lost from an acceleration record without a gap in its times."""
+    values = np.delete(record("acceleration", forces, seed).values, lost)
+    columns = [bench.column("time", TIME[: len(values)]), bench.column("acceleration", values)]
+    table = bench.table("free_vibration", columns, "decay")
+    return [found for found in lint_decay(table, bench.rig(table)) if found.code == "readings.jump"]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_lost_samples_of_an_acceleration_are_named(seed: int) -> None:
+    """One jump stands alone, also beside those of weak dry friction. A jump at every turn is dry friction."""
+    weak = {**VISCOUS, "F_dry": 0.01 * bench.K1 * RELEASE}
+    for forces in (VISCOUS, weak):
+        (found,) = jumps(forces, seed, slice(50, 65))
+        assert (found.level, found.facts["column"]) == ("fail", "acceleration")
+        assert abs(found.facts["rows"][0] - 50) <= 9
+        assert jumps(forces, seed, slice(0, 0)) == []
+
+
+@pytest.mark.parametrize("fraction", [0.03, 0.1, 0.19, 0.24, 0.28, 0.35])
+def test_jumps_of_dry_friction_are_no_lost_samples(fraction: float) -> None:
+    """From 0.22 on, the rod sticks before a jump recurs."""
+    forces = {**VISCOUS, "F_dry": fraction * bench.K1 * RELEASE}
+    assert [found for seed in range(5) for found in jumps(forces, seed, slice(0, 0))] == []
+
+
 def write(folder: Path, header: str, columns: list[np.ndarray], settings: str = "") -> Path:
     """A rig folder with one decay."""
     np.savetxt(folder / "d.csv", np.stack(columns, axis=1), delimiter=",", header=header, comments="", fmt="%.9g")

@@ -47,9 +47,10 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         inside = time[used]
         last = len(inside) if decay.stop is None else int(np.searchsorted(inside, decay.stop, side="right"))
         used = slice(used.start + int(np.searchsorted(inside, decay.start)), used.start + last)
-        # Dry friction makes an acceleration jump where the rod turns.
-        smooth = [name for name in channels if name != "acceleration"]
-        faults = faults or [found for name in smooth for found in lint_smooth(table, name, used, period)]
+        # Dry friction makes an acceleration jump wherever the rod turns; lost samples make one jump that stands alone.
+        faults = faults or [
+            found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")
+        ]
     yield from faults
     window = time[used], table[channels[0]][used]
     yield from _thinned(table, *window)

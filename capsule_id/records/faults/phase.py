@@ -21,6 +21,10 @@ JUMP_SDS, JUMP_STEPS = 6.0, 0.7
 MEDIAN = np.sqrt(2.0 * np.log(2.0))
 #: The oscillation must be at least this many times the noise.
 AMPLITUDE_NOISE = 4.0
+#: A jump recurs where half a period away, give or take this part of a period, one of opposite sign has this part of it.
+SLACK, RECURRING = 0.1, 0.5
+#: Periods after a jump for which the oscillation must go on, else dry friction may have ended it before a jump recurs.
+GOES_ON = 1.5
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class Jump:
     size: float
 
 
-def phase_jump(values: np.ndarray, period: float) -> Jump | None:
+def phase_jump(values: np.ndarray, period: float, alone: bool = False) -> Jump | None:
     """Return the largest jump of a smooth oscillation; None where there is none.
 
     Polynomials through the samples before and after a place agree in value and slope where no sample is lost.
@@ -40,6 +44,7 @@ def phase_jump(values: np.ndarray, period: float) -> Jump | None:
     ----------
     values : (n,) evenly sampled, free oscillation or forced tone
     period : samples
+    alone : leave out jumps that recur every half period with opposite sign, as those of an acceleration by dry friction
     """
     # Errors of reading in steps are correlated in a slow record, so they do not average out.
     noise = max(noise_level(values), reading_step(values))
@@ -47,7 +52,7 @@ def phase_jump(values: np.ndarray, period: float) -> Jump | None:
         side = round(share * period)
         jumps = []
         for part in pieces(len(values), 2 * side):
-            jump = _jump(values[part], period, side, smallest, noise)
+            jump = _jump(values[part], period, side, smallest, noise, alone)
             jumps += [] if jump is None else [Jump(part.start + jump.row, jump.size)]
             release(values)
         if jumps:
@@ -55,7 +60,7 @@ def phase_jump(values: np.ndarray, period: float) -> Jump | None:
     return None
 
 
-def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float) -> Jump | None:
+def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float, alone: bool) -> Jump | None:
     """The most significant jump by polynomials over ``side`` samples."""
     if side < ORDER + 3 or len(values) < 2 * side:
         return None
@@ -81,7 +86,28 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
     size = np.hypot(jumps[0], jumps[1] / step) if smallest > LARGE else np.abs(jumps[0])
     phase = size / np.maximum(amplitude, 1e-300)
     large = (deviation > JUMP_SDS) & (phase > max(smallest, JUMP_STEPS * step)) & (amplitude > AMPLITUDE_NOISE * noise)
-    if not large.any():
-        return None
-    worst = int(np.argmax(np.where(large, deviation, 0.0)))
-    return Jump(worst + side, float(phase[worst]))
+    if alone:
+        later = np.minimum(np.arange(len(deviation)) + round(GOES_ON * period), len(deviation) - 1)
+        large &= amplitude[later] > AMPLITUDE_NOISE * noise
+    while large.any():
+        worst = int(np.argmax(np.where(large, deviation, 0.0)))
+        if not alone or not _recurs(jumps, precision, worst, period):
+            return Jump(worst + side, float(phase[worst]))
+        large[max(0, worst - side) : worst + side] = False
+    return None
+
+
+def _recurs(jumps: np.ndarray, precision: np.ndarray, place: int, period: float) -> bool:
+    """Whether the jump at ``place`` recurs with opposite sign half a period before or after; True where neither is known.
+
+    Parameters
+    ----------
+    jumps : (2, n) of value and slope
+    precision : (2, 2) inverse covariance of a jump
+    """
+    one = jumps[:, place] @ precision
+    part = -(one @ jumps) / (one @ jumps[:, place])
+    near, far = round((0.5 - SLACK) * period), round((0.5 + SLACK) * period)
+    before, after = part[max(0, place - far) : max(0, place - near + 1)], part[place + near : place + far + 1]
+    beside = np.concatenate([before, after])
+    return beside.size == 0 or bool(np.max(beside) >= RECURRING)
