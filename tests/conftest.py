@@ -36,7 +36,6 @@ NOT_OPTIMISED = {
     "test_forced_run.py",
     "test_forces.py",
     "test_foreign_law.py",
-    "test_friction_family.py",
     "test_friction_laws.py",
     "test_general_derivatives.py",
     "test_general_faults.py",

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +53,11 @@ def interrupt(fit: subprocess.Popen[str], number: signal.Signals) -> float:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_is_read_at_the_next_step(number: signal.Signals) -> None:
-    before = signal.getsignal(number)
+def test_a_signal_is_read_at_the_next_step(number: signal.Signals, request: pytest.FixtureRequest) -> None:
+    # A shell lets its background jobs ignore SIGINT; a handler that ignores stays.
+    request.addfinalizer(partial(signal.signal, number, signal.getsignal(number)))
+    before = signal.default_int_handler
+    signal.signal(number, before)
     with interruptible("ended"):
         stop_if_interrupted()
         signal.raise_signal(number)  # raises nothing: a callback cannot swallow it

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.fit import point_stage
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.run_studies import disagreement_of, named_by, plant_spring, plant_surface, recover
@@ -18,13 +17,6 @@ from tests.inference.run_studies import disagreement_of, named_by, plant_spring,
 RIGS = 20
 PLANTED = {"k2[medium]": partial(plant_spring, spring="medium"), "mu": plant_surface}
 small = partial(disagreement_of, seed=0, runs=("run_1",))
-
-
-@pytest.fixture(autouse=True)
-def nothing_compiled_ahead(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The small versions draw no sample from runs."""
-    if request.node.get_closest_marker("slow") is None:
-        monkeypatch.setattr(point_stage, "_compile", lambda *_: None)
 
 
 @pytest.fixture(scope="module")

@@ -54,10 +54,10 @@ def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypat
 
     monkeypatch.setattr(point_stage, "joint_fit", joint_fit)
     monkeypatch.setattr(point_stage, "correct_starts", other_kind)
-    target, fit, findings = point_stage._fit_with_right_starts(LogPosterior(run.rig, [run]), {}, 0, None)
+    target, fit, findings = point_stage._fit_with_right_starts(LogPosterior(run.rig, [run]), {}, 0)
     assert len(fitted) == point_stage.ROUNDS
     assert target is fit is fitted[-1]
     assert [(finding.level, finding.experiment) for finding in findings] == [("fail", "run_3")]
     monkeypatch.setattr(point_stage, "correct_starts", lambda *_: None)
-    *_, findings = point_stage._fit_with_right_starts(LogPosterior(run.rig, [run]), {}, 0, None)
+    *_, findings = point_stage._fit_with_right_starts(LogPosterior(run.rig, [run]), {}, 0)
     assert findings == []
