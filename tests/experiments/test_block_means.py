@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.decay_models import half_cycles, interpolate
+from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.readings.blocks import Blocks, block_mean, block_means, default_block_size
@@ -167,16 +168,14 @@ def test_the_estimate_of_a_long_record_is_that_of_its_means(monkeypatch: pytest.
     values = bench.released(TIME, RELEASE, c=C) + 0.1 * NOISE * noise("white", 4000)
     table = bench.table("free_vibration", [bench.column("time", TIME), bench.column("x_rel", values)], "decay")
     record = FreeVibration(table, bench.rig(table))
-    whole = record.paper_decrement()
+    whole = cast(Decrement, record.paper_decrement())
     monkeypatch.setattr(release, "PIECE", 1000)
-    means = record.paper_decrement()
+    means = cast(Decrement, record.paper_decrement())
     assert len(record.condensed[0]) == 1000
     # The second fit takes its readings from every sample, as the record does.
     assert len(record.whole[0]) == 4000
     assert len(Screening(record).values) == record.n
     assert record.even
-    assert whole is not None
-    assert means is not None
     assert means.k1 != whole.k1
     assert means.k1 == pytest.approx(whole.k1, rel=2e-3)
     assert means.c == pytest.approx(whole.c, rel=1e-2)

@@ -18,6 +18,7 @@ from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.checks import check_drift
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 from capsule_id.experiments.free_vibration.second_fit.screening import second_models
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
@@ -116,8 +117,7 @@ def test_the_drift_of_the_highest_swing_is_no_drift(tmp_path: Path) -> None:
     rig = make_rig(tmp_path, entry, head={"m1": quantity(1.0, "kg")})
     ((record,), _) = second_models(cast(list[FreeVibration], make_experiments(rig)))
     assert record.model.drift == "gp"
-    assert record.about.screened is not None
-    found = record.about.screened
+    found = cast(Screened, record.about.screened)
     values = {row.name: found.values.get(row.symbol, found.noise) for row in record.parameters}
     fit = SimpleNamespace(values={"m1": 1.0, **values})
     (finding,) = check_drift([record], fit)  # type: ignore[arg-type]  # pyright: ignore

@@ -9,8 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label, band
-from capsule_id.experiments.checks.series import autocorrelation
+from capsule_id.experiments.base import About, Start, ValuesBySymbol
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.free_vibration.checks import (
     check_drift,
@@ -41,7 +40,7 @@ from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Ch
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.starts import decay_starts, first_turning_point
-from capsule_id.experiments.free_vibration.tables import damping_table, decay_table, second_fit_table
+from capsule_id.experiments.free_vibration.tables import damping_table, decay_comparison, decay_table, second_fit_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -50,7 +49,7 @@ from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import choose_window, savitzky_golay
 from capsule_id.rig.formats.columns import in_blocks
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Curve, Facts, Finding, Points
+from capsule_id.views import Comparison, Facts, Finding
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.second_fit.fits import Screened
@@ -250,6 +249,8 @@ class FreeVibration(SurfaceExperiment):
         variance = (self.reading_sd * self.relative_sd) ** 2
         return (Moments(yy, self.width * ay, self.width**2 * aa, self.n, variance, self.relative_sd),)
 
+    # -- the paper's estimator and starts ---------------------------------------------------------------------------
+
     @property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
         """Time, s from the first sample, and the channel, SI, of every sample, thinned or not."""
@@ -292,8 +293,9 @@ class FreeVibration(SurfaceExperiment):
     def rough_decrement(self) -> Decrement:
         """The paper's estimate, or one from the first zero crossings where there are too few peaks."""
         decrement = self.decrement()
-        found = decrement if decrement is not None and decrement.delta > 0.0 else None
-        return found or crossing_decrement(self.time, self.values, self.mass)
+        if decrement is not None and decrement.delta > 0.0:
+            return decrement
+        return crossing_decrement(self.time, self.values, self.mass)
 
     def rough_damping(self, symbols: Sequence[str]) -> dict[str, float]:
         """Rough c, and those of F_dry and c_q in ``symbols``, SI, from the peaks; {} with too few of them."""
@@ -328,23 +330,4 @@ class FreeVibration(SurfaceExperiment):
         return {"model": "decay", **facts, **self.damping_trend()}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        def curve(values: ValuesBySymbol) -> np.ndarray:
-            raw, design = self.unwhitened(values, np)
-            return self.values - raw + self.width * design @ self.nuisance_mean(values)
-
-        unit, time = self.column.to_display, self.time + float(decay_window(self.table)[0][0])
-        lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)
-        residuals = np.asarray(self.residuals(theta, np))[: self.n]
-        return Comparison(
-            self.kind,
-            self.label,
-            f"{self.label}: free decay",
-            "time [s]",
-            axis_label(self.column),
-            (Points(self.label, time, self.values * unit),),
-            (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
-            time,
-            residuals,
-            autocorrelation(residuals, min(60, self.n // 4)),
-            1.96 / float(np.sqrt(self.n)),
-        )
+        return decay_comparison(self, theta, draws)

@@ -1,4 +1,4 @@
-"""Tables of free decays: estimates by record, and comparison of the stated with the quoted model."""
+"""Views of free decays: estimates by record, comparison of the stated with the quoted model, and the fitted curve."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from capsule_id.experiments.base import ValuesBySymbol, axis_label, band
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
-from capsule_id.experiments.checks.series import LEVEL, ljung_box
+from capsule_id.experiments.checks.series import LEVEL, autocorrelation, ljung_box
 from capsule_id.experiments.free_vibration.checks import stiffness_by_record
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
-from capsule_id.experiments.free_vibration.settings import DecayModel
-from capsule_id.views import ResultTable
+from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
+from capsule_id.views import Comparison, Curve, Points, ResultTable
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -87,3 +88,28 @@ def _weighted_mean(fits: "Sequence[Screened]", symbol: str) -> tuple[float, floa
     """Mean of the estimates of every record, weighted by their standard errors, and its standard error."""
     weight = np.array([one.errors[symbol] for one in fits]) ** -2.0
     return float(np.average([one.values[symbol] for one in fits], weights=weight)), float(np.sum(weight) ** -0.5)
+
+
+def decay_comparison(e: "FreeVibration", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    """Return the readings, the curve at ``theta``, the band of at most 50 ``draws``, and the residuals of one record."""
+
+    def curve(values: ValuesBySymbol) -> np.ndarray:
+        raw, design = e.unwhitened(values, np)
+        return e.values - raw + e.width * design @ e.nuisance_mean(values)
+
+    unit, time = e.column.to_display, e.time + float(decay_window(e.table)[0][0])
+    lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)
+    residuals = np.asarray(e.residuals(theta, np))[: e.n]
+    return Comparison(
+        e.kind,
+        e.label,
+        f"{e.label}: free decay",
+        "time [s]",
+        axis_label(e.column),
+        (Points(e.label, time, e.values * unit),),
+        (Curve(f"this fit, {e.model_name}", time, curve(theta) * unit, lower, upper),),
+        time,
+        residuals,
+        autocorrelation(residuals, min(60, e.n // 4)),
+        1.96 / float(np.sqrt(e.n)),
+    )

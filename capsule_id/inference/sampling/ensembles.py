@@ -221,7 +221,7 @@ def _advance(samplers: Sequence[Ensemble], goal: int, thin: int) -> Iterator[int
 def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
     """Return one ensemble: burnt in from its own start, or resumed from ``backend``.
 
-    The starts are independent draws from the adapted proposal, which has wider tails than the posterior.
+    The starts are independent draws from the adapted proposal.
     """
     last = None if backend is None else backend.last_state()
     if last is not None:

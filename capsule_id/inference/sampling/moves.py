@@ -15,8 +15,7 @@ class BlockMove(emcee.moves.Move):
     """Independence Metropolis–Hastings of all blocks of parameters in every step, each accepted separately.
 
     The posterior is a product over blocks. emcee stores its factors as blobs, so that one evaluation suffices for all
-    blocks. Each block has its own proposal. It is fixed before the recorded chain starts,
-    so that detailed balance holds.
+    blocks. Each block has its own proposal. It is fixed before the recorded chain starts, so that detailed balance holds.
 
     Parameters
     ----------

@@ -102,7 +102,8 @@ def refined(
     ----------
     parts : (n, d) -> (n, blocks), log-densities of the blocks
     prior : centre and width of the normal prior of u; NaN for a parameter with another prior
-    large : for each block whether its first proposal stays where it is good enough, and becomes a map where it is not
+    large : for each block whether its first proposal stays where it is good enough; where it is not, a block of at most
+        ``LARGEST_MAP`` parameters gets a map, a larger one a mixture
 
     Raises
     ------
@@ -121,8 +122,10 @@ def refined(
         good = list[bool]()
         for j, own in enumerate(rounds):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
-            settled = i >= SINGLE or (i == 0 and large[j])
-            good.append(size >= (ENOUGH if settled else EXCELLENT) * DRAWS and (i > 0 or large[j]))
+            if i == 0:
+                good.append(large[j] and size >= ENOUGH * DRAWS)
+            else:
+                good.append(size >= (ENOUGH if i >= SINGLE else EXCELLENT) * DRAWS)
             own.next(good[j], rng)
         if all(good):
             break

@@ -107,6 +107,14 @@ def test_parts_are_whole_periods_and_phases(known: SampledFit) -> None:
     assert np.all(np.abs(np.bincount(phase) - 200 / 6) < 4)
 
 
+def test_the_rows_of_the_priors_are_no_part(known: SampledFit) -> None:
+    run, dimension = cast(BaseRun, known.experiments[0]), known.target.dimension
+    part = parts_of_residuals(known, [run], by_time)
+    assert len(part) == len(residual_jacobian(known.target, known.fit.u))
+    assert np.all(part[-dimension:] == PRIORS)
+    assert np.all(part[:-dimension] != PRIORS)
+
+
 def test_a_parameter_that_only_its_prior_determines_does_not_widen_another() -> None:
     """As the damping of a run on a shaken table does. Negative control: the priors as one more part."""
     rng = np.random.default_rng(0)

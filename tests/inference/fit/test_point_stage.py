@@ -1,5 +1,7 @@
 """Runs that cannot be predicted are cut, and it is said; others are left alone."""
 
+from typing import cast
+
 import pytest
 
 from capsule_id.experiments.base import Experiment
@@ -48,8 +50,7 @@ def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypat
         return target
 
     def other_kind(target: LogPosterior, *_: object) -> tuple[list[Experiment], dict[str, float]]:
-        (own,) = target.experiments
-        assert isinstance(own, ForcedRun)
+        (own,) = cast(list[ForcedRun], target.experiments)
         return [own.restarted(0.0 if own.moves else 1e-2)], {}
 
     monkeypatch.setattr(point_stage, "joint_fit", joint_fit)

@@ -179,8 +179,8 @@ def test_draws_of_all_rounds_are_weighted_by_the_densities_of_all_rounds() -> No
         u = rounds.proposals[-1].draw(rng, number)
         rounds.add(u, log_density(u))
         rounds.next(False, rng)
-    mean = np.exp(rounds.log_weights)
-    assert abs(np.mean(mean) * 3 - 1.0) < 4.0 * 3 * np.std(mean) / np.sqrt(3 * number)
+    weights = 3.0 * np.exp(rounds.log_weights)
+    assert abs(np.mean(weights) - 1.0) < 4.0 * np.std(weights) / np.sqrt(3 * number)
     first = rounds.proposals[0].draw(rng, number)
     alone = np.exp(log_density(first) - rounds.proposals[2].log_density(first))
     assert abs(np.mean(alone) - 1.0) > 0.1
