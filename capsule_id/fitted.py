@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from capsule_id.errors import InputError
-from capsule_id.inference.checks.trust import MASSES
 from capsule_id.inference.prediction import DRAWS, predict
 from capsule_id.inference.result import Result
 from capsule_id.output import check_directory, publish, work_in_progress
+from capsule_id.parameters import is_stated
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
 from capsule_id.report.columns import table_rows
@@ -57,7 +57,7 @@ class Fit(Result):
         return finding_text(item, messages) if isinstance(item, Finding) else caption_of(item, messages)
 
     def __repr__(self) -> str:
-        rows = [row for row in table_rows(self.summary) if row.name not in MASSES]
+        rows = [row for row in table_rows(self.summary) if not is_stated(row.name)]
         shown = [f"{row.name} = {row.quoted} {row.unit}" for row in rows]
         more = f", and {len(shown) - SHOWN_PARAMETERS} more" if len(shown) > SHOWN_PARAMETERS else ""
         synthetic = ", synthetic" if self.rig.synthetic else ""
@@ -119,7 +119,7 @@ class Fit(Result):
             If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter is missing.
         """
         chosen = self._draws(draws, seed)
-        stated = {name: self.rig.mass(name) for name in MASSES if getattr(self.rig, name) is not None}
+        stated = {name: self.rig.mass(name) for name in ("m1", "m2") if getattr(self.rig, name) is not None}
         ground = {name: q.value for name, q in (("slope", self.rig.slope), ("N0", self.rig.N0)) if q is not None}
         values = {
             **stated,

@@ -37,9 +37,9 @@ name = "@NAME@"
 #: mass of the capsule, needed for forced runs, sliding forces and free vibrations with capsule = "free"
 # m2 = { value = 0.530, sd = 0.001, unit = "kg" }
 # g = { value = 9.81, unit = "m/s^2" }
-#: slope of the track, +x_capsule uphill, and force that presses the capsule down besides its weight, both exact.
+#: slope of the track, +x_capsule uphill, and force that presses the capsule down besides its weight; exact without sd.
 #: An experiment may state its own; a tilt takes its own angle
-# slope = { value = 0, unit = "deg" }
+# slope = { value = 0, sd = 0.1, unit = "deg" }
 # N0 = { value = 0, unit = "N" }
 
 #: Choices of the model. friction: "stribeck" (eq. (1)) or "constant" (the same at every speed, no v_s).

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from capsule_id.parameters import symbol_of
+from capsule_id.parameters import is_stated, symbol_of
 from capsule_id.report.typography import MISSING, decimals_for, fixed, prefix_for
 
 Output = Literal["json", "csv", "html", "console"]
@@ -119,11 +119,13 @@ def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | Non
 
 
 def _informed(row: Row) -> str:
-    """Masses read "weighed": their prior is the weighing, so data that do not narrow it further are normal."""
+    """Masses read "weighed", a stated slope "stated": their prior is a reading, which data rarely narrow further."""
     informed = row.values["informed"]
     if pd.isna(informed):
         return ""
-    return "yes" if informed else "weighed" if row.name in ("m1", "m2") else "no"
+    if informed or not is_stated(row.name):
+        return "yes" if informed else "no"
+    return "weighed" if row.name in ("m1", "m2") else "stated"
 
 
 @dataclass(frozen=True)

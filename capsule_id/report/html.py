@@ -10,6 +10,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from capsule_id.inference.result import Result
+from capsule_id.parameters import is_stated
 from capsule_id.report.columns import Output, columns_of, skewed_names, table_rows
 from capsule_id.report.console_table import verdict_text
 from capsule_id.report.gallery import Picture
@@ -65,8 +66,8 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
 
 
 def _answers(result: Result) -> list[dict[str, str]]:
-    """The rows of the first screen: name, value ± sd with its unit, interval, trust, truth; weighed masses last."""
-    rows = sorted(table_rows(result.summary), key=lambda row: row.name in ("m1", "m2"))
+    """The rows of the first screen: name, value ± sd with its unit, interval, trust, truth; stated quantities last."""
+    rows = sorted(table_rows(result.summary), key=lambda row: is_stated(row.name))
     columns = {column.key: column for column in columns_of("html", result.summary)}
     answers = []
     for row in rows:

@@ -86,9 +86,10 @@ def check_normal_forces(document: TomlDocument, tables: Sequence[Table[Any]], st
     mass = sum(stated[name].value for name in ("m1", "m2") if name in stated)
     for index, table in enumerate(tables):
         settings = table.settings
-        if not isinstance(settings, GroundSettings) or not settings.N0 or "m2" not in stated:
+        if not isinstance(settings, GroundSettings) or settings.N0 is None or "m2" not in stated:
             continue
-        N = mass * stated["g"].value * cos(settings.slope or 0.0) + settings.N0
+        slope = 0.0 if settings.slope is None else settings.slope.value
+        N = mass * stated["g"].value * cos(slope) + settings.N0.value
         if N <= 0.0:
             rule = f"the normal force (m1 + m2) g cos(slope) + N0 of {table.label} must be positive"
             place = place_of(document, ("experiment", index), "N0")

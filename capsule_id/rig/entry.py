@@ -42,10 +42,11 @@ class Entry(Generic[S]):
             Where ``key``, "slope" or "N0", is stated.
         """
         settings: Any = self.table.settings
-        if value := getattr(settings, key):
+        if stated := settings.ground.get(key):
             unit = "deg" if key == "slope" else "N"
             remedy = f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it'
-            raise self.document.error(place_of(self.document, self.path, key), rule, f"{value:.3g} in SI units", remedy)
+            value = f"{stated.value:.3g}{f' ± {stated.sd:.3g}' if stated.sd else ''} in SI units"
+            raise self.document.error(place_of(self.document, self.path, key), rule, value, remedy)
 
     def check_spring_with_gap(self) -> None:
         """Require a gap where a spring is within reach.

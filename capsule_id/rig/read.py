@@ -77,7 +77,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         if key in head:
             with collecting(faults):
                 stated[key] = read_quantity(document, ("rig", key), head[key], rule.si, rule.domain, rule.has_sd)
-    ground = {key: stated[key].value for key in ("slope", "N0") if key in stated}
+    ground = {key: stated[key] for key in ("slope", "N0") if key in stated}
     tables, files = _read_experiments(document, kinds, ground, faults)
     raise_all(faults)
     model = read_model(document)
@@ -162,7 +162,7 @@ def _check_prior_of_spring(document: TomlDocument, path: KeyPath, spring: str, t
 
 
 def _read_experiments(
-    document: TomlDocument, kinds: Mapping[str, KindRule], ground: Mapping[str, float], faults: list[InputError]
+    document: TomlDocument, kinds: Mapping[str, KindRule], ground: Mapping[str, Quantity], faults: list[InputError]
 ) -> tuple[tuple[Table, ...], dict[str, str]]:
     """Every ``[[experiment]]``, and the sha256 of every file read; the first error of each is appended to ``faults``."""
     entries = document.data.get("experiment", [])
@@ -205,7 +205,7 @@ def _read_experiment(
     path: KeyPath,
     entry: dict[str, Any],
     kinds: Mapping[str, KindRule],
-    ground: Mapping[str, float],
+    ground: Mapping[str, Quantity],
     label: str,
 ) -> tuple[Table, Mapping[str, str]]:
     """One entry with its table, and the sha256 of its files; ``label`` where the entry states none."""
@@ -233,7 +233,7 @@ def _read_experiment(
 
 
 def _read_settings(
-    document: TomlDocument, path: KeyPath, entry: dict[str, Any], kind: KindRule, ground: Mapping[str, float]
+    document: TomlDocument, path: KeyPath, entry: dict[str, Any], kind: KindRule, ground: Mapping[str, Quantity]
 ) -> Settings:
     """The entry's settings, defaults filled in; ``ground`` are those of [rig]."""
     rules = kind.setting_rules

@@ -77,22 +77,23 @@ class QuantityRule:
         return quantity if self.has_sd else quantity.value
 
 
-#: Slope of the track and force that presses the capsule down, exact.
-SLOPE = QuantityRule("rad", INCLINE, usual=(INCLINE.low, INCLINE.high))
-PRESSING_FORCE = QuantityRule("N", ANY, usual=(-1e3, 1e3))
+#: Slope of the track and force that presses the capsule down.
+SLOPE = QuantityRule("rad", INCLINE, has_sd=True, usual=(INCLINE.low, INCLINE.high))
+PRESSING_FORCE = QuantityRule("N", ANY, has_sd=True, usual=(-1e3, 1e3))
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundSettings(Settings):
     """``slope`` of the track, rad, +X uphill, and ``N0``, N, besides the weight; absent: those of [rig]."""
 
-    slope: Annotated[float | None, SLOPE] = None
-    N0: Annotated[float | None, PRESSING_FORCE] = None
+    slope: Annotated[Quantity | None, SLOPE] = None
+    N0: Annotated[Quantity | None, PRESSING_FORCE] = None
 
     @property
-    def ground(self) -> dict[str, float]:
-        """The leaves of the capsule that differ from level ground and the weight alone, SI."""
-        return {name: value for name, value in (("slope", self.slope), ("N0", self.N0)) if value}
+    def ground(self) -> dict[str, Quantity]:
+        """The leaves of the capsule that may differ from level ground and the weight alone, SI."""
+        stated = (("slope", self.slope), ("N0", self.N0))
+        return {name: quantity for name, quantity in stated if quantity is not None and quantity != Quantity(0.0)}
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ MASS, WEIGHT = bench.M1 + bench.M2, (bench.M1 + bench.M2) * bench.G
 NORMAL = WEIGHT * np.cos(SLOPE) + N0
 MU, V_S = 0.45, 0.3
 GROUND = {"slope": SLOPE, "N0": N0}
+STATED = {name: Quantity(value) for name, value in GROUND.items()}
 THETA = {
     "m1": bench.M1, "m2": bench.M2, "g": bench.G, "k1": bench.K1, "c": bench.C, "mu": MU, "v_s": V_S,
     "pull_scatter": 0.02, "push_scatter": 0.02, "sliding_scatter": 0.02,
@@ -43,7 +44,7 @@ def slid(speed: float, sign: float, mu: float = MU) -> float:
     return quad(per_speed, 0.0, speed)[0]
 
 
-def readings(direction: str, rng: np.random.Generator, **ground: float) -> list[Table]:
+def readings(direction: str, rng: np.random.Generator, **ground: Quantity) -> list[Table]:
     """Pulls, pushes and steady sliding with a relative scatter of mu of 2 %."""
     sign = 1.0 if direction == "forward" else -1.0
     along = sign * WEIGHT * np.sin(SLOPE)
@@ -71,17 +72,17 @@ def posterior_of_mu(experiment: Experiment) -> tuple[float, float]:
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 @pytest.mark.parametrize("kind", [0, 1, 2])
 def test_mu_is_recovered_on_a_slope_and_not_without_it(direction: str, kind: int) -> None:
-    (experiment,) = make_experiments(bench.rig(readings(direction, np.random.default_rng(3), **GROUND)[kind]))
+    (experiment,) = make_experiments(bench.rig(readings(direction, np.random.default_rng(3), **STATED)[kind]))
     mean, sd = posterior_of_mu(experiment)
     assert abs(mean - MU) < 3.0 * sd
     # Negative control: the same readings, taken as on level ground.
-    (level,) = make_experiments(bench.rig(readings(direction, np.random.default_rng(3), N0=N0)[kind]))
+    (level,) = make_experiments(bench.rig(readings(direction, np.random.default_rng(3), N0=Quantity(N0))[kind]))
     mean, sd = posterior_of_mu(level)
     assert abs(mean - MU) > 4.0 * sd
 
 
 def test_points_of_the_paper_show_mu_without_the_weight_along_the_slope() -> None:
-    pulls, pushes, sliding = make_experiments(bench.rig(*readings("backward", np.random.default_rng(3), **GROUND)))
+    pulls, pushes, sliding = make_experiments(bench.rig(*readings("backward", np.random.default_rng(3), **STATED)))
     kinetic = 0.5 * MU * (1.0 + np.exp(-np.linspace(0.2, 1.0, 8) / V_S))
     assert np.allclose(pulls.paper_points()[1], MU, rtol=0.06)  # pyright: ignore[reportAttributeAccessIssue]
     assert np.allclose(sliding.paper_points()[1], kinetic, rtol=0.06)  # pyright: ignore[reportAttributeAccessIssue]
@@ -105,7 +106,7 @@ def test_a_progression_on_a_slope_starts_at_equilibrium() -> None:
     table = bench.table(
         "progression",
         [bench.column(name, values) for name, values in columns.items()],
-        drive="pulses", P_on=Quantity(6.0), **GROUND,
+        drive="pulses", P_on=Quantity(6.0), slope=Quantity(SLOPE), N0=Quantity(N0),
     )  # fmt: skip
     (only,) = make_experiments(bench.rig(table))
     e = cast(Progression, only)
@@ -134,7 +135,7 @@ def run_table(**settings: Any) -> Table:
 
 
 def test_a_forced_run_on_a_slope_is_that_of_simulate() -> None:
-    (only,) = make_experiments(bench.rig(run_table(**GROUND, start="stuck")))
+    (only,) = make_experiments(bench.rig(run_table(**STATED, start="stuck")))
     run = cast(ForcedRun, only)
     theta = {**THETA, "phase": 0.4, "x_start": 2e-4, "y_start": 0.05}
     p = CapsuleParameters(**CAPSULE, k2=0.0, G=np.inf, **GROUND)
@@ -151,7 +152,9 @@ def test_a_forced_run_on_a_slope_is_that_of_simulate() -> None:
 def test_a_free_decay_on_a_slope_is_that_of_simulate() -> None:
     time = np.linspace(0.0, 0.3, 300)
     columns = [bench.column("time", time), bench.column("x_rel", bench.released(time, 5e-3))]
-    table = bench.table("free_vibration", columns, capsule="free", forward="capsule", **GROUND)
+    table = bench.table(
+        "free_vibration", columns, capsule="free", forward="capsule", slope=Quantity(SLOPE), N0=Quantity(N0)
+    )
     e = cast(CapsuleDecay, make_experiments(bench.rig(table))[0])
     p = CapsuleParameters(**CAPSULE, k2=0.0, G=1e3, **GROUND)
     expected = simulate(p, Excitation(0.0, 1.0), e.time, (5e-3, 0.0, 0.0, 0.0))

@@ -7,6 +7,7 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
+from capsule_id.rig.model import Quantity
 
 HEAD = '[rig]\nname = "hill"\nm1 = { value = 0.11, unit = "kg" }\nm2 = { value = 0.53, unit = "kg" }\n'
 SLOPE = 'slope = { value = 5, unit = "deg" }'
@@ -31,18 +32,19 @@ def test_the_rig_states_them_and_an_experiment_overrides(tmp_path: Path) -> None
     level = PUSHES + 'slope = { value = 0, unit = "deg" }\n'
     rig = read_rig(written(tmp_path, PULLS, level, TILTS, DECAY, rig=SLOPE))
     pulls, pushes, _, _ = rig.tables
-    assert pulls.settings.ground == {"slope": pytest.approx(np.deg2rad(5.0))}
+    assert pulls.settings.ground == {"slope": Quantity(float(np.deg2rad(5.0)))}
     assert pushes.settings.ground == {}
     own = PULLS + 'N0 = { value = -2, unit = "N" }\nslope = { value = -3, unit = "deg" }\n'
     (pulls,) = read_rig(written(tmp_path, own, rig=SLOPE)).tables
-    assert pulls.settings.ground == {"slope": pytest.approx(np.deg2rad(-3.0)), "N0": -2.0}
+    assert pulls.settings.ground == {"slope": Quantity(float(np.deg2rad(-3.0))), "N0": Quantity(-2.0)}
 
 
 LIFTED = 'N0 = { value = -6.27, unit = "N" }'
 LEVEL = 'slope = { value = 0, unit = "deg" }\n'
 FAULTS = {
     # name: (entries, [rig], line of rig.toml, words of the rule, entries after the remedy, [rig] after the remedy)
-    "sd": ([PULLS], 'slope = { value = 5, sd = 1, unit = "deg" }', 5, "unknown key", [PULLS], SLOPE),
+    "sd": ([PULLS], 'slope = { value = 5, sd = -1, unit = "deg" }', 5, "0 or greater", [PULLS], SLOPE),
+    "tilt, level to its sd": ([TILTS + 'slope = { value = 0, sd = 0.1, unit = "deg" }\n'], "", 9, "its own angle", [TILTS], ""),
     "steep": ([PULLS], 'slope = { value = 90, unit = "deg" }', 5, "between -90 and 90 deg", [PULLS], SLOPE),
     "lifted": ([PULLS], SLOPE + "\n" + LIFTED, 6, "must be positive", [PULLS], SLOPE),
     "lifted by its own": ([PULLS + LIFTED + "\n"], SLOPE, 9, "must be positive", [PULLS], SLOPE),

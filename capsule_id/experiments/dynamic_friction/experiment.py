@@ -11,7 +11,7 @@ from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
 from capsule_id.experiments.families.friction_experiment import FrictionExperiment
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
-from capsule_id.experiments.families.inclined import Track, track_of
+from capsule_id.experiments.families.inclined import Track, ground_of, ground_parameters, track_of
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.rig.model import Rig, Table
 
@@ -33,8 +33,8 @@ class DynamicFriction(FrictionExperiment):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction = friction = replace(friction, direction=table.settings.direction)
-        self.about = About(table, rig, (*friction.parameters, PUSH_SCATTER))
-        self.ground = table.settings.ground
+        self.about = About(table, rig, (*friction.parameters, PUSH_SCATTER, *ground_parameters(table, rig)))
+        self.ground = ground_of(table)
         self.speed, self.distance = table["speed"], table["distance"]
         self.speed_sd = table.columns["speed"].reading_sd
         self.distance_sd = table.columns["distance"].reading_sd
@@ -57,11 +57,11 @@ class DynamicFriction(FrictionExperiment):
 
     def track(self, theta: ValuesBySymbol) -> Track:
         """Normal force and weight along the slope at ``theta``."""
-        return track_of(theta, self.ground, self.backward)
+        return track_of(theta, self.ground_at(theta), self.backward)
 
     def locked_slide(self, theta: ValuesBySymbol) -> tuple[Any, Any, Any]:
         """Slide with the rod locked: distance, m, its variance from reading errors, m^2, its change with mu, m; (n,)."""
-        law, track = self.friction.coefficient({**theta, **self.ground}), self.track(theta)
+        law, track = self.friction.coefficient({**theta, **self.ground_at(theta)}), self.track(theta)
         slope = self.speed / (track.normal * track.braking(law).forward(self.speed))
         variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
         return track.distance(law, self.speed), variance, track.change(law, self.speed)
@@ -72,9 +72,9 @@ class DynamicFriction(FrictionExperiment):
 
     @property
     def stated_track(self) -> Track:
-        """``track`` at the stated masses."""
+        """``track`` at the stated values."""
         stated = {name: self.rig.mass(name) for name in ("m1", "m2")} if "N0" in self.ground else {}
-        return self.track({**stated, "g": self.rig.g.value})
+        return self.track({**stated, **self.stated_ground, "g": self.rig.g.value})
 
     def point_errors(self) -> tuple[np.ndarray, float]:
         relative = np.hypot(self.distance_sd / self.distance, 2.0 * self.speed_sd / self.speed)

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import DecayAbout, FreeVibration
 from capsule_id.experiments.free_vibration.settings import DecayModel
@@ -52,7 +52,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         FreeVibration.__init__(self, table, rig, friction, DecayModel())
-        self.smoothing, self.ground = None, table.settings.ground
+        self.smoothing, self.ground = None, ground_of(table)
         gap = table.settings.gap
         self.within_reach = gap is not None
         self.gap = FAR if gap is None else gap.value
@@ -63,7 +63,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
             if gap.sd > 0.0:
                 rows.append(parameter("G", table.label, Prior("positive_normal", gap.value, gap.sd)))
         rows += self.motion_parameters(self.rough_decrement())
-        rows.append(NOISE_SD.named(table.label, self.noise_prior()))
+        rows += [NOISE_SD.named(table.label, self.noise_prior()), *ground_parameters(table, rig)]
         self.about = DecayAbout(table, rig, tuple(rows))
 
     @classmethod
@@ -111,7 +111,7 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
         DynamicFriction.__init__(self, table, rig, friction)
         self.smoothing = None
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
-        self.about = About(table, rig, (parameter("k1"), parameter("c"), *self.friction.parameters, PUSH_SCATTER))
+        self.about = About(table, rig, (parameter("k1"), parameter("c"), *self.parameters))
 
     def slide(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
         """(n,) slide distance of the capsule, m."""

@@ -6,7 +6,7 @@ import equinox as eqx
 from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.experiments.families.friction_model import SurfaceExperiment
+from capsule_id.experiments.families.friction_model import GroundExperiment
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
@@ -14,17 +14,15 @@ from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.views import Facts
 
 
-class CapsuleForward(SurfaceExperiment):
+class CapsuleForward(GroundExperiment):
     """An experiment that the capsule model predicts.
 
     Attributes
     ----------
     smoothing : widths of the smoothed model; None: the exact model
-    ground : slope, rad, and N0, N, where they are not 0
     """
 
     smoothing: Smoothing | None
-    ground: dict[str, float]
 
     event_driven = True
 
@@ -55,7 +53,7 @@ class CapsuleForward(SurfaceExperiment):
             g=theta["g"],
             k_cubic=theta.get("k_cubic", 0.0),
             c2=theta.get("c2", 0.0),
-            **self.ground,
+            **self.ground_at(theta),
         )
 
     def simulated(
@@ -67,7 +65,7 @@ class CapsuleForward(SurfaceExperiment):
 
     def law(self, theta: ValuesBySymbol) -> FrictionLaw:
         """The friction law at ``theta``, N."""
-        return self.friction.force({**theta, **self.ground})
+        return self.friction.force({**theta, **self.ground_at(theta)})
 
     def noise_facts(self) -> Facts:
         return {"model": "capsule"}

@@ -12,7 +12,7 @@ from capsule_id.experiments.base import Start, ValuesBySymbol, band
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.families.friction_checks import check_variants, variant_table
-from capsule_id.experiments.families.friction_model import FrictionModel, SurfaceExperiment
+from capsule_id.experiments.families.friction_model import FrictionModel, GroundExperiment
 from capsule_id.experiments.families.inclined import weight_along
 from capsule_id.physics.friction import CoulombStribeck, normal_force, slide_distance
 from capsule_id.views import Comparison, Curve, Finding, Points
@@ -77,11 +77,8 @@ def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) 
     return [Finding("friction.one_surface", "ok", facts)]
 
 
-class FrictionExperiment(SurfaceExperiment):
+class FrictionExperiment(GroundExperiment):
     """A friction experiment; all of them share the friction law, the paper's protocol and one panel."""
-
-    #: Slope, rad, and N0, N, where they are not 0; a tilt has none.
-    ground: dict[str, float]
 
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
     checks = (check_one_surface, check_variants)
@@ -99,17 +96,19 @@ class FrictionExperiment(SurfaceExperiment):
     @property
     def stated_normal_force(self) -> float:
         """N of the stated masses."""
-        return normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value, **self.ground)
+        return normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value, **self.stated_ground)
 
     def along(self, theta: ValuesBySymbol) -> Any:
         """Weight of capsule and rod along the slope, N, positive where it opposes the motion."""
-        return weight_along(theta["m1"] + theta["m2"], theta["g"], self.ground, self.backward) if self.ground else 0.0
+        if not self.ground:
+            return 0.0
+        return weight_along(theta["m1"] + theta["m2"], theta["g"], self.ground_at(theta), self.backward)
 
     @property
     def stated_along(self) -> float:
         """``along`` at the stated masses."""
         stated = {name: self.rig.mass(name) for name in ("m1", "m2")} if self.ground else {}
-        return float(self.along({**stated, "g": self.rig.g.value}))
+        return float(self.along({**stated, **self.stated_ground, "g": self.rig.g.value}))
 
     @abstractmethod
     def point_errors(self) -> tuple[Any, Any]:

@@ -244,3 +244,23 @@ class SurfaceExperiment(Experiment):
     @classmethod
     def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> "tuple[SurfaceExperiment, ...]":
         return (cls(table, rig, friction),)  # type: ignore[call-arg, arg-type]  # pyright: ignore
+
+
+class GroundExperiment(SurfaceExperiment):
+    """An experiment whose capsule slides on a track that may have a slope, with a force besides the weight.
+
+    Attributes
+    ----------
+    ground : slope, rad, and N0, N, where they are not 0; None: a parameter, because an sd is stated
+    """
+
+    ground: dict[str, float | None]
+
+    def ground_at(self, theta: ValuesBySymbol) -> dict[str, Any]:
+        """Slope, rad, and N0, N, at ``theta``, where they are not 0."""
+        return {name: theta[name] if value is None else value for name, value in self.ground.items()}
+
+    @property
+    def stated_ground(self) -> dict[str, float]:
+        """``ground_at`` at the stated values."""
+        return {name: self.table.settings.ground[name].value for name in self.ground}

@@ -7,9 +7,10 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 
 from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.parameters import Parameter
+from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import FrictionLaw, normal_force, slide_distance
+from capsule_id.rig.model import Rig, Table
 
 #: A slide downhill is braked by this share of its friction at least. It then lasts far beyond any reading.
 LEAST_BRAKING = 1e-3
@@ -42,6 +43,25 @@ class _Sensitivity(Braking):
 
     def forward(self, speed: Any) -> Any:
         return super().forward(speed) ** 2 / self.law.forward(speed)
+
+
+def ground_of(table: Table[Any]) -> dict[str, float | None]:
+    """Slope, rad, and N0, N, where they differ from level ground and the weight alone; None: sampled, with its sd."""
+    return {name: None if stated.sd else stated.value for name, stated in table.settings.ground.items()}
+
+
+def ground_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
+    """Parameters for slope and N0 where an sd is stated, with a normal prior.
+
+    Equal statements of several experiments are one quantity; that of [rig] has no bracket.
+    """
+    rows = []
+    for name, stated in table.settings.ground.items():
+        if stated.sd:
+            same = (other.label for other in rig.tables if getattr(other.settings, name, None) == stated)
+            of = "" if stated == getattr(rig, name) else next(same, table.label)
+            rows.append(parameter(name, of, Prior("normal", stated.value, stated.sd)))
+    return tuple(rows)
 
 
 class Track(NamedTuple):

@@ -21,6 +21,7 @@ from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
+from capsule_id.experiments.families.inclined import ground_of
 from capsule_id.experiments.forced_run.declaration import NOISE
 from capsule_id.experiments.forced_run.feasibility import check_feasible
 from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts
@@ -122,7 +123,7 @@ class ForcedRun(CapsuleForward):
         """
         self.read_drive(table)
         settings, gap = table.settings, stated_gap(table)
-        self.friction, self.smoothing, self.ground = friction, None, settings.ground
+        self.friction, self.smoothing, self.ground = friction, None, ground_of(table)
         self.reaction = rig.model.share_of_reaction
         self.channels = tuple(name for name in NOISE if name in table.columns and name not in self.inputs)
         self.time = table["time"]

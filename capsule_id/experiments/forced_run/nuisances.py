@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.experiments.base import Start
+from capsule_id.experiments.families.inclined import ground_parameters
 from capsule_id.experiments.forced_run.declaration import CAPSULE_START, CORRELATION, CURRENT_AMPLITUDE, NOISE
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -23,7 +24,7 @@ PHASE_WIDTH = np.pi
 def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...]:
     """Return the parameters sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
     of, whole, settings = run.label, run.about.record, run.table.settings
-    rows = [parameter("k1"), parameter("c"), *run.friction.parameters]
+    rows = [parameter("k1"), parameter("c"), *run.friction.parameters, *ground_parameters(run.table, run.rig)]
     free = ("k_cubic",) if run.spring is None else ("k_cubic", "c2")
     rows += [parameter(symbol) for symbol in free if symbol in run.rig.model.free]
     if run.spring is not None:

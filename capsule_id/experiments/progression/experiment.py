@@ -20,6 +20,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import (
@@ -82,7 +83,7 @@ class Progression(CapsuleForward):
     reaction: float = eqx.field(static=True)
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction, self.smoothing, self.ground = friction, None, table.settings.ground
+        self.friction, self.smoothing, self.ground = friction, None, ground_of(table)
         self.drive, self.reaction = table.settings.drive, rig.model.share_of_reaction
         self.distance = table["distance"]
         self.reading_variance = table.columns["distance"].reading_sd ** 2
@@ -104,7 +105,7 @@ class Progression(CapsuleForward):
 
     def _sampled(self) -> tuple[Parameter, ...]:
         settings, free = self.table.settings, self.rig.model.free
-        rows = [parameter("k1"), parameter("c"), *self.friction.parameters]
+        rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
         rows += [parameter("k_cubic")] if "k_cubic" in free else []
         if self.amplitude_from == "current":
             rows.append(parameter("K"))

@@ -11,6 +11,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.families.friction_experiment import FrictionExperiment
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.sliding_friction.declaration import SLIDING_SCATTER
 from capsule_id.physics.friction import FrictionLaw
@@ -33,8 +34,8 @@ class SlidingFriction(FrictionExperiment):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction = friction = replace(friction, direction=table.settings.direction)
-        self.about = About(table, rig, (*friction.parameters, SLIDING_SCATTER))
-        self.ground = table.settings.ground
+        self.about = About(table, rig, (*friction.parameters, SLIDING_SCATTER, *ground_parameters(table, rig)))
+        self.ground = ground_of(table)
         self.quantity = "force" if "force" in table.columns else "coefficient"
         self.speed, self.values = table["speed"], table[self.quantity]
         self.speed_sd = table.columns["speed"].reading_sd
@@ -53,7 +54,7 @@ class SlidingFriction(FrictionExperiment):
         return self.values
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        theta = {**theta, **self.ground}
+        theta = {**theta, **self.ground_at(theta)}
         law = self.friction.force(theta) if self.quantity == "force" else self.friction.coefficient(theta)
         predicted, slope = (xp.asarray(values) for values in _value_and_slope(law, self.speed))
         variance = self.values_sd**2 + (slope * self.speed_sd) ** 2

@@ -71,7 +71,7 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
     """Refuse a slope of its own and N0 for tilts, and N0 beside the normal force of a pull."""
     settings = entry.table.settings
     if "force" not in entry.table.columns:
-        if settings.slope and (*entry.path, "slope") in entry.document.keys:
+        if "slope" in settings.ground and (*entry.path, "slope") in entry.document.keys:
             rule = "a tilt takes its own angle as slope"
             raise entry.error("slope", rule, "slope", "remove slope, or give the column force", of_key=True)
         entry.refuse_ground("N0", "a tilt must have the weight alone as normal force")

@@ -10,6 +10,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.families.friction_experiment import FrictionExperiment
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.experiments.static_friction.declaration import PULL_SCATTER, TILT_SD
 from capsule_id.physics.friction import CoulombStribeck, normal_force
@@ -101,8 +102,8 @@ class StaticPulls(FrictionExperiment):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction = friction = replace(friction, direction=table.settings.direction)
-        self.ground = table.settings.ground
-        self.about = About(table, rig, (*friction.parameters_at_rest, PULL_SCATTER))
+        self.ground = ground_of(table)
+        self.about = About(table, rig, (*friction.parameters_at_rest, PULL_SCATTER, *ground_parameters(table, rig)))
         self.force, self.reading_sd = table["force"], table.columns["force"].reading_sd
         self.normal_force = table.settings.normal_force
 
@@ -122,7 +123,7 @@ class StaticPulls(FrictionExperiment):
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         normal: Any = self.normal_force
         if normal is None:
-            normal = normal_force(theta["m1"], theta["m2"], theta["g"], **self.ground)
+            normal = normal_force(theta["m1"], theta["m2"], theta["g"], **self.ground_at(theta))
         friction: Any = normal * self.friction.coefficient(theta).forward(0.0)
         expected = friction + self.along(theta)
         return (Misfit(self.force - expected, self.reading_sd**2, friction, no_design(self.n, xp)),)

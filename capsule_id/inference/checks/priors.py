@@ -12,8 +12,8 @@ from scipy import stats
 
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.inference.checks.sampled_fit import SampledFit
-from capsule_id.inference.checks.trust import MASSES
 from capsule_id.inference.target.priors import prior_of
+from capsule_id.parameters import is_stated
 from capsule_id.views import Finding
 
 #: Smallest part of a prior's variance that the data count as removing: below, rounding of the sample decides.
@@ -89,7 +89,7 @@ def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
         "name": name,
         "unit": "" if row.unit == "1" else f" {row.unit}",
         "prior": prior_of(row).describe(),
-        "stated": "rig" if name in MASSES else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",
+        "stated": "rig" if is_stated(name) else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",
         "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
         "fitted": s.values[name],
         "p": p,

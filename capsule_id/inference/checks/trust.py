@@ -5,16 +5,13 @@ inform a parameter, and where a warning names it, its number is not judged: no c
 """
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.parameters import is_stated
 from capsule_id.views import Finding, Trust
-
-#: Weighed constants: their prior is a reading.
-MASSES: Final = ("m1", "m2")
 
 
 def concerned(finding: Finding, experiments: Sequence[Experiment]) -> frozenset[str] | None:
@@ -36,7 +33,7 @@ def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:
     doubtful = {name for f in sampled.findings if f.level == "warn" for name in f.parameters}
     words: dict[str, Trust] = {}
     for row, known in zip(sampled.target.parameters, informed, strict=True):
-        judged = sampled.posterior is not None and (known or row.name in MASSES) and row.name not in doubtful
+        judged = sampled.posterior is not None and (known or is_stated(row.name)) and row.name not in doubtful
         words[row.name] = "trusted" if judged else "not judged"
         if any(names is None or row.name in names for names in failed):
             words[row.name] = "not trusted"

@@ -20,6 +20,7 @@ from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.parameters import is_stated
 from capsule_id.views import Finding
 
 #: The data inform a parameter where posterior sd / prior sd (in u) is at most this, dimensionless.
@@ -104,11 +105,11 @@ def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -
 
 def _informed(s: SampledFit) -> list[Finding]:
     known = informed(s.target, s.posterior, s.fit)
-    # No other reading narrows a weighed mass. A scatter with a stated reading error may be zero.
+    # No other reading narrows a stated mass or slope. A scatter with a stated reading error may be zero.
     names = [
         row.name
         for row, ok in zip(s.target.parameters, known, strict=True)
-        if row.physical and row.symbol not in ("m1", "m2") and not ok
+        if row.physical and not is_stated(row.name) and not ok
     ]
     return [Finding("parameters.informed", "warn" if names else "ok", {"names": ", ".join(names)})]
 

@@ -14,6 +14,7 @@ from capsule_id.inference.fit.covariance import Jacobian, covariance
 from capsule_id.inference.result import STATED
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.priors import prior_of
+from capsule_id.parameters import is_stated
 
 
 def variance_shares(
@@ -35,7 +36,7 @@ def variance_shares(
         return {}
     effect = (jacobian @ found.matrix) ** 2 / np.diag(found.matrix)
     inputs = [e.table.label for e in owners if e is not None]
-    stated = [prior_of(row).kind == "positive_normal" for row in target.parameters]
+    stated = [is_stated(row.name) or prior_of(row).kind == "positive_normal" for row in target.parameters]
     inputs += [
         f"{STATED if is_stated else 'prior of '}{name}" for name, is_stated in zip(target.names, stated, strict=True)
     ]

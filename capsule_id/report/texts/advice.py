@@ -6,12 +6,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from capsule_id.inference.result import STATED, Result
-from capsule_id.parameters import symbol_of
+from capsule_id.parameters import is_stated, symbol_of
 from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.views import Finding
 
-#: Weighed constants: more tests do not narrow them.
-_WEIGHED = ("m1", "m2")
 #: Share of a variance above which one input decides the sd.
 DECISIVE = 0.5
 #: Share below which an input is not named.
@@ -45,7 +43,7 @@ def _missing(result: Result) -> Iterator[tuple[str, str]]:
             "Run fit-params without --no-sample: only a sample gives intervals and lets checks judge the numbers.",
         )
         return
-    names = [str(name) for name in result.summary.index if name not in _WEIGHED]
+    names = [str(name) for name in result.summary.index if not is_stated(name)]
     for name in names:
         # NaN for an exact constant: nothing is to be measured.
         if f"{result.summary.at[name, 'informed']}" == "False":
@@ -61,8 +59,9 @@ def _inputs(result: Result) -> Iterator[tuple[str, str]]:
         if source.startswith(STATED) and source != f"{STATED}{name}" and share > DECISIVE:
             gains.setdefault(source.removeprefix(STATED), {})[name] = _factor(1.0 - share)
     for stated, factors in gains.items():
+        verb = "Weigh" if stated in ("m1", "m2") else "Measure"
         yield (
-            f"{'Weigh' if stated in _WEIGHED else 'Measure'} {stated} more precisely",
+            f"{verb} {stated} more precisely",
             f"The sd of {', '.join(factors)} comes mainly from the stated sd of {stated}. With an exact {stated} it would be "
             f"at least {', '.join(factors.values())} times smaller; more readings of the tests help little.",
         )
@@ -89,9 +88,9 @@ def _widest(result: Result) -> Iterator[tuple[str, str]]:
 
 
 def _quotable(result: Result) -> list[str]:
-    """Names of the parameters that a better measurement can narrow: not the masses, nothing that a check contradicts."""
+    """Names of the parameters that a better measurement can narrow: not stated, and not contradicted by a check."""
     words = result.summary["trust"].to_dict()
-    return [str(name) for name, word in words.items() if name not in _WEIGHED and word != "not trusted"]
+    return [str(name) for name, word in words.items() if not is_stated(name) and word != "not trusted"]
 
 
 def _largest_input(result: Result, name: str) -> tuple[str, float]:

@@ -41,7 +41,10 @@ def _conflict(facts: Facts) -> str:
     name, unit, experiments = facts["name"], facts["unit"], facts["experiments"]
     default = f'median = {facts["fitted"]:.3g}, factor = 10, unit = "{unit.strip() or 1}"'
     source, remedy = {
-        "rig": (f"[rig] {name}", f"Check value, sd and unit of {name} in rig.toml, and the units in {experiments}."),
+        "rig": (
+            f"{name} of rig.toml" if "[" in name else f"[rig] {name}",
+            f"Check value, sd and unit of {name} in rig.toml, and the units in {experiments}.",
+        ),
         "prior": (
             f"[prior] {name}",
             f"Check value and unit of [prior] {name} in rig.toml and the units in {experiments}; remove a guessed prior.",
