@@ -40,6 +40,7 @@ NOT_OPTIMISED = {
     "test_general_derivatives.py",
     "test_general_faults.py",
     "test_general_reference.py",
+    "test_hidden_terms.py",
     "test_likelihoods.py",
     "test_misfit.py",
     "test_progression.py",

@@ -12,8 +12,9 @@ from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.free_vibration.decrement import equilibrium
-from capsule_id.experiments.free_vibration.readings.noise import drift_by_shape, whiten
+from capsule_id.experiments.free_vibration.readings.noise import drift_by_shape
 from capsule_id.experiments.free_vibration.second_fit.fits import Screening
+from capsule_id.experiments.free_vibration.second_fit.sensitivities import sensitivities, whitened
 from capsule_id.experiments.free_vibration.settings import decay_window
 from capsule_id.parameters import parameter
 from capsule_id.views import Finding
@@ -24,8 +25,6 @@ HALVES_DISAGREE, HALVES_FAIL = 3.0, 4.0
 FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
-#: Step of difference quotients, in natural units of each parameter.
-STEP = 1e-5
 #: Largest part of a drift that is as fast as the motion, relative to the motion.
 FAST_DRIFT = 0.01
 #: Largest part of a drift that is as fast as the motion, relative to the residuals left: about half of what white noise gives.
@@ -162,9 +161,7 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
     """
     if e.n < 2 * READINGS_PER_INTERVAL:
         return None
-    raw, design = e.unwhitened(theta, np)
-    nuisances = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
-    left = raw - design @ nuisances
+    left, design, moved = sensitivities(e, theta)
     # At rest the last digits of this difference depend on the residuals, and must not choose the interval.
     curve = np.round((e.values - left) / np.ptp(e.values), 9) * np.ptp(e.values)
     offsets, limits = [], []
@@ -176,14 +173,7 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
         place = np.clip(np.searchsorted(edges, curve, side="right") - 1, 0, number - 1)
         offsets += [ahead & (place == i) for i in range(number)]
         limits += list(itertools.pairwise(edges))
-    size, k1, m1 = e.largest_deflection, theta["k1"], theta["m1"]
-    units = {"k1": k1, "c": theta["c"], "F_dry": k1 * size, "c_q": m1 / size, "k_cubic": k1 / size**2}
-    units |= {"amplitude": size, "turning_time": float(np.sqrt(m1 / k1))}
-    moved = []
-    for name in ("k1", "c", *e.model.symbols, *(() if e.closed else ("amplitude", "turning_time"))):
-        other, basis = e.unwhitened({**theta, name: theta[name] + STEP * units[name]}, np)
-        moved.append((other - basis @ nuisances - left) / STEP)
-    known = whitened(e, theta, np.column_stack([design, *moved]))
+    known = whitened(e, theta, np.column_stack([design, *moved.values()]))
     known = known[:, np.linalg.norm(known, axis=0) > 0.0]
     known = np.linalg.qr(known / np.linalg.norm(known, axis=0))[0]
     own, columns = (
@@ -199,16 +189,6 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
     largest = np.argmax(np.abs(columns.T @ own) / np.maximum(np.linalg.norm(columns, axis=0), UNSEEN))
     low, high = limits[largest]
     return p, float(low), float(high)
-
-
-def whitened(e: "FreeVibration", theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
-    """Columns (n,) or (n, q) in the coordinates where noise and drift of ``e`` are white."""
-    table = np.reshape(columns, (e.n, -1))
-    if e.model.whitened:
-        table = np.asarray(whiten(e.times, table, e.model, theta))
-    else:
-        table = table / np.reshape(e.relative_sd, (-1, 1))
-    return np.reshape(table, columns.shape)
 
 
 def _halves(e: "FreeVibration") -> "list[FreeVibration]":

@@ -38,6 +38,7 @@ from capsule_id.experiments.free_vibration.decrement import (
 from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, default_block_size, is_even
 from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Channel, channel_of
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
+from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.starts import decay_starts, first_turning_point
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_comparison, decay_table, second_fit_table
@@ -104,7 +105,7 @@ class FreeVibration(SurfaceExperiment):
     order: int = eqx.field(static=True)
 
     time_series = True
-    checks = (check_stiffness, check_free_decay, check_halves, check_positions, check_drift)
+    checks = (check_stiffness, check_free_decay, check_halves, check_positions, check_drift, check_hidden_terms)
     tables = (decay_table, damping_table, second_fit_table)
 
     def __init__(

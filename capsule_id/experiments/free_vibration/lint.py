@@ -7,9 +7,16 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.readings.blocks import block_size, default_block_size
-from capsule_id.experiments.free_vibration.settings import DecaySettings, decay_window, release_time, window_of
+from capsule_id.experiments.free_vibration.settings import (
+    DAMPING,
+    EFFECTS,
+    DecaySettings,
+    decay_window,
+    release_time,
+    window_of,
+)
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
-from capsule_id.parameters import TABLE
+from capsule_id.parameters import TABLE, parameter
 from capsule_id.records.faults.aliasing import aliases
 from capsule_id.records.faults.magnitudes import USUAL, unit_meant
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
@@ -17,7 +24,7 @@ from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
-from capsule_id.views import Finding, Message, counted
+from capsule_id.views import Facts, Finding, Message, counted
 
 #: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
@@ -189,6 +196,29 @@ _ALIAS = (
     "to hold one of them only."
 )
 
+
+def _hidden(facts: Facts) -> str:
+    """The forces that the records allow, the limits of the parameter beside them, and remedies."""
+    name, unit, words = facts["name"], facts["unit"], [word for word, own in DAMPING.items() if own in facts["symbols"]]
+    effects = " or ".join(EFFECTS[symbol] for symbol in facts["symbols"])
+    allowed = ", ".join(
+        f"{symbol} up to {size:.2g} {parameter(symbol).unit}"
+        for symbol, size in zip(facts["symbols"], facts["largest"], strict=True)
+    )
+    found = (
+        f"With {allowed} they fit as well, and {name} lies between {facts['low']:.3g} and {facts['high']:.3g} {unit}"
+    )
+    all_words = ", ".join(f'"{word}"' for word in ("viscous", *words))
+    lines = [(f"damping = [{all_words}]", 'damping = ["viscous"]')] if words else []
+    lines += [('stiffness = "cubic"', 'stiffness = "linear"')] if "k_cubic" in facts["symbols"] else []
+    free, known = (" and ".join(each) for each in zip(*lines, strict=True))
+    return (
+        f"{', '.join(facts['labels'])}: expected records that exclude {effects}; they do not. {found} (the fit without: "
+        f"{facts['value']:.3g}). Record more periods with less noise, or write {free} in the experiment for an interval that "
+        f"includes this. If another measurement excludes {effects}, write {known}."
+    )
+
+
 MESSAGES = {
     "decays.release": Message(
         "release of a decay",
@@ -217,6 +247,11 @@ MESSAGES = {
             "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at "
             "its frequency. It hides an error of the model. State a later start, for smaller amplitudes."
         ),
+    ),
+    "decays.hidden": Message(
+        "further forces of a decay",
+        ok="{labels}: no further force that the records allow changes c or k1 by much",
+        fail=_hidden,
     ),
     "decays.thinned": Message(
         "length of a decay",

@@ -15,7 +15,8 @@ from capsule_id.rig.schema import CountRule, GroundSettings, NameRule, QuantityR
 #: Parameter of every damping term besides the viscous one, and of the cubic spring.
 DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 
-_EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
+#: What every parameter of a further force stands for, in words.
+EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
 _DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
 _NOISES = {"ar1": "coloured noise (AR(1))", "arma": "white and coloured noise (ARMA)"}
 
@@ -112,7 +113,7 @@ class DecayModel:
     @property
     def additions(self) -> list[str]:
         """Effects of the model that the default lacks, in words."""
-        words = [_EFFECTS[symbol] for symbol in self.symbols]
+        words = [EFFECTS[symbol] for symbol in self.symbols]
         return words + (["drift of the zero"] if self.drift != "none" else [])
 
     @property

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import stats
-from scipy.signal import lsim
 
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
-from capsule_id.experiments.free_vibration.decay_models import rates
 from capsule_id.experiments.free_vibration.readings.blocks import block_size
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
+from capsule_id.experiments.free_vibration.second_fit.sensitivities import force_responses
 from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
 from capsule_id.physics.batches import pool
 from capsule_id.records.noise import noise_level
@@ -27,8 +26,8 @@ from capsule_id.views import Finding
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
 
-#: Records are thinned to this many readings per period before their models are ranked; points per period of the responses.
-READINGS_PER_PERIOD, RESPONSE_POINTS = 16, 60
+#: Records are thinned to this many readings per period before their models are ranked.
+READINGS_PER_PERIOD = 16
 #: Fewest readings per period of a thinned record.
 FEWEST_PER_PERIOD = 8
 #: Largest number of samples of a record that is no free decay.
@@ -79,22 +78,8 @@ def response_p(record: "FreeVibration", theta: Mapping[str, float]) -> float:
     """p-value of the F test for the responses of the rod to further forces and for a drift, at a viscous fit."""
     raw, design = record.unwhitened(theta, np)
     parts = np.linalg.lstsq(design, raw, rcond=None)[0]
-    m1, k1, c = theta["m1"], theta["k1"], theta["c"]
-    length = float(record.time[-1])
-    points = max(200, int(RESPONSE_POINTS * length * np.sqrt(k1 / m1) / (2.0 * np.pi)))
-    grid = np.linspace(0.0, length, points)
-    gamma, omega = rates(k1, c, m1, np)
-    rate_of = complex(-gamma, omega)
-    # The readings are the real part of A exp(rate t); x_rel is that of A exp(rate t) / rate^order.
-    curve = complex(parts[0], -parts[1]) / rate_of**record.order * np.exp(rate_of * grid)
-    x, rate = curve.real, (rate_of * curve).real
-    system = ([1.0 / m1], [1.0, c / m1, k1 / m1])
-    forces = [force / np.max(np.abs(force)) for force in (np.sign(rate), rate * np.abs(rate), x**3)]
-    responses = [lsim(system, force, grid)[1] for force in forces]
-    for _ in range(record.order):
-        responses = [np.gradient(response, grid[1]) for response in responses]
-    columns = [np.interp(record.time, grid, response) for response in responses]
-    relative = record.time / length - 0.5
+    columns = force_responses(record, theta).values()
+    relative = record.time / record.time[-1] - 0.5
     extra = np.column_stack([*columns, relative, relative**2])
     moved = [record.unwhitened({**theta, name: 1.001 * theta[name]}, np)[1] @ parts for name in ("k1", "c")]
     known = np.column_stack([design, *(column - design @ parts for column in moved)])

@@ -1,0 +1,152 @@
+"""Forces that a short decay cannot exclude: limits against SciPy, the finding, its remedy, and no false alarms.
+
+Twin of a measured pendulum from 3.2 s on: dry friction beside the viscous, in a few periods. It is fitted as viscous.
+"""
+
+import re
+import tomllib
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import capsule_id as cid
+from capsule_id.api import Fit
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.checks.refit import refit
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms, hidden_terms
+from capsule_id.experiments.free_vibration.second_fit.screening import second_models
+from capsule_id.rig.model import Rig, Table
+from capsule_id.views import Finding
+from tests.cli_tools import DATA
+from tests.experiments import bench
+from tests.scipy_decay import scipy_decay
+
+RELEASE, NOISE = 2e-3, 4e-5
+VISCOUS = {"k1": bench.K1, "m1": bench.M1, "c": 0.8}
+#: The peaks lose as much to dry friction as to viscous damping, when the amplitude is half the release.
+DRY = {**VISCOUS, "c": 0.4, "F_dry": 0.04}
+PERIOD = 2.0 * np.pi * float(np.sqrt(bench.M1 / bench.K1))
+#: Of the last turning point before the record.
+TURNING_TIME = -0.1 * PERIOD
+SHORT, LONG = 4.0, 16.0
+SEED = 1
+
+
+def decay_table(periods: float, forces: dict[str, float], seed: int = SEED, **settings: object) -> Table:
+    """A record of so many periods, 30 samples a period."""
+    time = np.linspace(0.0, periods * PERIOD, int(30 * periods))
+    x = scipy_decay(time, forces, RELEASE, TURNING_TIME)[0] + NOISE * np.random.default_rng(seed).standard_normal(
+        len(time)
+    )
+    return bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)], "decay", **settings)
+
+
+def viscous_fit(table: Table) -> tuple[FreeVibration, dict[str, float]]:
+    """The record under the stated model, and the values of its fit."""
+    record = cast(FreeVibration, make_experiments(bench.rig(table))[0])
+    start = {"m1": bench.M1, "k1": bench.K1, "c": 0.8, record.scatters[0]: NOISE}
+    found = {name: value for name, (value, _) in refit(record, start, []).items()}
+    return record, {**start, **found, f"noise_sd[{record.label}]": NOISE}
+
+
+def findings(table: Table) -> list[Finding]:
+    """The findings on further forces at a viscous fit."""
+    record, values = viscous_fit(table)
+    return check_hidden_terms([record], SimpleNamespace(values=values))  # type: ignore[arg-type]  # pyright: ignore
+
+
+@pytest.fixture(scope="module")
+def short() -> Fit:
+    return cid.fit(bench.rig(decay_table(SHORT, DRY)), budget=None)
+
+
+def test_a_short_record_with_dry_friction_is_not_clean_and_wrong(short: Fit) -> None:
+    assert [f.code for f in short.findings if f.level == "fail"] == ["decays.hidden"]
+    row = short.summary.loc["c"]
+    # This is what the check is for: by its own sd the value is far off.
+    assert (row["value"] - DRY["c"]) / row["sd"] > 8.0
+    assert (row["trust"], short.summary.loc["k1", "trust"]) == ("not trusted", "not judged")
+    (finding,) = [f for f in short.findings if f.code == "decays.hidden"]
+    assert finding.facts["low"] < DRY["c"] < finding.facts["high"]
+    assert finding.facts["largest"][0] > DRY["F_dry"]
+    assert "dry friction" in short.text(finding)
+
+
+def with_the_remedy(short: Fit) -> Rig:
+    """The rig with the line that the finding states."""
+    (finding,) = [f for f in short.findings if f.code == "decays.hidden"]
+    line = cast("re.Match[str]", re.search(r"or write (damping = \[.*?\])", short.text(finding)))[1]
+    return bench.rig(decay_table(SHORT, DRY, damping=tuple(tomllib.loads(line)["damping"])))
+
+
+def test_the_remedy_in_the_text_gives_an_error_that_contains_the_truth(short: Fit) -> None:
+    fit = cid.fit(with_the_remedy(short), budget=None)
+    assert fit.clean
+    for name in ("c", "F_dry"):
+        row = fit.summary.loc[name]
+        assert abs(row["value"] - DRY[name]) < 2.0 * row["sd"]
+
+
+@pytest.mark.slow
+def test_with_the_remedy_c_is_trusted_and_covered(short: Fit) -> None:
+    fit = cid.fit(with_the_remedy(short))
+    row = fit.summary.loc["c"]
+    assert row["trust"] == "trusted"
+    assert row["lower"] < DRY["c"] < row["upper"]
+
+
+def test_the_longer_record_in_the_text_names_dry_friction() -> None:
+    records = cast(list[FreeVibration], make_experiments(bench.rig(decay_table(LONG, DRY))))
+    ((record,), (finding,)) = second_models(records)
+    assert (finding.code, record.model.symbols) == ("decays.second_fit", ("F_dry",))
+    assert record.about.screened is not None
+    found = record.about.screened
+    for name in ("c", "F_dry"):
+        assert abs(found.values[name] - DRY[name]) < 3.0 * found.errors[name]
+
+
+def test_stated_words_count_as_known() -> None:
+    assert findings(decay_table(SHORT, DRY, damping=("viscous",), stiffness="linear")) == []
+
+
+def test_viscous_records_raise_a_finding_where_they_are_short_only() -> None:
+    levels = {
+        periods: [[f.level for f in findings(decay_table(periods, VISCOUS, seed))] for seed in range(10)]
+        for periods in (SHORT, LONG)
+    }
+    assert levels == {SHORT: [["fail"]] * 10, LONG: [["ok"]] * 10}
+
+
+def test_the_records_of_data_exclude_further_forces() -> None:
+    rig = cid.read_rig(DATA)
+    records = [e for e in make_experiments(rig, "bench") if isinstance(e, FreeVibration)]
+    values = {"m1": rig.mass("m1"), "k1": 1422.0, "c": 3.88, **{f"noise_sd[{e.label}]": 2e-5 for e in records}}
+    (found,) = check_hidden_terms(records, SimpleNamespace(values=values))  # type: ignore[arg-type]  # pyright: ignore
+    assert found.level == "ok"
+
+
+@pytest.mark.parametrize("name", ["F_dry", "c_q", "k_cubic"])
+def test_estimate_error_and_slope_of_a_further_force_are_those_of_a_fit_of_both(name: str) -> None:
+    """Independent route: SciPy's fit of SciPy's motion with the force as an unknown."""
+    force = {"F_dry": 0.004, "c_q": 1.0, "k_cubic": 1e7}[name]
+    table = decay_table(8.0, {**VISCOUS, name: force})
+    record, values = viscous_fit(table)
+    found = hidden_terms([record], values)[name]
+    time, scale = table["time"], np.array([bench.K1, 0.8, force, RELEASE, TURNING_TIME, NOISE])
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        k1, c, extra, release, turning_time, offset = z * scale
+        x = scipy_decay(time, {**VISCOUS, "k1": k1, "c": c, name: extra}, release, turning_time)[0]
+        return (table["x_rel"] - x - offset) / NOISE
+
+    end = least_squares(residuals, [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], diff_step=1e-5)
+    covariance = np.linalg.inv(end.jac.T @ end.jac) * np.outer(scale, scale)
+    sd = float(np.sqrt(covariance[2, 2]))
+    assert found.sd == pytest.approx(sd, rel=0.15)
+    assert found.estimate == pytest.approx(end.x[2] * force, abs=0.5 * sd)
+    for i, other in enumerate(("k1", "c")):
+        assert found.slopes[other] * sd == pytest.approx(covariance[i, 2] / sd, abs=0.15 * np.sqrt(covariance[i, i]))
