@@ -1,12 +1,17 @@
 """Coverage-guided fuzzing of one reader: ``python -m tests.rig.formats.fuzz_readers .lvm CORPUS -max_total_time=1800``.
 
-It needs the package atheris. Every input reads, or ends in an ``InputError``; libFuzzer stops at any other exception, at
-an input that takes longer than ``-timeout``, and above ``-rss_limit_mb``. Inputs that were found so are kept in
-``test_damaged_files.py``.
+It needs the package atheris. Half of the mutations of an archive (.xlsx, .npz, .csv.gz) are of what it holds, packed
+again: a changed byte of compressed data ends at its checksum. Every input reads, or ends in an ``InputError``; libFuzzer
+stops at any other exception, at an input that takes longer than ``-timeout``, and above ``-rss_limit_mb``. Inputs that
+were found so are kept in ``test_damaged_files.py``.
 """
 
+import gzip
+import io
+import random
 import sys
 import warnings
+import zipfile
 from pathlib import Path
 
 import atheris
@@ -52,6 +57,36 @@ def read_all(suffix: str, content: bytes) -> bool:
     return True
 
 
+def members_of(content: bytes) -> dict[str, bytes]:
+    """What a zip or gzip holds, by name; {} where it is damaged or neither."""
+    try:
+        if content.startswith(b"\x1f\x8b"):
+            return {"": gzip.decompress(content)}
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            return {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # zipfile reports damage in many ways
+        return {}
+
+
+def mutate_inside(content: bytes, limit: int, seed: int) -> bytes:
+    """Mutate one member of an archive and pack it again; every second time, and elsewhere, the bytes themselves."""
+    rng = random.Random(seed)
+    members = members_of(content) if rng.random() < 0.5 else {}
+    if members:
+        name = rng.choice(list(members))
+        members[name] = atheris.Mutate(members[name][:limit], limit)
+        packed = io.BytesIO()
+        if name:
+            with zipfile.ZipFile(packed, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+                for own, member in members.items():
+                    archive.writestr(own, member)
+        else:
+            packed.write(gzip.compress(members[name], 1))
+        if len(packed.getvalue()) <= limit:
+            return packed.getvalue()
+    return atheris.Mutate(content, limit)
+
+
 def main() -> None:
     """Fuzz the reader of the suffix in the first argument; the second is a folder, filled with seeds if it is empty."""
     suffix, folder = sys.argv[1], Path(sys.argv[2])
@@ -61,7 +96,10 @@ def main() -> None:
             if own == suffix:
                 (folder / f"seed{number}").write_bytes(write(COLUMNS))
     warnings.simplefilter("error")
-    atheris.Setup([sys.argv[0], str(folder), *sys.argv[3:]], lambda content: read_all(suffix, content) and None)
+    packed = {"custom_mutator": mutate_inside} if suffix in (".xlsx", ".npz", ".csv.gz") else {}
+    atheris.Setup(
+        [sys.argv[0], str(folder), *sys.argv[3:]], lambda content: read_all(suffix, content) and None, **packed
+    )
     atheris.Fuzz()
 
 
