@@ -244,6 +244,7 @@ TABLE: Mapping[str, Parameter] = {
         Parameter("c_q", "N s^2/m^2", "quadratic damping between rod and capsule", "c_q", _lognormal(10.0, 1000.0)),
         nuisance("x_start", "m", "x_rel at the start of a record", "x_0"),
         nuisance("y_start", "m/s", "rate of x_rel at the start of a record", "y_0"),
+        nuisance("clock_drift", "1", "drift of the clock of a record", r"\delta_\mathrm{clock}"),
         scatter("scatter", "N", "scatter about a calibration line", "s"),
     )
 }  # fmt: skip
@@ -280,4 +281,4 @@ def symbol_of(name: str) -> str:
 
 def is_stated(name: str) -> bool:
     """Whether rig.toml states the parameter: its prior is a reading, and tests are not meant to narrow it."""
-    return symbol_of(name) in ("m1", "m2", "slope", "N0")
+    return symbol_of(name) in ("m1", "m2", "slope", "N0", "clock_drift")

@@ -53,7 +53,7 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
 
 
 def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:
-    """The line ``clock = ...`` that puts the second of two files on the clock of the first one, with its sds.
+    """The line ``clock = ...`` with sds that puts the second of two files on the clock of the first one.
 
     Parameters
     ----------
@@ -81,9 +81,9 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
         column = guessed.columns[TIME]
         records += [scale(found.columns[column.index], factor_to_si(column.unit, "s")), found.columns[index]]
     clock = estimate_clock(*records)
-    line = f'clock = {{ offset = {{ value = {clock.offset:.9g}, unit = "s" }}, '
-    line += f'drift = {{ value = {1e6 * clock.drift:.6g}, unit = "ppm" }} }}'
-    return f"{line}  # sd {clock.offset_sd:.2g} s and {1e6 * clock.drift_sd:.2g} ppm; {clock.explained:.1%} explained"
+    offset = f'{{ value = {clock.offset:.9g}, sd = {clock.offset_sd:.2g}, unit = "s" }}'
+    drift = f'{{ value = {1e6 * clock.drift:.6g}, sd = {1e6 * clock.drift_sd:.2g}, unit = "ppm" }}'
+    return f"clock = {{ offset = {offset}, drift = {drift} }}  # {clock.explained:.1%} of the signal explained"
 
 
 def _sampling(time: np.ndarray) -> Iterable[str]:

@@ -20,6 +20,10 @@ class Quantity:
     sd: float = 0.0
 
 
+#: A clock that agrees with true time.
+NO_DRIFT = Quantity(0.0)
+
+
 @dataclass(frozen=True)
 class PriorOverride:
     """One line of ``[prior]``, SI: log-normal by ``median`` and ``factor`` (95 % within median/factor..median*factor),
@@ -116,6 +120,7 @@ class Table(Generic[S]):
     missing, other : rows of the files that a column map drops: for a missing cell, and outside ``where``
     rejected : rows dropped as outliers, by the rule ``reject``
     encodings : of its texts, by file
+    drift : of the clock of its times against true time, 1; the times are read with its value
     """
 
     kind: str
@@ -129,6 +134,7 @@ class Table(Generic[S]):
     other: int = 0
     rejected: int = 0
     encodings: Mapping[str, str] = field(default_factory=dict)
+    drift: Quantity = NO_DRIFT
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of column ``name``, (n,) SI."""

@@ -225,7 +225,7 @@ def _read_experiment(
     label = read_name(document, (*path, "label"), entry["label"]) if "label" in entry else label
     columns = {key: _with_reading_error(document, path, entry, column, kind) for key, column in file.columns.items()}
     _refuse_reading_errors_without_column(document, path, entry, errors, file)
-    dropped = file.missing, file.other, file.rejected, file.encodings
+    dropped = file.missing, file.other, file.rejected, file.encodings, file.drift
     table = Table(word, label, name, MappingProxyType(columns), settings, file.raw.rows, kind.bench, *dropped)
     for rule in kind.rules:
         rule(Entry(table, document, path, file))

@@ -22,7 +22,7 @@ from capsule_id.rig.maps.mapped import apply_map
 from capsule_id.rig.maps.plateaus import Plateaus, read_plateaus, readings_of_plateaus
 from capsule_id.rig.maps.proposal import proposal
 from capsule_id.rig.maps.rejection import Rejection, outlying_rows, read_rejection
-from capsule_id.rig.model import Column
+from capsule_id.rig.model import NO_DRIFT, Column, Quantity
 from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_string, shown
@@ -42,6 +42,7 @@ class TableFile:
     missing, other : rows that a column map drops: for a missing cell, and outside ``where``
     rejected : rows dropped as outliers
     encodings : of the texts, by name in ``rig.toml``
+    drift : of the clock, 1
     """
 
     sha256: Mapping[str, str]
@@ -52,6 +53,7 @@ class TableFile:
     other: int = 0
     rejected: int = 0
     encodings: Mapping[str, str] = field(default_factory=dict)
+    drift: Quantity = NO_DRIFT
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""
@@ -124,7 +126,7 @@ def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[
         del exports
         table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other, encodings=encodings)
     if (clock := read_clock(document, path, entry)) is not None:
-        table = replace(table, raw=on_reference(document, path, table.raw, clock))
+        table = replace(table, raw=on_reference(document, path, table.raw, clock), drift=clock.drift)
     if rejection is not None:
         table = _without_outliers(document, path, table, rejection)
     if plateaus is not None:

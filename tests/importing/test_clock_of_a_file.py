@@ -34,9 +34,9 @@ def test_the_estimated_line_puts_the_times_on_one_clock(tmp_path: Path, capsys: 
     a, b = files(tmp_path)
     assert cli.capsule_id(["import", str(b), "--clock-of", str(a), "--common", "x_rel [mm]"]) == 0
     line = capsys.readouterr().out.strip()
-    found = re.search(r"value = (\S+), .* value = (\S+), .*sd (\S+) s and (\S+) ppm", line)
+    found = re.search(r"value = (\S+), sd = (\S+), .* value = (\S+), sd = (\S+), ", line)
     assert found is not None, line
-    offset, drift, offset_sd, drift_sd = map(float, found.groups())
+    offset, offset_sd, drift, drift_sd = map(float, found.groups())
     assert abs(offset - OFFSET) < 4 * offset_sd < 1e-3
     assert abs(1e-6 * drift - DRIFT) < 4e-6 * drift_sd < 1e-3
     readings = {}
@@ -44,6 +44,8 @@ def test_the_estimated_line_puts_the_times_on_one_clock(tmp_path: Path, capsys: 
         (tmp_path / "rig.toml").write_text(f"{HEAD}{ENTRY}{own}\n", encoding="utf-8")
         (table,) = capsule_id.read_rig(tmp_path).tables
         np.testing.assert_allclose(table["time"], offset + (1.0 + 1e-6 * drift) * OTHER if own else OTHER, atol=1e-9)
+        stated = (1e-6 * drift, 1e-6 * drift_sd) if own else (0.0, 0.0)
+        assert (table.drift.value, table.drift.sd) == pytest.approx(stated)
         readings[own] = table["x_rel"]
     np.testing.assert_array_equal(readings[""], readings[line])  # no reading is interpolated
 
@@ -51,6 +53,8 @@ def test_the_estimated_line_puts_the_times_on_one_clock(tmp_path: Path, capsys: 
 @pytest.mark.parametrize(
     ("clock", "rule"),
     [
+        ('{ drift = { value = 20, sd = 200000, unit = "ppm" } }', "sd of drift must lie between"),
+        ('{ drift = { value = 20, sd = -1, unit = "ppm" } }', "sd of drift must be 0 or greater"),
         ("{}", "must have an offset or a drift"),
         ('{ drift = { value = 20, unit = "1" } }', "drift must lie between"),
         ('{ offset = { value = 1e20, unit = "s" } }', "offset must lie between"),

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
+from capsule_id.experiments.clock import clock_parameters, stretch
 from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
@@ -64,6 +65,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
                 rows.append(parameter("G", table.label, Prior("positive_normal", gap.value, gap.sd)))
         rows += self.motion_parameters(self.rough_decrement())
         rows += [NOISE_SD.named(table.label, self.noise_prior()), *ground_parameters(table, rig)]
+        rows += clock_parameters(table, rig)
         self.about = DecayAbout(table, rig, tuple(rows))
 
     @classmethod
@@ -78,7 +80,8 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         """(n,) x_rel of the model, m."""
         p = self.parameters_of(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
-        t = self.simulated(theta, p, OFF, self.time, initial)
+        times = jnp.multiply.outer(stretch(self.clock_rate, theta), self.time)
+        t = self.simulated(theta, p, OFF, times, initial)
         return t.X1 - t.X2
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.clock import stretch
 from capsule_id.experiments.forced_run.drives.runs import OtherRun
 from capsule_id.experiments.forced_run.start_state.rough import RunStart, rough_start
 from capsule_id.physics.drives.recorded import RodMotion
@@ -54,5 +55,6 @@ class BaseRun(OtherRun):
         return super().law({"m1": 0.0, **theta})
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Any]:
-        X1 = jnp.add.outer(theta["x_start"], self.base)
-        return self.with_spring({"m1": 0.0, **theta}), RodMotion(self.time, X1, self.base_rate)
+        X1, time = jnp.add.outer(theta["x_start"], self.base), self.true_time(theta)
+        rate = jnp.multiply.outer(1.0 / stretch(self.clock_rate, theta), self.base_rate)
+        return self.with_spring({"m1": 0.0, **theta}), RodMotion(time, X1, rate)

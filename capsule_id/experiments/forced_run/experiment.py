@@ -19,6 +19,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
+from capsule_id.experiments.clock import stated_rate, stretch
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of
@@ -67,6 +68,7 @@ class ForcedRun(CapsuleForward):
     reading_variance : (channels,) stated, SI
     moves : factor of ``capsule_start``, 0 or 1, so that one program computes runs of both kinds
     normal_force : stated, N; 0 where it is the weight
+    clock_rate, middle : 1 + the stated drift of the clock, and the middle of the whole record, s; None: an exact clock
     reaction : share of the drive's force that pushes the capsule back, 1
     """
 
@@ -83,6 +85,8 @@ class ForcedRun(CapsuleForward):
     reading_variance: np.ndarray
     moves: float
     normal_force: float
+    clock_rate: float | None
+    middle: float | None
     channels: tuple[str, ...] = eqx.field(static=True)
     settled: bool = eqx.field(static=True)
     gap_known: bool = eqx.field(static=True)
@@ -127,6 +131,9 @@ class ForcedRun(CapsuleForward):
         self.reaction = rig.model.share_of_reaction
         self.channels = tuple(name for name in NOISE if name in table.columns and name not in self.inputs)
         self.time = table["time"]
+        self.clock_rate = stated_rate(table)
+        whole = next((other for other in rig.tables if other.label == part_of), table)["time"]
+        self.middle = None if self.clock_rate is None else 0.5 * float(whole[0] + whole[-1])
         self.values = np.stack([table[name] for name in self.channels])
         self.Omega = stated_Omega(table)
         self.gap, self.gap_known = gap.value, gap.sd == 0.0
@@ -232,19 +239,27 @@ class ForcedRun(CapsuleForward):
         """Parameters at ``theta`` with the support spring of this run; k2 = 0 where there is none."""
         return self.parameters_of(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
 
+    def true_time(self, theta: ValuesBySymbol) -> Any:
+        """Times of the samples (..., n), s, with the drift of the clock at ``theta``."""
+        if self.middle is None:
+            return self.time
+        # About the middle of the record the drift is nearly independent of the phase.
+        return self.middle + jnp.multiply.outer(stretch(self.clock_rate, theta), self.time - self.middle)
+
     def motion(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Trajectory:
         """Simulate the motion at the samples (n,), X2 = 0 at the first."""
         p, e = self.capsule(theta)
+        time = self.true_time(theta)
         if self.settled:
-            early = self.time[:1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
+            early = time[..., :1] - SETTLING_PERIODS * 2.0 * np.pi / self.Omega
             rest = (equilibrium(p), 0.0, 0.0, 0.0) if "slope" in self.ground else None
-            run = self.simulated(theta, p, e, xp.concatenate([early, self.time]), rest)
+            run = self.simulated(theta, p, e, xp.concatenate([early, time], axis=-1), rest)
             settled = {name: getattr(run, name)[1:] for name in ("times", "X1", "Y1", "X2", "Y2")}
             X2 = settled["X2"][0]
             return replace(run, **settled | {"X1": settled["X1"] - X2, "X2": settled["X2"] - X2})
         Y2 = self.moves * theta.get("capsule_start", 0.0) + 0.0 * theta["x_start"]
         initial = (theta["x_start"], theta.get("y_start", 0.0) + Y2, 0.0, Y2)
-        return self.simulated(theta, p, e, self.time, initial)
+        return self.simulated(theta, p, e, time, initial)
 
     def predict(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> list[Any]:
         """Predict noise-free channels (n,), without offsets and gains, in the order of ``channels``.
@@ -266,13 +281,13 @@ class ForcedRun(CapsuleForward):
                 # A batch axis of the leaves precedes the axis of the samples.
                 e, I_d = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], (self.capsule(theta)[1], theta["I_d"]))
                 assert isinstance(e, Excitation), "a current belongs to a harmonic drive"
-                seen.append(I_d * e.cosine(self.time))
+                seen.append(I_d * e.cosine(self.true_time(theta)))
         return seen
 
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
         """Acceleration of the rod at the samples, m/s^2, from x_rel (..., n), m, and its rate."""
         p, e = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.capsule(theta))
-        return rod_acceleration(p, e, self.time, x_rel, rate)
+        return rod_acceleration(p, e, self.true_time(theta), x_rel, rate)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
         parts = []

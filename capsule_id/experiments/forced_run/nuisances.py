@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.experiments.base import Start
+from capsule_id.experiments.clock import clock_parameters
 from capsule_id.experiments.families.inclined import ground_parameters
 from capsule_id.experiments.forced_run.declaration import CAPSULE_START, CORRELATION, CURRENT_AMPLITUDE, NOISE
 from capsule_id.experiments.linear import NUISANCE_WIDTH
@@ -27,6 +28,7 @@ def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...
     rows = [parameter("k1"), parameter("c"), *run.friction.parameters, *ground_parameters(run.table, run.rig)]
     free = ("k_cubic",) if run.spring is None else ("k_cubic", "c2")
     rows += [parameter(symbol) for symbol in free if symbol in run.rig.model.free]
+    rows += clock_parameters(run.table, run.rig)
     if run.spring is not None:
         rows.append(parameter("k2", run.spring))
     if not run.gap_known:

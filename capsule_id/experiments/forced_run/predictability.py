@@ -34,7 +34,8 @@ def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
     motion = run.motion(theta, np)
     start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
     x_rel, rate, Y2 = np.concatenate([start + STEP * np.diag(size), start - STEP * np.diag(size)]).T
-    times = np.linspace(run.time[0], run.time[-1], INSTANTS + 1)
+    time = np.asarray(run.true_time(theta))
+    times = np.linspace(time[0], time[-1], INSTANTS + 1)
     t = run.simulated(theta, *run.capsule(theta), times, (x_rel, rate + Y2, np.zeros(6), Y2))
     states = np.stack([t.x_rel, t.Y1 - t.Y2, t.Y2], axis=-1)[:, 1:] / (2.0 * STEP * size)
     if not np.isfinite(states).all():

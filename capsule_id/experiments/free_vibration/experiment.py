@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol
+from capsule_id.experiments.clock import clock_parameters, stated_rate, stretch
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.free_vibration.checks import (
     check_drift,
@@ -97,6 +98,7 @@ class FreeVibration(SurfaceExperiment):
     side: float
     folded: np.ndarray
     step: float
+    clock_rate: float | None
     about: DecayAbout = eqx.field(static=True)
     model: DecayModel = eqx.field(static=True)
     half_cycles: int = eqx.field(static=True)
@@ -138,6 +140,7 @@ class FreeVibration(SurfaceExperiment):
         self.step = step or 0.0
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side, self.half_cycles = 1.0, 0
+        self.clock_rate = stated_rate(table)
         self.about = DecayAbout(table, rig, (), screened)
         rows = [parameter("k1"), parameter("c"), self.channel.noise.named(table.label, self.noise_prior())]
         if self.model.whitened:
@@ -156,7 +159,7 @@ class FreeVibration(SurfaceExperiment):
                 ),
                 TURNING_TIME.named(table.label, Prior("normal", 0.0, float(self.time[-1]))),
             ]
-        self.about = DecayAbout(table, rig, tuple(rows), screened)
+        self.about = DecayAbout(table, rig, (*rows, *clock_parameters(table, rig)), screened)
 
     def with_model(self, model: DecayModel, screened: "Screened | None" = None) -> "FreeVibration":
         """Return the same record with another model; its fit ``screened`` gives the starting point."""
@@ -225,7 +228,7 @@ class FreeVibration(SurfaceExperiment):
         trend = xp.ones((self.n, 1))
         if self.model.drift == "linear":
             trend = xp.stack([xp.ones(self.n), xp.asarray(self.time) / self.time[-1] - 0.5], axis=1)
-        nodes = xp.asarray(self.nodes).ravel()
+        nodes = xp.asarray(self.nodes).ravel() * stretch(self.clock_rate, theta)
         if self.closed:
             basis = viscous_basis(nodes, theta["k1"], theta["c"], theta["m1"], xp)
             basis = block_mean(basis, self.weights, xp)
@@ -245,7 +248,7 @@ class FreeVibration(SurfaceExperiment):
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         if not self.uniform or xp is np:
             return super().summaries(theta, xp)
-        gamma, omega = rates(theta["k1"], theta["c"], theta["m1"])
+        gamma, omega = (rate * stretch(self.clock_rate, theta) for rate in rates(theta["k1"], theta["c"], theta["m1"]))
         yy, ay, aa = decay_moments(self.folded, self.n, self.step, gamma, omega)
         variance = (self.reading_sd * self.relative_sd) ** 2
         return (Moments(yy, self.width * ay, self.width**2 * aa, self.n, variance, self.relative_sd),)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, axis_label, band
+from capsule_id.experiments.clock import clock_parameters, stated_rate, stretch
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.free_vibration.decay_models import half_cycles
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
@@ -37,6 +38,7 @@ class TurningPoints(SurfaceExperiment):
     time_width: float
     reading_sd: float
     time_reading_sd: float
+    clock_rate: float | None
     last: int = eqx.field(static=True)
     both_sides: bool = eqx.field(static=True)
     model: DecayModel = eqx.field(static=True)
@@ -57,6 +59,7 @@ class TurningPoints(SurfaceExperiment):
         self.reading_sd, self.time_reading_sd = table.columns["x_rel"].reading_sd, table.columns["time"].reading_sd
         size = float(np.ptp(self.values)), float(np.median(step))
         noise = [Prior("lognormal", NOISE_FRACTION * scale, NOISE_FACTOR) for scale in size]
+        self.clock_rate = stated_rate(table)
         self.about = About(table, rig, ())
         rough = self.paper_decrement()
         hardening = Prior("normal", 0.0, rough.k1 / float(np.max(np.abs(rough.peaks))) ** 2)
@@ -66,6 +69,7 @@ class TurningPoints(SurfaceExperiment):
             AMPLITUDE.named(table.label, Prior("lognormal", abs(float(rough.peaks[0])), NUISANCE_WIDTH)),
             NOISE_SD.named(table.label, noise[0]),
             TIME_SD.named(table.label, noise[1]),
+            *clock_parameters(table, rig),
         ]
         self.about = About(table, rig, tuple(rows))
 
@@ -87,7 +91,7 @@ class TurningPoints(SurfaceExperiment):
         index = xp.asarray(self.index).astype(int)
         one = xp.ones((self.values.shape[0], 1))
         positions = self.values - self.sides * xp.asarray(path.amplitudes)[index]
-        times = self.time - xp.asarray(path.times)[index]
+        times = self.time - xp.asarray(path.times)[index] / stretch(self.clock_rate, theta)
         rest = self.width * one[:, : int(self.both_sides)]
         return (
             Misfit(positions, self.reading_sd**2, 1.0, rest),

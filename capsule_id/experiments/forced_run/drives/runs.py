@@ -57,7 +57,7 @@ class RecordedRun(OtherRun):
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         force = jnp.multiply.outer(jnp.asarray(theta["K"]), self.current)
-        return self.with_spring(theta), RecordedDrive(self.time, force, self.reaction)
+        return self.with_spring(theta), RecordedDrive(self.true_time(theta), force, self.reaction)
 
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
         p = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.with_spring(theta))
