@@ -134,5 +134,5 @@ def _compare(args: argparse.Namespace, rig: Rig, kinds: Registry) -> int:
 
     with Progress(not args.quiet) as progress:
         choice = compare_models(rig, args.compare.split(","), kinds, args.seed, progress)
-    say(f"{choice.table.round(2).to_string()}\n{choice.line}")
+    say(choice.text)
     return 0

@@ -7,9 +7,7 @@ import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.panels import new_trials
-from capsule_id.experiments.progression.trials import settings_of
+from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.inference.result import Result
 from capsule_id.rig.model import Column, Table
 from capsule_id.rig.tables import read_settings
@@ -41,7 +39,7 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
         If nothing was sampled, no progression was fitted, ``draws`` is out of range, or the settings break a rule.
     """
     made = make_experiments(result.rig, "all", result.registry)
-    experiment = next((e for e in made if isinstance(e, Progression) and e.label in result.observed), None)
+    experiment = next((e for e in made if isinstance(e, TrialsExperiment) and e.label in result.observed), None)
     if experiment is None:
         raise InputError("a prediction needs a fit with a progression", "none", "add one to the rig and fit again")
     if result.posterior is None:
@@ -57,15 +55,15 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
     values = [
         experiment.local({**constants, **dict(zip(result.posterior.names, theta, strict=True))}) for theta in chosen
     ]
-    rows = settings_of({name: column.values for name, column in columns.items()}, experiment.table.settings)[0]
-    trials = 1e3 * new_trials(experiment, values, rows, rng)
+    rows, time = experiment.settings_of(columns)
+    trials = 1e3 * experiment.new_trials(values, rows, rng)
     lower, median, upper = np.quantile(trials, [0.025, 0.5, 0.975], axis=0)
     return pd.DataFrame(
         {
             "distance [mm]": median,
             "distance_lower [mm]": lower,
             "distance_upper [mm]": upper,
-            "mean_velocity [mm/s]": median / (rows[:, 0] * rows[:, 1]),
+            "mean_velocity [mm/s]": median / time,
         }
     )
 

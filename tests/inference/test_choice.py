@@ -1,17 +1,28 @@
-"""Choice of the model: the variants of a rig, the density of a setting left out, the recommendation."""
+"""Choice of the model: variants, densities of settings left out, evidence, predictions, recommendation."""
+
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy import stats
 from scipy.stats import multivariate_normal
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.experiments.progression.left_out import conditional_densities
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
-from capsule_id.inference.choice.compare import _choose, _Variant
-from capsule_id.inference.choice.leave_out import conditional_densities
+from capsule_id.experiments.registry import default_registry
+from capsule_id.inference.choice import compare, leave_out
+from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models
+from capsule_id.inference.choice.evidence import _bridge, log_evidence
+from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_out
+from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
 from capsule_id.inference.choice.variants import variants_of
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
@@ -38,22 +49,130 @@ def test_each_word_varies_its_own_choice(rig: Rig) -> None:
         variants_of(rig, ["lagg"])
 
 
-def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
-    (e,) = make_experiments(rig)
-    assert isinstance(e, Progression)
+def joint_density(e: Progression) -> float:
+    """Log-density of all readings at ``THETA``."""
     misfit = e.misfit(THETA)
     covariance = np.diag(misfit.sd**2) + misfit.design @ misfit.design.T
+    return float(multivariate_normal(cov=covariance).logpdf(misfit.raw))
+
+
+def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
+    """p(y_b | y_rest) = p(y) / p(y_rest); the rest is also the experiment without the setting."""
+    (e,) = cast(list[Progression], make_experiments(rig))
     found = conditional_densities(e, [THETA, THETA])
-    for setting, column in enumerate(e.setting.T):
-        rest = np.flatnonzero(column == 0.0)
-        # p(y_b | y_rest) = p(y) / p(y_rest)
-        joint = multivariate_normal(cov=covariance).logpdf(misfit.raw)
-        other = multivariate_normal(cov=covariance[np.ix_(rest, rest)]).logpdf(misfit.raw[rest])
-        np.testing.assert_allclose(found[:, setting], joint - other, rtol=1e-6)
+    for setting in range(len(e.settings)):
+        smaller = e.without(setting)
+        assert smaller.n == e.n - 3
+        np.testing.assert_allclose(found[:, setting], joint_density(e) - joint_density(smaller), rtol=1e-6)
+
+
+class Readings:
+    """Readings y_b ~ N(theta, 1), each a setting of its own; the posterior of theta under a flat prior is normal."""
+
+    parameters = (SimpleNamespace(name="theta"),)
+    settings, label = np.zeros((6, 1)), "readings"
+    distance = np.array([0.4, -0.9, 0.3, 2.9, 0.2, 0.9]) * 1e-3
+    setting, time = np.eye(6), np.ones(6)
+
+    def local(self, values: dict[str, float]) -> dict[str, float]:
+        return values
+
+    def densities_of_settings(self, draws: list[dict[str, float]]) -> np.ndarray:
+        theta = np.array([draw["theta"] for draw in draws])
+        return stats.norm.logpdf(1e3 * self.distance, theta[:, None])
+
+    def new_trials(self, draws: list[dict[str, float]], settings: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        theta = np.array([draw["theta"] for draw in draws])
+        return 1e-3 * (theta[:, None] + rng.standard_normal((len(draws), len(settings))))
+
+    def setting_names(self) -> list[str]:
+        return list("abcdef")
+
+
+def readings_and_draws(number: int) -> tuple[Any, WeightedDraws]:
+    """Draws of a wide Student proposal, weighted by the posterior of theta."""
+    e, rng = Readings(), np.random.default_rng(0)
+    theta = 0.3 + 0.8 * rng.standard_t(6.0, number)
+    posterior = stats.norm.logpdf(theta, 1e3 * np.mean(e.distance), 6.0**-0.5)
+    log_weight = posterior - stats.t.logpdf(theta, 6.0, 0.3, 0.8) + 7.0
+    values = [{"theta": one} for one in theta]
+    nothing = cast(Any, None)
+    return e, WeightedDraws(nothing, nothing, nothing, values, log_weight[:, None], {"theta": 0}, 0)
+
+
+def test_readings_left_out_have_their_predictive_density() -> None:
+    """In closed form N(mean of the others, 1 + 1/5). Negative control: with the reading itself the density is higher."""
+    e, draws = readings_and_draws(20_000)
+    y = 1e3 * e.distance
+    others = (np.sum(y) - y) / 5.0
+    exact = stats.norm.logpdf(y, others, np.sqrt(1.2))
+    found = leave_settings_out(e, draws)
+    assert [one.density for one in found] == pytest.approx(exact, abs=0.02)
+    assert max(one.shape for one in found) < leave_out.LARGEST_SHAPE
+    with_it = stats.norm.logpdf(y, np.mean(y), np.sqrt(7.0 / 6.0))
+    assert np.max(np.abs(with_it - exact)) > 0.3
+
+    table = left_out_predictions(e, found, 0)
+    reach = 1.96 * np.sqrt(1.2)
+    assert table["predicted [mm/s]"].to_numpy() == pytest.approx(others, abs=0.06)
+    assert table["upper [mm/s]"].to_numpy() == pytest.approx(others + reach, abs=0.12)
+    inside = np.abs(y - others) < reach
+    assert table["inside"].tolist() == inside.astype(int).tolist()
+    beyond = np.maximum(np.abs(y - others) - reach, 0.0)
+    assert table["score [mm/s]"].to_numpy() == pytest.approx(2.0 * reach + 40.0 * beyond, abs=0.25)
+    assert predictions_text(table) == (
+        "Each setting is predicted by all others: the direction is right in 2 of 3 settings above 0.5 mm/s, and 5 of "
+        "6 trials lie in the 95 % band."
+    )
+
+
+def test_draws_without_a_density_have_no_weight() -> None:
+    _, draws = readings_and_draws(2000)
+    found = leave_out._left_out(np.zeros(2000), np.where(np.arange(2000) < 3, np.nan, -1.0), draws)
+    assert found.density == pytest.approx(-1.0)
+    assert np.all(found.log_weight[:3] == -np.inf)
+
+
+@pytest.mark.parametrize("outside", [0, 500])
+def test_the_evidence_is_that_of_the_closed_form(outside: int) -> None:
+    """A normal posterior times e^7. Negative control: draws of the proposal in place of those of the posterior."""
+    weights = readings_and_draws(4000)[1].log_weight[:, 0]
+    rng = np.random.default_rng(1)
+    value, error = log_evidence(rng.permutation(np.append(weights, np.full(outside, -np.inf))), rng)
+    exact = 7.0 + np.log(4000 / (4000 + outside))
+    assert error < 0.05
+    assert abs(value - exact) < 4.0 * max(error, 0.01)
+    assert abs(_bridge(weights[:2000], weights[2000:]) - 7.0) > 0.1
+
+
+def test_a_comparison_of_a_robot(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws near the true values stand for the adapted proposals. The truth has the lag of 8 ms."""
+
+    def draws_of(target: LogPosterior, *_: object) -> WeightedDraws:
+        truth = {**THETA, "trial_sd[progression]": 1e-3, "discrepancy[progression]": 2e-4}
+        centre = target.unconstrain(np.array([truth[name] for name in target.names]))
+        u = centre + 0.01 * np.random.default_rng(0).standard_normal((40, target.dimension))
+        values = [target.mapping(theta) for theta in target.theta(u)]
+        nothing = cast(Any, None)
+        return WeightedDraws(target, nothing, nothing, values, np.zeros((40, 1)), dict.fromkeys(target.names, 0), 0)
+
+    monkeypatch.setattr(compare, "joint_fit", lambda *_: None)
+    for module in (compare, leave_out):
+        monkeypatch.setattr(module, "weighted_draws", draws_of)
+    seen = list[tuple[int, int, str]]()
+    choice = compare_models(rig, ["lag"], default_registry(), 0, lambda *step: seen.append(step))
+    assert seen == [(0, 2, "as stated"), (1, 2, "no lag")]
+    assert list(choice.table.index) == ["as stated", "no lag"]
+    assert choice.table.loc["no lag", "difference"] < -2.0
+    assert choice.table["log_evidence"].tolist() == pytest.approx([0.0, 0.0])
+    assert list(choice.predictions.index) == [
+        f"{t} ms, duty 30 %, {n} periods" for t, n in ((60, 67), (80, 50), (100, 40))
+    ]
+    assert "direction is right in 3 of 3 settings" in choice.text
 
 
 def variant(parameters: int, density: list[float]) -> _Variant:
-    return _Variant(parameters, 0.0, np.array(density), 0.3, 0)
+    return _Variant(parameters, np.array(density), (0.0, 0.1), 0.3, 0, pd.DataFrame({"inside": [len(density)]}))
 
 
 def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> None:
@@ -62,9 +181,10 @@ def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> Non
         "as good": variant(4, [0.9, 1.3, 0.9, 1.0]),
         "wrong": variant(3, [-3.0, -2.5, -3.1, -2.9]),
     }
-    choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices(free=("lag",))))
+    choice: Choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices(free=("lag",))))
     assert list(choice.table.index) == ["best", "as good", "wrong"]
     assert choice.recommended == "as good"
+    assert choice.predictions is fitted["as good"].predictions
     assert 'free = ["lag"]' in choice.line
     difference = np.array(fitted["as good"].density) - np.array(fitted["best"].density)
     assert choice.table.loc["as good", "se"] == pytest.approx(2.0 * np.std(difference, ddof=1))

@@ -7,7 +7,7 @@ sessions and the response to s_j, so that s_j enters linearly and is integrated 
 the model's mean velocity at setting b that all trials of the setting share.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol
-from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
+from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import (
@@ -31,8 +31,9 @@ from capsule_id.experiments.progression.declaration import (
     TRIAL_SD,
 )
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.panels import progression_panels
-from capsule_id.experiments.progression.trials import sessions_of, settings_of
+from capsule_id.experiments.progression.left_out import conditional_densities
+from capsule_id.experiments.progression.panels import new_trials, progression_panels
+from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import pool
 from capsule_id.physics.displacement import Displacement, displacement
@@ -41,7 +42,7 @@ from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.forces import equilibrium
 from capsule_id.physics.friction import scaled
 from capsule_id.physics.model import CapsuleParameters
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison
 
 #: Scales of the half-normal priors of trial_sd and discrepancy, relative to the largest reading.
@@ -52,26 +53,20 @@ DRAWS_OF_A_BATCH = 16
 DAMPING_RATIO, FRICTION = 0.1, 0.3
 
 
-class Progression(CapsuleForward):
+class Progression(TrialsExperiment):
     """Trials of one table.
 
     Attributes
     ----------
-    distance : (n,) m
-    settings : (settings, 4) period, s, number of periods, duty, amplitude, N or A; see ``settings_of``
-    setting, session : (n, settings), (n, sessions) 1 where a row belongs to it
-    time : (settings,) duration of a trial, s
+    settings : (settings, 4) period, s, number of periods, duty, amplitude, N or A; see ``trials.settings_of``
+    session : (n, sessions) 1 where a row belongs to it
     reading_variance : m^2
     force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
     has_lag : whether the lag is a parameter
     """
 
-    distance: np.ndarray
-    settings: np.ndarray
-    setting: np.ndarray
     session: np.ndarray
     groups: TrialGroups
-    time: np.ndarray
     reading_variance: float
     force: float
     lag: float
@@ -256,6 +251,39 @@ class Progression(CapsuleForward):
         size = float(np.median(np.abs(self.distance)))
         scatter = np.hypot(theta["trial_sd"], theta["trial_scatter"] * size) + np.sqrt(self.reading_variance)
         return float(np.hypot(scatter, theta["discrepancy"] * np.median(self.time)) / scatter)
+
+    # -- settings left out and new ones -------------------------------------------------------------------------------
+
+    def settings_of(self, columns: Mapping[str, Column]) -> tuple[np.ndarray, np.ndarray]:
+        rows, _ = settings_of({name: column.values for name, column in columns.items()}, self.table.settings)
+        return rows, rows[:, 0] * rows[:, 1]
+
+    def setting_names(self) -> list[str]:
+        return [name_of(row, self.drive, self.amplitude_from) for row in self.settings]
+
+    def new_trials(self, draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return new_trials(self, draws, settings, rng)
+
+    def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
+        return conditional_densities(self, draws)
+
+    def without(self, setting: int) -> "Progression":
+        kept = self.setting[:, setting] == 0.0
+        distance, membership = self.distance[kept], np.delete(self.setting[kept], setting, axis=1)
+        session = self.session[kept]
+        session = session[:, session.any(axis=0)]
+        return eqx.tree_at(
+            lambda e: (e.distance, e.settings, e.setting, e.session, e.groups, e.time),
+            self,
+            (
+                distance,
+                np.delete(self.settings, setting, axis=0),
+                membership,
+                session,
+                TrialGroups(distance, membership, session),
+                np.delete(self.time, setting),
+            ),
+        )
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return self.comparisons(theta, draws)[0]

@@ -32,3 +32,12 @@ def sessions_of(table: Table, rows: np.ndarray) -> np.ndarray:
     else:
         index = np.cumsum(np.concatenate([[0], np.any(rows[1:] != rows[:-1], axis=1)]))
     return np.eye(int(np.max(index)) + 1)[index]
+
+
+def name_of(setting: np.ndarray, drive: str, amplitude_from: str) -> str:
+    """Name of one row of ``settings_of``: period, duty and amplitude where they may differ, number of periods."""
+    period, periods, duty, amplitude = setting
+    parts = [f"{1e3 * period:g} ms"]
+    parts += [f"duty {100.0 * duty:g} %"] if drive == "pulses" else []
+    parts += {"column": [f"{amplitude:g} N"], "current": [f"{amplitude:g} A"]}.get(amplitude_from, [])
+    return ", ".join([*parts, f"{periods:g} periods"])

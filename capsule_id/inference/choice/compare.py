@@ -10,21 +10,21 @@ import pandas as pd
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.experiments.registry import Registry
+from capsule_id.inference.choice.evidence import log_evidence
 from capsule_id.inference.choice.leave_out import (
     LARGEST_SHAPE,
-    WeightedDraws,
-    conditional_densities,
-    laplace_draws,
+    LeftOut,
+    leave_setting_out,
     leave_settings_out,
+    weighted_draws,
 )
+from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
 from capsule_id.inference.choice.variants import variants_of
 from capsule_id.inference.fit.joint_fit import joint_fit
-from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.rig.model import Column, ModelChoices, Rig, Table
+from capsule_id.rig.model import ModelChoices, Rig
 
 #: Standard errors by which the best variant must be better for a simpler one to be rejected.
 STANDARD_ERRORS = 2.0
@@ -36,15 +36,18 @@ class Choice:
 
     Attributes
     ----------
-    table : a row per variant (index ``variant``), the best first: parameters, log_posterior, elpd, its difference from
-        the best and the standard error of the difference, shape (largest Pareto shape), refits
+    table : a row per variant (index ``variant``), the best first: parameters, elpd, its difference from the best and
+        the standard error of the difference, log_evidence and its standard error, shape (largest Pareto shape of the
+        densities that enter), refits
     recommended : the variant with the fewest parameters within two standard errors of the best
     choices : the choices of ``[model]`` by variant
+    predictions : of the recommended variant, see ``capsule_id.inference.choice.predictions.left_out_predictions``
     """
 
     table: pd.DataFrame
     recommended: str
     choices: Mapping[str, ModelChoices]
+    predictions: pd.DataFrame
 
     @property
     def line(self) -> str:
@@ -58,16 +61,23 @@ class Choice:
             f"(elpd {row['difference']:.1f} ± {row['se']:.1f}). Write in [model]: {lines}"
         )
 
+    @property
+    def text(self) -> str:
+        """Both tables, the recommendation, and how well the recommended variant predicts settings left out."""
+        tables = self.table.round(2).to_string(), self.predictions.round(2).to_string()
+        return "\n".join([tables[0], self.line, "", tables[1], predictions_text(self.predictions)])
+
 
 @dataclass(frozen=True)
 class _Variant:
-    """A fitted variant: its number of parameters, maximum, densities of the settings left out, shapes and refits."""
+    """A fitted variant: parameters, densities of the settings left out, evidence and its error, shape, refits."""
 
     parameters: int
-    log_posterior: float
     density: np.ndarray
+    evidence: tuple[float, float]
     shape: float
     refits: int
+    predictions: pd.DataFrame
 
 
 def compare_models(
@@ -86,7 +96,7 @@ def compare_models(
         If a word is unknown, or the rig has no progression.
     """
     choices = variants_of(rig, words)
-    if not any(isinstance(e, Progression) for e in make_experiments(rig, "all", registry)):
+    if not any(isinstance(e, TrialsExperiment) for e in make_experiments(rig, "all", registry)):
         remedy = "compare friction laws of bench tests in the report of fit-params"
         raise InputError("--compare needs a progression, whose settings are left out", "none", remedy)
     fitted = {}
@@ -100,47 +110,28 @@ def compare_models(
 def _fit_variant(rig: Rig, registry: Registry, seed: int) -> _Variant:
     target = LogPosterior(rig, make_experiments(rig, "all", registry))
     fit = joint_fit(target, {}, seed)
-    draws = laplace_draws(target, fit, seed)
-    density, shape, refits = [], [], 0
+    draws = weighted_draws(target, fit, seed)
+    found, tables, refits = list[LeftOut](), list[pd.DataFrame](), 0
     for e in target.experiments:
-        if not isinstance(e, Progression):
+        if not isinstance(e, TrialsExperiment):
             continue
-        found = leave_settings_out(target, e, draws)
-        own = found.density.copy()
-        for setting in np.flatnonzero(~(found.shape <= LARGEST_SHAPE)):
-            own[setting] = _refitted_density(target, e, int(setting), fit, seed)
+        own = leave_settings_out(e, draws)
+        for setting in [k for k, one in enumerate(own) if not one.shape <= LARGEST_SHAPE]:
+            own[setting] = leave_setting_out(draws, e, setting, seed)
             refits += 1
-        density.append(own)
-        shape.append(float(np.max(found.shape)))
-    value = float(np.max(fit.log_posterior))
-    return _Variant(target.dimension, value, np.concatenate(density), max(shape), refits)
-
-
-def _refitted_density(target: LogPosterior, e: Progression, setting: int, fit: PointFit, seed: int) -> float:
-    """Log-density of the readings of ``setting`` under draws of a fit without them, from the maximum with them."""
-    kept = np.flatnonzero(e.setting[:, setting] == 0.0)
-    other = Progression(_rows(e.table, kept), e.rig, e.friction)
-    experiments: list[Experiment] = [other if each is e else each for each in target.experiments]
-    smaller = LogPosterior(target.rig, experiments)
-    start = smaller.unconstrain(np.array([fit.values[name] for name in smaller.names]))
-    draws = laplace_draws(smaller, joint_fit(smaller, {}, seed, starts=start[None]), seed)
-    values = [e.local(target.mapping(theta)) for theta in smaller.theta(draws.u)]
-    return _expected(draws, conditional_densities(e, values)[:, setting])
-
-
-def _expected(draws: WeightedDraws, density: np.ndarray) -> float:
-    """Log of the weighted mean of exp(density)."""
-    weight = np.where(np.isfinite(draws.log_weight), draws.log_weight, -np.inf)
-    finite = np.nan_to_num(density, nan=-1e9, neginf=-1e9)
-    return float(np.logaddexp.reduce(weight + finite) - np.logaddexp.reduce(weight))
-
-
-def _rows(table: Table, rows: np.ndarray) -> Table:
-    """The table with some of its rows."""
-    columns: dict[str, Column] = {
-        name: replace(column, values=column.values[rows]) for name, column in table.columns.items()
-    }
-    return replace(table, columns=columns, rows=table.rows[rows])
+        tables.append(left_out_predictions(e, own, seed))
+        found += own
+    rng, outside = np.random.default_rng(seed), np.full((draws.outside, draws.log_weight.shape[1]), -np.inf)
+    blocks = rng.permutation(np.concatenate([draws.log_weight, outside])).T
+    evidence, errors = np.array([log_evidence(block, rng) for block in blocks]).T
+    return _Variant(
+        target.dimension,
+        np.array([one.density for one in found]),
+        (float(np.sum(evidence)), float(np.linalg.norm(errors))),
+        max(one.shape for one in found),
+        refits,
+        pd.concat(tables),
+    )
 
 
 def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices]) -> Choice:
@@ -151,14 +142,15 @@ def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices])
         difference = one.density - best.density
         rows[name] = {
             "parameters": one.parameters,
-            "log_posterior": one.log_posterior,
             "elpd": float(np.sum(one.density)),
             "difference": float(np.sum(difference)),
             "se": float(np.sqrt(len(difference) * np.var(difference, ddof=1))),
+            "log_evidence": one.evidence[0],
+            "± log_evidence": one.evidence[1],
             "shape": one.shape,
             "refits": one.refits,
         }
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("variant")
     close = table[table["difference"] >= -STANDARD_ERRORS * table["se"]]
     recommended = min(close.index, key=lambda name: (fitted[name].parameters, -float(np.sum(fitted[name].density))))
-    return Choice(table, recommended, dict(choices))
+    return Choice(table, recommended, dict(choices), fitted[recommended].predictions)

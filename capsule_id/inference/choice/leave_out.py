@@ -1,100 +1,120 @@
 """Expected log predictive density of settings left out, by Pareto-smoothed importance sampling (PSIS-LOO).
 
-For each draw the readings of a setting are normal given all other readings: session effects and discrepancies are
-integrated out. Draws come from the Laplace approximation at the maximum, widened, and are weighted by the posterior.
+Independent draws of the sampler's adapted proposal are weighted by the posterior. For each draw the readings of a
+setting are normal given all other readings. Division by their density leaves the setting out.
 (A. Vehtari, A. Gelman, J. Gabry, *Practical Bayesian model evaluation using leave-one-out cross-validation and WAIC*,
 Statistics and Computing 27, 2017, 1413.)
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
+from jaxtyping import Float
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.linear import LOG_2PI
-from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.inference.fit.joint_starts import weigh
+from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.inference.result import PointFit
+from capsule_id.inference.sampling.ensembles import adapted_proposal
+from capsule_id.inference.sampling.proposal import BlockProposal
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.marginal import MarginalPosterior
 
-#: Draws of the Laplace approximation, their degrees of freedom, and its widening.
-DRAWS, FREEDOM, WIDENING = 256, 8.0, 1.1
+#: Draws of the proposal.
+DRAWS = 4096
 #: Importance weights with a larger Pareto shape are not reliable.
 LARGEST_SHAPE = 0.7
 
 
+@dataclass(frozen=True, eq=False)
+class WeightedDraws:
+    """Independent draws of the proposal that the sampler adapts to a posterior.
+
+    Attributes
+    ----------
+    target, fit : posterior, and the point fit that the adaptation began with
+    values : values by name of the m draws inside the posterior
+    log_weight : (m, blocks) log of posterior over proposal density of each block of parameters
+    block : block of each parameter by name
+    outside : number of draws outside
+    """
+
+    target: LogPosterior
+    fit: PointFit
+    proposal: BlockProposal
+    values: list[dict[str, float]]
+    log_weight: np.ndarray
+    block: Mapping[str, int]
+    outside: int
+
+    def of(self, e: TrialsExperiment) -> Float[np.ndarray, " m"]:
+        """Log-weights of the block that ``e`` depends on."""
+        return self.log_weight[:, next(self.block[row.name] for row in e.parameters if row.name in self.block)]
+
+
 @dataclass(frozen=True)
 class LeftOut:
-    """Log predictive density of every setting given the others, and the Pareto shape of its weights, (settings,)."""
+    """One setting left out.
 
-    density: np.ndarray
-    shape: np.ndarray
+    Attributes
+    ----------
+    density : log predictive density of its readings given all others
+    shape : Pareto shape of the weights
+    log_weight : (m,) of ``draws``, smoothed, normalised
+    """
 
-
-@dataclass(frozen=True)
-class WeightedDraws:
-    """Draws (m, d) in u, and log importance weights (m,) towards the posterior."""
-
-    u: np.ndarray
+    density: float
+    shape: float
     log_weight: np.ndarray
+    draws: WeightedDraws
 
 
-def laplace_draws(target: LogPosterior, fit: PointFit, seed: int) -> WeightedDraws:
-    """Draws about the maximum with their weights; a draw without a finite log-posterior has weight 0."""
-    rng, d = np.random.default_rng(seed), target.dimension
-    root = WIDENING * np.linalg.cholesky(fit.covariance + 1e-12 * np.diag(np.diag(fit.covariance)))
-    z = rng.standard_normal((DRAWS, d)) * np.sqrt(FREEDOM / rng.chisquare(FREEDOM, (DRAWS, 1)))
-    u = fit.u + z @ root.T
-    proposed = -0.5 * (FREEDOM + d) * np.log1p(np.sum(z**2, axis=1) / FREEDOM)
-    return WeightedDraws(u, weigh(target, u) - proposed)
+def weighted_draws(target: LogPosterior, fit: PointFit, seed: int, first: BlockProposal | None = None) -> WeightedDraws:
+    """Draws of the proposal that the sampler adapts to ``target`` from the Laplace approximation, or from ``first``."""
+    marginal, random = MarginalPosterior(target, fit), np.random.RandomState(seed)
+    proposal = adapted_proposal(marginal, random, first)
+    v = proposal.draw(random, DRAWS)
+    v = v[np.all(np.isfinite(v), axis=1)]
+    log_weight = marginal.parts(v) - proposal.log_density(v)
+    inside = np.all(np.isfinite(log_weight), axis=1)
+    u, _ = marginal.restore(v[inside], seed)
+    located = np.flatnonzero(~target.integrated)
+    label = {target.names[i]: k for k, block in enumerate(marginal.blocks) for i in located[block]}
+    values = [target.mapping(theta) for theta in target.theta(u)]
+    return WeightedDraws(target, fit, proposal, values, log_weight[inside], label, DRAWS - len(u))
 
 
-def leave_settings_out(target: LogPosterior, e: Progression, draws: WeightedDraws) -> LeftOut:
+def leave_settings_out(e: TrialsExperiment, draws: WeightedDraws) -> list[LeftOut]:
     """Leave out every setting of ``e`` in turn."""
-    usable = np.isfinite(draws.log_weight)
-    values = [target.mapping(theta) for theta in target.theta(draws.u[usable])]
-    density = conditional_densities(e, [e.local(value) for value in values])
-    own = np.nan_to_num(density, nan=-1e9, neginf=-1e9)
-    log_weight = draws.log_weight[usable, None] - own
-    smoothed, shape = _smooth(log_weight.T)
-    return LeftOut(np.asarray(logsumexp(smoothed + own.T, axis=1)), shape)
+    density = e.densities_of_settings([e.local(values) for values in draws.values])
+    return [_left_out(draws.of(e) - one, one, draws) for one in density.T]
 
 
-def conditional_densities(e: Progression, draws: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """(draws, settings) log-density of the readings of each setting, given the parameters and all other readings."""
-    means, per_sd = e.responses_of_draws(draws)
-    rows = [np.flatnonzero(column) for column in e.setting.T]
-    return np.stack([_conditional(e, *one, rows) for one in zip(draws, means, per_sd, strict=True)])
+def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, seed: int) -> LeftOut:
+    """Leave out one setting of ``e`` by draws of the posterior without it."""
+    target = draws.target
+    experiments = [e.without(setting) if each is e else each for each in target.experiments]
+    smaller = weighted_draws(LogPosterior(target.rig, experiments), draws.fit, seed, draws.proposal)
+    density = e.densities_of_settings([e.local(values) for values in smaller.values])[:, setting]
+    return _left_out(smaller.of(e), density, smaller)
 
 
-def _conditional(
-    e: Progression, theta: Mapping[str, Any], mean: np.ndarray, per_sd: np.ndarray, rows: list[np.ndarray]
-) -> np.ndarray:
-    """(settings,) from the precision matrix K: y_b given the others has precision K_bb, and residual K_bb^-1 (K y)_b."""
-    misfit = e.misfit_of(theta, mean, per_sd, np).at(theta["trial_sd"], np)
-    covariance = np.diag(misfit.sd**2) + misfit.design @ misfit.design.T
-    if not np.isfinite(covariance).all():
-        return np.full(len(rows), -np.inf)
-    precision = np.linalg.inv(covariance)
-    weighted = precision @ misfit.raw
-    found = []
-    for own in rows:
-        block = precision[np.ix_(own, own)]
-        square = float(weighted[own] @ np.linalg.solve(block, weighted[own]))
-        found.append(0.5 * (float(np.linalg.slogdet(block)[1]) - len(own) * LOG_2PI - square))
-    return np.array(found)
+def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws) -> LeftOut:
+    """Smooth the weights. A draw without a density lies far outside the posterior and has weight 0."""
+    known = np.isfinite(density)
+    smoothed, (weights, shape) = np.full(len(density), -np.inf), _smooth(log_weight[known])
+    smoothed[known] = weights
+    return LeftOut(float(np.logaddexp.reduce(weights + density[known])), shape, smoothed, draws)
 
 
-def _smooth(log_weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normalised log-weights (settings, draws) smoothed by ArviZ, and their Pareto shapes (settings,)."""
+def _smooth(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
+    """Normalised log-weights (m,) smoothed by ArviZ, and their Pareto shape."""
     try:
         psislw: Any = import_module("arviz").psislw
     except (ImportError, AttributeError):
         rule, remedy = "comparing models needs the package arviz", "pip install 'capsule-id[compare]'"
         raise InputError(rule, "not installed", remedy) from None
-    smoothed, shape = psislw(log_weight)
-    return np.asarray(smoothed), np.asarray(shape)
+    smoothed, shape = map(np.asarray, psislw(log_weight))
+    return smoothed, float(shape)

@@ -27,7 +27,7 @@ from capsule_id.inference.sampling.diagnostics import (
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import Moves, block_move, other_moves
 from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
-from capsule_id.inference.sampling.refinement import NO_MASS, refined
+from capsule_id.inference.sampling.refinement import NO_MASS, SINGLE, refined
 
 #: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
@@ -174,11 +174,7 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
 def pilot(target: Target, seed: int) -> Schedule:
     """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
     random = np.random.RandomState(seed)
-    large = [len(block) >= LARGE for block in target.blocks]
-    narrow = np.isin(np.arange(target.dimension), np.concatenate([[], *compress(target.blocks, large)]))
-    laplace = np.where(np.outer(narrow, narrow), target.covariance, OVERDISPERSION**2 * target.covariance)
-    first = block_proposal(target.blocks, target.centre, laplace, large)
-    proposal = refined(target.parts, first, target.normal_priors, random, large)
+    proposal = adapted_proposal(target, random)
     ensemble = Ensemble(target.parts, _initial(target, proposal, random), block_move(proposal))
     moves, measured = {FIRST: block_move(proposal), **other_moves()}, dict[str, float]()
     # The most promising move runs first, briefly, then longer. The other moves come last, because they are slow.
@@ -194,6 +190,22 @@ def pilot(target: Target, seed: int) -> Schedule:
     tau = measured[best]
     thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
     return Schedule(proposal, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
+
+
+def adapted_proposal(
+    target: Target, random: np.random.RandomState, first: BlockProposal | None = None
+) -> BlockProposal:
+    """Proposal adapted to the density of ``target``, from the Laplace approximation.
+
+    A proposal ``first`` that is adapted to a similar density takes its place, and needs a few rounds only.
+    """
+    large = [len(block) >= LARGE for block in target.blocks]
+    if first is not None:
+        return refined(target.parts, first, target.normal_priors, random, large, SINGLE)
+    narrow = np.isin(np.arange(target.dimension), np.concatenate([[], *compress(target.blocks, large)]))
+    laplace = np.where(np.outer(narrow, narrow), target.covariance, OVERDISPERSION**2 * target.covariance)
+    first = block_proposal(target.blocks, target.centre, laplace, large)
+    return refined(target.parts, first, target.normal_priors, random, large)
 
 
 def _checks(done: int, last: int) -> Iterator[int]:

@@ -95,6 +95,7 @@ def refined(
     prior: Float[np.ndarray, "2 d"],
     rng: np.random.RandomState,
     large: Sequence[bool],
+    rounds: int = SINGLE + SEVERAL,
 ) -> BlockProposal:
     """Proposal adapted to a posterior, from the proposal ``first``.
 
@@ -104,6 +105,7 @@ def refined(
     prior : centre and width of the normal prior of u; NaN for a parameter with another prior
     large : for each block whether its first proposal stays where it is good enough; where it is not, a block of at most
         ``LARGEST_MAP`` parameters gets a map, a larger one a mixture
+    rounds : largest number of rounds
 
     Raises
     ------
@@ -111,16 +113,16 @@ def refined(
         If no draw has a finite log-density.
     """
     pairs = zip(first.blocks, first.densities, large, strict=True)
-    rounds = [_Rounds(mixture, prior[:, block], own) for block, mixture, own in pairs]
+    blocks = [_Rounds(mixture, prior[:, block], own) for block, mixture, own in pairs]
     proposal = first
-    for i in range(SINGLE + SEVERAL):
+    for i in range(rounds):
         u = proposal.draw(rng, DRAWS)
         inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in first.blocks], axis=1)
         u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
         found = parts(u)
         log_parts = np.where(inside & ~np.isnan(found), found, -np.inf)
         good = list[bool]()
-        for j, own in enumerate(rounds):
+        for j, own in enumerate(blocks):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
             if i == 0:
                 good.append(large[j] and size >= ENOUGH * DRAWS)
@@ -130,7 +132,7 @@ def refined(
         if all(good):
             break
         # The newest proposal knows the draws of all rounds, so that it misses the fewest tails.
-        proposal = BlockProposal(first.blocks, [own.proposals[-1] for own in rounds])
+        proposal = BlockProposal(first.blocks, [own.proposals[-1] for own in blocks])
     return proposal
 
 

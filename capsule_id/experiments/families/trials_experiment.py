@@ -1,0 +1,53 @@
+"""Base of experiments whose rows are trials at settings of the drive: a setting can be left out, and new ones predicted."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+import numpy as np
+from jaxtyping import Float
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.families.capsule_experiment import CapsuleForward
+from capsule_id.rig.model import Column
+
+
+class TrialsExperiment(CapsuleForward):
+    """Trials of one table.
+
+    Attributes
+    ----------
+    distance : (n,) displacement of the capsule, m
+    settings : (settings, p) numbers of the drive, in an order of the kind's own
+    setting : (n, settings) 1 where a row belongs to a setting
+    time : (settings,) duration of a trial, s
+    """
+
+    distance: np.ndarray
+    settings: np.ndarray
+    setting: np.ndarray
+    time: np.ndarray
+
+    @abstractmethod
+    def settings_of(
+        self, columns: Mapping[str, Column]
+    ) -> tuple[Float[np.ndarray, "rows p"], Float[np.ndarray, " rows"]]:
+        """Settings in the rows of a table, and the durations of their trials, s."""
+
+    @abstractmethod
+    def setting_names(self) -> list[str]:
+        """A short name for every setting, with units."""
+
+    @abstractmethod
+    def new_trials(
+        self, draws: Sequence[ValuesBySymbol], settings: Float[np.ndarray, "rows p"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "draws rows"]:
+        """Displacement, m, of a new trial in a new session at each draw of the parameters and each of ``settings``."""
+
+    @abstractmethod
+    def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> Float[np.ndarray, "draws settings"]:
+        """Log-density of the readings of each setting given the parameters and all others; not finite where none."""
+
+    @abstractmethod
+    def without(self, setting: int) -> Self:
+        """Return the experiment without the trials of one setting."""

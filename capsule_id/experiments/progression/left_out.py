@@ -1,0 +1,40 @@
+"""Densities of the trials of a progression at one setting, given the parameters and the trials at all other settings."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.linear import LOG_2PI
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.progression.experiment import Progression
+
+
+def conditional_densities(e: "Progression", draws: Sequence[ValuesBySymbol]) -> Float[np.ndarray, "draws settings"]:
+    """Log-densities at each draw: the trials are jointly normal, sessions and discrepancies integrated out."""
+    means, per_sd = e.responses_of_draws(draws)
+    rows = [np.flatnonzero(column) for column in e.setting.T]
+    return np.stack([_conditional(e, *one, rows) for one in zip(draws, means, per_sd, strict=True)])
+
+
+def _conditional(
+    e: "Progression", theta: ValuesBySymbol, mean: np.ndarray, per_sd: np.ndarray, rows: list[np.ndarray]
+) -> Float[np.ndarray, " settings"]:
+    """From the precision matrix K: y_b given the others has precision K_bb, and residual K_bb^-1 (K y)_b."""
+    misfit = e.misfit_of(theta, mean, per_sd, np).at(theta["trial_sd"], np)
+    covariance = np.diag(misfit.sd**2) + misfit.design @ misfit.design.T
+    try:
+        precision = np.linalg.inv(covariance)
+    except np.linalg.LinAlgError:
+        return np.full(len(rows), -np.inf)
+    # A covariance that is not finite gives NaN.
+    weighted = precision @ misfit.raw
+    found = []
+    for own in rows:
+        block = precision[np.ix_(own, own)]
+        square = float(weighted[own] @ np.linalg.solve(block, weighted[own]))
+        found.append(0.5 * (float(np.linalg.slogdet(block)[1]) - len(own) * LOG_2PI - square))
+    return np.array(found)
