@@ -48,7 +48,7 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     above = range((layout.data_from_line or first + 1) - 2, -1, -1)
     found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width, layout))]
     headers = tuple(names for _, names in found)
-    wanted = [k for k in range(width) if layout.columns is None or _is_wanted(k, headers, layout.columns)]
+    wanted = [k for k in range(width) if layout.columns is None or is_wanted(k, headers, layout.columns)]
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
     rows = plain_rows(file, shape, wanted) or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing)
@@ -65,7 +65,7 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     return Export(path, headers, width, lines, values, place, file.encoding)
 
 
-def _is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:
+def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:
     """Whether a column is named by its number or by a header."""
     return column + 1 in wanted or any(names[column] in wanted for names in headers)
 

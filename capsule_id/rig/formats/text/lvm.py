@@ -4,7 +4,9 @@ The layout is that of "LabVIEW Measurement File", National Instruments. The pack
 and loads pickled copies that lie beside a file, so this reader is the package's own.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +14,17 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.binary.arrays import refuse_line
 from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.text.any_layout import is_wanted
 from capsule_id.rig.formats.text.blocks import Content, TextFile
 from capsule_id.rig.formats.text.cells import BLANKS, cells_of, number_in, read_column, shown_cell
+from capsule_id.rig.formats.text.rows import Rows, Shape, plain_rows
 
 _END = "***End_of_Header***"
 _SPECIAL, _END_SPECIAL = "***Start_Special***", "***End_Special***"
 _TIMES, _COMMENT = "X_Value", "Comment"
 _REMEDY = "export the record again"
+#: Lines in which the headers of a record of one segment end.
+_HEAD = 10_000
 
 
 @dataclass(frozen=True)
@@ -72,10 +78,19 @@ class _File:
             found.append((start, step))
         return found
 
-    def computed(self, channel: int) -> np.ndarray:
-        """The times of a channel, counted from 1."""
-        pairs = zip(self.clocks(channel), self.segments, strict=True)
-        return np.concatenate([start + step * np.arange(len(segment.rows)) for (start, step), segment in pairs])
+    def computed(self, channel: int, sizes: Sequence[int]) -> np.ndarray:
+        """The times of a channel, counted from 1; ``sizes`` are the rows of the segments."""
+        pairs = zip(self.clocks(channel), sizes, strict=True)
+        return np.concatenate([start + step * np.arange(size) for (start, step), size in pairs])
+
+    def sources(self) -> list[int]:
+        """For every column that is returned, the column of the file, or -k for the computed times of channel k."""
+        names = self.segments[0].names
+        channels = range(1, len(names))
+        if not self.times_computed:
+            return list(range(len(names)))
+        alike = len({tuple(self.clocks(channel)) for channel in channels}) == 1
+        return [-1, *channels] if alike else [source for channel in channels for source in (-channel, channel)]
 
     def place(self, line: int, column: int) -> tuple[int, int]:
         """1-based line and character of a cell."""
@@ -102,18 +117,15 @@ def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
     """
     refuse_line(layout, path)
     text = TextFile(content, path)
+    if (long := _one_plain_segment(text, path, layout)) is not None:
+        return long
     file = _take_apart([*text.lines(), ""], path, layout.missing)
-    names = file.segments[0].names
-    channels = range(1, len(names))
-    #: A column of the file, or the computed times of channel k as -k.
-    sources = list(range(len(names)))
-    if file.times_computed:
-        alike = len({tuple(file.clocks(channel)) for channel in channels}) == 1
-        sources = [-1, *channels] if alike else [source for channel in channels for source in (-channel, channel)]
+    sources, names = file.sources(), file.segments[0].names
+    sizes = [len(segment.rows) for segment in file.segments]
 
     def values(column: int) -> np.ndarray:
         source = sources[column]
-        return file.stored(source) if source >= 0 else file.computed(-source)
+        return file.stored(source) if source >= 0 else file.computed(-source, sizes)
 
     numbers = [line for segment in file.segments for line in segment.lines]
 
@@ -122,6 +134,45 @@ def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
 
     headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
     return Export(path, (headers,), len(headers), np.asarray(numbers) + 1, values, place, text.encoding)
+
+
+def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | None:
+    """Read a file with one segment of numbers alone in blocks, and only the wanted columns; None for any other file."""
+    head: list[str] = []
+    ends = 0
+    for line in islice(text.lines(), _HEAD):
+        head.append(line)
+        ends += line.startswith(_END)
+        if ends == 2 and len(head) > 2 and head[-3].startswith(_END):
+            break
+    try:
+        file = _take_apart([*head, ""], path, layout.missing)
+        sources = file.sources()
+    except InputError:
+        return None
+    segment = file.segments[0]
+    headers = tuple(_TIMES if source < 0 else segment.names[source] for source in sources)
+    chosen = [k for k in range(len(headers)) if layout.columns is None or is_wanted(k, (headers,), layout.columns)]
+    stored = sorted({sources[k] for k in chosen if sources[k] >= 0})
+    row = head[segment.lines[0]]
+    width = len(segment.names)
+    trailing = len(segment.rows[0]) == width + 1 and not segment.rows[0][-1].strip()
+    decimal = file.decimal or ("," if "," in row and file.separator != "," else ".")
+    rows: Rows | None = plain_rows(text, Shape(segment.lines[0], file.separator, width, decimal, trailing), stored)
+    if rows is None or rows.lines[-1] - rows.lines[0] + 1 != len(rows.lines):
+        return None
+
+    def values(column: int) -> np.ndarray:
+        source = sources[column]
+        return rows.column(source) if source >= 0 else file.computed(-source, [len(rows.lines)])
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        line = segment.lines[0] - 1 if row is None else int(rows.lines[row]) - 1
+        cells = cells_of(text.line(line), file.separator)
+        source = max(sources[column], 0)
+        return line + 1, cells[source][1] if source < len(cells) else len(text.line(line)) + 1
+
+    return Export(path, (headers,), len(headers), rows.lines, values, place, text.encoding)
 
 
 def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:
