@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy import stats
 
@@ -155,7 +156,11 @@ class Fit(Result):
 
     def predict(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
         """Predict a new trial in a new session at each row of a table; see ``capsule_id.inference.prediction``."""
-        return predict(self, settings, draws, seed)
+        return predict(self, settings, draws, seed).table
+
+    def plot_prediction(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Figure:
+        """Figure of the predictions of ``predict``: mean velocity against period, with the trials of the fit."""
+        return comparisons.side_by_side(predict(self, settings, draws, seed).panels)
 
     def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""

@@ -14,31 +14,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("result", metavar="RESULT", type=Path, help="result directory of fit-params")
     parser.add_argument("settings", metavar="SETTINGS", type=Path, help="table of a progression without distance")
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="table of the predictions, a new file")
+    parser.add_argument("--figure", metavar="PNG", type=Path, help="mean velocities against period too, a new file")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the draws (default 0)")
     add_cache_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write FILE; 0.
+    """Write FILE and the figure; 0.
 
     Raises
     ------
     InputError
-        If RESULT is none, holds no sample or no progression, the settings break a rule, or FILE exists.
+        If RESULT is none, holds no sample or no progression, the settings break a rule, or a file exists.
     """
     if args.seed < 0:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
-    if args.out.exists():
-        raise InputError("--out must name a new file", "it exists", "choose another name", args.out)
+    for option, file in (("--out", args.out), ("--figure", args.figure)):
+        if file is not None and file.exists():
+            raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
     set_xla_options()
     if not args.no_cache:
         keep_programs()
     from capsule_id.api import load
+    from capsule_id.inference.prediction import predict
+    from capsule_id.report.figures.comparisons import side_by_side
+    from capsule_id.report.figures.style import png
 
-    table = load(args.result).predict(args.settings, seed=args.seed)
-    try:
-        table.to_csv(args.out, index=False, float_format="%.6g", lineterminator="\n")
-    except OSError as error:
-        raise InputError("--out must be writable", str(error.strerror), "name another file", args.out) from None
-    say(f"wrote {args.out}: {counted(len(table), 'setting')}")
+    made = predict(load(args.result), args.settings, seed=args.seed)
+    table = made.table.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode()
+    written = [("--out", args.out, table)]
+    if args.figure is not None:
+        written.append(("--figure", args.figure, png(side_by_side(made.panels))))
+    for option, file, content in written:
+        try:
+            file.write_bytes(content)
+        except OSError as error:
+            raise InputError(f"{option} must be writable", str(error.strerror), "name another file", file) from None
+        say(f"wrote {file}: {counted(len(made.table), 'setting')}")
     return 0

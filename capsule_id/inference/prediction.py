@@ -1,5 +1,6 @@
 """Displacement of a capsule robot at new settings, from a fit with progressions."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.inference.result import Result
 from capsule_id.rig.model import Column, Table
 from capsule_id.rig.tables import read_settings
+from capsule_id.views import Comparison
 
 #: Draws of the posterior; the ends of the 95 % interval then have a standard error of a tenth of its sd.
 DRAWS = 1000
@@ -18,7 +20,15 @@ DRAWS = 1000
 READING = "distance"
 
 
-def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted displacements as a table, and panels of mean velocity against period with the trials of the fit."""
+
+    table: pd.DataFrame
+    panels: tuple[Comparison, ...]
+
+
+def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Prediction:
     """Predict a new trial in a new session at each row of a table of settings.
 
     Parameters
@@ -30,7 +40,7 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
 
     Returns
     -------
-    DataFrame with a row per row of ``settings``: ``distance [mm]`` (median), ``distance_lower [mm]`` and
+    Its ``table`` has a row per row of ``settings``: ``distance [mm]`` (median), ``distance_lower [mm]`` and
     ``distance_upper [mm]`` (central 95 %, all scatter included), ``mean_velocity [mm/s]`` (of the median).
 
     Raises
@@ -58,7 +68,7 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
     rows, time = experiment.settings_of(columns)
     trials = 1e3 * experiment.new_trials(values, rows, rng)
     lower, median, upper = np.quantile(trials, [0.025, 0.5, 0.975], axis=0)
-    return pd.DataFrame(
+    table = pd.DataFrame(
         {
             "distance [mm]": median,
             "distance_lower [mm]": lower,
@@ -66,6 +76,8 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
             "mean_velocity [mm/s]": median / time,
         }
     )
+    label = "predicted, 95 % band of a new trial"
+    return Prediction(table, experiment.speed_panels(rows, median / time, (lower / time, upper / time), label))
 
 
 def _check_settings(fitted: Table, columns: dict[str, Column], path: Path) -> None:

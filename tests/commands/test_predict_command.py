@@ -29,3 +29,13 @@ def test_wrong_input_is_named(
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
     assert out.exists() == taken
+
+
+def test_a_figure_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, figure = tmp_path / "predicted.csv", tmp_path / "speeds.png"
+    figure.write_text("kept")
+    asked = ["predict", str(tmp_path), str(tmp_path / "settings.csv"), "--out", str(out), "--figure", str(figure)]
+    assert capsule_id(asked) == 2
+    assert "--figure must name a new file, it exists, choose another name" in capsys.readouterr().err
+    assert not out.exists()
+    assert figure.read_text() == "kept"

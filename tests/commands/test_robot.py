@@ -30,7 +30,9 @@ def test_a_robot_is_fitted_sampled_and_predicted(tmp_path: Path, monkeypatch: py
     (tmp_path / "settings.csv").write_text(SETTINGS)
     made = tmp_path / "predicted.csv"
     asked = ["predict", str(out), str(tmp_path / "settings.csv"), "--out", str(made)]
+    asked += ["--figure", str(made.with_suffix(".png"))]
     assert capsule_id(asked) == 0
+    assert made.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     written = pd.read_csv(made, comment="#")
     loaded = cid.load(out).predict(tmp_path / "settings.csv")
     for name in loaded:

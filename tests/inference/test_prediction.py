@@ -13,6 +13,7 @@ from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, robot_pr
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.prediction import predict
 from capsule_id.inference.result import Result
+from capsule_id.report.figures.comparisons import side_by_side
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
 DESIGN = RobotDesign(PERIODS, np.full(3, 0.3), sessions=3, session_sd=0.05, trial_sd=1e-3)
@@ -39,7 +40,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
 def test_the_band_is_that_of_new_trials_in_new_sessions(result: Result, tmp_path: Path, draws: int, seeds: int) -> None:
     path = tmp_path / "settings.csv"
     path.write_text(SETTINGS)
-    table = predict(result, path, draws=draws)
+    made = predict(result, path, draws=draws)
+    table = made.table
     assert list(table) == ["distance [mm]", "distance_lower [mm]", "distance_upper [mm]", "mean_velocity [mm/s]"]
     # The twin has no two sessions alike: its tables are new trials.
     trials = np.array([robot_progression(seed, DESIGN)["distance [mm]"][::3] for seed in range(seeds)])
@@ -50,6 +52,32 @@ def test_the_band_is_that_of_new_trials_in_new_sessions(result: Result, tmp_path
     )
     time = np.array([60.0 * 67, 80.0 * 50, 100.0 * 40]) * 1e-3
     np.testing.assert_allclose(table["mean_velocity [mm/s]"], table["distance [mm]"] / time)
+    (panel,) = made.panels
+    (curve,), (points,) = panel.curves, panel.points
+    np.testing.assert_allclose(curve.x, [60.0, 80.0, 100.0])
+    for name, drawn in (("distance", curve.y), ("distance_lower", curve.lower), ("distance_upper", curve.upper)):
+        np.testing.assert_allclose(drawn, table[f"{name} [mm]"] / time)
+    measured = 1e3 * result.rig.tables[0]["distance"]
+    np.testing.assert_allclose(sorted(points.y), sorted(measured / np.repeat(time, 3)))
+
+
+def test_settings_of_other_duties_have_panels_of_their_own(result: Result, tmp_path: Path) -> None:
+    """In any order of rows; a duty without trials has no points."""
+    path = tmp_path / "settings.csv"
+    path.write_text("period [ms],duty [%],periods [1]\n80,40,50\n100,30,40\n60,40,67\n")
+    made = predict(result, path, draws=16)
+    assert [panel.title for panel in made.panels] == [
+        "progression, duty 30 %: mean velocity", "progression, duty 40 %: mean velocity",
+    ]  # fmt: skip
+    one, two = made.panels
+    assert [len(points.x) for points in one.points] == [9]
+    assert two.points == ()
+    speed = made.table["mean_velocity [mm/s]"].to_numpy()
+    assert one.curves[0].y.tolist() == [speed[1]]
+    assert two.curves[0].x.tolist() == [60.0, 80.0]
+    assert two.curves[0].y.tolist() == [speed[2], speed[0]]
+    figure = side_by_side(made.panels)
+    assert [ax.get_title(loc="left") for ax in figure.axes] == [panel.title for panel in made.panels]
 
 
 @pytest.mark.parametrize(
@@ -68,4 +96,4 @@ def test_faults_of_the_settings_are_named(result: Result, tmp_path: Path, text: 
     assert rule in str(caught.value)
     assert caught.value.file == str(path)
     path.write_text(SETTINGS)
-    assert len(predict(result, path, draws=1)) == 3
+    assert len(predict(result, path, draws=1).table) == 3

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.rig.model import Column
+from capsule_id.views import Comparison
 
 
 class TrialsExperiment(CapsuleForward):
@@ -43,6 +44,16 @@ class TrialsExperiment(CapsuleForward):
         self, draws: Sequence[ValuesBySymbol], settings: Float[np.ndarray, "rows p"], rng: np.random.Generator
     ) -> Float[np.ndarray, "draws rows"]:
         """Displacement, m, of a new trial in a new session at each draw of the parameters and each of ``settings``."""
+
+    @abstractmethod
+    def speed_panels(
+        self,
+        settings: Float[np.ndarray, "rows p"],
+        centre: Float[np.ndarray, " rows"],
+        limits: tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, " rows"] | None],
+        label: str,
+    ) -> tuple[Comparison, ...]:
+        """Panels of mean velocities: ``centre`` and ``limits`` of its band, mm/s, at ``settings``, and the trials."""
 
     @abstractmethod
     def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> Float[np.ndarray, "draws settings"]:

@@ -32,7 +32,7 @@ from capsule_id.experiments.progression.declaration import (
 )
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.left_out import conditional_densities
-from capsule_id.experiments.progression.panels import new_trials, progression_panels
+from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import pool
@@ -263,6 +263,15 @@ class Progression(TrialsExperiment):
 
     def new_trials(self, draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return new_trials(self, draws, settings, rng)
+
+    def speed_panels(
+        self,
+        settings: np.ndarray,
+        centre: np.ndarray,
+        limits: tuple[np.ndarray | None, np.ndarray | None],
+        label: str,
+    ) -> tuple[Comparison, ...]:
+        return speed_panels(self, settings, centre, limits, label)
 
     def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
         return conditional_densities(self, draws)

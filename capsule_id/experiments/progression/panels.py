@@ -1,6 +1,7 @@
 """Predictions of progressions and their panels: mean velocity against period, for every duty and amplitude."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,31 +43,59 @@ def progression_panels(e: "Progression", theta: ValuesBySymbol, draws: list[Valu
     chosen = draws[:: max(1, len(draws) // BAND_DRAWS)]
     trials = new_trials(e, chosen, settings, np.random.default_rng(BAND_SEED)) if chosen else np.empty((0, 0))
     lower, upper = band(trials * speed if chosen else trials)
+    panels = speed_panels(e, settings, centre, (lower, upper), "this fit, 95 % band of a new trial")
     residuals = np.asarray(e.residuals(theta, np))[: e.n]
-    panels = []
-    for group in np.unique(settings[:, 2:], axis=0):
+    rows = [_rows_of(e, group) for group in _groups(settings)]
+    period = e.setting @ (1e3 * settings[:, 0])
+    return tuple(
+        replace(panel, residual_x=period[own], residuals=residuals[own])
+        for panel, own in zip(panels, rows, strict=True)
+    )
+
+
+def speed_panels(
+    e: "Progression",
+    settings: np.ndarray,
+    centre: np.ndarray,
+    limits: tuple[np.ndarray | None, np.ndarray | None],
+    label: str,
+) -> tuple[Comparison, ...]:
+    """One panel per duty and amplitude of ``settings`` (rows, 4): mean velocity against period, and the trials there.
+
+    Parameters
+    ----------
+    centre, limits : (rows,) mean velocity and the limits of its band, mm/s
+    label : of the curve
+    """
+    speed, panels = 1e3 / e.time, []
+    for group in _groups(settings):
         own = np.flatnonzero(np.all(settings[:, 2:] == group, axis=1))
-        rows = np.flatnonzero(e.setting[:, own].any(axis=1))
-        name = f"{e.label}, duty {100.0 * group[0]:g} %" if e.drive == "pulses" else e.label
-        x = 1e3 * settings[:, 0]
-        curve = Curve(
-            "this fit, 95 % band of a new trial",
-            x[own],
-            centre[own],
-            None if lower is None else lower[own],
-            None if upper is None else upper[own],
-        )
+        own = own[np.argsort(settings[own, 0], kind="stable")]
+        lower, upper = (None if limit is None else limit[own] for limit in limits)
+        rows = _rows_of(e, group)
+        trials = Points(e.label, (e.setting @ (1e3 * e.settings[:, 0]))[rows], (e.distance * (e.setting @ speed))[rows])
+        amplitude = {"column": f", {group[1]:g} N", "current": f", {group[1]:g} A"}.get(e.amplitude_from, "")
+        duty = f", duty {100.0 * group[0]:g} %" if e.drive == "pulses" else ""
         panels.append(
             Comparison(
                 "progression",
                 e.label,
-                f"{name}: mean velocity",
+                f"{e.label}{duty}{amplitude}: mean velocity",
                 "period [ms]",
                 "mean velocity [mm/s]",
-                (Points(e.label, (e.setting @ x)[rows], (e.distance * (e.setting @ speed))[rows]),),
-                (curve,),
-                (e.setting @ x)[rows],
-                residuals[rows],
+                (trials,) if len(rows) else (),
+                (Curve(label, 1e3 * settings[own, 0], centre[own], lower, upper),),
             )
         )
     return tuple(panels)
+
+
+def _groups(settings: np.ndarray) -> np.ndarray:
+    """(groups, 2) duty and amplitude."""
+    return np.unique(settings[:, 2:], axis=0)
+
+
+def _rows_of(e: "Progression", group: np.ndarray) -> np.ndarray:
+    """Rows of the trials with the duty and amplitude of ``group``."""
+    own = np.flatnonzero(np.all(e.settings[:, 2:] == group, axis=1))
+    return np.flatnonzero(e.setting[:, own].any(axis=1))

@@ -3,6 +3,8 @@
 Every panel is ``(thing, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own; labels are plain text.
 """
 
+from collections.abc import Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -132,6 +134,28 @@ def comparison_figure(item: Comparison) -> Figure:
     return figure
 
 
+def side_by_side(items: Sequence[Comparison]) -> Figure:
+    """All panels in one figure, two in a row."""
+    columns = min(len(items), 2)
+    rows = -(-len(items) // columns)
+    figure = new_figure(6.4 * columns, 4.4 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for ax, item in zip_longest(grid.flat, items):
+        if item is None:
+            ax.set_axis_off()
+        else:
+            comparison(item, ax)
+    figure.subplots_adjust(
+        left=0.9 / (6.4 * columns),
+        right=1 - 0.2 / (6.4 * columns),
+        bottom=0.62 / (4.4 * rows),
+        top=1 - 0.39 / (4.4 * rows),
+        wspace=0.2,
+        hspace=0.3,
+    )
+    return figure
+
+
 def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
     """Where each start of the point fit began and ended, per parameter, in standard deviations from the best maximum.
 
@@ -167,11 +191,15 @@ def _draw_curve(ax: Axes, curve: Curve, band_label: str | None, over_cloud: bool
     style = dict(_CURVE_STYLES[curve.role])
     if over_cloud:  # a line as wide as the dots would hide a record that leaves it by less than that
         style["lw"] *= 0.5
-    ax.plot(curve.x, curve.y, label=curve.label, zorder=3, **style)
     if curve.lower is not None and curve.upper is not None:
+        if curve.x.size == 1:
+            reach = [curve.y - curve.lower, curve.upper - curve.y]
+            ax.errorbar(curve.x, curve.y, reach, capsize=4.0, marker="D", label=curve.label, zorder=3, **style)
+            return
         ax.fill_between(
             curve.x, curve.lower, curve.upper, color=style["color"], alpha=0.22, lw=0, zorder=1, label=band_label
         )
+    ax.plot(curve.x, curve.y, label=curve.label, zorder=3, **style)
 
 
 def _draw_points(ax: Axes, points: Points) -> None:
