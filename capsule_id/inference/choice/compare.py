@@ -11,7 +11,7 @@ from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
-from capsule_id.experiments.registry import Registry
+from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.inference.choice.evidence import log_evidence
 from capsule_id.inference.choice.leave_out import (
     LARGEST_SHAPE,
@@ -81,13 +81,18 @@ class _Variant:
 
 
 def compare_models(
-    rig: Rig, words: Sequence[str], registry: Registry, seed: int = 0, progress: OnProgress | None = None
+    rig: Rig,
+    words: Sequence[str],
+    registry: Registry | None = None,
+    seed: int = 0,
+    progress: OnProgress | None = None,
 ) -> Choice:
     """Fit every variant that ``words`` name and compare them by leaving out settings of the progressions.
 
     Parameters
     ----------
     words : some of ``capsule_id.inference.choice.variants.WORDS``
+    registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
     progress : called with (variants done, variants, name of the variant)
 
     Raises
@@ -95,15 +100,15 @@ def compare_models(
     InputError
         If a word is unknown, or the rig has no progression.
     """
-    choices = variants_of(rig, words)
-    if not any(isinstance(e, TrialsExperiment) for e in make_experiments(rig, "all", registry)):
+    choices, kinds = variants_of(rig, words), registry or default_registry()
+    if not any(isinstance(e, TrialsExperiment) for e in make_experiments(rig, "all", kinds)):
         remedy = "compare friction laws of bench tests in the report of fit-params"
         raise InputError("--compare needs a progression, whose settings are left out", "none", remedy)
     fitted = {}
     for number, (name, model) in enumerate(choices.items()):
         if progress:
             progress(number, len(choices), name)
-        fitted[name] = _fit_variant(replace(rig, model=model), registry, seed)
+        fitted[name] = _fit_variant(replace(rig, model=model), kinds, seed)
     return _choose(fitted, choices)
 
 
