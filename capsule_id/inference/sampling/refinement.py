@@ -52,15 +52,17 @@ class _Rounds:
         Raises
         ------
         RuntimeError
-            If no draw has a finite log-posterior.
+            If no draw of any round has a finite log-posterior.
         """
-        if not np.any(np.isfinite(log_posterior)):
-            raise RuntimeError(NO_MASS)
         densities = [proposal.log_density(u) for proposal in self.proposals]
         earlier = np.logaddexp(self._log_drawn, self.proposals[-1].log_density(self._u))
         self._u = np.concatenate([self._u, u])
         self._log_posterior = np.concatenate([self._log_posterior, log_posterior])
         self._log_drawn = np.concatenate([earlier, np.logaddexp.reduce(densities, axis=0)])
+        if not np.any(np.isfinite(self._log_posterior)):
+            raise RuntimeError(NO_MASS)
+        if not np.any(np.isfinite(log_posterior)):
+            return 0.0
         return effective_size(log_posterior - densities[-1])
 
     @property
@@ -95,7 +97,7 @@ def refined(
     prior: Float[np.ndarray, "2 d"],
     rng: np.random.RandomState,
     large: Sequence[bool],
-    rounds: int = SINGLE + SEVERAL,
+    rounds: int | None = None,
 ) -> BlockProposal:
     """Proposal adapted to a posterior, from the proposal ``first``.
 
@@ -105,7 +107,7 @@ def refined(
     prior : centre and width of the normal prior of u; NaN for a parameter with another prior
     large : for each block whether its first proposal stays where it is good enough; where it is not, a block of at most
         ``LARGEST_MAP`` parameters gets a map, a larger one a mixture
-    rounds : largest number of rounds
+    rounds : largest number of rounds, by default ``SINGLE`` + ``SEVERAL``
 
     Raises
     ------
@@ -115,7 +117,7 @@ def refined(
     pairs = zip(first.blocks, first.densities, large, strict=True)
     blocks = [_Rounds(mixture, prior[:, block], own) for block, mixture, own in pairs]
     proposal = first
-    for i in range(rounds):
+    for i in range(rounds or SINGLE + SEVERAL):
         u = proposal.draw(rng, DRAWS)
         inside = np.stack([np.all(np.isfinite(u[:, block]), axis=1) for block in first.blocks], axis=1)
         u = np.where(np.isfinite(u), u, np.nanmean(u, axis=0))
