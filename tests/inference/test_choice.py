@@ -19,11 +19,14 @@ from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.choice import compare, leave_out
 from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models
 from capsule_id.inference.choice.evidence import _bridge, log_evidence
-from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_out
+from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_out, weighted_draws
 from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
 from capsule_id.inference.choice.variants import variants_of
+from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.marginal import density_of
 from capsule_id.rig.model import ModelChoices, Rig
+from tests.experiments import bench
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
 THETA = {**ROBOT, "g": 9.81, "session_sd": 0.05, "trial_scatter": 0.04, "trial_sd": 1e-3, "discrepancy": 2e-4}
@@ -97,7 +100,7 @@ def readings_and_draws(number: int) -> tuple[Any, WeightedDraws]:
     log_weight = posterior - stats.t.logpdf(theta, 6.0, 0.3, 0.8) + 7.0
     values = [{"theta": one} for one in theta]
     nothing = cast(Any, None)
-    return e, WeightedDraws(nothing, nothing, nothing, values, log_weight[:, None], {"theta": 0}, 0)
+    return e, WeightedDraws(nothing, nothing, nothing, log_weight[:, None], {"theta": 0}, np.arange(number), values)
 
 
 def test_readings_left_out_have_their_predictive_density() -> None:
@@ -145,6 +148,31 @@ def test_the_evidence_is_that_of_the_closed_form(outside: int) -> None:
     assert abs(_bridge(weights[:2000], weights[2000:]) - 7.0) > 0.1
 
 
+def test_the_evidence_of_a_bench_test_is_that_of_quadrature() -> None:
+    """Draws of the adapted proposal of two springs, each a block of its own; by sums over stiffness and scatter."""
+    force = np.array([1.0, 2.1, 2.9, 4.2, 4.8, 6.1])
+    columns = bench.column("deflection", 1e-4 * np.arange(1.0, 7.0)), bench.column("force", force)
+    other = columns[0], bench.column("force", 3.0 * force + np.array([0.1, -0.1, 0.0, 0.2, -0.2, 0.1]))
+    tables = [
+        bench.table("support_spring", own, label, spring=label) for own, label in ((columns, "soft"), (other, "stiff"))
+    ]
+    rig = bench.rig(*tables)
+    target = LogPosterior(rig, make_experiments(rig))
+    fit, density = point_fit(target, 0), density_of(target)
+    draws = weighted_draws(target, fit, 0)
+    assert draws.log_weight.shape == (leave_out.DRAWS, 2)
+    rng, total = np.random.default_rng(0), 0.0
+    for block in target.blocks:
+        grid = np.meshgrid(*(fit.u[i] + np.linspace(-12.0, 12.0, 401) * fit.covariance[i, i] ** 0.5 for i in block))
+        u = np.repeat(fit.u[None], grid[0].size, axis=0)
+        u[:, block] = np.stack([each.ravel() for each in grid], axis=1)
+        cell = np.prod([24.0 / 400.0 * fit.covariance[i, i] ** 0.5 for i in block])
+        total += np.logaddexp.reduce(density(u)) + np.log(cell)
+    exact = total - density(fit.u[None])[0]
+    found, errors = np.array([log_evidence(own, rng) for own in draws.log_weight.T]).T
+    assert np.sum(found) == pytest.approx(exact, abs=4.0 * np.linalg.norm(errors) + 0.01)
+
+
 def test_a_comparison_of_a_robot(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Draws near the true values stand for the adapted proposals. The truth has the lag of 8 ms."""
 
@@ -154,7 +182,8 @@ def test_a_comparison_of_a_robot(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> N
         u = centre + 0.01 * np.random.default_rng(0).standard_normal((40, target.dimension))
         values = [target.mapping(theta) for theta in target.theta(u)]
         nothing = cast(Any, None)
-        return WeightedDraws(target, nothing, nothing, values, np.zeros((40, 1)), dict.fromkeys(target.names, 0), 0)
+        block = dict.fromkeys(target.names, 0)
+        return WeightedDraws(target, nothing, nothing, np.zeros((40, 1)), block, np.arange(40), values)
 
     monkeypatch.setattr(compare, "joint_fit", lambda *_: None)
     for module in (compare, leave_out):

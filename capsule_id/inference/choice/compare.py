@@ -126,9 +126,8 @@ def _fit_variant(rig: Rig, registry: Registry, seed: int) -> _Variant:
             refits += 1
         tables.append(left_out_predictions(e, own, seed))
         found += own
-    rng, outside = np.random.default_rng(seed), np.full((draws.outside, draws.log_weight.shape[1]), -np.inf)
-    blocks = rng.permutation(np.concatenate([draws.log_weight, outside])).T
-    evidence, errors = np.array([log_evidence(block, rng) for block in blocks]).T
+    rng = np.random.default_rng(seed)
+    evidence, errors = np.array([log_evidence(block, rng) for block in draws.log_weight.T]).T
     return _Variant(
         target.dimension,
         np.array([one.density for one in found]),

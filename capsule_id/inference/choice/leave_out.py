@@ -35,23 +35,24 @@ class WeightedDraws:
     Attributes
     ----------
     target, fit : posterior, and the point fit that the adaptation began with
-    values : values by name of the m draws inside the posterior
-    log_weight : (m, blocks) log of posterior over proposal density of each block of parameters
+    log_weight : (n, blocks) log of posterior over proposal density of each block of parameters; -inf outside
     block : block of each parameter by name
-    outside : number of draws outside
+    inside, values : indices (m,) of the draws inside the posterior, and their values by name
     """
 
     target: LogPosterior
     fit: PointFit
     proposal: BlockProposal
-    values: list[dict[str, float]]
     log_weight: np.ndarray
     block: Mapping[str, int]
-    outside: int
+    inside: np.ndarray
+    values: list[dict[str, float]]
 
     def of(self, e: TrialsExperiment) -> Float[np.ndarray, " m"]:
         """Log-weights of the block that ``e`` depends on."""
-        return self.log_weight[:, next(self.block[row.name] for row in e.parameters if row.name in self.block)]
+        return self.log_weight[
+            self.inside, next(self.block[row.name] for row in e.parameters if row.name in self.block)
+        ]
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,15 @@ def weighted_draws(target: LogPosterior, fit: PointFit, seed: int, first: BlockP
     marginal, random = MarginalPosterior(target, fit), np.random.RandomState(seed)
     proposal = adapted_proposal(marginal, random, first)
     v = proposal.draw(random, DRAWS)
-    v = v[np.all(np.isfinite(v), axis=1)]
-    log_weight = marginal.parts(v) - proposal.log_density(v)
-    inside = np.all(np.isfinite(log_weight), axis=1)
+    known = np.stack([np.all(np.isfinite(v[:, block]), axis=1) for block in marginal.blocks], axis=1)
+    v = np.where(np.isfinite(v), v, np.nanmean(v, axis=0))
+    log_weight = np.where(known, marginal.parts(v) - proposal.log_density(v), -np.inf)
+    inside = np.flatnonzero(np.all(np.isfinite(log_weight), axis=1))
     u, _ = marginal.restore(v[inside], seed)
     located = np.flatnonzero(~target.integrated)
     label = {target.names[i]: k for k, block in enumerate(marginal.blocks) for i in located[block]}
     values = [target.mapping(theta) for theta in target.theta(u)]
-    return WeightedDraws(target, fit, proposal, values, log_weight[inside], label, DRAWS - len(u))
+    return WeightedDraws(target, fit, proposal, log_weight, label, inside, values)
 
 
 def leave_settings_out(e: TrialsExperiment, draws: WeightedDraws) -> list[LeftOut]:
