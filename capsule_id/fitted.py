@@ -158,7 +158,7 @@ class Fit(Result):
         """Predict a new trial in a new session at each row of a table; see ``capsule_id.inference.prediction``."""
         return predict(self, settings, draws, seed).table
 
-    def plot_prediction(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Figure:
+    def prediction_figure(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Figure:
         """Figure of the predictions of ``predict``: mean velocity against period, with the trials of the fit."""
         return comparisons.side_by_side(predict(self, settings, draws, seed).panels)
 
