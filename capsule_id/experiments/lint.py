@@ -87,7 +87,12 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
     for names, members in groups.items():
         by_label = {table.label: table for table in members}
         readings = [
-            Readings(table.label, _matrix([table[name] for name in names]), "time" in table.columns)
+            Readings(
+                table.label,
+                _matrix([table[name] for name in names]),
+                "time" in table.columns,
+                tuple(table.columns[name].to_display for name in names),
+            )
             for table in members
         ]
         for block in repeated_blocks(readings):

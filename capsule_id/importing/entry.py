@@ -1,7 +1,7 @@
 """Writes the entry of ``rig.toml`` that reads an export, with a comment and a confidence at every guess."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
 from capsule_id.experiments.registry import default_registry
 from capsule_id.importing.guess import TIME, ColumnGuess, Guess, disordered_times, free_part, guess
+from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
 from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
@@ -73,7 +74,7 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
         If the file cannot be read.
     """
     found = find_layout(content, path, dimensions_of(kinds))
-    guessed = guess(found, kinds)
+    guessed, unread = guess(found, kinds), list(_unread_lines(found, dimensions_of(kinds)))
     if guessed is None:
         words = " ".join(kinds)
         headers = ", ".join(name for name in found.names if name) or "none"
@@ -88,6 +89,7 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
                 if times
                 else []
             ),
+            *unread,
             f"#: Write one of {words}, and the columns of that kind.",
             "# [[experiment]]",
             '# kind = "..."',
@@ -96,12 +98,25 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
         ]
         return "\n".join(lines) + "\n", None
     kind = kinds[guessed.kind]
-    lines = ["[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
+    lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
     lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
     lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
     lines += _setting_lines(found, guessed, kind, file)
     lines += ["[experiment.columns]", *_column_lines(found, guessed)]
     return "\n".join(lines) + "\n", guessed
+
+
+def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str]:
+    """A comment on every column with the unit of a reading, or the name of a time, whose cells are not all numbers."""
+    for index, error in found.unread.items():
+        name, text = name_and_unit(found.names[index], dimensions)
+        text = text or found.units[index]
+        if not fits_name(name, TIME) and (not text or unit_of(text, dimensions) is None):
+            continue
+        remedy = "Correct the cell or delete the row, or list its text in missing."
+        if ":" in error.value:
+            remedy = "Export times as seconds, or state the sampling rate."
+        yield f"#: {found.names[index]!r} is not read: line {error.line} has {' '.join(error.value.split())}. {remedy}"
 
 
 def _commented(line: str, confidence: str, reason: str) -> str:

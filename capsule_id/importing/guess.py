@@ -1,7 +1,7 @@
 """Guesses the kind of experiment of an export, and which of its columns and units are those of the kind."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -106,8 +106,11 @@ def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
             if scored is not None:
                 scores[i, j], guesses[i, j] = scored
         rows, places = linear_sum_assignment(scores, maximize=True)
+        pairs = [(i, j) for i, j in zip(rows, places, strict=True) if (i, j) in guesses]
+        used = {j for _, j in pairs}
         chosen = {
-            wanted[i]: (guesses[i, j], scores[i, j]) for i, j in zip(rows, places, strict=True) if (i, j) in guesses
+            wanted[i]: (_with_rival(guesses[i, j], _rival(found, scores[i], float(scores[i, j]), used)), scores[i, j])
+            for i, j in pairs
         }
         if not needed <= set(chosen) or (kind.channels and not set(kind.channels) & set(chosen)):
             continue
@@ -115,6 +118,25 @@ def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
             continue
         score = sum(score for _, score in chosen.values()) + LEFT_OUT * (len(columns) - len(set(columns) & set(chosen)))
         yield _Candidate(kind, {name: column for name, (column, _) in chosen.items()}, float(score))
+
+
+def _rival(found: FoundLayout, scores: np.ndarray, score: float, used: Container[int]) -> str | None:
+    """A column of the file that is not ``used`` but fits as well as the chosen one, in words; None where there is none.
+
+    ``scores`` (columns,) for one wanted column, ``score`` that of the chosen one.
+    """
+    better = [j for j in np.flatnonzero(scores >= score).tolist() if j not in used]
+    if not better:
+        return None
+    index = list(found.columns)[better[0]]
+    return f"column {index + 1}, {found.names[index]!r}," if found.names[index] else f"column {index + 1}"
+
+
+def _with_rival(column: ColumnGuess, rival: str | None) -> ColumnGuess:
+    """The guess, unsure where another column fits as well."""
+    if rival is None:
+        return column
+    return replace(column, confidence="unsure", reason=f"{column.reason}; {rival} fits as well")
 
 
 def _score(

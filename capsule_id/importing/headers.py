@@ -7,8 +7,20 @@ from capsule_id.rig.units import UnitError, factor_to_si
 
 #: Words for a column of a kind, by its name; a column is always known by its own name too.
 WORDS: Mapping[str, tuple[str, ...]] = {
-    "time": ("time", "t", "zeit", "temps", "elapsed", "timestamp", "clock", "value"),
-    "x_rel": ("relative", "displacement", "disp", "deflection", "position", "pos", "x", "weg", "laser", "auslenkung"),
+    "time": ("time", "t", "zeit", "temps", "tiempo", "elapsed", "timestamp", "clock", "value"),
+    "x_rel": (
+        "relative",
+        "displacement",
+        "disp",
+        "deflection",
+        "position",
+        "pos",
+        "x",
+        "weg",
+        "laser",
+        "auslenkung",
+        "desplazamiento",
+    ),
     "x_capsule": ("capsule", "kapsel", "housing"),
     "x_base": ("base", "shaker"),
     "acceleration_rod": ("acceleration", "acc", "accel", "accelerometer", "beschleunigung", "a"),
@@ -19,7 +31,7 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "angle": ("angle", "tilt", "winkel", "inclination", "neigung", "theta", "alpha"),
     "height": ("height", "hoehe", "höhe", "h"),
     "length": ("length", "laenge", "länge", "l", "board"),
-    "speed": ("speed", "velocity", "v", "geschwindigkeit", "vitesse"),
+    "speed": ("speed", "velocity", "v", "v0", "geschwindigkeit", "vitesse"),
     "distance": ("distance", "travel", "slide", "strecke", "weg", "x", "d", "displacement"),
     "deflection": ("deflection", "displacement", "disp", "compression", "extension", "verformung", "weg", "x"),
     "coefficient": ("coefficient", "mu", "reibwert"),

@@ -33,6 +33,7 @@ class FoundLayout:
     layout : what ``rig.toml`` must state, with all possible markers
     names, units : of every column, "" where the file has none
     columns : index of a column of readings -> (rows,) numbers, NaN where missing
+    unread : index of any other column -> the error at its first cell that is no number
     rate : sampling rate that the file states, Hz
     """
 
@@ -42,6 +43,7 @@ class FoundLayout:
     names: tuple[str, ...]
     units: tuple[str, ...]
     columns: dict[int, np.ndarray]
+    unread: dict[int, InputError]
     rate: float | None
 
 
@@ -71,9 +73,9 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
     else:
         layout = Layout(missing=MARKERS)
     export = EXPORTS[suffix](content, path, layout)
-    columns, singles = _readings(export)
+    columns, singles, unread = _readings(export)
     names, units = _headers(export, dimensions)
-    return FoundLayout(path, export, layout, names, units, columns, _rate(beginning, names, singles))
+    return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles))
 
 
 def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
@@ -126,7 +128,9 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
             except InputError as error:
                 first = first or error
                 continue
-            columns, _ = _readings(export)
+            columns, _, unread = _readings(export)
+            if not columns and unread:
+                first = first or unread[min(unread)]
             if columns and len(export.lines) == 1:
                 rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
                 first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
@@ -136,13 +140,16 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
     raise first
 
 
-def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float]]:
-    """The columns of readings, all of the most frequent length, and the columns of one number."""
-    columns, singles = {}, {}
+def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]:
+    """The columns of readings, all of the most frequent length; the columns of one number; errors of all others."""
+    columns: dict[int, np.ndarray] = {}
+    singles: dict[int, float] = {}
+    unread: dict[int, InputError] = {}
     for column in range(export.width):
         try:
             values = export.values(column)
-        except InputError:
+        except InputError as error:
+            unread[column] = error
             continue
         if values.size == 1:
             singles[column] = float(values[0])
@@ -152,7 +159,7 @@ def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float]]:
     common = max(set(sizes), key=lambda size: (sizes.count(size), size)) if sizes else 0
     longest = max(sizes, default=0)
     common = longest if common == 1 else common
-    return {column: values for column, values in columns.items() if values.size == common}, singles
+    return {column: values for column, values in columns.items() if values.size == common}, singles, unread
 
 
 def _headers(export: Export, dimensions: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -189,3 +189,55 @@ def test_an_export_of_one_row_is_refused_with_its_line(tmp_path: Path, capsys: p
     assert "one.csv:2: an export must have two rows of numbers or more, one row" in capsys.readouterr().err
     assert cli.capsule_id(["import", str(tmp_path)]) == 2
     assert "a directory" in capsys.readouterr().err
+
+
+def two_columns(first: str, second: str) -> str:
+    """Rows of a time, a decay and a second decay."""
+    rows = [line.split(",") for line in decay_rows().splitlines()]
+    return f"Time (s),{first},{second}\n" + "".join(f"{t},{x},{-0.8 * float(x):.3f}\n" for t, x in rows)
+
+
+@pytest.mark.parametrize(
+    ("headers", "rival"),
+    [
+        (("Acceleration x (m/s^2)", "Acceleration y (m/s^2)"), "column 3, 'Acceleration y (m/s^2)', fits as well"),
+        (("x (mm)", "x (mm)"), "column 3, 'x (mm)', fits as well"),
+        (("Disp (mm)", "Temp (degC)"), None),
+    ],
+)
+def test_of_two_columns_that_fit_alike_none_is_sure(
+    tmp_path: Path, headers: tuple[str, str], rival: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "decay.csv"
+    file.write_text(two_columns(*headers), encoding="utf-8")
+    assert cli.capsule_id(["import", str(file)]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if re.match("x_rel|acceleration", line)]
+    assert ("# unsure" in line) == (rival is not None)
+    assert rival is None or rival in line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ("0.0000,", "00:00:00.000,", "'Time (s)' is not read: line 2 has '00:00:00.000'. Export times as seconds"),
+        (",2.500\n", ",OVER\n", "'Disp (mm)' is not read: line 2 has 'OVER'. Correct the cell"),
+        ("0.1995,", "Mean,", "'Time (s)' is not read: line 401 has 'Mean'. Correct the cell or delete the row"),
+    ],
+)
+def test_a_column_with_a_cell_that_is_no_number_is_named(
+    tmp_path: Path, old: str, new: str, part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "decay.csv"
+    text = "Time (s),Disp (mm)\n" + decay_rows()
+    assert text.count(old) == 1
+    for written_text, named in ((text, False), (text.replace(old, new), True)):
+        file.write_text(written_text, encoding="utf-8")
+        assert cli.capsule_id(["import", str(file)]) == 0
+        assert (part in capsys.readouterr().out) == named
+
+
+def test_a_second_table_in_a_file_is_named_by_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = "time [s],x_rel [mm]\n" + decay_rows()
+    (tmp_path / "two.csv").write_text(f"{text}\n{text}", encoding="utf-8")
+    assert cli.capsule_id(["import", str(tmp_path / "two.csv")]) == 2
+    assert "two.csv:403:1: a cell must be a number, 'time [s]'" in capsys.readouterr().err

@@ -303,3 +303,16 @@ def test_repeated_rows_of_a_table_of_readings() -> None:
 
 def test_the_decay_of_these_tests_is_that_of_the_bench() -> None:
     assert C / (2.0 * np.sqrt(K1 * M1)) == pytest.approx(0.156, abs=1e-3)
+
+
+def test_equal_readings_of_a_coarse_angle_are_no_repeated_rows() -> None:
+    """Tilts read to 0.1 deg agree by chance; in rad their step is no decimal one."""
+    angles = np.round(33.0 + np.random.default_rng(0).standard_normal(12), 1)
+    assert len(np.unique(angles)) < len(angles)
+    degrees = Readings("tilts", np.deg2rad(angles)[:, None], False, (180.0 / np.pi,))
+    assert repeated_blocks([degrees]) == []
+    # Negative control: angles read to 1e-6 deg do not agree by chance.
+    fine = angles + 1e-6 * np.arange(12) ** 2
+    fine[5:7] = fine[2:4]
+    (found,) = repeated_blocks([Readings("tilts", np.deg2rad(fine)[:, None], False, (180.0 / np.pi,))])
+    assert (found.row, found.first_row, found.count) == (5, 2, 2)

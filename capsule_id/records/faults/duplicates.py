@@ -31,11 +31,19 @@ MOST_LEVELS, MOST_LEVELS_OF_RECORD = 0.5, 0.9
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of one table: (n, columns) in one unit per column, without time; ``record``: a time series."""
+    """Readings of one table without time.
+
+    Attributes
+    ----------
+    values : (n, columns), in units that are the same in all tables
+    record : a time series
+    to_display : (columns,) factors to the units in which the readings were written; (): 1
+    """
 
     label: str
     values: np.ndarray
     record: bool
+    to_display: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -78,8 +86,10 @@ def _largest(values: np.ndarray) -> float:
 def chance_of_equality(readings: Readings) -> float:
     """Probability that two independent rows agree in all columns; 1 where the reading step hides the scatter."""
     chance = 1.0
-    for values in readings.values.T:
-        step, width = reading_step(values), TABLE_SCATTER * float(np.ptp(values))
+    factors = readings.to_display or (1.0,) * readings.values.shape[1]
+    for values, factor in zip(readings.values.T, factors, strict=True):
+        # A step of 0.1 deg is a decimal one in deg alone.
+        step, width = reading_step(factor * thinned(values)) / factor, TABLE_SCATTER * float(np.ptp(values))
         if readings.record and len(values) >= SHORTEST_RECORD:
             width = WIDTH * noise_level(values)
         # A step of 0 is that of float64.

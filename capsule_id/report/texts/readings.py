@@ -14,6 +14,18 @@ def _unusual(facts: Facts) -> str:
     )
 
 
+def _repeated(facts: Facts) -> str:
+    """The rows that stand twice."""
+    line, last, first, end = (facts[key] for key in ("line", "last", "first_line", "first_last"))
+    later, earlier = f"lines {line} to {last} repeat lines", f"{first} to {end}"
+    if line == last:
+        later, earlier = f"line {line} repeats line", f"{first}"
+    return (
+        f"{facts['file']}:{line}: each reading must stand once; {later} {earlier} of {facts['first']}. "
+        f"Delete the repeated {'row' if line == last else 'rows'}."
+    )
+
+
 DATA_MESSAGES: Mapping[str, Message] = {
     "masses.exact": Message(
         "masses", warn="{name}: no sd stated, so its value counts as exact. State the weighing error."
@@ -51,10 +63,7 @@ DATA_MESSAGES: Mapping[str, Message] = {
     ),
     "readings.repeated": Message(
         "repeated readings",
-        fail=(
-            "{file}:{line}: each reading must stand once; lines {line} to {last} repeat lines {first_line} to {first_last} of "
-            "{first}. Delete the repeated rows."
-        ),
+        fail=_repeated,
     ),
     "readings.magnitude": Message("magnitudes", warn=_unusual),
     "readings.gaps": Message(
