@@ -5,6 +5,7 @@ Twin of a measured pendulum from 3.2 s on: dry friction beside the viscous, in a
 
 import re
 import tomllib
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -97,6 +98,17 @@ def test_with_the_remedy_c_is_trusted_and_covered(short: Fit) -> None:
     row = fit.summary.loc["c"]
     assert row["trust"] == "trusted"
     assert row["lower"] < DRY["c"] < row["upper"]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_the_default_prior_of_a_force_follows_the_size_of_the_rig(scale: float) -> None:
+    """One median for all rigs preferred no dry friction in a measured pendulum: c = 0.44 ± 0.04 where it is 0.21."""
+    table = decay_table(SHORT, DRY, damping=("viscous", "dry", "quadratic"))
+    columns = {**table.columns, "x_rel": replace(table.columns["x_rel"], values=scale * table["x_rel"])}
+    (record,) = make_experiments(bench.rig(replace(table, columns=columns)))
+    median = {row.symbol: row.prior.location for row in record.parameters if row.symbol in ("F_dry", "c_q")}
+    assert median["F_dry"] == pytest.approx(0.05 * bench.K1 * scale * RELEASE, rel=0.1)
+    assert median["c_q"] == pytest.approx(0.05 * bench.M1 / (scale * RELEASE), rel=0.1)
 
 
 def test_the_longer_record_in_the_text_names_dry_friction() -> None:

@@ -41,7 +41,7 @@ from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Ch
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
-from capsule_id.experiments.free_vibration.starts import decay_starts, first_turning_point
+from capsule_id.experiments.free_vibration.starts import decay_starts, first_turning_point, further_parameters
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_comparison, decay_table, second_fit_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -151,8 +151,7 @@ class FreeVibration(SurfaceExperiment):
             self.side = float(np.sign(turning[1]))
             # The margin allows for a frequency 1.25 times the rough estimate.
             self.half_cycles = int(1.25 * rough.Omega_o * float(self.time[-1]) / np.pi) + 5
-            hardening = Prior("normal", 0.0, rough.k1 / self.largest_deflection**2)
-            rows += [parameter(s, prior=hardening if s == "k_cubic" else None) for s in self.model.symbols]
+            rows += further_parameters(self.model.symbols, rough.k1, self.mass, self.largest_deflection)
             rows += [
                 AMPLITUDE.named(
                     table.label, Prior("lognormal", self.deflection * float(np.ptp(self.values)), NUISANCE_WIDTH)

@@ -1,18 +1,35 @@
 """Starting points of a fit of free decays."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from capsule_id.experiments.base import Start
 from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium
+from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.noise import noise_level
 
 #: Latest first turning point after the first sample, in half periods.
 LATEST_TURNING_POINT = 0.1
+#: Log-normal priors of dry friction and quadratic damping: median relative to k1 x and m1/x, and factor.
+FURTHER_MEDIAN, FURTHER_FACTOR = 0.05, 100.0
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
+
+
+def further_parameters(symbols: Sequence[str], k1: float, m1: float, size: float) -> list[Parameter]:
+    """Rows of the forces in ``symbols``, SI, with priors relative to what the rod feels at its largest deflection ``size``.
+
+    A prior far below that would prefer the absence of a force that the record does not exclude, and the c beside it.
+    """
+    priors = {
+        "F_dry": Prior("lognormal", FURTHER_MEDIAN * k1 * size, FURTHER_FACTOR),
+        "c_q": Prior("lognormal", FURTHER_MEDIAN * m1 / size, FURTHER_FACTOR),
+        "k_cubic": Prior("normal", 0.0, k1 / size**2),
+    }
+    return [parameter(symbol, prior=priors[symbol]) for symbol in symbols]
 
 
 def decay_starts(e: "FreeVibration") -> dict[str, Start]:

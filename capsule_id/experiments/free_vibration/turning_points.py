@@ -13,6 +13,7 @@ from capsule_id.experiments.free_vibration.decay_models import half_cycles
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
+from capsule_id.experiments.free_vibration.starts import further_parameters
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Prior, parameter
@@ -57,14 +58,14 @@ class TurningPoints(SurfaceExperiment):
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.time_width = NUISANCE_WIDTH * float(self.time[-1])
         self.reading_sd, self.time_reading_sd = table.columns["x_rel"].reading_sd, table.columns["time"].reading_sd
-        size = float(np.ptp(self.values)), float(np.median(step))
-        noise = [Prior("lognormal", NOISE_FRACTION * scale, NOISE_FACTOR) for scale in size]
+        scales = float(np.ptp(self.values)), float(np.median(step))
+        noise = [Prior("lognormal", NOISE_FRACTION * scale, NOISE_FACTOR) for scale in scales]
         self.clock_rate = stated_rate(table)
         self.about = About(table, rig, ())
         rough = self.paper_decrement()
-        hardening = Prior("normal", 0.0, rough.k1 / float(np.max(np.abs(rough.peaks))) ** 2)
+        size = float(np.max(np.abs(rough.peaks)))
         rows = [parameter("k1"), parameter("c")]
-        rows += [parameter(s, prior=hardening if s == "k_cubic" else None) for s in self.model.symbols]
+        rows += further_parameters(self.model.symbols, rough.k1, rig.mass("m1"), size)
         rows += [
             AMPLITUDE.named(table.label, Prior("lognormal", abs(float(rough.peaks[0])), NUISANCE_WIDTH)),
             NOISE_SD.named(table.label, noise[0]),
