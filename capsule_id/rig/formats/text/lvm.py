@@ -159,7 +159,10 @@ def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | N
     trailing = len(segment.rows[0]) == width + 1 and not segment.rows[0][-1].strip()
     decimal = file.decimal or ("," if "," in row and file.separator != "," else ".")
     rows: Rows | None = plain_rows(text, Shape(segment.lines[0], file.separator, width, decimal, trailing), stored)
-    if rows is None or rows.lines[-1] - rows.lines[0] + 1 != len(rows.lines):
+    # Rows must follow one another without comments and blank lines, and nothing may follow them.
+    if rows is None or (rows.lines[0], rows.lines[-1]) != (segment.lines[0] + 1, segment.lines[0] + len(rows.lines)):
+        return None
+    if any(line.strip() for line in text.lines(int(rows.lines[-1]))):
         return None
 
     def values(column: int) -> np.ndarray:
