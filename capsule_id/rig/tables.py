@@ -310,6 +310,9 @@ def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.nda
         text, remedy = f"{name} must increase from row to row", "sort the rows and delete repeated ones"
         for first in range(0, len(values) - 1, IN_MEMORY):
             rises = np.diff(values[first : first + IN_MEMORY + 1]) > 0.0
+            fall = first + int(np.argmin(rises))
+            if table.file_of(fall + 1, index) != table.file_of(fall, index):
+                remedy = "name the files in the order of time, or make an experiment of each"
             _raise_at_first_false(table, index, rises, (text, remedy), first + 1)
 
 

@@ -97,6 +97,10 @@ def _registry() -> "pint.UnitRegistry":
     return registry
 
 
+#: Units of the output of a sensor.
+_SIGNALS = ("V", "mV")
+
+
 @cache
 def factor_to_si(unit: str, si: str) -> float:
     """The factor from ``unit`` to the SI unit ``si``.
@@ -117,6 +121,9 @@ def factor_to_si(unit: str, si: str) -> float:
         raise UnitError("a unit is a product of symbols, e.g. kN/m, N*s/m or m/s^2 (1: no unit)", remedy)
     for symbol in re.findall(r"g_n|[A-Za-z]+", written):
         if symbol not in _DEFINITIONS:
+            if symbol in _SIGNALS and si != "1":
+                remedy += f" and the factor to it: columns = {{ ... = {{ from = 1, unit = ..., scale = ... }} }}, per {symbol}"
+                raise UnitError(f"a reading in {symbol} needs the sensitivity of its sensor", remedy)
             close = get_close_matches(symbol, _DEFINITIONS, n=1)
             raise UnitError(f"unknown unit symbol {symbol}", f"{remedy}; did you mean {close[0]}?" if close else remedy)
     (factor, base), (_, wanted) = (_registry().get_base_units(each) for each in (written, si))

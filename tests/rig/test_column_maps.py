@@ -82,6 +82,28 @@ def test_an_unknown_column_proposes_a_map(tmp_path: Path) -> None:
     assert_read(rig_of(tmp_path, {}, f'file = "t.csv"\n{proposed[0]}'))
 
 
+def test_files_in_another_order_than_time_are_named(tmp_path: Path) -> None:
+    text = LAB.splitlines(keepends=True)
+    files: dict[str, str | bytes] = {"a.csv": "".join(text[:7]), "b.csv": text[0] + "".join(text[7:])}
+    fault = fault_of(tmp_path, files, f'files = ["b.csv", "a.csv"]\n{MAP}')
+    assert str(fault).startswith(f"{tmp_path}/a.csv:2:1: ")
+    assert fault.remedy == "name the files in the order of time, or make an experiment of each"
+    assert_read(rig_of(tmp_path, {}, f'files = ["a.csv", "b.csv"]\n{MAP}'))
+    # Within one file the rows are at fault.
+    fault = fault_of(tmp_path, {"c.csv": "".join([*text, text[3]])}, f'file = "c.csv"\n{MAP}')
+    assert fault.remedy == "sort the rows and delete repeated ones"
+
+
+def test_a_reading_in_volts_needs_a_scale(tmp_path: Path) -> None:
+    volts = "Time (s),Disp (V)\n" + LAB.split("\n", 1)[1]
+    wrong = 'columns = { time = { from = "Time (s)", unit = "s" }, x_rel = { from = "Disp (V)", unit = "V" } }'
+    fault = fault_of(tmp_path, {"lab.csv": volts}, f'file = "lab.csv"\n{wrong}')
+    assert fault.rule == "a reading in V needs the sensitivity of its sensor"
+    assert "scale = ..." in fault.remedy
+    scaled = wrong.replace('unit = "V"', 'unit = "mm", scale = 1.0')
+    assert_read(rig_of(tmp_path, {}, f'file = "lab.csv"\n{scaled}'))
+
+
 EXTRA = np.round(7.0 - TIME, 3)
 BY_NUMBER = 'columns = { time = { from = 1, unit = "s" }, x_rel = { from = 3, unit = "mm" } }'
 BY_NAME = 'columns = { time = { from = "t", unit = "s" }, x_rel = { from = "x", unit = "mm" } }'
