@@ -128,6 +128,11 @@ HOSTILE = {
     ),
     "1. control characters in a header": (".lvm", lambda: lvm(COLUMNS).replace(b"\tx\t", b"\t\x01\t"), None),
     "1. other channels": (".lvm", lambda: lvm(COLUMNS, parts=2).replace(b"\tx\t", b"\t\x01\t", 1), "same columns"),
+    "7. rows that are comments alone": (
+        ".lvm",
+        lambda: b"LabVIEW Measurement\t\n" + 2 * b"***End_of_Header***\t\n" + b"X_Value\tx\tComment\n#3,0\t025\t0,35\n\t\n",
+        "a cell must be a number",
+    ),
     "3. scales of a channel": (
         ".tdms",
         lambda: tdms(COLUMNS).replace(b"Scales\x07\0\0\0\x01\0\0\0", b"Scales\x07\0\0\0\xff\xff\xff\x7f"),

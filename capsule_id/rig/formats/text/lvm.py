@@ -160,7 +160,9 @@ def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | N
     decimal = file.decimal or ("," if "," in row and file.separator != "," else ".")
     rows: Rows | None = plain_rows(text, Shape(segment.lines[0], file.separator, width, decimal, trailing), stored)
     # Rows must follow one another without comments and blank lines, and nothing may follow them.
-    if rows is None or (rows.lines[0], rows.lines[-1]) != (segment.lines[0] + 1, segment.lines[0] + len(rows.lines)):
+    if rows is None or len(rows.lines) == 0:
+        return None
+    if (rows.lines[0], rows.lines[-1]) != (segment.lines[0] + 1, segment.lines[0] + len(rows.lines)):
         return None
     if any(line.strip() for line in text.lines(int(rows.lines[-1]))):
         return None
