@@ -132,7 +132,7 @@ def _compare(args: argparse.Namespace, rig: Rig, kinds: Registry) -> int:
         keep_programs()
     from capsule_id.inference.choice.compare import compare_models
 
-    with Progress(not args.quiet) as progress:
+    with Progress(not args.quiet, "variant") as progress:
         choice = compare_models(rig, args.compare.split(","), kinds, args.seed, progress)
     say(choice.text)
     return 0

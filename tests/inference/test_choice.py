@@ -69,6 +69,13 @@ def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
         np.testing.assert_allclose(found[:, setting], joint_density(e) - joint_density(smaller), rtol=1e-6)
 
 
+def test_absurd_values_have_no_density(rig: Rig) -> None:
+    """Displacements of a light year leave the covariance singular."""
+    (e,) = cast(list[Progression], make_experiments(rig))
+    theta = {**THETA, "discrepancy": 1e16, "trial_scatter": 0.0}
+    assert np.all(np.isnan(conditional_densities(e, [theta])))
+
+
 class Readings:
     """Readings y_b ~ N(theta, 1), each a setting of its own; the posterior of theta under a flat prior is normal."""
 

@@ -23,18 +23,20 @@ def conditional_densities(e: "Progression", draws: Sequence[ValuesBySymbol]) -> 
 def _conditional(
     e: "Progression", theta: ValuesBySymbol, mean: np.ndarray, per_sd: np.ndarray, rows: list[np.ndarray]
 ) -> Float[np.ndarray, " settings"]:
-    """From the precision matrix K: y_b given the others has precision K_bb, and residual K_bb^-1 (K y)_b."""
+    """From the precision matrix K: y_b given the others has precision K_bb, and residual K_bb^-1 (K y)_b.
+
+    NaN where the covariance is singular or not finite, as at absurd values far outside any posterior.
+    """
     misfit = e.misfit_of(theta, mean, per_sd, np).at(theta["trial_sd"], np)
-    covariance = np.diag(misfit.sd**2) + misfit.design @ misfit.design.T
     try:
-        precision = np.linalg.inv(covariance)
+        precision = np.linalg.inv(np.diag(misfit.sd**2) + misfit.design @ misfit.design.T)
+        weighted = precision @ misfit.raw
+        return np.array([_log_density(precision[np.ix_(own, own)], weighted[own]) for own in rows])
     except np.linalg.LinAlgError:
-        return np.full(len(rows), -np.inf)
-    # A covariance that is not finite gives NaN.
-    weighted = precision @ misfit.raw
-    found = []
-    for own in rows:
-        block = precision[np.ix_(own, own)]
-        square = float(weighted[own] @ np.linalg.solve(block, weighted[own]))
-        found.append(0.5 * (float(np.linalg.slogdet(block)[1]) - len(own) * LOG_2PI - square))
-    return np.array(found)
+        return np.full(len(rows), np.nan)
+
+
+def _log_density(precision: Float[np.ndarray, "b b"], weighted: Float[np.ndarray, " b"]) -> float:
+    """Normal log-density with this precision, at a residual that is the inverse precision times ``weighted``."""
+    square = float(weighted @ np.linalg.solve(precision, weighted))
+    return 0.5 * (float(np.linalg.slogdet(precision)[1]) - len(weighted) * LOG_2PI - square)
