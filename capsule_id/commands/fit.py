@@ -123,10 +123,12 @@ def _check_numbers(args: argparse.Namespace) -> None:
 
 def _compare(args: argparse.Namespace, rig: Rig, kinds: Registry) -> int:
     """Print the comparison of models; 0."""
-    ignored = [f"--{name}" for name in ("out", "json", "no_sample", "resume") if getattr(args, name)]
+    unused = {"out": None, "json": False, "no_sample": False, "resume": False}
+    unused |= {"experiments": "all", "max_steps": DEFAULT_MAX_STEPS, "ess": DEFAULT_ESS}
+    ignored = [f"--{name}" for name, default in unused.items() if getattr(args, name) != default]
     if ignored:
         names = ", ".join(ignored).replace("_", "-")
-        raise InputError("--compare prints a table and writes nothing", names, f"remove {names}")
+        raise InputError("--compare prints tables, writes nothing and fits all experiments", names, f"remove {names}")
     set_xla_options()
     if not args.no_cache:
         keep_programs()

@@ -30,8 +30,10 @@ def run(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
     for option, file in (("--out", args.out), ("--figure", args.figure)):
-        if file is not None and file.exists():
-            raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
+        if file is not None:
+            _check_new(option, file)
+    if args.figure is not None and (args.figure.suffix.lower() != ".png" or args.figure == args.out):
+        raise InputError("--figure must name a .png file of its own", args.figure.name, "write NAME.png", args.figure)
     set_xla_options()
     if not args.no_cache:
         keep_programs()
@@ -50,5 +52,17 @@ def run(args: argparse.Namespace) -> int:
             file.write_bytes(content)
         except OSError as error:
             raise InputError(f"{option} must be writable", str(error.strerror), "name another file", file) from None
-        say(f"wrote {file}: {counted(len(made.table), 'setting')}")
+        say(f"wrote {file}: {counted(len(made.table), 'setting')}" if option == "--out" else f"wrote {file}")
     return 0
+
+
+def _check_new(option: str, file: Path) -> None:
+    """Refuse a file that exists or cannot be made, before the predictions are computed."""
+    try:
+        taken, room = file.exists(), file.parent.is_dir()
+    except OSError as error:
+        raise InputError(f"{option} must be writable", str(error.strerror), "name another file", file) from None
+    if taken:
+        raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
+    if not room:
+        raise InputError(f"{option} must stand in a directory", "there is none", f"make {file.parent}", file)

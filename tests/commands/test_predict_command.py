@@ -39,3 +39,22 @@ def test_a_figure_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--figure must name a new file, it exists, choose another name" in capsys.readouterr().err
     assert not out.exists()
     assert figure.read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    ("figure", "words"),
+    [
+        ("predicted.pdf", "--figure must name a .png file of its own, predicted.pdf, write NAME.png"),
+        ("predicted.png", "--figure must name a .png file of its own, predicted.png, write NAME.png"),
+        ("none/speeds.png", "--figure must stand in a directory, there is none, make "),
+        (f"{'x' * 300}.png", "--figure must be writable"),
+    ],
+)
+def test_a_figure_that_cannot_be_is_named_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], figure: str, words: str
+) -> None:
+    out = tmp_path / "predicted.png"
+    asked = ["predict", str(tmp_path), str(tmp_path / "s.csv"), "--out", str(out), "--figure", str(tmp_path / figure)]
+    assert capsule_id(asked) == 2
+    assert words in capsys.readouterr().err
+    assert not out.exists()

@@ -18,9 +18,9 @@ from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms, hidden_terms
+from capsule_id.experiments.free_vibration.second_fit.hidden_terms import Hidden, check_hidden_terms, hidden_terms
 from capsule_id.experiments.free_vibration.second_fit.screening import second_models
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Finding
 from tests.cli_tools import DATA
 from tests.experiments import bench
@@ -162,3 +162,27 @@ def test_estimate_error_and_slope_of_a_further_force_are_those_of_a_fit_of_both(
     assert found.estimate == pytest.approx(end.x[2] * force, abs=0.5 * sd)
     for i, other in enumerate(("k1", "c")):
         assert found.slopes[other] * sd == pytest.approx(covariance[i, 2] / sd, abs=0.15 * np.sqrt(covariance[i, i]))
+
+
+def test_the_clock_of_a_record_stretches_its_further_forces() -> None:
+    """A clock that loses 1 % shows the same forces. Negative control: at times as read F_dry looks different."""
+    table = decay_table(60.0, VISCOUS)
+    time = table.columns["time"]
+    slow = {**table.columns, "time": replace(time, values=time.values / 1.01)}
+    drifting = replace(table, columns=slow, drift=Quantity(0.0, 0.02))
+    found = []
+    for each in (table, drifting):
+        (record,) = cast(list[FreeVibration], make_experiments(bench.rig(each)))
+        values = {"m1": bench.M1, "k1": bench.K1, "c": 0.8, "noise_sd[decay]": NOISE, "clock_drift[decay]": 0.01}
+        found.append(hidden_terms([record], values))
+    one, other = found
+    for name in ("F_dry", "c_q", "k_cubic"):
+        assert other[name].sd == pytest.approx(one[name].sd, rel=0.02)
+        assert other[name].slopes["c"] == pytest.approx(one[name].slopes["c"], rel=0.05)
+
+
+def test_the_limit_of_a_force_far_below_zero_is_small() -> None:
+    for ratio in (-20.0, -50.0, -1e6):
+        low, high = Hidden(ratio, 1.0, {}, {}).limits(False)
+        assert low == 0.0
+        assert 0.0 < high < 0.2

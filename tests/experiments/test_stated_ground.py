@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.checks.refit import refit
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -97,3 +98,30 @@ def test_a_forced_run_moves_on_the_sampled_slope() -> None:
     found = loose.motion({**theta, "slope": SLOPE}).X2  # type: ignore[attr-defined] # pyright: ignore[reportAttributeAccessIssue]
     assert np.array_equal(found, expected)
     assert any(row.name == f"slope[{loose.label}]" for row in loose.parameters)
+
+
+@pytest.mark.parametrize("kind", [0, 2])
+def test_estimates_of_one_experiment_hold_what_the_rig_states(kind: int) -> None:
+    """Tables and checks fit parts of an experiment: with and without an sd of the slope these estimates are equal."""
+    found = []
+    for slope in (Quantity(SLOPE), LOOSE["slope"]):
+        (e,) = make_experiments(bench.rig(readings("forward", np.random.default_rng(3), slope=slope)[kind]))
+        theta = {
+            **THETA,
+            "mu": MU,
+            "v_s": V_S,
+            "slope": SLOPE,
+            **{row.name: 0.02 for row in e.parameters if row.scatter},
+        }
+        found.append(refit(e, theta, [2]))
+    exact, loose = found
+    assert list(loose) == list(exact)
+    for name in exact:
+        assert loose[name] == pytest.approx(exact[name], rel=1e-9)
+
+
+def test_pulls_and_pushes_of_one_surface_are_fitted_together() -> None:
+    """Pulls give no starting point of v_s, because nothing slides there."""
+    pulls, pushes, _ = readings("forward", np.random.default_rng(3), slope=Quantity(SLOPE), N0=Quantity(N0))
+    fit = point_fit(target_of(bench.rig(pulls, pushes)), 0, 1)
+    assert abs(fit.values["mu"] - MU) < 4.0 * fit.standard_errors["mu"]

@@ -1,5 +1,6 @@
 """Choice of the model: variants, densities of settings left out, evidence, predictions, recommendation."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -131,8 +132,8 @@ def test_readings_left_out_have_their_predictive_density() -> None:
     beyond = np.maximum(np.abs(y - others) - reach, 0.0)
     assert table["score [mm/s]"].to_numpy() == pytest.approx(2.0 * reach + 40.0 * beyond, abs=0.25)
     assert predictions_text(table) == (
-        "Each setting is predicted by all others: the direction is right in 2 of 3 settings above 0.5 mm/s, and 5 of "
-        "6 trials lie in the 95 % band."
+        "Each setting is predicted by all others: the direction is right in 2 of 3 settings above 0.5 mm/s, and the "
+        "95 % band holds 5 of 6 trials."
     )
 
 
@@ -141,6 +142,17 @@ def test_draws_without_a_density_have_no_weight() -> None:
     found = leave_out._left_out(np.zeros(2000), np.where(np.arange(2000) < 3, np.nan, -1.0), draws)
     assert found.density == pytest.approx(-1.0)
     assert np.all(found.log_weight[:3] == -np.inf)
+    nothing = leave_out._left_out(np.zeros(2000), np.full(2000, np.nan), draws)
+    assert (nothing.density, nothing.shape) == (-np.inf, np.inf)
+
+
+def test_a_draw_without_a_density_does_not_spoil_the_predictions() -> None:
+    e, draws = readings_and_draws(2000)
+    table = left_out_predictions(e, leave_settings_out(e, draws), 0)
+    draws.values[5] = {"theta": np.nan}
+    again = left_out_predictions(e, leave_settings_out(e, draws), 0)
+    for name in ("predicted [mm/s]", "lower [mm/s]", "upper [mm/s]"):
+        assert again[name].to_numpy() == pytest.approx(table[name].to_numpy(), abs=0.1)
 
 
 @pytest.mark.parametrize("outside", [0, 500])
@@ -207,8 +219,8 @@ def test_a_comparison_of_a_robot(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> N
     assert "direction is right in 3 of 3 settings" in choice.text
 
 
-def variant(parameters: int, density: list[float]) -> _Variant:
-    return _Variant(parameters, np.array(density), (0.0, 0.1), 0.3, 0, pd.DataFrame({"inside": [len(density)]}))
+def variant(parameters: int, density: list[float], shape: float = 0.3) -> _Variant:
+    return _Variant(parameters, np.array(density), (0.0, 0.1), shape, 0, pd.DataFrame({"inside": [len(density)]}))
 
 
 def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> None:
@@ -224,3 +236,23 @@ def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> Non
     assert 'free = ["lag"]' in choice.line
     difference = np.array(fitted["as good"].density) - np.array(fitted["best"].density)
     assert choice.table.loc["as good", "se"] == pytest.approx(2.0 * np.std(difference, ddof=1))
+
+
+def test_an_uncertain_comparison_says_so() -> None:
+    fitted = {"one": variant(5, [1.0, 1.2, 0.9]), "other": variant(4, [0.0, -np.inf, 0.1], np.inf)}
+    choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices()))
+    assert choice.recommended == "one"
+    assert "few draws determine it (shape above 0.7): other." in choice.line
+    assert "uncertain" not in _choose({"one": fitted["one"]}, {"one": ModelChoices()}).line
+
+
+def test_too_few_settings_are_named(tmp_path: Path) -> None:
+    synthesize_robot(tmp_path / "rig", 1, RobotDesign(PERIODS[:2], np.full(2, 0.3)))
+    with pytest.raises(InputError, match="needs 3 settings or more in progression, to leave each one out, 2 settings"):
+        compare_models(read_rig(tmp_path / "rig"), ["lag"])
+
+
+def test_no_evidence_where_few_draws_are_inside() -> None:
+    value, error = log_evidence(np.append(np.zeros(10), np.full(90, -np.inf)), np.random.default_rng(0))
+    assert np.isnan(value)
+    assert np.isnan(error)

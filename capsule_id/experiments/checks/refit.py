@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
+from capsule_id.parameters import is_stated
 
 #: Residuals, in units of the noise, where the model has no solution.
 UNFIT = 1e9
@@ -14,7 +15,8 @@ UNFIT = 1e9
 def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]) -> dict[str, tuple[float, float]]:
     """Estimate and standard error of the experiment's physical parameters without some readings, SI.
 
-    Scatters stay at the point fit when nothing is left out, and are rescaled by the remaining misfit otherwise.
+    Parameters that rig.toml states stay at the point fit: one experiment alone may not determine them. Scatters stay
+    there too when nothing is left out, and are rescaled by the remaining misfit otherwise.
     SciPy's Levenberg-Marquardt on NumPy residuals takes 1 to 8 ms; compiling JAX residuals takes a second.
 
     Parameters
@@ -22,7 +24,7 @@ def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]
     theta : the point fit
     left_out : row indices
     """
-    symbols = [row.symbol for row in experiment.parameters if row.physical]
+    symbols = [row.symbol for row in experiment.parameters if row.physical and not is_stated(row.name)]
     keep = np.setdiff1d(np.arange(experiment.n), left_out)
     signed = experiment.estimates_may_be_negative
     at = np.array([float(theta[s]) for s in symbols])

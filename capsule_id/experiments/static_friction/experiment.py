@@ -137,7 +137,9 @@ class StaticPulls(FrictionExperiment):
         return self.reading_sd / (self.force - self.stated_along), 1.0
 
     def starts(self) -> dict[str, Start]:
-        return {**self.rough_starts(), "pull_scatter": Start(0.02, 0.3)}
+        # Pulls have no speed that could start v_s.
+        rough = {name: start for name, start in self.rough_starts().items() if name != "v_s"}
+        return {**rough, "pull_scatter": Start(0.02, 0.3)}
 
 
 def _angles(table: Table) -> tuple[np.ndarray, np.ndarray]:

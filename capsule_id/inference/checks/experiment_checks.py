@@ -51,7 +51,9 @@ def check_outliers(s: SampledFit) -> tuple[list[Finding], dict[str, list[int]]]:
             "p": found[0].p,
             "most": MOST_FLAGGED,
             "estimates": [
-                (row.name, row.unit, s.values[row.name], without[row.symbol][0]) for row in e.parameters if row.physical
+                (row.name, row.unit, s.values[row.name], without[row.symbol][0])
+                for row in e.parameters
+                if row.symbol in without
             ],
         }
         findings.append(Finding("outliers", "fail", facts, e.label))

@@ -18,14 +18,19 @@ from capsule_id.inference.choice.leave_out import (
     LeftOut,
     leave_setting_out,
     leave_settings_out,
+    psislw,
     weighted_draws,
 )
 from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
 from capsule_id.inference.choice.variants import variants_of
 from capsule_id.inference.fit.joint_fit import joint_fit
+from capsule_id.inference.pipeline import check_readings, second_models
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
+from capsule_id.views import counted
 
+#: Fewest settings of a progression: two differences of densities determine a standard error badly.
+FEWEST_SETTINGS = 3
 #: Standard errors by which the best variant must be better for a simpler one to be rejected.
 STANDARD_ERRORS = 2.0
 
@@ -56,9 +61,16 @@ class Choice:
         free = ", ".join(f'"{symbol}"' for symbol in own.free)
         lines = f'friction = "{own.friction}", reaction = "{own.reaction}", free = [{free}]'
         row = self.table.loc[self.recommended]
-        return (
+        said = (
             f"{self.recommended}: the simplest variant within {STANDARD_ERRORS:g} standard errors of the best "
             f"(elpd {row['difference']:.1f} ± {row['se']:.1f}). Write in [model]: {lines}"
+        )
+        rough = [name for name in self.table.index if not self.table.loc[name, "shape"] <= LARGEST_SHAPE]
+        if not rough:
+            return said
+        return (
+            f"{said}\nThe elpd of these variants is uncertain, because few draws determine it (shape above "
+            f"{LARGEST_SHAPE:g}): {', '.join(rough)}. Measure more settings, or narrow the priors."
         )
 
     @property
@@ -98,12 +110,18 @@ def compare_models(
     Raises
     ------
     InputError
-        If a word is unknown, or the rig has no progression.
+        If a word is unknown, ArviZ is not installed, or a progression has too few settings or there is none.
     """
+    psislw()
     choices, kinds = variants_of(rig, words), registry or default_registry()
-    if not any(isinstance(e, TrialsExperiment) for e in make_experiments(rig, "all", kinds)):
+    made = [e for e in make_experiments(rig, "all", kinds) if isinstance(e, TrialsExperiment)]
+    if not made:
         remedy = "compare friction laws of bench tests in the report of fit-params"
         raise InputError("--compare needs a progression, whose settings are left out", "none", remedy)
+    for e in made:
+        if len(e.settings) < FEWEST_SETTINGS:
+            rule = f"--compare needs {FEWEST_SETTINGS} settings or more in {e.label}, to leave each one out"
+            raise InputError(rule, counted(len(e.settings), "setting"), "measure further settings")
     fitted = {}
     for number, (name, model) in enumerate(choices.items()):
         if progress:
@@ -113,7 +131,9 @@ def compare_models(
 
 
 def _fit_variant(rig: Rig, registry: Registry, seed: int) -> _Variant:
-    target = LogPosterior(rig, make_experiments(rig, "all", registry))
+    # Decays get the models that their readings demand, as in a fit.
+    experiments, _ = second_models(make_experiments(rig, "all", registry), check_readings(rig, "all", registry))
+    target = LogPosterior(rig, experiments)
     fit = joint_fit(target, {}, seed)
     draws = weighted_draws(target, fit, seed)
     found, tables, refits = list[LeftOut](), list[pd.DataFrame](), 0
@@ -134,7 +154,7 @@ def _fit_variant(rig: Rig, registry: Registry, seed: int) -> _Variant:
         (float(np.sum(evidence)), float(np.linalg.norm(errors))),
         max(one.shape for one in found),
         refits,
-        pd.concat(tables),
+        pd.concat(tables) if len(tables) == 1 else pd.concat({str(table.index.name): table for table in tables}),
     )
 
 
@@ -143,18 +163,26 @@ def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices])
     best = max(fitted.values(), key=lambda variant: float(np.sum(variant.density)))
     rows: dict[str, dict[str, Any]] = {}
     for name, one in sorted(fitted.items(), key=lambda item: -float(np.sum(item[1].density))):
-        difference = one.density - best.density
+        with np.errstate(invalid="ignore"):
+            # A setting without a density gives -inf.
+            difference = one.density - best.density
+            error = float(np.sqrt(len(difference) * np.var(difference, ddof=1)))
         rows[name] = {
             "parameters": one.parameters,
             "elpd": float(np.sum(one.density)),
             "difference": float(np.sum(difference)),
-            "se": float(np.sqrt(len(difference) * np.var(difference, ddof=1))),
+            "se": error,
             "log_evidence": one.evidence[0],
             "± log_evidence": one.evidence[1],
             "shape": one.shape,
             "refits": one.refits,
         }
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("variant")
-    close = table[table["difference"] >= -STANDARD_ERRORS * table["se"]]
-    recommended = min(close.index, key=lambda name: (fitted[name].parameters, -float(np.sum(fitted[name].density))))
+    close = [name for name in table.index if fitted[name] is best or _close(table.loc[name])]
+    recommended = min(close, key=lambda name: (fitted[name].parameters, -float(np.sum(fitted[name].density))))
     return Choice(table, recommended, dict(choices), fitted[recommended].predictions)
+
+
+def _close(row: pd.Series) -> bool:
+    """Whether a variant predicts nearly as well as the best one."""
+    return bool(row["difference"] >= -STANDARD_ERRORS * row["se"])

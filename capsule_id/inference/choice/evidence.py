@@ -19,8 +19,14 @@ def log_evidence(log_weight: Float[np.ndarray, " m"], rng: np.random.Generator) 
     Parameters
     ----------
     log_weight : log of posterior density, without normalisation, over proposal density; -inf outside the posterior
+
+    Returns
+    -------
+    NaN where a quarter of the draws has none inside the posterior.
     """
     parts = np.array_split(log_weight, PARTS)
+    if not all(np.any(np.isfinite(part)) for part in parts):
+        return np.nan, np.nan
     found = [_bridge(_posterior_sample(parts[k - 1], rng), parts[k]) for k in range(PARTS)]
     return float(np.mean(found)), float(np.std(found, ddof=1) / np.sqrt(PARTS))
 

@@ -6,7 +6,7 @@ setting are normal given all other readings. Division by their density leaves th
 Statistics and Computing 27, 2017, 1413.)
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -72,6 +72,21 @@ class LeftOut:
     draws: WeightedDraws
 
 
+def psislw() -> Callable[[np.ndarray], tuple[Any, Any]]:
+    """ArviZ' Pareto smoothing of importance weights.
+
+    Raises
+    ------
+    InputError
+        If ArviZ is not installed.
+    """
+    try:
+        return import_module("arviz").psislw
+    except (ImportError, AttributeError):
+        rule, remedy = "comparing models needs the package arviz", "pip install 'capsule-id[compare]'"
+        raise InputError(rule, "not installed", remedy) from None
+
+
 def weighted_draws(target: LogPosterior, fit: PointFit, seed: int, first: BlockProposal | None = None) -> WeightedDraws:
     """Draws of the proposal that the sampler adapts to ``target`` from the Laplace approximation, or from ``first``."""
     marginal, random = MarginalPosterior(target, fit), np.random.RandomState(seed)
@@ -105,18 +120,15 @@ def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, s
 
 def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws) -> LeftOut:
     """Smooth the weights. A draw without a density lies far outside the posterior and has weight 0."""
-    known = np.isfinite(density)
-    smoothed, (weights, shape) = np.full(len(density), -np.inf), _smooth(log_weight[known])
+    known, smoothed = np.isfinite(density), np.full(len(density), -np.inf)
+    if not np.any(known):
+        return LeftOut(-np.inf, np.inf, smoothed, draws)
+    weights, shape = _smooth(log_weight[known])
     smoothed[known] = weights
     return LeftOut(float(np.logaddexp.reduce(weights + density[known])), shape, smoothed, draws)
 
 
 def _smooth(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
     """Normalised log-weights (m,) smoothed by ArviZ, and their Pareto shape."""
-    try:
-        psislw: Any = import_module("arviz").psislw
-    except (ImportError, AttributeError):
-        rule, remedy = "comparing models needs the package arviz", "pip install 'capsule-id[compare]'"
-        raise InputError(rule, "not installed", remedy) from None
-    smoothed, shape = map(np.asarray, psislw(log_weight))
+    smoothed, shape = map(np.asarray, psislw()(log_weight))
     return smoothed, float(shape)

@@ -30,9 +30,12 @@ def left_out_predictions(e: TrialsExperiment, left_out: Sequence[LeftOut], seed:
         if one.draws not in of_draws:
             of_draws[one.draws] = e.new_trials([e.local(values) for values in one.draws.values], e.settings, rng)
         speed = 1e3 / e.time[k]
-        weights = np.exp(one.log_weight)
-        lower, median, upper = np.quantile(
-            speed * of_draws[one.draws][:, k], [0.025, 0.5, 0.975], weights=weights, method="inverted_cdf"
+        used = np.isfinite(one.log_weight)
+        drawn, weights = speed * of_draws[one.draws][used, k], np.exp(one.log_weight[used])
+        lower, median, upper = (
+            np.quantile(drawn, [0.025, 0.5, 0.975], weights=weights, method="inverted_cdf")
+            if used.any()
+            else np.full(3, np.nan)
         )
         measured = speed * e.distance[e.setting[:, k] > 0.0]
         beyond = np.maximum(lower - measured, 0.0) + np.maximum(measured - upper, 0.0)
@@ -59,6 +62,6 @@ def predictions_text(table: pd.DataFrame) -> str:
     inside, trials = (int(np.sum(table[name].to_numpy())) for name in ("inside", "trials"))
     return (
         f"Each setting is predicted by all others: the direction is right in {right} of "
-        f"{counted(int(np.sum(moving)), 'setting')} above {SLOW:g} mm/s, and {inside} of {counted(trials, 'trial')} lie in the "
-        "95 % band."
+        f"{counted(int(np.sum(moving)), 'setting')} above {SLOW:g} mm/s, and the 95 % band holds {inside} of "
+        f"{counted(trials, 'trial')}."
     )

@@ -47,8 +47,7 @@ def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:
         return float(np.std(sample.draws[..., sample.names.index(name)], ddof=1))
     if fit is None or name not in fit.names:
         return float("nan")
-    i = fit.names.index(name)
-    return float(np.sqrt(fit.covariance[i, i]) * abs(fit.values[name]))
+    return fit.standard_errors[name]
 
 
 def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing | None = None) -> ResultTable:

@@ -30,6 +30,8 @@ LIMIT = 0.975
 #: Changes of c and of k1 by a force at its limit that matter: relative to the value, and in standard errors.
 CHANGES: Mapping[str, float] = {"c": 0.2, "k1": 0.05}
 CHANGE_IN_ERRORS = 3.0
+#: Estimates further below zero, in standard errors, count as this one.
+LOWEST = -30.0
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,10 @@ class Hidden:
         if signed:
             width = self.sd * float(stats.norm.isf(1.0 - LIMIT))
             return self.estimate - width, self.estimate + width
-        beyond = (1.0 - LIMIT) * float(stats.norm.cdf(self.estimate / self.sd))
-        return 0.0, self.estimate + self.sd * float(stats.norm.isf(beyond))
+        # Far below zero the posterior above zero is exponential: its limit goes to 0.
+        ratio = max(self.estimate / self.sd, LOWEST)
+        beyond = (1.0 - LIMIT) * float(stats.norm.cdf(ratio))
+        return 0.0, self.sd * (ratio + float(stats.norm.isf(beyond)))
 
 
 def check_hidden_terms(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:

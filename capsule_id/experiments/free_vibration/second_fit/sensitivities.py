@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import lsim
 
+from capsule_id.experiments.clock import stretch
 from capsule_id.experiments.free_vibration.decay_models import rates
 from capsule_id.experiments.free_vibration.readings.noise import whiten
 from capsule_id.experiments.free_vibration.settings import DAMPING
@@ -67,7 +68,8 @@ def force_responses(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str,
     raw, design = e.unwhitened(theta, np)
     parts = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
     m1, k1, c = theta["m1"], theta["k1"], theta["c"]
-    length = float(e.time[-1])
+    time = e.time * stretch(e.clock_rate, theta)
+    length = float(time[-1])
     points = max(FEWEST_POINTS, int(RESPONSE_POINTS * length * np.sqrt(k1 / m1) / (2.0 * np.pi)))
     grid = np.linspace(0.0, length, points)
     gamma, omega = rates(k1, c, m1, np)
@@ -81,7 +83,7 @@ def force_responses(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str,
         response = -lsim(system, force, grid)[1]
         for _ in range(e.order):
             response = np.gradient(response, grid[1])
-        found[name] = np.interp(e.time, grid, response)
+        found[name] = np.interp(time, grid, response)
     return found
 
 
