@@ -15,7 +15,7 @@ from typing import NoReturn, TextIO
 from capsule_id import console
 from capsule_id.commands.compilation import discard_damaged
 from capsule_id.errors import InputError
-from capsule_id.interruption import INTERRUPTED, interruptible
+from capsule_id.interruption import INTERRUPTED, end_in_time, interruptible
 
 BAD_INPUT, INTERNAL = 2, 1
 _RESUME = "; --resume continues from the saved state"
@@ -121,6 +121,8 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         return BAD_INPUT
     except KeyboardInterrupt:
         print(interrupted, file=sys.stderr)
+        if arguments is None:  # the process ends with this command
+            end_in_time()
         return INTERRUPTED
     except Exception as error:
         print(f"{program}: internal failure: {_one_line(error)}; {_save_traceback()}", file=sys.stderr)

@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -18,6 +19,7 @@ INTERRUPTED = 130
 GRACE = 4.0
 _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 _flag = threading.Event()
+_arrivals: list[float] = []
 
 
 def stop_if_interrupted() -> None:
@@ -62,8 +64,20 @@ def interruptible(message: str) -> Iterator[None]:
         _flag.clear()
 
 
+def end_in_time() -> None:
+    """After an interruption, end the process ``GRACE`` seconds after the signal at the latest.
+
+    Python waits for its worker threads before it ends, and one of them may compile for long.
+    """
+    left = GRACE - (time.monotonic() - _arrivals[-1]) if _arrivals else GRACE
+    timer = threading.Timer(max(left, 0.0), os._exit, [INTERRUPTED])
+    timer.daemon = True
+    timer.start()
+
+
 def _set_flag(number: int, frame: FrameType | None) -> None:
     del number, frame
+    _arrivals.append(time.monotonic())
     _flag.set()
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.records.faults.clipping import clipped_samples
-from capsule_id.records.faults.phase import phase_jump
+from capsule_id.records.faults.phase import phase_jump, single_spike
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
 from capsule_id.rig.filters import TIMING_TOLERANCE, largest_offset, median_step
 from capsule_id.rig.formats.columns import in_blocks
@@ -98,9 +98,11 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
     step = median_step(time)
     if largest_offset(time, step) > TIMING_TOLERANCE * step:
         return
-    jump = phase_jump(table[name][used], period / step, alone)
+    values = table[name][used]
+    jump = phase_jump(values, period / step, alone)
     if jump is not None:
-        row = used.start + jump.row
+        spike = single_spike(values, jump, period / step, alone)
+        row = used.start + (jump.row if spike is None else spike)
         facts = {
             "file": table.file,
             "column": name,
@@ -109,4 +111,4 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
             "size": jump.size,
             "rows": [row],
         }
-        yield Finding("readings.jump", "fail", facts, table.label)
+        yield Finding("readings.jump" if spike is None else "readings.spike", "fail", facts, table.label)

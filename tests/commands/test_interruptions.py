@@ -23,6 +23,14 @@ SHORT += "ensembles.FIRST_CHECK, ensembles.CHECK_EVERY, ensembles.PILOT_STEPS = 
 HANGING = "import time\nfrom capsule_id import interruption\nfrom capsule_id.inference.sampling import ensembles\n"
 HANGING += "interruption.GRACE = 0.5\nensembles.pilot = lambda *_: open('hanging', 'w').close() or time.sleep(60)\n"
 
+#: The step that starts the first ensemble waits for an interruption, while a worker thread computes for a minute.
+WORKING = "import time\nfrom concurrent.futures import ThreadPoolExecutor\nfrom capsule_id import interruption\n"
+WORKING += "from capsule_id.inference.sampling import ensembles\ninterruption.GRACE = 1.0\n"
+WORKING += "def step(*_):\n    ThreadPoolExecutor(1).submit(time.sleep, 60)\n    open('working', 'w').close()\n"
+WORKING += (
+    "    while True:\n        interruption.stop_if_interrupted()\n        time.sleep(0.01)\nensembles.pilot = step\n"
+)
+
 
 def start(folder: Path, *words: str, before: str = "", cache: bool = False) -> subprocess.Popen[str]:
     """Start ``fit-params``, by default without compiled programs from disk; ``folder/log`` shows every compilation."""
@@ -76,6 +84,15 @@ def test_a_step_that_does_not_end_is_ended(tmp_path: Path) -> None:
     assert (tmp_path / "log").read_text(encoding="utf-8").splitlines()[
         -1
     ] == "fit-params: interrupted; --resume continues from the saved state"
+
+
+def test_a_worker_thread_that_does_not_end_is_ended(tmp_path: Path) -> None:
+    """The main thread ends at once, and Python then waits for the worker."""
+    small_rig(tmp_path / "rig")
+    fit = start(tmp_path, "rig", "--out", "out", "--quiet", before=WORKING, cache=True)
+    wait_until((tmp_path / "working").exists, fit)
+    assert 0.5 < interrupt(fit, signal.SIGTERM) < 1.0 + LONGEST - GRACE
+    assert fit.returncode == 130
 
 
 def test_interrupted_in_a_compilation_and_in_the_sample(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
+from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import default_registry
 from capsule_id.report.texts.messages import finding_text, messages_of
@@ -184,3 +185,20 @@ def test_a_rod_that_friction_holds_after_one_swing_needs_a_larger_release() -> N
     with pytest.raises(cid.InputError, match="release it from a larger deflection"):
         KINDS["free_vibration"].check([one])
     KINDS["free_vibration"].check([larger])
+
+
+def test_a_spike_is_no_loss_of_samples_and_its_row_can_be_deleted() -> None:
+    time = np.arange(1200) / 400.0
+    clean = bench.released(time, 4e-3, c=0.6) + 1.5e-5 * np.random.default_rng(13).standard_normal(1200)
+
+    def found(time: np.ndarray, x: np.ndarray) -> list[Finding]:
+        table = bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", x)])
+        return [f for f in lint_decay(table, bench.rig(table)) if f.level == "fail"]
+
+    spoiled = clean + 2e-3 * (np.arange(1200) == 500)
+    ((finding,), lost) = found(time, spoiled), found(time[:1187], np.delete(clean, slice(60, 73)))
+    assert (finding.code, finding.facts["line"]) == ("readings.spike", 502)
+    assert finding_text(finding, messages_of(default_registry())).endswith("Delete its row.")
+    assert found(np.delete(time, 500), np.delete(spoiled, 500)) == []
+    # Negative control: lost samples are no spike.
+    assert [f.code for f in lost] == ["readings.jump"]

@@ -60,6 +60,21 @@ def phase_jump(values: np.ndarray, period: float, alone: bool = False) -> Jump |
     return None
 
 
+def single_spike(values: np.ndarray, jump: Jump, period: float, alone: bool = False) -> int | None:
+    """Row of the one sample without which there is no ``jump``; None where several samples are wrong, or some lost.
+
+    Parameters are those of ``phase_jump``.
+    """
+    near = max(1, round(SIDES[0][0] * period))
+    rows = np.arange(max(1, jump.row - near), min(len(values) - 2, jump.row + near) + 1)
+    row = int(rows[np.argmax(np.abs(values[rows - 1] - 2.0 * values[rows] + values[rows + 1]))])
+    part = slice(max(0, row - round(2.0 * period)), row + round(2.0 * period))
+    mended = values[part].copy()
+    place = row - part.start
+    mended[place] = 0.5 * (mended[place - 1] + mended[place + 1])
+    return row if phase_jump(mended, period, alone) is None else None
+
+
 def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float, alone: bool) -> Jump | None:
     """The most significant jump by polynomials over ``side`` samples."""
     if side < ORDER + 3 or len(values) < 2 * side:

@@ -106,4 +106,11 @@ DATA_MESSAGES: Mapping[str, Message] = {
             "are even: samples were lost. Use the record on one side of the jump only, or repeat it."
         ),
     ),
+    "readings.spike": Message(
+        "spikes",
+        fail=(
+            "{file}:{line}: {column} must be smooth; one sample at {time:.5g} s stands off by {size:.2g} of the amplitude. "
+            "Delete its row."
+        ),
+    ),
 }
