@@ -90,6 +90,22 @@ def test_the_growth_of_initial_errors_is_that_of_the_motion_under_the_same_pulse
     assert growth(run, {**TRUTH, **own}) == pytest.approx(np.linalg.norm(columns, 2), rel=1e-3)
 
 
+def test_a_later_part_of_a_record_has_the_pulses_of_the_whole(tmp_path: Path) -> None:
+    """All parts share the phase, which counts from the first sample of the record."""
+    drive = Pulses(6.0, PERIOD, DUTY, phase=PHASE, lag=LAG)
+    write(tmp_path, drive, 50 * PERIOD, None, PULSES)
+    toml = (tmp_path / "rig.toml").read_text()
+    segment = 'start = "moving"\nsegment = { value = 100, unit = "ms" }'
+    (tmp_path / "rig.toml").write_text(toml.replace('start = "stuck"', segment))
+    part = make_experiments(read_rig(tmp_path))[1]
+    assert (part.time[0] - TIME[0]) / PERIOD % 1.0 > 0.05
+    own = {"P_on": 6.0, "lag": LAG, "phase": PHASE, "x_start": 1e-3, "y_start": -0.05, "capsule_start": -0.1}
+    found = part.motion({**TRUTH, **own, "moves": 1.0}, np)
+    Y2 = part.moves * -0.1
+    exact = simulate(P, drive, 50 * PERIOD + part.time - TIME[0], (1e-3, -0.05 + Y2, 0.0, Y2))
+    assert np.asarray(found.x_rel) == pytest.approx(np.asarray(exact.x_rel), abs=1e-9)
+
+
 def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     current = np.interp(TIME, np.arange(0.0, 0.7, 0.05), 2.0 * rng.standard_normal(14))

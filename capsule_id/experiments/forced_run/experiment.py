@@ -68,6 +68,7 @@ class ForcedRun(CapsuleForward):
     reading_variance : (channels,) stated, SI
     moves : factor of ``capsule_start``, 0 or 1, so that one program computes runs of both kinds
     normal_force : stated, N; 0 where it is the weight
+    first : time of the first sample of the whole record, s
     clock_rate, middle : 1 + the stated drift of the clock, and the middle of the whole record, s; None: an exact clock
     reaction : share of the drive's force that pushes the capsule back, 1
     """
@@ -87,6 +88,7 @@ class ForcedRun(CapsuleForward):
     normal_force: float
     clock_rate: float | None
     middle: float | None
+    first: float
     channels: tuple[str, ...] = eqx.field(static=True)
     settled: bool = eqx.field(static=True)
     gap_known: bool = eqx.field(static=True)
@@ -133,6 +135,7 @@ class ForcedRun(CapsuleForward):
         self.time = table["time"]
         self.clock_rate = stated_rate(table)
         whole = next((other for other in rig.tables if other.label == part_of), table)["time"]
+        self.first = float(whole[0])
         self.middle = None if self.clock_rate is None else 0.5 * float(whole[0] + whole[-1])
         self.values = np.stack([table[name] for name in self.channels])
         self.Omega = stated_Omega(table)

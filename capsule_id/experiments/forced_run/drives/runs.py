@@ -93,4 +93,4 @@ class PulseRun(OtherRun):
         self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
     ) -> Trajectory:
         earlier = EARLIER_PERIODS * 2.0 * np.pi / self.Omega
-        return super().simulated(theta, p, e, jnp.asarray(times) - self.time[0] + earlier, initial)
+        return super().simulated(theta, p, e, jnp.asarray(times) - self.first + earlier, initial)
