@@ -236,7 +236,7 @@ def parameter_rows(kinds: Mapping[str, KindRule]) -> dict[str, Parameter]:
 RIG_QUANTITIES: Mapping[str, QuantityRule] = {
     "m1": QuantityRule("kg", has_sd=True),
     "m2": QuantityRule("kg", has_sd=True),
-    "g": QuantityRule("m/s^2", has_sd=True, usual=(9.5, 10.1)),
+    "g": QuantityRule("m/s^2", usual=(9.5, 10.1)),
     "slope": SLOPE,
     "N0": PRESSING_FORCE,
 }

@@ -23,6 +23,7 @@ TOML_FAULTS = [
     ("synthetic = true", 'synthetic = ‸"yes"', "synthetic must be true or false"),
     ("synthetic = true", "‸colour = 1", "unknown key, 'colour', remove it"),
     ('m1 = { value = 110, sd = 0.5, unit = "g" }', "m1 = ‸0.11", "m1 must be a table"),
+    ("g = { value = 9.81,", "g = { value = 9.81, ‸sd = 0.01,", "unknown key, 'sd', remove it"),
     ("m1 = { value = 110", "m1 = { value = ‸-110", "m1 must be greater than 0"),
     ("m1 = { value = 110", "m1 = { value = ‸0", "m1 must be greater than 0"),
     ("m1 = { value = 110", "m1 = { value = ‸true", "m1 must be a number"),
