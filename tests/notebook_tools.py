@@ -34,10 +34,7 @@ SHORT = {
     "06": "RUNS, SAMPLES = (1,), 1000",
     "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
     "08": "DRAWS, POINTS = 24, 16",
-    "09": 'FILE, STEPS, PERIODS = Path("capsubot.csv"), 200, (60, 80, 100)',
 }
-#: Chapters that take minutes even when small: they run with the slow tests. Their kept outputs are always checked.
-LONG = {"09"}
 #: First cell in a kernel that has run another notebook.
 CLEAN = """%reset -f
 %cd -q {folder}
