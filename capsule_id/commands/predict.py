@@ -32,7 +32,9 @@ def run(args: argparse.Namespace) -> int:
     for option, file in (("--out", args.out), ("--figure", args.figure)):
         if file is not None:
             _check_new(option, file)
-    if args.figure is not None and (args.figure.suffix.lower() != ".png" or args.figure == args.out):
+    if args.figure is not None and (
+        args.figure.suffix.lower() != ".png" or args.figure.resolve() == args.out.resolve()
+    ):
         raise InputError("--figure must name a .png file of its own", args.figure.name, "write NAME.png", args.figure)
     set_xla_options()
     if not args.no_cache:

@@ -114,7 +114,7 @@ def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str
         if not fits_name(name, TIME) and (not text or unit_of(text, dimensions) is None):
             continue
         remedy = "Correct the cell or delete the row, or list its text in missing."
-        if ":" in error.value:
+        if ":" in error.value and fits_name(name, TIME):
             remedy = "Export times as seconds, or state the sampling rate."
         yield f"#: {found.names[index]!r} is not read: line {error.line} has {' '.join(error.value.split())}. {remedy}"
 

@@ -18,6 +18,7 @@ from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import Hidden, check_hidden_terms, hidden_terms
 from capsule_id.experiments.free_vibration.second_fit.screening import second_models
 from capsule_id.rig.model import Quantity, Rig, Table
@@ -115,8 +116,7 @@ def test_the_longer_record_in_the_text_names_dry_friction() -> None:
     records = cast(list[FreeVibration], make_experiments(bench.rig(decay_table(LONG, DRY))))
     ((record,), (finding,)) = second_models(records)
     assert (finding.code, record.model.symbols) == ("decays.second_fit", ("F_dry",))
-    assert record.about.screened is not None
-    found = record.about.screened
+    found = cast(Screened, record.about.screened)
     for name in ("c", "F_dry"):
         assert abs(found.values[name] - DRY[name]) < 3.0 * found.errors[name]
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.inference.result import Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.calibration import normal_score
@@ -48,11 +50,10 @@ def recover(folder: Path, seed: int, budget: int) -> Recovery:
     truth = random_truth(np.random.default_rng([seed, 4]))
     synthesize(folder, seed, truth, runs=True)
     result = cid.fit(read_rig(folder), seed, budget=budget)
-    assert result.posterior is not None
-    known = truth.flat()
-    z = {name: normal_score(result.posterior, name, known[name]) for name in result.summary.index if name in known}
+    known, posterior = truth.flat(), cast(Posterior, result.posterior)
+    z = {name: normal_score(posterior, name, known[name]) for name in result.summary.index if name in known}
     failed = tuple((f.code, result.text(f)) for f in result.findings if f.level == "fail")
-    return Recovery(z, failed, float(np.max(result.posterior.rhat)), float(np.min(result.posterior.ess)))
+    return Recovery(z, failed, float(np.max(posterior.rhat)), float(np.min(posterior.ess)))
 
 
 def plant_spring(folder: Path, spring: str) -> None:

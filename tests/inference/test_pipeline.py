@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ from capsule_id.inference.pipeline import (
     sample_posterior,
     stage_seeds,
 )
+from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from tests.cli_tools import small_rig
 
@@ -51,14 +53,12 @@ def test_stages_one_by_one_give_the_numbers_of_the_whole(tmp_path: Path) -> None
     assert result.provenance == whole.provenance
     assert [note.code for note in result.notes] == [note.code for note in whole.notes]
     assert [item.predictive_p for item in result.comparisons] == [item.predictive_p for item in whole.comparisons]
-    assert result.pointwise is not None
-    assert whole.pointwise is not None
-    for label, values in result.pointwise.log_likelihood.items():
-        np.testing.assert_array_equal(values, whole.pointwise.log_likelihood[label])
-        np.testing.assert_array_equal(result.pointwise.replicates[label], whole.pointwise.replicates[label])
+    own, other = cast(Pointwise, result.pointwise), cast(Pointwise, whole.pointwise)
+    assert list(own.log_likelihood) == list(other.log_likelihood)
+    for label, values in own.log_likelihood.items():
+        np.testing.assert_array_equal(values, other.log_likelihood[label])
+        np.testing.assert_array_equal(own.replicates[label], other.replicates[label])
     # Negative control: another seed gives another sample.
-    assert isinstance(point, PointStage)
-    other = sample_posterior(point, stage_seeds(4).walkers, BUDGET)
-    assert other.posterior is not None
-    assert result.posterior is not None
-    assert not np.array_equal(other.posterior.draws, result.posterior.draws)
+    another = sample_posterior(cast(PointStage, point), stage_seeds(4).walkers, BUDGET)
+    draws = [cast(Posterior, each.posterior).draws for each in (another, result)]
+    assert not np.array_equal(*draws)

@@ -37,9 +37,7 @@ def variance_shares(
     effect = (jacobian @ found.matrix) ** 2 / np.diag(found.matrix)
     inputs = [e.table.label for e in owners if e is not None]
     stated = [is_stated(row.name) or prior_of(row).kind == "positive_normal" for row in target.parameters]
-    inputs += [
-        f"{STATED if is_stated else 'prior of '}{name}" for name, is_stated in zip(target.names, stated, strict=True)
-    ]
+    inputs += [f"{STATED if own else 'prior of '}{name}" for name, own in zip(target.names, stated, strict=True)]
     names = list(dict.fromkeys(inputs))
     number = np.array([names.index(name) for name in inputs])
     shares = np.stack([np.bincount(number, column, len(names)) for column in effect.T])

@@ -212,13 +212,18 @@ def bent(u: np.ndarray) -> np.ndarray:
     return np.sum(parts, axis=1, keepdims=True) - np.linalg.slogdet(MIXED)[1]
 
 
-def test_a_map_describes_a_bent_block() -> None:
-    """Five bends at once, from exact draws. Negative control: the same Student densities without the map."""
+def bent_draws() -> np.ndarray:
+    """Exact draws of ``bent``."""
     z = np.random.default_rng(1).standard_normal((20_000, 10))
     z[:, 1::2] = 0.4 * (z[:, ::2] ** 2 - 1.0) + np.exp(0.2 * z[:, ::2]) * z[:, 1::2]
-    exact, share = z @ MIXED, {}
+    return z @ MIXED
+
+
+def test_a_map_describes_a_bent_block() -> None:
+    """Five bends at once, from exact draws. Negative control: the same Student densities without the map."""
+    exact, share = bent_draws(), {}
     straight = concentric(np.mean(exact, axis=0), np.cov(exact.T))
-    for name, found in {"map": Transported(exact, np.full(len(z), 1.0 / len(z))), "straight": straight}.items():
+    for name, found in {"map": Transported(exact, np.full(len(exact), 1.0 / len(exact))), "straight": straight}.items():
         u = found.draw(np.random.RandomState(1), 50_000)
         weights = np.exp(bent(u)[:, 0] - found.log_density(u))
         assert np.mean(weights) == pytest.approx(1.0, abs=4.0 * np.std(weights) / np.sqrt(len(u)))
@@ -229,10 +234,15 @@ def test_a_map_describes_a_bent_block() -> None:
 
 def test_a_large_block_that_its_first_proposal_misses_gets_a_map() -> None:
     first = block_proposal([np.arange(10)], np.zeros(10), 0.4 * MIXED.T @ MIXED, [True])
-    found = refined(bent, first, np.full((2, 10), np.nan), np.random.RandomState(0), [True])
-    u = found.draw(np.random.RandomState(1), 20_000)
-    assert isinstance(found.densities[0], Transported)
-    assert effective_size((bent(u) - found.log_density(u))[:, 0]) > 0.1 * len(u)
+    exact, waits = bent_draws(), dict[bool, float]()
+    for large in (True, False):
+        found = refined(bent, first, np.full((2, 10), np.nan), np.random.RandomState(0), [large])
+        u = found.draw(np.random.RandomState(1), 20_000)
+        assert effective_size((bent(u) - found.log_density(u))[:, 0]) > 0.1 * len(u)
+        # Steps that a chain waits at the draws in the tails, as many as the weight there.
+        waits[large] = float(np.quantile(bent(exact) - found.log_density(exact), 0.98))
+    # Negative control: a mixture, as smaller blocks have.
+    assert waits[True] < waits[False] + np.log(0.75), waits
 
 
 def test_weights_of_a_hopeless_start_are_cut_to_the_best_draws() -> None:

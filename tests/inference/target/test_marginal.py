@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,7 @@ from capsule_id.inference.fit.curvature import BATCH, hessian, root_of_inverse
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior, conditional, density_of
-from capsule_id.parameters import Parameter
+from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import Truth, synthesize
 
@@ -30,11 +31,11 @@ ROUGH = {"tilt_sd": 0.009, "push_scatter": 0.02, "sliding_scatter": 0.02}
 
 def log_prior(row: Parameter, u: float) -> float:
     """Log-density of u = log(value), by SciPy."""
-    assert row.prior is not None
-    location, spread = row.prior.location, row.prior.spread
-    if row.prior.kind == "lognormal":
+    prior = cast(Prior, row.prior)
+    location, spread = prior.location, prior.spread
+    if prior.kind == "lognormal":
         return float(stats.norm.logpdf(u, np.log(location), np.log(spread) / stats.norm.ppf(0.975)))
-    if row.prior.kind == "halfnormal":
+    if prior.kind == "halfnormal":
         return float(stats.halfnorm.logpdf(np.exp(u), scale=spread) + u)
     return float(stats.truncnorm.logpdf(np.exp(u), -location / spread, np.inf, location, spread) + u)
 

@@ -14,6 +14,7 @@ from scipy import stats
 
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import (
+    absent,
     further_sensitivities,
     sensitivities,
     whitened,
@@ -118,11 +119,6 @@ def hidden_terms(records: "Sequence[FreeVibration]", values: Mapping[str, float]
         slopes = dict(zip(names, -change, strict=True))
         found[symbol] = Hidden(-float(own @ left) / power, power**-0.5, slopes, errors)
     return found
-
-
-def absent(e: "FreeVibration") -> list[str]:
-    """Symbols of the forces that the model of ``e`` lacks."""
-    return [symbol for symbol in ("F_dry", "c_q", "k_cubic") if symbol not in e.model.symbols]
 
 
 def _own_nuisances_removed(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -46,17 +46,22 @@ def sensitivities(
     return left, design, moved
 
 
+def absent(e: "FreeVibration") -> list[str]:
+    """Symbols of the forces that the model of ``e`` lacks."""
+    return [symbol for symbol in FURTHER if symbol not in e.model.symbols]
+
+
 def further_sensitivities(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Derivatives (n,) of the residuals with respect to the forces that the model of ``e`` lacks, at zero force."""
     if e.closed:
         return {name: -response for name, response in force_responses(e, theta).items()}
     full = e.with_model(replace(e.model, damping=tuple(DAMPING), cubic=True))
-    absent = [name for name in FURTHER if name not in e.model.symbols]
-    known = {**theta, **dict.fromkeys(absent, 0.0)}
+    names = absent(e)
+    known = {**theta, **dict.fromkeys(names, 0.0)}
     raw, units = full.unwhitened(known, np)[0], _units(e, theta)
     return {
         name: (full.unwhitened({**known, name: STEP * units[name]}, np)[0] - raw) / (STEP * units[name])
-        for name in absent
+        for name in names
     }
 
 
