@@ -58,3 +58,13 @@ def test_a_figure_that_cannot_be_is_named_first(
     assert capsule_id(asked) == 2
     assert words in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_one_file_by_two_paths_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    asked = ["predict", str(tmp_path), "s.csv", "--out", str(tmp_path / "predicted.png"), "--figure", "predicted.png"]
+    assert capsule_id(asked) == 2
+    assert "--figure must name a .png file of its own" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

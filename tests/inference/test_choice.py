@@ -1,24 +1,19 @@
-"""Choice of the model: variants, densities of settings left out, evidence, predictions, recommendation."""
+"""Choice of the model: variants, densities of settings left out, evidence, predictions."""
 
-from pathlib import Path
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import stats
 from scipy.stats import multivariate_normal
 
-from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.left_out import conditional_densities
-from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.choice import compare, leave_out
-from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models
+from capsule_id.inference.choice import leave_out
 from capsule_id.inference.choice.evidence import _bridge, log_evidence
 from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_out, weighted_draws
 from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
@@ -28,16 +23,12 @@ from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import density_of
 from capsule_id.rig.model import ModelChoices, Rig
 from tests.experiments import bench
-
-PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
-THETA = {**ROBOT, "g": 9.81, "session_sd": 0.05, "trial_scatter": 0.04, "trial_sd": 1e-3, "discrepancy": 2e-4}
+from tests.inference.three_settings import THETA, three_settings
 
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
-    folder = tmp_path_factory.mktemp("robot") / "rig"
-    synthesize_robot(folder, 1, RobotDesign(PERIODS, np.full(3, 0.3), sessions=2))
-    return read_rig(folder)
+    return three_settings(tmp_path_factory.mktemp("robot") / "rig")
 
 
 def test_each_word_varies_its_own_choice(rig: Rig) -> None:
@@ -84,6 +75,11 @@ class Readings:
     settings, label = np.zeros((6, 1)), "readings"
     distance = np.array([0.4, -0.9, 0.3, 2.9, 0.2, 0.9]) * 1e-3
     setting, time = np.eye(6), np.ones(6)
+
+    def without(self, setting: int) -> "Readings":
+        smaller = Readings()
+        smaller.distance = np.delete(self.distance, setting)
+        return smaller
 
     def local(self, values: dict[str, float]) -> dict[str, float]:
         return values
@@ -137,13 +133,43 @@ def test_readings_left_out_have_their_predictive_density() -> None:
     )
 
 
-def test_draws_without_a_density_have_no_weight() -> None:
+@pytest.mark.parametrize(("log_weight", "reliable"), [(-8.0, True), (0.0, False)])
+def test_draws_without_a_density_have_no_weight(log_weight: float, reliable: bool) -> None:
+    """Where they held 1/400 of it before, the shape says that the density of the setting is not known."""
     _, draws = readings_and_draws(2000)
-    found = leave_out._left_out(np.zeros(2000), np.where(np.arange(2000) < 3, np.nan, -1.0), draws)
+    without = np.arange(2000) < 5
+    weights = np.where(without, log_weight, 0.1 * np.random.default_rng(0).standard_normal(2000))
+    found = leave_out._left_out(weights, np.where(without, np.nan, -1.0), draws, -1.0)
     assert found.density == pytest.approx(-1.0)
-    assert np.all(found.log_weight[:3] == -np.inf)
-    nothing = leave_out._left_out(np.zeros(2000), np.full(2000, np.nan), draws)
+    assert np.all(found.log_weight[:5] == -np.inf)
+    assert (found.shape <= leave_out.LARGEST_SHAPE) == reliable
+    nothing = leave_out._left_out(np.zeros(2000), np.full(2000, np.nan), draws, -1.0)
     assert (nothing.density, nothing.shape) == (-np.inf, np.inf)
+
+
+def test_a_refit_without_a_reading_gives_its_predictive_density(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws of the posterior without the reading need no division by its density."""
+    e, draws = readings_and_draws(4000)
+    draws = replace(draws, target=cast(Any, SimpleNamespace(rig=None, experiments=[e])))
+    y = 1e3 * e.distance
+    asked = list[list[Any]]()
+
+    def posterior(_: object, experiments: list[Any]) -> list[Any]:
+        asked.append(experiments)
+        return experiments
+
+    def drawn(experiments: list[Any], *_: object) -> WeightedDraws:
+        theta = 0.2 + 0.6 * np.random.default_rng(1).standard_t(6.0, 20_000)
+        left = 1e3 * experiments[0].distance
+        weight = stats.norm.logpdf(theta, np.mean(left), len(left) ** -0.5) - stats.t.logpdf(theta, 6.0, 0.2, 0.6)
+        values = [{"theta": one} for one in theta]
+        return replace(draws, log_weight=weight[:, None], inside=np.arange(20_000), values=values)
+
+    monkeypatch.setattr(leave_out, "LogPosterior", posterior)
+    monkeypatch.setattr(leave_out, "weighted_draws", drawn)
+    found = leave_out.leave_setting_out(draws, e, 3, 0)
+    assert len(asked[0][0].distance) == 5
+    assert found.density == pytest.approx(stats.norm.logpdf(y[3], (np.sum(y) - y[3]) / 5.0, np.sqrt(1.2)), abs=0.02)
 
 
 def test_a_draw_without_a_density_does_not_spoil_the_predictions() -> None:
@@ -190,66 +216,6 @@ def test_the_evidence_of_a_bench_test_is_that_of_quadrature() -> None:
     exact = total - density(fit.u[None])[0]
     found, errors = np.array([log_evidence(own, rng) for own in draws.log_weight.T]).T
     assert np.sum(found) == pytest.approx(exact, abs=4.0 * np.linalg.norm(errors) + 0.01)
-
-
-def test_a_comparison_of_a_robot(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draws near the true values stand for the adapted proposals. The truth has the lag of 8 ms."""
-
-    def draws_of(target: LogPosterior, *_: object) -> WeightedDraws:
-        truth = {**THETA, "trial_sd[progression]": 1e-3, "discrepancy[progression]": 2e-4}
-        centre = target.unconstrain(np.array([truth[name] for name in target.names]))
-        u = centre + 0.01 * np.random.default_rng(0).standard_normal((40, target.dimension))
-        values = [target.mapping(theta) for theta in target.theta(u)]
-        nothing = cast(Any, None)
-        block = dict.fromkeys(target.names, 0)
-        return WeightedDraws(target, nothing, nothing, np.zeros((40, 1)), block, np.arange(40), values)
-
-    monkeypatch.setattr(compare, "joint_fit", lambda *_: None)
-    for module in (compare, leave_out):
-        monkeypatch.setattr(module, "weighted_draws", draws_of)
-    seen = list[tuple[int, int, str]]()
-    choice = compare_models(rig, ["lag"], default_registry(), 0, lambda *step: seen.append(step))
-    assert seen == [(0, 2, "as stated"), (1, 2, "no lag")]
-    assert list(choice.table.index) == ["as stated", "no lag"]
-    assert choice.table.loc["no lag", "difference"] < -2.0
-    assert choice.table["log_evidence"].tolist() == pytest.approx([0.0, 0.0])
-    assert list(choice.predictions.index) == [
-        f"{t} ms, duty 30 %, {n} periods" for t, n in ((60, 67), (80, 50), (100, 40))
-    ]
-    assert "direction is right in 3 of 3 settings" in choice.text
-
-
-def variant(parameters: int, density: list[float], shape: float = 0.3) -> _Variant:
-    return _Variant(parameters, np.array(density), (0.0, 0.1), shape, 0, pd.DataFrame({"inside": [len(density)]}))
-
-
-def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> None:
-    fitted = {
-        "best": variant(5, [1.0, 1.2, 0.9, 1.1]),
-        "as good": variant(4, [0.9, 1.3, 0.9, 1.0]),
-        "wrong": variant(3, [-3.0, -2.5, -3.1, -2.9]),
-    }
-    choice: Choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices(free=("lag",))))
-    assert list(choice.table.index) == ["best", "as good", "wrong"]
-    assert choice.recommended == "as good"
-    assert choice.predictions is fitted["as good"].predictions
-    assert 'free = ["lag"]' in choice.line
-    difference = np.array(fitted["as good"].density) - np.array(fitted["best"].density)
-    assert choice.table.loc["as good", "se"] == pytest.approx(2.0 * np.std(difference, ddof=1))
-
-
-def test_an_uncertain_comparison_says_so() -> None:
-    fitted = {"one": variant(5, [1.0, 1.2, 0.9]), "other": variant(4, [0.0, -np.inf, 0.1], np.inf)}
-    choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices()))
-    assert choice.recommended == "one"
-    assert "few draws determine it (shape above 0.7): other." in choice.line
-    assert "uncertain" not in _choose({"one": fitted["one"]}, {"one": ModelChoices()}).line
-
-
-def test_too_few_settings_are_named(tmp_path: Path) -> None:
-    synthesize_robot(tmp_path / "rig", 1, RobotDesign(PERIODS[:2], np.full(2, 0.3)))
-    with pytest.raises(InputError, match="needs 3 settings or more in progression, to leave each one out, 2 settings"):
-        compare_models(read_rig(tmp_path / "rig"), ["lag"])
 
 
 def test_no_evidence_where_few_draws_are_inside() -> None:

@@ -26,6 +26,8 @@ from capsule_id.inference.target.marginal import MarginalPosterior
 DRAWS = 4096
 #: Importance weights with a larger Pareto shape are not reliable.
 LARGEST_SHAPE = 0.7
+#: Weight that draws without a density may hold.
+NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,7 @@ def weighted_draws(target: LogPosterior, fit: PointFit, seed: int, first: BlockP
 def leave_settings_out(e: TrialsExperiment, draws: WeightedDraws) -> list[LeftOut]:
     """Leave out every setting of ``e`` in turn."""
     density = e.densities_of_settings([e.local(values) for values in draws.values])
-    return [_left_out(draws.of(e) - one, one, draws) for one in density.T]
+    return [_left_out(draws.of(e), one, draws, -1.0) for one in density.T]
 
 
 def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, seed: int) -> LeftOut:
@@ -115,17 +117,26 @@ def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, s
     experiments = [e.without(setting) if each is e else each for each in target.experiments]
     smaller = weighted_draws(LogPosterior(target.rig, experiments), draws.fit, seed, draws.proposal)
     density = e.densities_of_settings([e.local(values) for values in smaller.values])[:, setting]
-    return _left_out(smaller.of(e), density, smaller)
+    return _left_out(smaller.of(e), density, smaller, 0.0)
 
 
-def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws) -> LeftOut:
-    """Smooth the weights. A draw without a density lies far outside the posterior and has weight 0."""
+def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws, power: float) -> LeftOut:
+    """Multiply the weights by ``density`` to a power, and smooth them.
+
+    A draw without a density lies far outside the posterior and has weight 0. Where such draws hold weight before, the
+    shape is infinite: the density of the setting is not known.
+    """
     known, smoothed = np.isfinite(density), np.full(len(density), -np.inf)
     if not np.any(known):
         return LeftOut(-np.inf, np.inf, smoothed, draws)
-    weights, shape = _smooth(log_weight[known])
-    smoothed[known] = weights
-    return LeftOut(float(np.logaddexp.reduce(weights + density[known])), shape, smoothed, draws)
+    smoothed[known], shape = _smooth(log_weight[known] + power * density[known])
+    lost = np.logaddexp.reduce(log_weight[~known]) - np.logaddexp.reduce(log_weight) if not np.all(known) else -np.inf
+    return LeftOut(
+        float(np.logaddexp.reduce(smoothed[known] + density[known])),
+        shape if lost < np.log(NEGLIGIBLE) else np.inf,
+        smoothed,
+        draws,
+    )
 
 
 def _smooth(log_weight: np.ndarray) -> tuple[np.ndarray, float]:

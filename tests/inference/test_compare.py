@@ -1,0 +1,126 @@
+"""Comparison of models: what is fitted, tables, recommendation, and what is refused first."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from capsule_id.api import read_rig
+from capsule_id.errors import InputError
+from capsule_id.experiments.families.trials_experiment import TrialsExperiment
+from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
+from capsule_id.experiments.registry import default_registry
+from capsule_id.inference.choice import compare, leave_out
+from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models
+from capsule_id.inference.choice.leave_out import WeightedDraws
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.rig.model import ModelChoices, Rig
+from tests.inference.three_settings import PERIODS, THETA, three_settings
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
+    return three_settings(tmp_path_factory.mktemp("robot") / "rig")
+
+
+def draws_near_the_truth(target: LogPosterior, *_: object) -> WeightedDraws:
+    """Equal weights, one block."""
+    own = {"trial_sd": 1e-3, "discrepancy": 2e-4}
+    truth = np.array([THETA.get(name, own.get(name.split("[")[0])) for name in target.names])
+    u = target.unconstrain(truth) + 0.01 * np.random.default_rng(0).standard_normal((40, target.dimension))
+    values = [target.mapping(theta) for theta in target.theta(u)]
+    nothing = cast(Any, None)
+    block = dict.fromkeys(target.names, 0)
+    return WeightedDraws(target, nothing, nothing, np.zeros((40, 1)), block, np.arange(40), values)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws near the true values stand for the adapted proposals."""
+    monkeypatch.setattr(compare, "joint_fit", lambda *_: None)
+    for module in (compare, leave_out):
+        monkeypatch.setattr(module, "weighted_draws", draws_near_the_truth)
+
+
+@pytest.mark.usefixtures("drawn")
+def test_a_comparison_of_a_robot(rig: Rig) -> None:
+    """The truth has the lag of 8 ms."""
+    seen = list[tuple[int, int, str]]()
+    choice = compare_models(rig, ["lag"], default_registry(), 0, lambda *step: seen.append(step))
+    assert seen == [(0, 2, "as stated"), (1, 2, "no lag")]
+    assert list(choice.table.index) == ["as stated", "no lag"]
+    assert choice.table.loc["no lag", "difference"] < -2.0
+    assert choice.table["log_evidence"].tolist() == pytest.approx([0.0, 0.0])
+    assert list(choice.predictions.index) == [
+        f"{t} ms, duty 30 %, {n} periods" for t, n in ((60, 67), (80, 50), (100, 40))
+    ]
+    assert "direction is right in 3 of 3 settings" in choice.text
+
+
+@pytest.mark.usefixtures("drawn")
+def test_two_progressions_are_named_in_the_predictions(rig: Rig) -> None:
+    """The variants leave out the settings of both, one at a time."""
+    (table,) = rig.tables
+    both = replace(rig, tables=(replace(table, label="first"), replace(table, label="second")))
+    choice = compare_models(both, ["lag"])
+    assert len(choice.predictions) == 6
+    assert set(choice.predictions.index.get_level_values(0)) == {"first", "second"}
+    assert choice.table.loc["as stated", "elpd"] > choice.table.loc["no lag", "elpd"]
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_models_that_the_readings_demand_are_compared(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a fit takes them from ``second_models``: here a stand-in leaves out one setting."""
+    monkeypatch.setattr(
+        compare, "second_models", lambda made, _: ([cast(TrialsExperiment, e).without(0) for e in made], [])
+    )
+    assert len(compare_models(rig, ["lag"]).predictions) == 2
+
+
+def test_arviz_is_missed_before_any_fit(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ImportError(name)
+
+    def fitted(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(leave_out, "import_module", missing)
+    monkeypatch.setattr(compare, "joint_fit", fitted)
+    with pytest.raises(InputError, match=r"comparing models needs the package arviz, not installed, pip install"):
+        compare_models(rig, ["lag"])
+
+
+def variant(parameters: int, density: list[float], shape: float = 0.3) -> _Variant:
+    return _Variant(parameters, np.array(density), (0.0, 0.1), shape, 0, pd.DataFrame({"inside": [len(density)]}))
+
+
+def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> None:
+    fitted = {
+        "best": variant(5, [1.0, 1.2, 0.9, 1.1]),
+        "as good": variant(4, [0.9, 1.3, 0.9, 1.0]),
+        "wrong": variant(3, [-3.0, -2.5, -3.1, -2.9]),
+    }
+    choice: Choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices(free=("lag",))))
+    assert list(choice.table.index) == ["best", "as good", "wrong"]
+    assert choice.recommended == "as good"
+    assert choice.predictions is fitted["as good"].predictions
+    assert 'free = ["lag"]' in choice.line
+    difference = np.array(fitted["as good"].density) - np.array(fitted["best"].density)
+    assert choice.table.loc["as good", "se"] == pytest.approx(2.0 * np.std(difference, ddof=1))
+
+
+def test_an_uncertain_comparison_says_so() -> None:
+    fitted = {"one": variant(5, [1.0, 1.2, 0.9]), "other": variant(4, [0.0, -np.inf, 0.1], np.inf)}
+    choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices()))
+    assert choice.recommended == "one"
+    assert "few draws determine it (shape above 0.7): other." in choice.line
+    assert "uncertain" not in _choose({"one": fitted["one"]}, {"one": ModelChoices()}).line
+
+
+def test_too_few_settings_are_named(tmp_path: Path) -> None:
+    synthesize_robot(tmp_path / "rig", 1, RobotDesign(PERIODS[:2], np.full(2, 0.3)))
+    with pytest.raises(InputError, match="needs 3 settings or more in progression, to leave each one out, 2 settings"):
+        compare_models(read_rig(tmp_path / "rig"), ["lag"])
