@@ -15,7 +15,7 @@ from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robo
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.choice import compare, leave_out
 from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models
-from capsule_id.inference.choice.leave_out import WeightedDraws
+from capsule_id.inference.choice.leave_out import LeftOut, WeightedDraws
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
 from tests.inference.three_settings import PERIODS, THETA, three_settings
@@ -50,7 +50,7 @@ def test_a_comparison_of_a_robot(rig: Rig) -> None:
     """The truth has the lag of 8 ms."""
     seen = list[tuple[int, int, str]]()
     choice = compare_models(rig, ["lag"], default_registry(), 0, lambda *step: seen.append(step))
-    assert seen == [(0, 2, "as stated"), (1, 2, "no lag")]
+    assert seen == [(0, 4, "as stated"), (1, 4, "no lag"), (2, 4, "as stated"), (3, 4, "no lag")]
     assert list(choice.table.index) == ["as stated", "no lag"]
     assert choice.table.loc["no lag", "difference"] < -2.0
     assert choice.table["log_evidence"].tolist() == pytest.approx([0.0, 0.0])
@@ -94,30 +94,69 @@ def test_arviz_is_missed_before_any_fit(rig: Rig, monkeypatch: pytest.MonkeyPatc
 
 
 def variant(parameters: int, density: list[float], shape: float = 0.3) -> _Variant:
-    return _Variant(parameters, np.array(density), (0.0, 0.1), shape, 0, pd.DataFrame({"inside": [len(density)]}))
+    """A variant of one progression with these densities of its settings."""
+    nothing = cast(Any, None)
+    left_out = [LeftOut(one, shape, np.zeros(1), nothing) for one in density]
+    return _Variant(parameters, nothing, ((nothing, left_out),), (0.0, 0.1))
 
 
+@pytest.fixture
+def tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of predictions, their number of settings."""
+    monkeypatch.setattr(compare, "left_out_predictions", lambda _, own, __: pd.DataFrame({"density": [own[0].density]}))
+
+
+@pytest.mark.usefixtures("tables")
 def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> None:
     fitted = {
         "best": variant(5, [1.0, 1.2, 0.9, 1.1]),
         "as good": variant(4, [0.9, 1.3, 0.9, 1.0]),
         "wrong": variant(3, [-3.0, -2.5, -3.1, -2.9]),
     }
-    choice: Choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices(free=("lag",))))
+    choice: Choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices(free=("lag",))), 0)
     assert list(choice.table.index) == ["best", "as good", "wrong"]
     assert choice.recommended == "as good"
-    assert choice.predictions is fitted["as good"].predictions
+    assert choice.predictions["density"].tolist() == [0.9]
     assert 'free = ["lag"]' in choice.line
     difference = np.array(fitted["as good"].density) - np.array(fitted["best"].density)
     assert choice.table.loc["as good", "se"] == pytest.approx(2.0 * np.std(difference, ddof=1))
 
 
+@pytest.mark.usefixtures("tables")
 def test_an_uncertain_comparison_says_so() -> None:
     fitted = {"one": variant(5, [1.0, 1.2, 0.9]), "other": variant(4, [0.0, -np.inf, 0.1], np.inf)}
-    choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices()))
+    choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices()), 0)
     assert choice.recommended == "one"
     assert "few draws determine it (shape above 0.7): other." in choice.line
-    assert "uncertain" not in _choose({"one": fitted["one"]}, {"one": ModelChoices()}).line
+    assert "uncertain" not in _choose({"one": fitted["one"]}, {"one": ModelChoices()}, 0).line
+
+
+@pytest.mark.usefixtures("tables")
+@pytest.mark.parametrize(("behind", "refits"), [(0.5, 2), (9.0, 0)])
+def test_variants_are_refitted_unless_they_are_hopeless(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, behind: float, refits: int
+) -> None:
+    """Two of four settings have a large shape. A variant far behind keeps it, and the recommendation holds all the same."""
+    density = {"ratio": [1.0, 1.2, 0.9, 1.1], "other": [1.0 - behind, 1.2 - 1.2 * behind, 0.9 - behind, 1.1 - behind]}
+
+    def fitted(rig: Rig, *_: object) -> _Variant:
+        own = variant(5, density["ratio" if "lag" in rig.model.free else "other"])
+        ((nothing, left_out),) = own.left_out
+        return replace(own, left_out=((nothing, [replace(left_out[k], shape=0.3 + 0.5 * (k > 1)) for k in range(4)]),))
+
+    asked = list[int]()
+
+    def again(_: object, __: object, setting: int, ___: int) -> LeftOut:
+        asked.append(setting)
+        return LeftOut(0.8, 0.4, np.zeros(1), cast(Any, None))
+
+    monkeypatch.setattr(compare, "_fit_variant", fitted)
+    monkeypatch.setattr(compare, "leave_setting_out", again)
+    choice = compare_models(rig, ["lag"])
+    assert choice.table.loc["as stated", "refits"] == 2
+    assert choice.table.loc["no lag", "refits"] == refits
+    assert asked == [2, 3] * (1 + refits // 2)
+    assert "uncertain" not in choice.line
 
 
 def test_too_few_settings_are_named(tmp_path: Path) -> None:

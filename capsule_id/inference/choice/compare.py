@@ -16,6 +16,7 @@ from capsule_id.inference.choice.evidence import log_evidence
 from capsule_id.inference.choice.leave_out import (
     LARGEST_SHAPE,
     LeftOut,
+    WeightedDraws,
     leave_setting_out,
     leave_settings_out,
     psislw,
@@ -33,6 +34,9 @@ from capsule_id.views import counted
 FEWEST_SETTINGS = 3
 #: Standard errors by which the best variant must be better for a simpler one to be rejected.
 STANDARD_ERRORS = 2.0
+#: A variant is hopeless, and has no refits, where it is worse by this much and this many standard errors. Smaller
+#: differences mean little (Sivula, Magnusson, Matamoros & Vehtari 2020).
+HOPELESS, HOPELESS_ERRORS = 4.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Choice:
     ----------
     table : a row per variant (index ``variant``), the best first: parameters, elpd, its difference from the best and
         the standard error of the difference, log_evidence and its standard error, shape (largest Pareto shape of the
-        densities that enter), refits
+        densities that enter), refits; none where a variant is far worse than the best
     recommended : the variant with the fewest parameters within two standard errors of the best
     choices : the choices of ``[model]`` by variant
     predictions : of the recommended variant, see ``capsule_id.inference.choice.predictions.left_out_predictions``
@@ -65,7 +69,8 @@ class Choice:
             f"{self.recommended}: the simplest variant within {STANDARD_ERRORS:g} standard errors of the best "
             f"(elpd {row['difference']:.1f} ± {row['se']:.1f}). Write in [model]: {lines}"
         )
-        rough = [name for name in self.table.index if not self.table.loc[name, "shape"] <= LARGEST_SHAPE]
+        columns = self.table[["shape", "difference", "se"]].itertuples()
+        rough = [str(name) for name, shape, *far in columns if not shape <= LARGEST_SHAPE and not _hopeless(*far)]
         if not rough:
             return said
         return (
@@ -82,14 +87,51 @@ class Choice:
 
 @dataclass(frozen=True)
 class _Variant:
-    """A fitted variant: parameters, densities of the settings left out, evidence and its error, shape, refits."""
+    """A fitted variant.
+
+    Attributes
+    ----------
+    parameters : number of parameters
+    draws : weighted draws of its posterior
+    left_out : settings left out by progression
+    evidence : log-evidence and its standard error
+    refits : number of posteriors drawn again without a setting
+    """
 
     parameters: int
-    density: np.ndarray
+    draws: WeightedDraws
+    left_out: tuple[tuple[TrialsExperiment, list[LeftOut]], ...]
     evidence: tuple[float, float]
-    shape: float
-    refits: int
-    predictions: pd.DataFrame
+    refits: int = 0
+
+    @property
+    def density(self) -> np.ndarray:
+        """Log predictive densities (settings,) of all progressions."""
+        return np.array([one.density for _, own in self.left_out for one in own])
+
+    @property
+    def elpd(self) -> float:
+        return float(np.sum(self.density))
+
+    @property
+    def shape(self) -> float:
+        """Largest Pareto shape."""
+        return max(one.shape for _, own in self.left_out for one in own)
+
+    def refitted(self, seed: int) -> "_Variant":
+        """Leave out again, by draws of the posterior without them, the settings whose shape is too large."""
+        found, refits = [], 0
+        for e, own in self.left_out:
+            poor = [k for k, one in enumerate(own) if not one.shape <= LARGEST_SHAPE]
+            again = {k: leave_setting_out(self.draws, e, k, seed) for k in poor}
+            found.append((e, [again.get(k, one) for k, one in enumerate(own)]))
+            refits += len(poor)
+        return replace(self, left_out=tuple(found), refits=refits)
+
+    def predictions(self, seed: int) -> pd.DataFrame:
+        """Tables of ``left_out_predictions``, named by their progression where there are several."""
+        tables = [left_out_predictions(e, own, seed) for e, own in self.left_out]
+        return tables[0] if len(tables) == 1 else pd.concat({str(table.index.name): table for table in tables})
 
 
 def compare_models(
@@ -125,52 +167,58 @@ def compare_models(
     fitted = {}
     for number, (name, model) in enumerate(choices.items()):
         if progress:
-            progress(number, len(choices), name)
+            progress(number, 2 * len(choices), name)
         fitted[name] = _fit_variant(replace(rig, model=model), kinds, seed)
-    return _choose(fitted, choices)
+    # The best first, so that hopeless variants are known when their turn comes.
+    for number, name in enumerate(sorted(fitted, key=lambda name: -fitted[name].elpd)):
+        if progress:
+            progress(len(choices) + number, 2 * len(choices), name)
+        if not _hopeless(*_difference(fitted[name], _best(fitted))):
+            fitted[name] = fitted[name].refitted(seed)
+    return _choose(fitted, choices, seed)
 
 
 def _fit_variant(rig: Rig, registry: Registry, seed: int) -> _Variant:
     # Decays get the models that their readings demand, as in a fit.
     experiments, _ = second_models(make_experiments(rig, "all", registry), check_readings(rig, "all", registry))
     target = LogPosterior(rig, experiments)
-    fit = joint_fit(target, {}, seed)
-    draws = weighted_draws(target, fit, seed)
-    found, tables, refits = list[LeftOut](), list[pd.DataFrame](), 0
-    for e in target.experiments:
-        if not isinstance(e, TrialsExperiment):
-            continue
-        own = leave_settings_out(e, draws)
-        for setting in [k for k, one in enumerate(own) if not one.shape <= LARGEST_SHAPE]:
-            own[setting] = leave_setting_out(draws, e, setting, seed)
-            refits += 1
-        tables.append(left_out_predictions(e, own, seed))
-        found += own
+    draws = weighted_draws(target, joint_fit(target, {}, seed), seed)
     rng = np.random.default_rng(seed)
     evidence, errors = np.array([log_evidence(block, rng) for block in draws.log_weight.T]).T
     return _Variant(
         target.dimension,
-        np.array([one.density for one in found]),
+        draws,
+        tuple((e, leave_settings_out(e, draws)) for e in target.experiments if isinstance(e, TrialsExperiment)),
         (float(np.sum(evidence)), float(np.linalg.norm(errors))),
-        max(one.shape for one in found),
-        refits,
-        pd.concat(tables) if len(tables) == 1 else pd.concat({str(table.index.name): table for table in tables}),
     )
 
 
-def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices]) -> Choice:
+def _best(fitted: Mapping[str, _Variant]) -> _Variant:
+    return max(fitted.values(), key=lambda variant: variant.elpd)
+
+
+def _difference(one: _Variant, best: _Variant) -> tuple[float, float]:
+    """Difference of the elpd, and its standard error from the settings; a setting without a density gives -inf, NaN."""
+    with np.errstate(invalid="ignore"):
+        each = one.density - best.density
+        return float(np.sum(each)), float(np.sqrt(len(each) * np.var(each, ddof=1)))
+
+
+def _hopeless(difference: float, error: float) -> bool:
+    """Whether no refit is needed: weights with a large shape overrate a variant, and it is far behind all the same."""
+    return difference < -(HOPELESS + HOPELESS_ERRORS * error)
+
+
+def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices], seed: int) -> Choice:
     """The table, the best variant first, and the recommendation."""
-    best = max(fitted.values(), key=lambda variant: float(np.sum(variant.density)))
+    best = _best(fitted)
     rows: dict[str, dict[str, Any]] = {}
-    for name, one in sorted(fitted.items(), key=lambda item: -float(np.sum(item[1].density))):
-        with np.errstate(invalid="ignore"):
-            # A setting without a density gives -inf.
-            difference = one.density - best.density
-            error = float(np.sqrt(len(difference) * np.var(difference, ddof=1)))
+    for name, one in sorted(fitted.items(), key=lambda item: -item[1].elpd):
+        difference, error = _difference(one, best)
         rows[name] = {
             "parameters": one.parameters,
-            "elpd": float(np.sum(one.density)),
-            "difference": float(np.sum(difference)),
+            "elpd": one.elpd,
+            "difference": difference,
             "se": error,
             "log_evidence": one.evidence[0],
             "± log_evidence": one.evidence[1],
@@ -179,8 +227,8 @@ def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices])
         }
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("variant")
     close = [name for name in table.index if fitted[name] is best or _close(table.loc[name])]
-    recommended = min(close, key=lambda name: (fitted[name].parameters, -float(np.sum(fitted[name].density))))
-    return Choice(table, recommended, dict(choices), fitted[recommended].predictions)
+    recommended = min(close, key=lambda name: (fitted[name].parameters, -fitted[name].elpd))
+    return Choice(table, recommended, dict(choices), fitted[recommended].predictions(seed))
 
 
 def _close(row: pd.Series) -> bool:

@@ -27,7 +27,7 @@ from capsule_id.inference.sampling.diagnostics import (
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import Moves, block_move, other_moves
 from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
-from capsule_id.inference.sampling.refinement import NO_MASS, SINGLE, refined
+from capsule_id.inference.sampling.refinement import NO_MASS, refined
 
 #: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
@@ -46,6 +46,8 @@ FIRST_CHECK, CHECK_EVERY = 120, 30
 #: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well, so that
 #: the Laplace approximation is tried as it is.
 LARGE = 9
+#: Rounds of adaptation that begin with a proposal adapted to a similar density.
+NEAR = 2
 #: Burn-in of every ensemble before its first stored draw, in autocorrelation times of the pilot. The first walkers come
 #: from a proposal that is close to the posterior already.
 BURN_IN_IN_TAU = 4.0
@@ -197,11 +199,11 @@ def adapted_proposal(
 ) -> BlockProposal:
     """Proposal adapted to the density of ``target``, from the Laplace approximation.
 
-    A proposal ``first`` that is adapted to a similar density takes its place, and needs a few rounds only.
+    A proposal ``first`` that is adapted to a similar density takes its place, and needs ``NEAR`` rounds only.
     """
     large = [len(block) >= LARGE for block in target.blocks]
     if first is not None:
-        return refined(target.parts, first, target.normal_priors, random, large, SINGLE)
+        return refined(target.parts, first, target.normal_priors, random, large, NEAR)
     narrow = np.isin(np.arange(target.dimension), np.concatenate([[], *compress(target.blocks, large)]))
     laplace = np.where(np.outer(narrow, narrow), target.covariance, OVERDISPERSION**2 * target.covariance)
     first = block_proposal(target.blocks, target.centre, laplace, large)
