@@ -13,6 +13,8 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.base_run import BaseRun
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.feasibility import feasibility
+from capsule_id.experiments.forced_run.start_state.slides import slides
+from capsule_id.inference.fit.joint_starts import choose_starts
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.records.label import measured_motion
 from capsule_id.rig.model import Quantity, Rig
@@ -166,6 +168,30 @@ def test_a_run_without_spring_is_one_whose_spring_is_far_away() -> None:
     assert feasibility(free, values, 1.0) == [
         f for f in feasibility(near, {**values, "k2": 1.0}, 1.0) if f.code != "runs.contact"
     ]
+
+
+def test_the_slides_of_a_record_give_starting_values(tmp_path: Path) -> None:
+    """Friction is constant there. c has a dispersion of 0.5; mu follows with the prior's v_s, 0.3 m/s for 0.05 m/s."""
+    shaken = rig(tmp_path).tables[0]
+    found = BaseRun(shaken, rig(tmp_path)).starts()
+    for name, largest in {"k1": 0.05, "mu": 0.35, "c": 1.0}.items():
+        assert abs(np.log(found[name].centre / TRUTH[name])) < largest, name
+    assert abs(found["x_start[shaken]"].centre - float(base(0.0))) < 1e-5
+    r, X2 = shaken["x_base"] - shaken["x_capsule"], shaken["x_capsule"]
+    # negative control: a spring that pushes where it should pull, a base at rest, a capsule at rest
+    for wrong in ((-r, X2), (0.0 * r, X2), (r, 0.0 * X2)):
+        assert slides(shaken["time"], *wrong, 0.5, M2) is None
+
+
+def test_the_fit_of_a_shaken_capsule_begins_near_its_maximum(tmp_path: Path) -> None:
+    shaken = rig(tmp_path)
+    target = LogPosterior(shaken, [BaseRun(shaken.tables[0], shaken)])
+    candidates = choose_starts(target, {}, 0, {})
+    k1, mu = (target.theta(candidates)[:, target.names.index(name)] for name in ("k1", "mu"))
+    assert np.max(np.abs(np.log(k1 / TRUTH["k1"]))) < 0.3
+    assert np.max(np.abs(np.log(mu / TRUTH["mu"]))) < 0.5
+    # Copies of one start would agree without a proof.
+    assert len(np.unique(candidates, axis=0)) == len(candidates)
 
 
 @pytest.mark.slow

@@ -11,15 +11,19 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.clock import stretch
 from capsule_id.experiments.forced_run.drives.runs import OtherRun
 from capsule_id.experiments.forced_run.start_state.rough import RunStart, rough_start
+from capsule_id.experiments.forced_run.start_state.slides import slides
 from capsule_id.physics.drives.recorded import RodMotion
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.records.stated_settings import relative_position
 from capsule_id.rig.model import Table
+
+#: Dispersion of the starts of k1, c and mu about their estimates from the record, natural logarithm.
+SPREAD = {"k1": 0.05, "c": 0.5, "mu": 0.1}
 
 
 class BaseRun(OtherRun):
@@ -50,6 +54,24 @@ class BaseRun(OtherRun):
         # Friction is about as strong in both directions, so the spring is unextended near the mean.
         seen = {name: table[name] for name in self.channels} | {"x_rel": relative[0] - np.mean(relative[0])}
         return rough_start(table["time"], seen, self.Omega)
+
+    def starts(self) -> dict[str, Start]:
+        """Starts as of any run, and those of spring, damper and friction from the slides of the record."""
+        starts, relative = super().starts(), relative_position(self.table)
+        if relative is None or self.rig.m2 is None or self.spring is not None:
+            return starts
+        r = relative[0] - np.mean(relative[0])
+        found = slides(self.time, r, self.table["x_base"] - relative[0], 2.0 * np.pi / self.Omega, self.rig.m2.value)
+        if found is None:
+            return starts
+        m1 = 0.0 if self.rig.m1 is None else self.rig.m1.value
+        masses = {"m1": m1, "m2": self.rig.m2.value, "g": self.rig.g.value}
+        per_mu = self.law({**masses, "mu": 1.0, "mu_back": 1.0}).forward(found.speed)
+        values = {"k1": found.k1, "c": found.c, "mu": found.friction / float(per_mu)}
+        sampled = {row.symbol for row in self.parameters}
+        starts |= {name: Start(value, SPREAD[name]) for name, value in values.items() if name in sampled}
+        at_first = f"x_start[{self.label}]"
+        return starts | {at_first: Start(float(r[0]) + found.extension, starts[at_first].spread)}
 
     def law(self, theta: ValuesBySymbol) -> FrictionLaw:
         return super().law({"m1": 0.0, **theta})

@@ -48,8 +48,8 @@ FARTHEST = 2.0
 NEGLIGIBLE_INCREASE = 0.1
 #: Stop refining a start whose cost exceeds this many times the best.
 COST_RATIO_TO_ABANDON = 3.0
-#: Try starts until two of them fit every channel within this many times its noise.
-NOISE_RATIO_OF_A_GOOD_FIT = 1.2
+#: Try starts until two of them fit every channel within this many times its noise, or so many end at the same maximum.
+NOISE_RATIO_OF_A_GOOD_FIT, ENOUGH_THAT_AGREE = 1.2, 4
 #: Search range of a scatter's conditional maximum about its value, natural logarithm.
 SCATTER_SEARCH = 6.0
 #: Settings of the search over scatters that act together, natural logarithm.
@@ -85,9 +85,9 @@ def joint_fit(
     starts = _choose_starts(target, known, seed, first or {}) if starts is None else starts
     ends: list[_End] = []
     for start in starts:
-        if len(ends) >= STARTS and sum(not _has_excess_noise(target, end.u) for end in ends) > 1:
-            break
         before = max(ends, key=lambda end: end.value, default=None)
+        if before is not None and _suffice(target, ends, before.value):
+            break
         if before is None or not np.isfinite(before.value):
             ends.append(_search(target, start, np.inf))
         else:
@@ -151,6 +151,15 @@ def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) ->
     away = np.max(np.abs(u - u[best]) / spread, axis=1)
     dent = (away < 1.0) & (value > value[best] - NEGLIGIBLE_INCREASE)
     return ~((away <= AGREEMENT) | dent) | ~np.isfinite(value)
+
+
+def _suffice(target: LogPosterior, ends: list[_End], highest: float) -> bool:
+    """Whether further starts are not needed: two fit every channel, or many reach the ``highest`` log-posterior."""
+    if len(ends) < STARTS:
+        return False
+    if sum(end.value > highest - NEGLIGIBLE_INCREASE for end in ends) >= ENOUGH_THAT_AGREE:
+        return True
+    return sum(not _has_excess_noise(target, end.u) for end in ends) > 1
 
 
 def _has_excess_noise(target: LogPosterior, u: np.ndarray) -> bool:

@@ -43,7 +43,8 @@ def choose_starts(
     candidates = np.where((rng.random(candidates.shape) < PROBABILITY_TO_PERTURB) & ~target.scatter, moved, centre)
     mirrored = np.isin(target.names, [name for e in target.experiments for name in e.mirrored])
     candidates = np.where(mirrored & (rng.random((len(candidates), 1)) < 0.5), -candidates, candidates)
-    candidates[0] = centre
+    # Copies of the centre would agree with it without a proof.
+    candidates = np.concatenate([centre[None], candidates[np.any(candidates != centre, axis=1)]])
     value = weigh(target, candidates)
     ranked = 1 + np.argsort(-value[1:])[: MAX_STARTS - 1]
     ranked = ranked[np.isfinite(value[ranked])]

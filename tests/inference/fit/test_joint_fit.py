@@ -20,6 +20,7 @@ from capsule_id.inference.fit.joint_fit import (
     _better_point,
     _descend,
     _is_converged,
+    _suffice,
     joint_fit,
     scatter_modes,
 )
@@ -113,6 +114,17 @@ def test_starts_go_on_until_two_ends_describe_the_runs(monkeypatch: pytest.Monke
     again = joint_fit(target, {}, 0)
     assert again.at_other_maximum.tolist() == [False, True, True, False]
     assert check_starts(again)[0].level == "warn"
+
+
+def test_starts_end_where_enough_of_them_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Model error leaves excess noise in every end; four ends at one maximum then suffice, and three do not."""
+    target, fit = fitted()
+    good = _descend(target, fit.u)
+    lower = replace(good, value=good.value - 1.0)
+    monkeypatch.setattr(module, "_has_excess_noise", lambda *_: True)
+    assert _suffice(target, [good] * 4, good.value)
+    assert not _suffice(target, [good, good, good, lower, lower], good.value)
+    assert not _suffice(target, [lower] * 4 + [good], good.value)
 
 
 def test_a_move_of_one_parameter_leads_out_of_a_side_maximum_and_not_out_of_the_maximum() -> None:
