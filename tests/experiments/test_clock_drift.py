@@ -84,10 +84,10 @@ def theta_of(e: Experiment) -> dict[str, float]:
 def test_the_drift_stretches_the_record(name: str) -> None:
     """The likelihood at a drift is that of the record whose times were read with this drift, stated as exact."""
     table = CASES[name](TIME)
-    loose, exact = only(restated(table, Quantity(0.0, SD))), only(restated(table, Quantity(TRUE)))
+    loose, exact = only(restated(table, Quantity(0.5 * TRUE, SD))), only(restated(table, Quantity(TRUE)))
     theta = theta_of(exact)
     # The noise of the times of turning points is that of the times as read.
-    scaled = {"time_sd": theta["time_sd"] * (1.0 + TRUE)} if "time_sd" in theta else {}
+    scaled = {"time_sd": theta["time_sd"] * (1.0 + TRUE) / (1.0 + 0.5 * TRUE)} if "time_sd" in theta else {}
     value = float(exact.log_likelihood({**theta, **scaled}))
     tolerance = 2e-4 if scaled else 1e-6
     assert float(loose.log_likelihood({**theta, "clock_drift": TRUE})) == pytest.approx(value, rel=tolerance)

@@ -18,7 +18,8 @@ from tests.rig.faults import fault_of
 TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.3, "v_s": 0.3, "g": 9.81}
 P = CapsuleParameters(**TRUTH, k2=0.0, G=np.inf)
 PERIOD, DUTY, LAG, PHASE, K = 0.09, 0.4, 0.006, 1.1, 2.0
-TIME = np.arange(600) / 1000.0
+#: Time since the first sample, and the time of the first sample on its clock, s.
+TIME, FIRST = np.arange(600) / 1000.0, 0.25
 NOISE = 1e-5
 HEAD = '[rig]\nname = "run"\nm1 = { value = 110, unit = "g" }\nm2 = { value = 530, unit = "g" }\n'
 RUN = (
@@ -34,7 +35,7 @@ def write(folder: Path, drive: Drive, shift: float, current: np.ndarray | None, 
     """A record of x_rel and x_capsule from rest, with noise, and its rig."""
     rng = np.random.default_rng(1)
     t = simulate(P, drive, shift + TIME)
-    columns = {"time [s]": TIME, "x_rel [m]": np.asarray(t.x_rel), "x_capsule [m]": np.asarray(t.X2)}
+    columns = {"time [s]": FIRST + TIME, "x_rel [m]": np.asarray(t.x_rel), "x_capsule [m]": np.asarray(t.X2)}
     noisy = {
         name: x if name.startswith("time") else x + NOISE * rng.standard_normal(x.size) for name, x in columns.items()
     }
@@ -98,11 +99,11 @@ def test_a_later_part_of_a_record_has_the_pulses_of_the_whole(tmp_path: Path) ->
     segment = 'start = "moving"\nsegment = { value = 100, unit = "ms" }'
     (tmp_path / "rig.toml").write_text(toml.replace('start = "stuck"', segment))
     part = make_experiments(read_rig(tmp_path))[1]
-    assert (part.time[0] - TIME[0]) / PERIOD % 1.0 > 0.05
+    assert (part.time[0] - FIRST) / PERIOD % 1.0 > 0.05
     own = {"P_on": 6.0, "lag": LAG, "phase": PHASE, "x_start": 1e-3, "y_start": -0.05, "capsule_start": -0.1}
     found = part.motion({**TRUTH, **own, "moves": 1.0}, np)
     Y2 = part.moves * -0.1
-    exact = simulate(P, drive, 50 * PERIOD + part.time - TIME[0], (1e-3, -0.05 + Y2, 0.0, Y2))
+    exact = simulate(P, drive, 50 * PERIOD + part.time - FIRST, (1e-3, -0.05 + Y2, 0.0, Y2))
     assert np.asarray(found.x_rel) == pytest.approx(np.asarray(exact.x_rel), abs=1e-9)
 
 

@@ -66,6 +66,7 @@ def test_absurd_values_have_no_density(rig: Rig) -> None:
     (e,) = cast(list[Progression], make_experiments(rig))
     theta = {**THETA, "discrepancy": 1e16, "trial_scatter": 0.0}
     assert np.all(np.isnan(conditional_densities(e, [theta])))
+    assert np.all(np.isnan(conditional_densities(e, [{**THETA, "trial_scatter": np.nan}])))
 
 
 class Readings:
@@ -206,6 +207,7 @@ def test_the_evidence_of_a_bench_test_is_that_of_quadrature() -> None:
     fit, density = point_fit(target, 0), density_of(target)
     draws = weighted_draws(target, fit, 0)
     assert draws.log_weight.shape == (leave_out.DRAWS, 2)
+    assert draws.block == {"k2[soft]": 0, "k2[stiff]": 1}
     rng, total = np.random.default_rng(0), 0.0
     for block in target.blocks:
         grid = np.meshgrid(*(fit.u[i] + np.linspace(-12.0, 12.0, 401) * fit.covariance[i, i] ** 0.5 for i in block))

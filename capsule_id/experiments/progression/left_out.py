@@ -28,8 +28,11 @@ def _conditional(
     NaN where the covariance is singular or not finite, as at absurd values far outside any posterior.
     """
     misfit = e.misfit_of(theta, mean, per_sd, np).at(theta["trial_sd"], np)
+    covariance = np.diag(misfit.sd**2) + misfit.design @ misfit.design.T
+    if not (np.all(np.isfinite(misfit.raw)) and np.all(np.isfinite(covariance))):
+        return np.full(len(rows), np.nan)
     try:
-        precision = np.linalg.inv(np.diag(misfit.sd**2) + misfit.design @ misfit.design.T)
+        precision = np.linalg.inv(covariance)
         weighted = precision @ misfit.raw
         return np.array([_log_density(precision[np.ix_(own, own)], weighted[own]) for own in rows])
     except np.linalg.LinAlgError:
