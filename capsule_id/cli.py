@@ -50,7 +50,7 @@ def _parser(program: str, text: str) -> _Parser:
 
 
 def _fit_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands import fit
+    from capsule_id.commands.fits import fit
 
     text = (
         "Fit the vibro-impact capsule to a folder of rig measurements. Prints value, sd and trust of every parameter, and "

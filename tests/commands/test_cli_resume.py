@@ -159,7 +159,7 @@ def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPa
 
 def test_killed_from_outside_and_resumed(here: Path) -> None:
     """SIGKILL at a real process: nothing of Python runs after it."""
-    kill = "import os, signal\nfrom capsule_id.commands.fit import Progress\n"
+    kill = "import os, signal\nfrom capsule_id.commands.fits.fit import Progress\n"
     kill += "from capsule_id.inference.sampling import chain_store, ensembles\n"
     kill += "".join(f"{name} = {value}\n" for name, value in SHORT.items())
     kill += "call = lambda self, done, total, text: done > 100 and os.kill(os.getpid(), signal.SIGKILL)\n"
@@ -202,7 +202,7 @@ def test_resume_refuses_what_has_changed(
     with monkeypatch.context() as patch:
         kinds = default_registry()
         with_package = replace(kinds, packages={**kinds.packages, "rolling-rig": "0.2"})
-        patch.setattr("capsule_id.commands.fit.default_registry", lambda: with_package)
+        patch.setattr("capsule_id.commands.fits.fit.default_registry", lambda: with_package)
         assert fit_params([*WORDS, "--out", "out", "--resume"]) == 2
         assert "the same versions" in capsys.readouterr().err
     _remove(here / "out.partial")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from capsule_id.commands.cluster import cluster
 from capsule_id.errors import InputError
 from capsule_id.motions import blocks
-from capsule_id.motions.cluster import cluster
 from capsule_id.motions.points import sweep_points
 from capsule_id.motions.response import Settling
 from capsule_id.motions.sweep import motion_map

@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from capsule_id.commands.capsule_options import (
     fitted_values,
     number,
 )
+from capsule_id.commands.cluster import client_of
 from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
 from capsule_id.commands.maps.sweep_output import prepare_store, publish_pair, remove_store
 from capsule_id.console import Progress, say
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     set_xla_options()
     if not args.no_cache:
         keep_programs()
-    with Progress(not args.quiet, unit="point") as progress, _dask_client(args.scheduler) as client:
+    with Progress(not args.quiet, unit="point") as progress, client_of(args.scheduler) as client:
         data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
         data.attrs["rig"] = rig.name if rig is not None else ""
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
@@ -281,15 +281,6 @@ def _whole_number(name: str, text: str) -> int:
     if value != int(value) or value < 0:
         raise InputError(f"--{name} must be a whole number", text, "give 0 or more")
     return int(value)
-
-
-def _dask_client(scheduler: str | None) -> Any:
-    """A context manager: a Dask client, or None to compute in this process."""
-    if scheduler is None:
-        return nullcontext()
-    from capsule_id.motions.cluster import cluster
-
-    return cluster(scheduler)
 
 
 def _default_out(rig: str | None, axes: Sequence[Axis]) -> Path:

@@ -1,7 +1,7 @@
-"""A Dask cluster for the blocks of a map: threads or processes of this machine, or a running cluster."""
+"""A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running cluster."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from capsule_id.errors import InputError
@@ -11,6 +11,11 @@ if TYPE_CHECKING:
 
 #: Longest wait for a scheduler at an address, s.
 CONNECT_TIMEOUT = 10.0
+
+
+def client_of(scheduler: str | None) -> "AbstractContextManager[Client | None]":
+    """A context manager: a Dask client, or None to compute in this process."""
+    return nullcontext() if scheduler is None else cluster(scheduler)
 
 
 @contextmanager

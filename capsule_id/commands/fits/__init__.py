@@ -1,0 +1,1 @@
+"""Fits of one rig folder or of several."""

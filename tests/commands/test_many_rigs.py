@@ -1,0 +1,113 @@
+"""``fit-params A B``: results as of single fits, from this process, from threads and from workers that die."""
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from capsule_id.cli import fit_params
+from capsule_id.commands.cluster import cluster
+from capsule_id.commands.fits import many_rigs
+from tests.cli_tools import listing, small_rig
+
+TABLES = {"tilts": ("static_friction",), "spring": ("support_spring_soft",)}
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name, tables in TABLES.items():
+        small_rig(tmp_path / name, name, tables)
+    return tmp_path
+
+
+def parameters(directory: Path) -> dict[str, Any]:
+    return json.loads((directory / "parameters.json").read_text())["parameters"]
+
+
+@pytest.mark.parametrize("scheduler", [(), ("--scheduler", "threads")], ids=["in turn", "threads"])
+def test_several_rigs_have_the_results_of_single_fits(
+    here: Path, capsys: pytest.CaptureFixture[str], scheduler: tuple[str, ...]
+) -> None:
+    code = fit_params(["tilts", "spring", "--no-sample", "--quiet", "--out", "all", *scheduler])
+    out, err = capsys.readouterr()
+    assert sorted(line.split(":")[0] for line in out.splitlines()) == ["spring", "tilts"]
+    alone = {name: fit_params([name, "--no-sample", "--quiet", "--out", f"one/{name}"]) for name in TABLES}
+    assert code == max(alone.values())
+    assert all((f"{name}" in err) == (own == 3) for name, own in alone.items())
+    for name in TABLES:
+        assert parameters(here / "all" / name) == parameters(here / "one" / name)
+        assert (here / "all" / name / "report.html").is_file()
+    assert sorted(path.name for path in (here / "all").iterdir()) == sorted(TABLES)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("tilts", "none"), "none"),
+        (("tilts", "tilts"), "must have different names, tilts, change name in rig.toml"),
+        (("tilts", "spring", "--resume"), "--resume and --json are for one rig, 2 rigs"),
+        (("tilts", "spring", "--json"), "--resume and --json are for one rig, 2 rigs"),
+        (("tilts", "spring", "--compare", "lag"), "--compare takes one rig, 2 rigs"),
+        (("tilts", "--scheduler", "threads"), "--scheduler is for several rigs, one rig"),
+        (("tilts", "--compare", "lag", "--scheduler", "threads"), "remove --scheduler"),
+        (("tilts", "spring", "--scheduler", "nowhere:1:2"), "the address of a Dask scheduler"),
+        (("tilts", "spring", "--out", "tilts"), "--out"),
+    ],
+)
+def test_bad_input_is_named_and_nothing_is_written(
+    here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], named: str
+) -> None:
+    (here / "tilts" / "spring").mkdir()
+    (here / "tilts" / "spring" / "mine.txt").write_text("kept")
+    before = listing(here)
+    assert fit_params([*words, "--no-sample", "--quiet"] if "--compare" not in words else [*words]) == 2
+    assert named in capsys.readouterr().err
+    assert listing(here) == before
+
+
+def test_a_rig_that_fails_does_not_stop_the_others(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = many_rigs.write_fit
+
+    def written(rig: Any, *rest: Any) -> Any:
+        if rig.name == "tilts":
+            raise RuntimeError("no finite log-posterior")
+        return fit(rig, *rest)
+
+    monkeypatch.setattr(many_rigs, "write_fit", written)
+    assert fit_params(["tilts", "spring", "--no-sample", "--quiet"]) == 1
+    assert "1 rig not fitted: tilts (RuntimeError: no finite log-posterior)" in capsys.readouterr().err
+    assert [path.name for path in (here / "results").iterdir()] == ["spring"]
+
+
+@pytest.mark.slow
+def test_a_study_of_many_rigs_survives_the_death_of_a_worker(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of the processes is killed after the first result: each rig has one line and one result."""
+    names = [f"rig{i}" for i in range(12)]
+    for name in names:
+        small_rig(here / name, name, TABLES["tilts"])
+    with cluster("processes") as client:
+        pids = list(client.run(os.getpid).values())
+        assert len(pids) >= 2, "with one worker there is nobody to take over"
+        write, written = many_rigs._write, list[str]()
+
+        def killing(found: Any, directory: Path, fingerprint: Any) -> None:
+            if not written:
+                os.kill(pids[0], signal.SIGKILL)
+            written.append(directory.name)
+            write(found, directory, fingerprint)
+
+        monkeypatch.setattr(many_rigs, "_write", killing)
+        fit_params([*names, "--max-steps", "200", "--quiet", "--scheduler", client.scheduler.address])
+        assert pids[0] not in client.run(os.getpid).values()
+    assert sorted(written) == sorted(names)
+    assert sorted(line.split(":")[0] for line in capsys.readouterr().out.splitlines()) == sorted(names)
+    first = parameters(here / "results" / names[0])
+    assert all(parameters(here / "results" / name) == first for name in names)
