@@ -18,9 +18,11 @@ from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.lint import MESSAGES
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import Hidden, check_hidden_terms, hidden_terms
-from capsule_id.experiments.free_vibration.second_fit.screening import second_models
+from capsule_id.experiments.free_vibration.second_fit.screening import open_models, second_models
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Finding
 from tests.cli_tools import DATA
@@ -110,6 +112,43 @@ def test_the_default_prior_of_a_force_follows_the_size_of_the_rig(scale: float) 
     median = {row.symbol: row.prior.location for row in record.parameters if row.symbol in ("F_dry", "c_q")}
     assert median["F_dry"] == pytest.approx(0.05 * bench.K1 * scale * RELEASE, rel=0.1)
     assert median["c_q"] == pytest.approx(0.05 * bench.M1 / (scale * RELEASE), rel=0.1)
+
+
+def test_records_of_unequal_size_share_a_prior_that_follows_both() -> None:
+    """Before, the first record alone set the scale; one in a hundred in size excluded what the other one showed."""
+    table = decay_table(SHORT, DRY, damping=("viscous", "dry"))
+    small = {**table.columns, "x_rel": replace(table.columns["x_rel"], values=1e-2 * table["x_rel"])}
+    pair = [table, replace(table, columns=small, label="small")]
+    found = []
+    for tables in (pair, pair[::-1]):
+        rig = bench.rig(*tables)
+        target = LogPosterior(rig, make_experiments(rig))
+        found.append(target.parameters[target.names.index("F_dry")].prior)
+    assert found[0] == found[1]
+    assert found[0] is not None
+    assert found[0].location == pytest.approx(0.1 * 0.05 * bench.K1 * RELEASE, rel=0.1)
+    assert found[0].spread == pytest.approx(1000.0, rel=0.1)
+
+
+def test_on_a_slope_no_cubic_spring_is_proposed() -> None:
+    """A slope shifts the rest position, where a cubic spring is no longer odd; rig.toml refuses the two together."""
+    slope = Quantity(np.radians(5.0), 0.0)
+    for settings, offered in ({}, True), ({"slope": slope}, False):
+        record = cast(FreeVibration, make_experiments(bench.rig(decay_table(SHORT, DRY, **settings)))[0])
+        assert any(model.cubic for model in open_models(record)[0]) is offered
+    facts = {"name": "k1", "unit": "N/m", "value": 1.0, "low": 0.5, "high": 1.5, "labels": ["decay"]}
+    both = {"symbols": ["F_dry", "k_cubic"], "largest": [1.0, 2.0]}
+    alone = {"symbols": ["k_cubic"], "largest": [2.0]}
+    write = MESSAGES["decays.hidden"].fail
+    assert callable(write)
+    level = write({**facts, **both, "offers_cubic": True})
+    assert 'or write damping = ["viscous", "dry"] and stiffness = "cubic" in' in level
+    sloping = write({**facts, **both, "offers_cubic": False})
+    assert 'stiffness = "cubic"' not in sloping
+    assert 'or write damping = ["viscous", "dry"] in the experiment' in sloping
+    last = write({**facts, **alone, "offers_cubic": False})
+    assert "write stiffness = " in last
+    assert "Record more periods with less noise, or release from smaller deflections. If" in last
 
 
 def test_the_longer_record_in_the_text_names_dry_friction() -> None:

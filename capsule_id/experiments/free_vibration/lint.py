@@ -211,11 +211,17 @@ def _hidden(facts: Facts) -> str:
     all_words = ", ".join(f'"{word}"' for word in ("viscous", *words))
     lines = [(f"damping = [{all_words}]", 'damping = ["viscous"]')] if words else []
     lines += [('stiffness = "cubic"', 'stiffness = "linear"')] if "k_cubic" in facts["symbols"] else []
-    free, known = (" and ".join(each) for each in zip(*lines, strict=True))
+    free, known = ([line[i] for line in lines] for i in (0, 1))
+    remedies = ["Record more periods with less noise"]
+    if "k_cubic" in facts["symbols"] and not facts["offers_cubic"]:
+        free.remove('stiffness = "cubic"')
+        remedies.append("release from smaller deflections")
+    if free:
+        remedies.append(f"write {' and '.join(free)} in the experiment for an interval that includes this")
     return (
         f"{', '.join(facts['labels'])}: expected records that exclude {effects}; they do not. {found} (the fit without: "
-        f"{facts['value']:.3g}). Record more periods with less noise, or write {free} in the experiment for an interval that "
-        f"includes this. If another measurement excludes {effects}, write {known}."
+        f"{facts['value']:.3g}). {', or '.join(remedies)}. If another measurement excludes {effects}, write "
+        f"{' and '.join(known)}."
     )
 
 

@@ -43,6 +43,11 @@ class DecaySettings(GroundSettings):
     gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
     forward: Literal["closed", "capsule"] = "closed"
 
+    @property
+    def offers_cubic(self) -> bool:
+        """Whether a cubic spring may be fitted where no stiffness is stated: on a slope it is refused."""
+        return "slope" not in self.ground
+
 
 def check_ground(entry: Entry[DecaySettings]) -> None:
     """Refuse a slope that the closed form does not have: of a held capsule it shifts the rest position alone."""

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol
 from capsule_id.inference.target.compiling import COMPILE
 from capsule_id.inference.target.groups import Group, make_groups
-from capsule_id.inference.target.priors import Priors, override, prior_of, prior_sd
+from capsule_id.inference.target.priors import Priors, covering_prior, override, prior_of, prior_sd
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Rig
 
@@ -73,9 +73,13 @@ class LogPosterior(eqx.Module):
                 rows[symbol] = parameter(symbol, prior=Prior("positive_normal", mass.value, mass.sd))
             elif mass is not None:
                 fixed[symbol] = mass.value
+        offered: dict[str, list[Parameter]] = {}
         for experiment in experiments:
             for row in experiment.parameters:
-                rows.setdefault(row.name, override(row, rig.priors.get(row.name)))
+                offered.setdefault(row.name, []).append(row)
+        for name, (row, *others) in offered.items():
+            shared = row.named(row.of, covering_prior([prior_of(one) for one in (row, *others)])) if others else row
+            rows.setdefault(name, override(shared, rig.priors.get(name)))
         self.origin = Origin(rig, tuple(experiments), tuple(rows.values()), fixed)
         self.names = tuple(rows)
         self.are_positive = tuple(row.positive for row in rows.values())

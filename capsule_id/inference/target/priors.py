@@ -91,3 +91,21 @@ def prior_sd(row: Parameter) -> float:
 def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
     """Return the row with the prior of ``rig.toml``, where one is stated."""
     return row if stated is None else row.named(row.of, stated.prior)
+
+
+def covering_prior(priors: Sequence[Prior]) -> Prior:
+    """Return the prior of a parameter for which several experiments have defaults, in any order.
+
+    Log-normal priors: the narrowest one whose central 95 % contain those of all. Normal priors about one mean: the widest.
+    Other priors are stated by the user: the first.
+    """
+    kinds, locations = {prior.kind for prior in priors}, {prior.location for prior in priors}
+    if len(set(priors)) == 1:
+        return priors[0]
+    if kinds == {"lognormal"}:
+        low = min(np.log(prior.location) - np.log(prior.spread) for prior in priors)
+        high = max(np.log(prior.location) + np.log(prior.spread) for prior in priors)
+        return Prior("lognormal", float(np.exp(0.5 * (low + high))), float(np.exp(0.5 * (high - low))))
+    if kinds == {"normal"} and len(locations) == 1:
+        return max(priors, key=lambda prior: prior.spread)
+    return priors[0]

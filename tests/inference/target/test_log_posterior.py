@@ -72,6 +72,23 @@ def test_samples_follow_the_density(prior: Prior, reference: Any) -> None:
     assert stats.kstest(wider, reference.cdf).pvalue < 1e-4
 
 
+def test_a_shared_parameter_has_a_prior_that_covers_those_of_all_experiments() -> None:
+    """Against SciPy's quantiles, in either order; a narrower prior would exclude a part (negative control)."""
+    sizes = [Prior("lognormal", 0.3, 10.0), Prior("lognormal", 6.0, 10.0), Prior("lognormal", 0.5, 4.0)]
+    for priors in (sizes, sizes[::-1]):
+        target = LogPosterior(rig_without_tables(), [Nothing([parameter("F_dry", prior=prior)]) for prior in priors])
+        found = target.parameters[0].prior
+        assert found is not None
+        low, high = (stats.lognorm(s=np.log(found.spread) / stats.norm.ppf(0.975), scale=found.location)).interval(0.95)
+        assert (low, high) == (pytest.approx(0.03), pytest.approx(60.0))
+    springs = [Prior("normal", 0.0, 2.0), Prior("normal", 0.0, 5.0)]
+    target = LogPosterior(rig_without_tables(), [Nothing([parameter("k_cubic", prior=prior)]) for prior in springs])
+    assert target.parameters[0].prior == springs[1]
+    stated = [Prior("normal", 1.0, 2.0), Prior("normal", 3.0, 5.0)]
+    target = LogPosterior(rig_without_tables(), [Nothing([parameter("P_on", prior=prior)]) for prior in stated])
+    assert target.parameters[0].prior == stated[0]
+
+
 def test_joint_prior_is_the_sum() -> None:
     priors = [prior for prior, _ in PRIORS.values()]
     joint, singles = target_of(*priors), [target_of(prior) for prior in priors]

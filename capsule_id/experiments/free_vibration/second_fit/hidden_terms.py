@@ -68,18 +68,20 @@ def check_hidden_terms(records: "Sequence[FreeVibration]", fit: Fitted) -> list[
     for e in records:
         settings = e.table.settings
         if not e.model.damping and None in (settings.damping, settings.stiffness):
-            groups.setdefault((e.model.cubic, settings.damping, settings.stiffness), []).append(e)
+            key = e.model.cubic, settings.damping, settings.stiffness, settings.offers_cubic
+            groups.setdefault(key, []).append(e)
     findings, compared = [], []
-    for (cubic, damping, stiffness), members in groups.items():
+    for (cubic, damping, stiffness, offers_cubic), members in groups.items():
         terms = hidden_terms(members, fit.values)
         offered = (() if damping is not None else tuple(DAMPING.values())) + (
             ("k_cubic",) * (stiffness is None and not cubic)
         )
-        compared += [e.label for e in members]
+        facts = {"labels": [e.label for e in members], "offers_cubic": offers_cubic}
+        compared += facts["labels"]
         findings += [
-            Finding("decays.hidden", "fail", {"labels": [e.label for e in members], **facts}, parameters=(name,))
+            Finding("decays.hidden", "fail", {**facts, **changed}, parameters=(name,))
             for name in CHANGES
-            if (facts := _change(name, fit.values[name], {symbol: terms[symbol] for symbol in offered}))
+            if (changed := _change(name, fit.values[name], {symbol: terms[symbol] for symbol in offered}))
         ]
     if compared and not findings:
         findings.append(Finding("decays.hidden", "ok", {"labels": ", ".join(compared)}))

@@ -50,7 +50,7 @@ def open_models(record: "FreeVibration") -> tuple[list[DecayModel], list[DecayMo
     forces = [
         replace(stated, damping=words, cubic=cubic)
         for words in (damping if settings.damping is None else [stated.damping])
-        for cubic in ((False, True) if settings.stiffness is None else (stated.cubic,))
+        for cubic in ((False, True) if settings.stiffness is None and settings.offers_cubic else (stated.cubic,))
     ]
     others = [
         replace(stated, drift=drift, noise=noise)
@@ -176,7 +176,8 @@ def second_models(
     no_decay = {f.experiment for f in readings if f.level == "fail" and f.code in ("decays.release", "decays.second")}
     for i, record in enumerate(records):
         settings = record.table.settings
-        stated = settings.damping, settings.stiffness, settings.drift, settings.noise
+        stiffness = settings.stiffness if settings.offers_cubic else "linear"
+        stated = settings.damping, stiffness, settings.drift, settings.noise
         if record.label not in no_decay:
             groups.setdefault(stated, []).append(i)
         elif None in stated:
