@@ -149,26 +149,34 @@ def test_draws_without_a_density_have_no_weight(log_weight: float, reliable: boo
 
 
 def test_a_refit_without_a_reading_gives_its_predictive_density(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draws of the posterior without the reading need no division by its density."""
+    """Draws of the posterior without the reading need no division by its density.
+
+    The first proposal is too narrow; the next adaptation begins with what the first one found.
+    """
     e, draws = readings_and_draws(4000)
     draws = replace(draws, target=cast(Any, SimpleNamespace(rig=None, experiments=[e])))
     y = 1e3 * e.distance
-    asked = list[list[Any]]()
+    asked, firsts = list[list[Any]](), list[Any]()
 
     def posterior(_: object, experiments: list[Any]) -> list[Any]:
         asked.append(experiments)
         return experiments
 
-    def drawn(experiments: list[Any], *_: object) -> WeightedDraws:
-        theta = 0.2 + 0.6 * np.random.default_rng(1).standard_t(6.0, 20_000)
+    def drawn(experiments: list[Any], _: object, __: object, first: Any) -> WeightedDraws:
+        firsts.append(first)
+        width = 0.1 if len(firsts) == 1 else 0.6
+        theta = 0.2 + width * np.random.default_rng(1).standard_t(6.0, 20_000)
         left = 1e3 * experiments[0].distance
-        weight = stats.norm.logpdf(theta, np.mean(left), len(left) ** -0.5) - stats.t.logpdf(theta, 6.0, 0.2, 0.6)
+        weight = stats.norm.logpdf(theta, np.mean(left), len(left) ** -0.5) - stats.t.logpdf(theta, 6.0, 0.2, width)
         values = [{"theta": one} for one in theta]
-        return replace(draws, log_weight=weight[:, None], inside=np.arange(20_000), values=values)
+        found = cast(Any, "adapted")
+        return replace(draws, log_weight=weight[:, None], inside=np.arange(20_000), values=values, proposal=found)
 
     monkeypatch.setattr(leave_out, "LogPosterior", posterior)
     monkeypatch.setattr(leave_out, "weighted_draws", drawn)
     found = leave_out.leave_setting_out(draws, e, 3, 0)
+    assert firsts == [None, "adapted"]
+    assert len(asked) == 1
     assert len(asked[0][0].distance) == 5
     assert found.density == pytest.approx(stats.norm.logpdf(y[3], (np.sum(y) - y[3]) / 5.0, np.sqrt(1.2)), abs=0.02)
 

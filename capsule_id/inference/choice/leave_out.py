@@ -26,6 +26,8 @@ from capsule_id.inference.target.marginal import MarginalPosterior
 DRAWS = 4096
 #: Importance weights with a larger Pareto shape are not reliable.
 LARGEST_SHAPE = 0.7
+#: Largest number of adaptations of the proposal without a setting, each from the one before.
+ADAPTATIONS = 3
 #: Weight that draws without a density may hold.
 NEGLIGIBLE = 1e-3
 
@@ -112,12 +114,20 @@ def leave_settings_out(e: TrialsExperiment, draws: WeightedDraws) -> list[LeftOu
 
 
 def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, seed: int) -> LeftOut:
-    """Leave out one setting of ``e`` by draws of the posterior without it."""
-    target = draws.target
+    """Leave out one setting of ``e`` by draws of the posterior without it.
+
+    Its proposal is adapted further, up to ``ADAPTATIONS`` times, while the shape is too large.
+    """
+    target, proposal = draws.target, draws.proposal
     experiments = [e.without(setting) if each is e else each for each in target.experiments]
-    smaller = weighted_draws(LogPosterior(target.rig, experiments), draws.fit, seed, draws.proposal)
-    density = e.densities_of_settings([e.local(values) for values in smaller.values])[:, setting]
-    return _left_out(smaller.of(e), density, smaller, 0.0)
+    smaller = LogPosterior(target.rig, experiments)
+    tried = list[LeftOut]()
+    while len(tried) < ADAPTATIONS and not any(one.shape <= LARGEST_SHAPE for one in tried):
+        left = weighted_draws(smaller, draws.fit, seed, proposal)
+        density = e.densities_of_settings([e.local(values) for values in left.values])[:, setting]
+        tried.append(_left_out(left.of(e), density, left, 0.0))
+        proposal = left.proposal
+    return min(tried, key=lambda one: one.shape)
 
 
 def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws, power: float) -> LeftOut:
