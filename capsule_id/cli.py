@@ -15,7 +15,7 @@ from typing import NoReturn, TextIO
 from capsule_id import console
 from capsule_id.commands.compilation import discard_damaged
 from capsule_id.errors import InputError
-from capsule_id.interruption import INTERRUPTED, end_in_time, interruptible
+from capsule_id.interruption import INTERRUPTED, end_interrupted, interruptible
 
 BAD_INPUT, INTERNAL = 2, 1
 _RESUME = "; --resume continues from the saved state"
@@ -88,10 +88,13 @@ def _capsule_parser(program: str) -> argparse.ArgumentParser:
 def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], arguments: Sequence[str] | None) -> int:
     """Parse and act. Every end gives an exit code and at most one line on standard error."""
     try:
-        return _act(program, make_parser, arguments)
+        code = _act(program, make_parser, arguments)
     except console.OutputError as error:
         print(f"{program}: {error}", file=sys.stderr)
-        return INTERNAL
+        code = INTERNAL
+    if arguments is None:  # the process ends with this command
+        end_interrupted(code)
+    return code
 
 
 def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], arguments: Sequence[str] | None) -> int:
@@ -121,8 +124,6 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         return BAD_INPUT
     except KeyboardInterrupt:
         print(interrupted, file=sys.stderr)
-        if arguments is None:  # the process ends with this command
-            end_in_time()
         return INTERRUPTED
     except Exception as error:
         print(f"{program}: internal failure: {_one_line(error)}; {_save_traceback()}", file=sys.stderr)

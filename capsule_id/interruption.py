@@ -7,15 +7,16 @@ Therefore a thread, woken by the signal itself, ends the process if the main thr
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 #: Exit code of an interrupted command.
 INTERRUPTED = 130
-#: Time that the main thread has to end by itself after a signal, s.
+#: Time that the process has to end by itself after a signal, s.
 GRACE = 4.0
 _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 _flag = threading.Event()
@@ -46,6 +47,7 @@ def interruptible(message: str) -> Iterator[None]:
     # None: installed outside Python, cannot be restored.
     before = {n: h for n in _SIGNALS if (h := signal.getsignal(n)) not in (signal.SIG_IGN, None)}
     ended = threading.Event()
+    _arrivals.clear()
     watchdog = threading.Thread(target=_watch, args=(receiver, ended, message), name="watchdog", daemon=True)
     watchdog.start()
     wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
@@ -64,20 +66,26 @@ def interruptible(message: str) -> Iterator[None]:
         _flag.clear()
 
 
-def end_in_time() -> None:
-    """After an interruption, end the process ``GRACE`` seconds after the signal at the latest.
+def end_interrupted(code: int) -> None:
+    """End the process at once with ``code`` if a signal has arrived in the last ``interruptible`` block.
 
-    Python waits for its worker threads before it ends, and one of them may compile for long.
+    Python's own end waits for worker threads and compilations, and stops the threads that could end the process in time.
     """
-    left = GRACE - (time.monotonic() - _arrivals[-1]) if _arrivals else GRACE
-    timer = threading.Timer(max(left, 0.0), os._exit, [INTERRUPTED])
+    if not _arrivals and code != INTERRUPTED:
+        return
+    # A full pipe blocks the flush.
+    left = GRACE - (time.monotonic() - _arrivals[0]) if _arrivals else GRACE
+    timer = threading.Timer(max(left, 0.0), os._exit, [code])
     timer.daemon = True
     timer.start()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def _set_flag(number: int, frame: FrameType | None) -> None:
     del number, frame
-    _arrivals.append(time.monotonic())
     _flag.set()
 
 
@@ -85,6 +93,8 @@ def _watch(receiver: socket.socket, ended: threading.Event, message: str) -> Non
     """Wait for a signal, then for the end of the block; end the process if that takes longer than ``GRACE``."""
     while arrived := receiver.recv(64):
         if _SIGNALS & set(arrived):
+            # The handler would be late: Python calls it after a compilation.
+            _arrivals.append(time.monotonic())
             if not ended.wait(GRACE):
                 os.write(2, f"{message}\n".encode())  # sys.stderr may be locked by the main thread
                 os._exit(INTERRUPTED)

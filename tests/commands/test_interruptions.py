@@ -1,8 +1,11 @@
 """Interruptions of a fit at random times, some during a compilation: it ends in time, and ``--resume`` repeats it."""
 
+import hashlib
+import os
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -11,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsule_id import interruption
 from capsule_id.interruption import GRACE, interruptible, stop_if_interrupted
 from tests.cli_tools import DATA, argv, environment, same_result, small_rig
 
@@ -30,6 +34,11 @@ WORKING += "def step(*_):\n    ThreadPoolExecutor(1).submit(time.sleep, 60)\n   
 WORKING += (
     "    while True:\n        interruption.stop_if_interrupted()\n        time.sleep(0.01)\nensembles.pilot = step\n"
 )
+#: The last step of the command takes half a second, while a worker thread computes for a minute.
+LAST = "import time\nfrom concurrent.futures import ThreadPoolExecutor\nfrom capsule_id import interruption\n"
+LAST += "from capsule_id.commands.fits import fit\ninterruption.GRACE = 1.0\nrun = fit.run\ndef last(args):\n"
+LAST += "    code = run(args)\n    ThreadPoolExecutor(1).submit(time.sleep, 60)\n    open('last', 'w').close()\n"
+LAST += "    time.sleep(0.5)\n    return code\nfit.run = last\n"
 
 
 def start(folder: Path, *words: str, before: str = "", cache: bool = False) -> subprocess.Popen[str]:
@@ -75,6 +84,28 @@ def test_a_signal_is_read_at_the_next_step(number: signal.Signals, request: pyte
     assert signal.getsignal(number) is before
 
 
+def test_the_time_counts_from_the_signal_and_not_from_its_handler() -> None:
+    """Python calls the handler after a long call into C, and the process then had the whole time once more."""
+    before = time.monotonic()
+    with interruptible("ended"):
+        threading.Timer(0.05, os.kill, [os.getpid(), signal.SIGTERM]).start()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 2_000_000)
+        after = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            stop_if_interrupted()
+    (arrival,) = interruption._arrivals
+    assert before < arrival < before + 0.5 * (after - before)
+
+
+def test_a_command_that_has_finished_keeps_its_code_and_ends_in_time(tmp_path: Path) -> None:
+    """The signal arrives in the last step; a worker thread would keep the process for a minute."""
+    small_rig(tmp_path / "rig")
+    fit = start(tmp_path, "rig", "--no-sample", "--out", "out", "--quiet", before=LAST, cache=True)
+    wait_until((tmp_path / "last").exists, fit)
+    assert interrupt(fit, signal.SIGTERM) < 1.0 + LONGEST - GRACE
+    assert fit.returncode in (0, 3)
+
+
 def test_a_step_that_does_not_end_is_ended(tmp_path: Path) -> None:
     small_rig(tmp_path / "rig")
     fit = start(tmp_path, "rig", "--out", "out", "--quiet", before=HANGING, cache=True)
@@ -87,11 +118,11 @@ def test_a_step_that_does_not_end_is_ended(tmp_path: Path) -> None:
 
 
 def test_a_worker_thread_that_does_not_end_is_ended(tmp_path: Path) -> None:
-    """The main thread ends at once, and Python then waits for the worker."""
+    """The main thread ends at once; Python would then wait for the worker."""
     small_rig(tmp_path / "rig")
     fit = start(tmp_path, "rig", "--out", "out", "--quiet", before=WORKING, cache=True)
     wait_until((tmp_path / "working").exists, fit)
-    assert 0.5 < interrupt(fit, signal.SIGTERM) < 1.0 + LONGEST - GRACE
+    assert interrupt(fit, signal.SIGTERM) < 1.0 + LONGEST - GRACE
     assert fit.returncode == 130
 
 
