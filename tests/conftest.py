@@ -8,7 +8,7 @@ import gc
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import pytest
@@ -31,6 +31,7 @@ FIRST = ("test_project.py", "test_notebooks.py", "test_notebooks_even.py", "test
 #: commands, fits, maps and reference cases come from optimised programs.
 NOT_OPTIMISED = {
     "test_block_means.py",
+    "test_capsule_bench.py",
     "test_decay_channels.py",
     "test_decays.py",
     "test_forced_run.py",
@@ -86,8 +87,14 @@ def pytest_configure(config: pytest.Config) -> None:
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
+def is_optimised(path: Path) -> bool:
+    """Whether the programs that a file of tests compiles are optimised."""
+    return path.name not in NOT_OPTIMISED
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
+    first = {name: at for at, name in enumerate(FIRST)}
+    items.sort(key=lambda item: (first.get(item.path.name, len(FIRST)), is_optimised(item.path)))
 
 
 def pytest_collection_finish() -> None:
@@ -98,15 +105,12 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _optimisation(request: pytest.FixtureRequest) -> Iterator[None]:
-    if request.path.name not in NOT_OPTIMISED:
-        yield
-        return
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-    # A compiled program in memory serves later files too, whatever the option says then.
-    jax.clear_caches()
+def _optimisation(request: pytest.FixtureRequest) -> None:
+    optimised = is_optimised(request.path)
+    if optimised and jax.config.read("jax_disable_most_optimizations"):
+        # A compiled program in memory serves later files too, whatever the option says then.
+        jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", not optimised)
 
 
 @pytest.fixture(scope="session")

@@ -35,6 +35,8 @@ SHORT = {
     "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
     "08": "DRAWS, POINTS = 24, 16",
 }
+#: Chapters that compile large programs and run them for milliseconds: their short studies are not optimised.
+NOT_OPTIMISED = {"06"}
 #: First cell in a kernel that has run another notebook.
 CLEAN = """%reset -f
 %cd -q {folder}
@@ -43,6 +45,12 @@ plt.close("all")
 plt.rcdefaults()
 %matplotlib inline
 del plt"""
+#: Second cell. A compiled program in memory serves later notebooks too, whatever the option says then.
+OPTIMISED = """import jax
+if jax.config.read("jax_disable_most_optimizations"):
+    jax.clear_caches()
+jax.config.update("jax_disable_most_optimizations", {quickly})
+del jax"""
 LONGEST_CELL = 25  # lines
 #: What notebooks import besides the standard library. Of this package they import its public names.
 LIBRARIES = {"numpy", "scipy", "pandas", "matplotlib.pyplot", "jax", "emcee", "arviz"}
@@ -107,23 +115,26 @@ def shorten(notebook: NotebookNode, values: str) -> None:
     cell.source = values
 
 
-def execute(notebook: NotebookNode, folder: Path, kernel: AsyncKernelManager) -> None:
+def execute(notebook: NotebookNode, folder: Path, kernel: AsyncKernelManager, quickly: bool = False) -> None:
     """Run a notebook in a copy of ``notebooks/`` beside a copy of ``data/``, as a checkout has them.
 
     The kernel may have run other notebooks: names and figures of theirs are removed first.
+
+    quickly : XLA does not optimise the programs
     """
     for part in ("notebooks", "data"):
         shutil.copytree(ROOT / part, folder / part)
     for cell in code(notebook):
         cell.outputs, cell.execution_count = [], None
-    notebook.cells.insert(0, new_code_cell(CLEAN.format(folder=str(folder / "notebooks"))))
+    own = [CLEAN.format(folder=str(folder / "notebooks")), OPTIMISED.format(quickly=quickly)]
+    notebook.cells[:0] = [new_code_cell(text) for text in own]
     client = NotebookClient(notebook, kernel, timeout=SECONDS)
     try:
         client.execute()
     finally:
         if client.kc is not None:
             client.kc.stop_channels()
-        del notebook.cells[0]
+        del notebook.cells[: len(own)]
 
 
 @contextmanager
@@ -144,7 +155,7 @@ def run_short(name: str, folder: Path, kernel: AsyncKernelManager) -> None:
     if name[:2] in SHORT:
         shorten(notebook, SHORT[name[:2]])
     kept = figures(notebook)
-    execute(notebook, folder, kernel)
+    execute(notebook, folder, kernel, quickly=name[:2] in NOT_OPTIMISED)
     assert figures(notebook) == kept
     assert [out.text for out in outputs(notebook, "stream") if out.name != "stdout"] == []
 
