@@ -34,6 +34,7 @@ NOT_OPTIMISED = {
     "test_capsule_bench.py",
     "test_decay_channels.py",
     "test_decays.py",
+    "test_displacement.py",
     "test_forced_run.py",
     "test_forces.py",
     "test_foreign_law.py",
