@@ -176,22 +176,16 @@ def test_commands_in_a_bare_surrounding(tmp_path: Path) -> None:
     bare = environment(HOME=None, LC_ALL="C", LANG=None, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
     done = run("check", "rig ü", cwd=tmp_path, name="capsule_id", env=bare)
     assert (done.returncode, done.stderr) == (0, "")
-    # A command that reads no data takes a tenth of the time.
-    for redirection, *words in (
-        ("<&-", "init", "a"),
-        (">&-", "init", "b"),
-        ("2>&-", "init", "c"),
-        ("<&- >&- 2>&-", "check", "rig ü"),
-    ):
-        command = " ".join(map(_quoted, argv(*words, name="capsule_id")))
+    closed = " ".join(map(_quoted, argv("check", "rig ü", name="capsule_id")))
+    for redirection, code in (("<&-", 0), (">&-", 0), ("2>&-", 0), ("<&- >&- 2>&-", 0)):
         shell = subprocess.run(
-            ["/bin/sh", "-c", f"{command} {redirection}"],
+            ["/bin/sh", "-c", f"{closed} {redirection}"],
             cwd=tmp_path,
             env=environment(),
             capture_output=True,
             check=False,
         )
-        assert (shell.returncode, shell.stderr) == (0, b"")
+        assert (shell.returncode, shell.stderr) == (code, b"")
     missing = subprocess.run(
         ["/bin/sh", "-c", f"{' '.join(map(_quoted, argv('missing')))} 2>&-"],
         cwd=tmp_path, env=environment(), capture_output=True, check=False,

@@ -58,9 +58,9 @@ def test_every_period_end_approaches_the_exact_state(cases: Cases) -> None:
 
 def test_order_of_the_smoothing(cases: Cases) -> None:
     coarse = replace(FINE, tolerance=1e-6)
-    velocity = [replace(coarse, velocity=width) for width in np.geomspace(1e-3, 1e-2, 3)]
+    velocity = [replace(coarse, velocity=width) for width in np.geomspace(1e-3, 1e-2, 4)]
     assert 1.6 < _slope(cases, velocity, "velocity") < 2.2
-    penetration = [replace(coarse, penetration=width) for width in np.geomspace(1e-5, 1e-4, 2)]
+    penetration = [replace(coarse, penetration=width) for width in np.geomspace(1e-5, 1e-4, 3)]
     assert 1.6 < _slope(cases, penetration, "penetration") < 2.4
 
 
