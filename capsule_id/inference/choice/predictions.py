@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
-from capsule_id.inference.choice.leave_out import LeftOut, WeightedDraws
+from capsule_id.inference.choice.leave_out import LeftOut
 from capsule_id.views import counted
 
 #: Smallest mean velocity whose direction counts, mm/s.
@@ -24,14 +24,16 @@ def left_out_predictions(e: TrialsExperiment, left_out: Sequence[LeftOut], seed:
     (Gneiting & Raftery 2007); ``shape``, the Pareto shape of the weights.
     """
     rng = np.random.default_rng(seed)
-    of_draws = dict[WeightedDraws, np.ndarray]()
+    trials = dict[int, np.ndarray]()
+    for draws in dict.fromkeys(one.draws for one in left_out):
+        own = [k for k, one in enumerate(left_out) if one.draws is draws]
+        drawn = e.new_trials([e.local(values) for values in draws.values], e.settings[own], rng)
+        trials.update(zip(own, drawn.T, strict=True))
     rows = list[dict[str, float]]()
     for k, one in enumerate(left_out):
-        if one.draws not in of_draws:
-            of_draws[one.draws] = e.new_trials([e.local(values) for values in one.draws.values], e.settings, rng)
         speed = 1e3 / e.time[k]
         used = np.isfinite(one.log_weight)
-        drawn, weights = speed * of_draws[one.draws][used, k], np.exp(one.log_weight[used])
+        drawn, weights = speed * trials[k][used], np.exp(one.log_weight[used])
         lower, median, upper = (
             np.quantile(drawn, [0.025, 0.5, 0.975], weights=weights, method="inverted_cdf")
             if used.any()
