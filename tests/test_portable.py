@@ -1,12 +1,14 @@
 """Windows and macOS: no module or function of Unix alone; every text file states its encoding and its line ends."""
 
 import ast
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from capsule_id import read_rig
 from capsule_id.errors import InputError
+from tests import matrix
 from tests.cli_tools import ROOT, run, small_rig
 
 #: Modules that Windows does not have, with those that filelock does not replace.
@@ -107,3 +109,13 @@ def test_names_that_windows_refuses(tmp_path: Path, name: str) -> None:
     text = (tmp_path / "rig" / "rig.toml").read_text(encoding="utf-8")
     (tmp_path / "rig" / "rig.toml").write_text(text.replace(f'"{name}"', str(caught.value).rsplit(" ", 1)[1]))
     assert read_rig(tmp_path / "rig").name == name.split(".")[0] + "-1"
+
+
+def test_the_matrix_pins_every_lower_bound_and_names_missing_interpreters() -> None:
+    assert matrix.lowest(["jax>=0.7.2,<0.13", "pyright[nodejs]>=1.1", "capsule-id[formats]"]) == [
+        "jax==0.7.2",
+        "pyright==1.1",
+    ]
+    needed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    assert len(matrix.lowest(needed)) == len(needed)
+    assert matrix.interpreter("2.0") is None
