@@ -3,8 +3,6 @@
 import argparse
 import gc
 import sys
-import tempfile
-import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -18,8 +16,7 @@ from capsule_id.errors import InputError
 from capsule_id.interruption import INTERRUPTED, end_interrupted, interruptible
 
 BAD_INPUT, INTERNAL = 2, 1
-_RESUME = "; --resume continues from the saved state"
-_LONGEST_MESSAGE = 300  # characters of an exception's message in the error line
+_RESUME = "; --resume continues the fit of one rig from the saved state"
 #: Objects until a collection of garbage: imports and traces make large trees, and each collection walks them all.
 _GARBAGE = (50_000, 20, 20)
 
@@ -126,7 +123,9 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         print(interrupted, file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
-        print(f"{program}: internal failure: {_one_line(error)}; {_save_traceback()}", file=sys.stderr)
+        print(
+            f"{program}: internal failure: {console.one_line(error)}; {console.save_traceback(error)}", file=sys.stderr
+        )
         return INTERNAL
 
 
@@ -145,19 +144,3 @@ def _show_warning(
     if text == str(message):
         text = f"{category.__name__}: {message} ({place})"
     print(" ".join(f"{program}: warning: {text}".split()), file=sys.stderr)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_MESSAGE]
-
-
-def _save_traceback() -> str:
-    """Save the traceback of the current exception and return a text with its place."""
-    try:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="capsule-id-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
-        ) as file:
-            traceback.print_exc(file=file)
-    except OSError as error:
-        return f"its traceback could not be saved: {_one_line(error)}"
-    return f"traceback in {file.name}"

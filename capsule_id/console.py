@@ -5,7 +5,9 @@ import io
 import os
 import shutil
 import sys
+import tempfile
 import time
+import traceback
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
@@ -14,6 +16,8 @@ from typing import Any
 OnProgress = Callable[[int, int, str], None]
 #: Seconds between two updates of the progress, on a terminal and in a file.
 TERMINAL_INTERVAL, FILE_INTERVAL = 0.1, 10.0
+#: Longest message of an exception in an error line, characters.
+LONGEST_MESSAGE = 300
 #: Width of the bar in a notebook, characters.
 NOTEBOOK_WIDTH = 100
 
@@ -62,6 +66,23 @@ def _discard(error: OSError) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if error.errno not in (errno.EPIPE, errno.EINVAL):
         raise OutputError(f"standard output cannot be written: {error.strerror}; direct it elsewhere") from error
+
+
+def one_line(error: BaseException) -> str:
+    """Type and message of an exception, at most ``LONGEST_MESSAGE`` characters."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_MESSAGE]
+
+
+def save_traceback(error: BaseException) -> str:
+    """Save the traceback of an exception and return a text with its place."""
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="capsule-id-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:
+            traceback.print_exception(error, file=file)
+    except OSError as unwritable:
+        return f"its traceback could not be saved: {one_line(unwritable)}"
+    return f"traceback in {file.name}"
 
 
 class Progress:

@@ -51,6 +51,19 @@ def check_directory(directory: Path) -> None:
         raise InputError(rule, f"it holds {foreign[0]}" if foreign else "it is not one", remedy, directory)
 
 
+def check_unfinished(directory: Path) -> None:
+    """Refuse ``directory`` where something else stands in the place of its unfinished work or of its older result.
+
+    Raises
+    ------
+    InputError
+        If it does.
+    """
+    with _writable(partial_directory(directory)):
+        _check_partial(partial_directory(directory), resume=False)
+        _check_old(directory)
+
+
 def _check_parents(directory: Path, remedy: str) -> None:
     for parent in directory.parents:
         if parent.exists():

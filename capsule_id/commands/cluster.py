@@ -1,5 +1,6 @@
 """A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running cluster."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING
@@ -45,6 +46,11 @@ def cluster(scheduler: str) -> "Iterator[Client]":
         return
     # Each process computes with as many threads as there are cores; see physics/batches.py.
     processes = scheduler == "processes"
-    local = {"processes": processes, "threads_per_worker": 1 if processes else None, "dashboard_address": None}
+    local = {
+        "processes": processes,
+        "threads_per_worker": 1 if processes else None,
+        "dashboard_address": None,
+        "silence_logs": logging.CRITICAL,
+    }
     with LocalCluster(**local) as workers, Client(workers) as client:
         yield client

@@ -111,7 +111,10 @@ def test_interrupted_and_resumed(
     with monkeypatch.context() as patch:
         die_in_progress(patch, stage, draws, interrupt)
         assert fit_params([*WORDS, "--out", "out"]) == 130
-    assert capsys.readouterr().err == "fit-params: interrupted; --resume continues from the saved state\n"
+    assert (
+        capsys.readouterr().err
+        == "fit-params: interrupted; --resume continues the fit of one rig from the saved state\n"
+    )
     assert not (here / "out").exists()
     assert fit_params([*WORDS, "--out", "out", "--resume"]) == 3
     same_as_uninterrupted(here, "out")

@@ -48,7 +48,9 @@ def test_several_rigs_have_the_results_of_single_fits(
     ("words", "named"),
     [
         (("tilts", "none"), "none"),
-        (("tilts", "tilts"), "must have different names, tilts, change name in rig.toml"),
+        (("tilts", "tilts"), "must have different names, tilts, change one name in rig.toml, or name each folder once"),
+        (("tilts", "spring", "--out", "old"), "must be none of a result, it holds parameters.json"),
+        (("tilts", "spring", "--out", "busy"), "DIR.partial must be unfinished work, it holds notes.txt"),
         (("tilts", "spring", "--resume"), "--resume and --json are for one rig, 2 rigs"),
         (("tilts", "spring", "--json"), "--resume and --json are for one rig, 2 rigs"),
         (("tilts", "spring", "--compare", "lag"), "--compare takes one rig, 2 rigs"),
@@ -61,6 +63,9 @@ def test_several_rigs_have_the_results_of_single_fits(
 def test_bad_input_is_named_and_nothing_is_written(
     here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], named: str
 ) -> None:
+    for folder, file in (("old", "parameters.json"), ("busy/spring.partial", "notes.txt")):
+        (here / folder).mkdir(parents=True)
+        (here / folder / file).write_text("kept")
     (here / "tilts" / "spring").mkdir()
     (here / "tilts" / "spring" / "mine.txt").write_text("kept")
     before = listing(here)
@@ -69,9 +74,11 @@ def test_bad_input_is_named_and_nothing_is_written(
     assert listing(here) == before
 
 
+@pytest.mark.parametrize("scheduler", [(), ("--scheduler", "threads")], ids=["in turn", "threads"])
 def test_a_rig_that_fails_does_not_stop_the_others(
-    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    here: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, scheduler: tuple[str, ...]
 ) -> None:
+    """Standard error holds one line, also of the workers."""
     fit = many_rigs.write_fit
 
     def written(rig: Any, *rest: Any) -> Any:
@@ -80,9 +87,40 @@ def test_a_rig_that_fails_does_not_stop_the_others(
         return fit(rig, *rest)
 
     monkeypatch.setattr(many_rigs, "write_fit", written)
-    assert fit_params(["tilts", "spring", "--no-sample", "--quiet"]) == 1
-    assert "1 rig not fitted: tilts (RuntimeError: no finite log-posterior)" in capsys.readouterr().err
+    assert fit_params(["tilts", "spring", "--no-sample", "--quiet", *scheduler]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert "1 rig not fitted: tilts (RuntimeError: no finite log-posterior; traceback in " in line
     assert [path.name for path in (here / "results").iterdir()] == ["spring"]
+
+
+def test_a_result_that_cannot_be_written_does_not_stop_the_others(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = many_rigs._write
+
+    def full(found: Any, directory: Path, fingerprint: Any) -> None:
+        if directory.name == "tilts":
+            raise OSError("No space left on device")
+        write(found, directory, fingerprint)
+
+    monkeypatch.setattr(many_rigs, "_write", full)
+    assert fit_params(["tilts", "spring", "--no-sample", "--quiet"]) == 1
+    assert "1 rig not fitted: tilts (OSError: No space left on device)" in capsys.readouterr().err
+    assert (here / "results" / "spring" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("scheduler", [(), ("--scheduler", "threads")], ids=["in turn", "threads"])
+def test_an_interruption_ends_the_study(
+    here: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, scheduler: tuple[str, ...]
+) -> None:
+    def interrupted(*_: Any) -> None:
+        signal.raise_signal(signal.SIGINT) if not scheduler else os.kill(os.getpid(), signal.SIGINT)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(many_rigs, "write_fit", interrupted)
+    assert fit_params(["tilts", "spring", "--no-sample", "--quiet", *scheduler]) == 130
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("fit-params: interrupted")
 
 
 @pytest.mark.slow

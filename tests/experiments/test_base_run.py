@@ -183,6 +183,15 @@ def test_the_slides_of_a_record_give_starting_values(tmp_path: Path) -> None:
         assert slides(shaken["time"], *wrong, 0.5, M2) is None
 
 
+@pytest.mark.parametrize("name", ["slope", "N0"])
+def test_a_ground_with_an_sd_has_starting_values_too(tmp_path: Path, name: str) -> None:
+    stated = {"slope": '{ value = 0.1, sd = 0.1, unit = "deg" }', "N0": '{ value = 0.1, sd = 0.1, unit = "N" }'}
+    exact, loose = (rig(tmp_path / sd, **{name: stated[name].replace("sd = 0.1", sd)}) for sd in ("sd = 0", "sd = 0.1"))
+    starts = [BaseRun(each.tables[0], each).starts() for each in (exact, loose)]
+    for symbol in ("k1", "c", "mu"):
+        assert starts[1][symbol].centre == pytest.approx(starts[0][symbol].centre, rel=1e-9)
+
+
 def test_the_fit_of_a_shaken_capsule_begins_near_its_maximum(tmp_path: Path) -> None:
     shaken = rig(tmp_path)
     target = LogPosterior(shaken, [BaseRun(shaken.tables[0], shaken)])

@@ -132,17 +132,19 @@ def test_an_uncertain_comparison_says_so() -> None:
 
 
 @pytest.mark.usefixtures("tables")
-@pytest.mark.parametrize(("behind", "refits"), [(0.5, 2), (9.0, 0)])
+@pytest.mark.parametrize(("behind", "shape", "refits"), [(0.5, 0.8, 2), (9.0, 0.8, 0), (9.0, np.inf, 2)])
 def test_variants_are_refitted_unless_they_are_hopeless(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch, behind: float, refits: int
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, behind: float, shape: float, refits: int
 ) -> None:
-    """Two of four settings have a large shape. A variant far behind keeps it, and the recommendation holds all the same."""
+    """Two of four settings have a large shape. A variant far behind keeps it and is named, unless its density is unknown."""
     density = {"ratio": [1.0, 1.2, 0.9, 1.1], "other": [1.0 - behind, 1.2 - 1.2 * behind, 0.9 - behind, 1.1 - behind]}
 
     def fitted(rig: Rig, *_: object) -> _Variant:
         own = variant(5, density["ratio" if "lag" in rig.model.free else "other"])
         ((nothing, left_out),) = own.left_out
-        return replace(own, left_out=((nothing, [replace(left_out[k], shape=0.3 + 0.5 * (k > 1)) for k in range(4)]),))
+        return replace(
+            own, left_out=((nothing, [replace(left_out[k], shape=shape if k > 1 else 0.3) for k in range(4)]),)
+        )
 
     asked = list[int]()
 
@@ -157,6 +159,9 @@ def test_variants_are_refitted_unless_they_are_hopeless(
     assert choice.table.loc["no lag", "refits"] == refits
     assert asked == [2, 3] * (1 + refits // 2)
     assert "uncertain" not in choice.line
+    assert ("Far behind, and therefore not fitted again without their settings: no lag." in choice.line) == (
+        refits == 0
+    )
 
 
 def test_too_few_settings_are_named(tmp_path: Path) -> None:

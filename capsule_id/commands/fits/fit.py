@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit and write; return 0 for a clean verdict, else 3. Several rigs return the largest code of theirs.
+    """Fit and write; return 0 for a clean verdict, else 3. See ``fit_many`` for several rigs.
 
     Raises
     ------

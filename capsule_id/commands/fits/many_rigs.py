@@ -2,8 +2,9 @@
 
 import sys
 import tempfile
+import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,12 +18,12 @@ from capsule_id.commands.fits.one_rig import (
     prepare_jax,
     write_fit,
 )
-from capsule_id.console import OnProgress, say
+from capsule_id.console import OnProgress, one_line, save_traceback, say
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.interruption import stop_if_interrupted
-from capsule_id.output import WORK_FILES, publish, work_in_progress
+from capsule_id.output import WORK_FILES, check_unfinished, publish, work_in_progress
 from capsule_id.rig.model import Rig
 from capsule_id.views import counted
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 #: Exit codes: a rig that cannot be fitted, a failed check, none of them.
 FAILED, NOT_CLEAN, CLEAN = 1, 3, 0
+#: Time between two looks at the tasks of a cluster, s.
+POLL = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,13 +58,18 @@ def fit_many(
     Raises
     ------
     InputError
-        If two rigs have one name, or one of them is bad; then nothing is written.
+        If two rigs have one name, one of them is bad, or an output directory cannot be; then nothing is written.
     """
-    twice = [name for name, number in Counter(rig.name for rig in rigs).items() if number > 1]
+    twice = [name for name, number in Counter(rig.name.casefold() for rig in rigs).items() if number > 1]
     if twice:
-        raise InputError("rigs that are fitted together must have different names", twice[0], "change name in rig.toml")
+        rule, remedy = "rigs that are fitted together must have different names", "change one name in rig.toml"
+        raise InputError(rule, twice[0], f"{remedy}, or name each folder once")
+    if (root / "parameters.json").exists():
+        rule = "the output directory of several rigs must be none of a result"
+        raise InputError(rule, "it holds parameters.json", "choose another --out", root)
     for rig in rigs:
         check_output(root / rig.name, options)
+        check_unfinished(root / rig.name)
     prepare_jax(options, any(rig.has_runs for rig in rigs))
     from capsule_id.report.texts.messages import messages_of
 
@@ -74,13 +82,17 @@ def fit_many(
         progress(0, len(rigs), "rigs")
         for done, (rig, found) in enumerate(outcomes, start=1):
             stop_if_interrupted()
-            if isinstance(found, FittedRig):
+            try:
+                if isinstance(found, Exception):
+                    raise found
                 _write(found, root / rig.name, fingerprint_of(rig, options, kinds))
-                say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}")
-                if not found.clean:
-                    unclean.append(rig.name)
+            except (InputError, OSError) as error:
+                failures.append(f"{rig.name} ({one_line(error)})")
+            except Exception as error:  # the other rigs are fitted all the same
+                failures.append(f"{rig.name} ({one_line(error)}; {save_traceback(error)})")
             else:
-                failures.append(f"{rig.name} ({' '.join(f'{type(found).__name__}: {found}'.split())})")
+                say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}")
+                unclean += [rig.name] * (not found.clean)
             progress(done, len(rigs), "rigs")
     if not failures and not unclean:
         return CLEAN
@@ -91,14 +103,23 @@ def fit_many(
 
 
 def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> FittedRig:
-    """Fit one rig in a folder of its own; on a worker with the kinds installed there."""
+    """Fit one rig in a folder of its own; on a worker with the kinds installed there.
+
+    Raises
+    ------
+    RuntimeError
+        If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
+    """
     prepare_jax(options, rig.has_runs)
     from capsule_id.report.console_table import verdict_text
 
     kinds = kinds or default_registry()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        result = write_fit(rig, options, folder, kinds, lambda *_: None)
+        try:
+            result = write_fit(rig, options, folder, kinds, lambda *_: None)
+        except KeyboardInterrupt:
+            raise RuntimeError("interrupted") from None
         files = {
             path.relative_to(folder).as_posix(): path.read_bytes()
             for path in folder.rglob("*")
@@ -107,26 +128,27 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
     return FittedRig(files, verdict_text(result.trust, failed_checks(result, kinds)), result.clean)
 
 
-def _in_process(
-    rigs: Sequence[Rig], options: Options, kinds: Registry
-) -> Iterator[tuple[Rig, FittedRig | BaseException]]:
+def _in_process(rigs: Sequence[Rig], options: Options, kinds: Registry) -> Iterator[tuple[Rig, FittedRig | Exception]]:
     for rig in rigs:
-        try:
-            yield rig, fitted_rig(rig, options, kinds)
-        except Exception as error:  # the other rigs are fitted all the same
-            yield rig, error
+        yield rig, _outcome(lambda rig=rig: fitted_rig(rig, options, kinds))
 
 
-def _on_cluster(
-    client: "Client", rigs: Sequence[Rig], options: Options
-) -> Iterator[tuple[Rig, FittedRig | BaseException]]:
+def _on_cluster(client: "Client", rigs: Sequence[Rig], options: Options) -> Iterator[tuple[Rig, FittedRig | Exception]]:
     """Results as they arrive. The scheduler gives the rig of a worker that dies to another one."""
-    from distributed import as_completed
-
     tasks = {client.submit(fitted_rig, rig, options, pure=False): rig for rig in rigs}
-    for task in as_completed(list(tasks)):
-        error = task.exception()
-        yield tasks[task], task.result() if error is None else error
+    while tasks:
+        # A wait for the next result would not notice an interruption.
+        stop_if_interrupted()
+        for task in [task for task in tasks if task.done()]:
+            yield tasks.pop(task), _outcome(task.result)
+        time.sleep(POLL)
+
+
+def _outcome(result: Callable[[], FittedRig]) -> FittedRig | Exception:
+    try:
+        return result()
+    except Exception as error:
+        return error
 
 
 def _write(found: FittedRig, directory: Path, fingerprint: Mapping[str, object]) -> None:

@@ -70,13 +70,17 @@ class Choice:
             f"(elpd {row['difference']:.1f} ± {row['se']:.1f}). Write in [model]: {lines}"
         )
         columns = self.table[["shape", "difference", "se"]].itertuples()
-        rough = [str(name) for name, shape, *far in columns if not shape <= LARGEST_SHAPE and not _hopeless(*far)]
-        if not rough:
-            return said
-        return (
-            f"{said}\nThe elpd of these variants is uncertain, because few draws determine it (shape above "
-            f"{LARGEST_SHAPE:g}): {', '.join(rough)}. Measure more settings, or narrow the priors."
-        )
+        unsure = {str(name): far for name, *far in columns if not far[0] <= LARGEST_SHAPE}
+        rough = [name for name, far in unsure.items() if not _hopeless(*far)]
+        left = [name for name in unsure if name not in rough]
+        if left:
+            said += f"\nFar behind, and therefore not fitted again without their settings: {', '.join(left)}."
+        if rough:
+            said += (
+                "\nThe elpd of these variants is uncertain, because few draws determine it (shape above "
+                f"{LARGEST_SHAPE:g}): {', '.join(rough)}. Measure more settings, or narrow the priors."
+            )
+        return said
 
     @property
     def text(self) -> str:
@@ -173,7 +177,7 @@ def compare_models(
     for number, name in enumerate(sorted(fitted, key=lambda name: -fitted[name].elpd)):
         if progress:
             progress(len(choices) + number, 2 * len(choices), name)
-        if not _hopeless(*_difference(fitted[name], _best(fitted))):
+        if not _hopeless(fitted[name].shape, *_difference(fitted[name], _best(fitted))):
             fitted[name] = fitted[name].refitted(seed)
     return _choose(fitted, choices, seed)
 
@@ -204,9 +208,12 @@ def _difference(one: _Variant, best: _Variant) -> tuple[float, float]:
         return float(np.sum(each)), float(np.sqrt(len(each) * np.var(each, ddof=1)))
 
 
-def _hopeless(difference: float, error: float) -> bool:
-    """Whether no refit is needed: weights with a large shape overrate a variant, and it is far behind all the same."""
-    return difference < -(HOPELESS + HOPELESS_ERRORS * error)
+def _hopeless(shape: float, difference: float, error: float) -> bool:
+    """Whether a variant is too far behind for refits. Weights with a large shape mostly overrate a variant.
+
+    Where the shape is infinite, the density of a setting is unknown and a refit is needed.
+    """
+    return bool(np.isfinite(shape)) and difference < -(HOPELESS + HOPELESS_ERRORS * error)
 
 
 def _choose(fitted: Mapping[str, _Variant], choices: Mapping[str, ModelChoices], seed: int) -> Choice:
