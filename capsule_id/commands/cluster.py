@@ -29,10 +29,20 @@ def cluster(scheduler: str) -> "Iterator[Client]":
         If Dask is not installed, or no scheduler answers at the address.
     """
     try:
-        from distributed import Client, LocalCluster
+        import distributed  # noqa: F401
+        from dask import config
     except ImportError:
         remedy = "install capsule-id[maps], or remove --scheduler"
         raise InputError("--scheduler needs Dask", "distributed is not installed", remedy) from None
+    # A client that no scheduler answers does not restore the setting of Dask, and nothing could be computed later.
+    with config.set(scheduler=config.get("scheduler", None)), _client(scheduler) as client:
+        yield client
+
+
+@contextmanager
+def _client(scheduler: str) -> "Iterator[Client]":
+    from distributed import Client, LocalCluster
+
     if scheduler not in ("threads", "processes"):
         try:
             client = Client(scheduler, timeout=CONNECT_TIMEOUT)

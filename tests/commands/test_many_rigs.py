@@ -3,9 +3,11 @@
 import json
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import dask
 import pytest
 
 from capsule_id.cli import fit_params
@@ -17,11 +19,13 @@ TABLES = {"tilts": ("static_friction",), "spring": ("support_spring_soft",)}
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     for name, tables in TABLES.items():
         small_rig(tmp_path / name, name, tables)
-    return tmp_path
+    yield tmp_path
+    # As before: later files of this process are written without Dask.
+    assert dask.config.get("scheduler", None) is None
 
 
 def parameters(directory: Path) -> dict[str, Any]:
