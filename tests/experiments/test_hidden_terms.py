@@ -23,6 +23,7 @@ from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import Hidden, check_hidden_terms, hidden_terms
 from capsule_id.experiments.free_vibration.second_fit.screening import open_models, second_models
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Finding
 from tests.cli_tools import DATA
@@ -125,9 +126,9 @@ def test_records_of_unequal_size_share_a_prior_that_follows_both() -> None:
         target = LogPosterior(rig, make_experiments(rig))
         found.append(target.parameters[target.names.index("F_dry")].prior)
     assert found[0] == found[1]
-    assert found[0] is not None
-    assert found[0].location == pytest.approx(0.1 * 0.05 * bench.K1 * RELEASE, rel=0.1)
-    assert found[0].spread == pytest.approx(1000.0, rel=0.1)
+    shared = cast(Prior, found[0])
+    assert shared.location == pytest.approx(0.1 * 0.05 * bench.K1 * RELEASE, rel=0.1)
+    assert shared.spread == pytest.approx(1000.0, rel=0.1)
 
 
 def test_on_a_slope_no_cubic_spring_is_proposed() -> None:

@@ -21,6 +21,7 @@ from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms
 from capsule_id.experiments.free_vibration.second_fit.screening import second_models
+from capsule_id.inference.result import Posterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import pendulum
@@ -101,8 +102,7 @@ def test_the_whole_record_is_cut_at_its_release_and_its_sensor_error_is_named(tm
     time, angle = pendulum(3)
     entry = Entry("free_vibration", "swing", {"time [s]": time, "x_rel [m]": angle}, {})
     fit = cid.fit(make_rig(tmp_path, entry, head={"m1": quantity(1.0, "kg")}))
-    assert fit.posterior is not None
-    assert fit.posterior.converged
+    assert cast(Posterior, fit.posterior).converged
     assert {f.code for f in fit.findings if f.level == "fail"} == {"decays.position"}
     assert "decays.release" in {f.code for f in fit.findings if f.level == "warn"}
     # With the hand's push k_cubic came out 30 % off and trusted. A cubic term alone, fitted to this record by
@@ -132,8 +132,7 @@ def test_the_highest_swing_late_on_cannot_tell_viscous_from_dry(tmp_path: Path) 
     rig = make_rig(tmp_path, entry, head={"m1": quantity(1.0, "kg")})
     ((record,), _) = second_models(cast(list[FreeVibration], make_experiments(rig)))
     assert record.model.damping == ()
-    assert record.about.screened is not None
-    found = record.about.screened
+    found = cast(Screened, record.about.screened)
     values = {row.name: found.values.get(row.symbol, found.noise) for row in record.parameters}
     fit = SimpleNamespace(values={"m1": 1.0, **values})
     (finding,) = check_hidden_terms([record], fit)  # type: ignore[arg-type]  # pyright: ignore

@@ -1,7 +1,7 @@
 """Priors against SciPy, their integrals and samples; the joint density is the sum of its parts."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -77,8 +77,7 @@ def test_a_shared_parameter_has_a_prior_that_covers_those_of_all_experiments() -
     sizes = [Prior("lognormal", 0.3, 10.0), Prior("lognormal", 6.0, 10.0), Prior("lognormal", 0.5, 4.0)]
     for priors in (sizes, sizes[::-1]):
         target = LogPosterior(rig_without_tables(), [Nothing([parameter("F_dry", prior=prior)]) for prior in priors])
-        found = target.parameters[0].prior
-        assert found is not None
+        found = cast(Prior, target.parameters[0].prior)
         low, high = (stats.lognorm(s=np.log(found.spread) / stats.norm.ppf(0.975), scale=found.location)).interval(0.95)
         assert (low, high) == (pytest.approx(0.03), pytest.approx(60.0))
     springs = [Prior("normal", 0.0, 2.0), Prior("normal", 0.0, 5.0)]
