@@ -58,8 +58,6 @@ def here(uninterrupted: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def shorten(patch: pytest.MonkeyPatch) -> None:
     for name, value in SHORT.items():
         patch.setattr(f"capsule_id.inference.sampling.{name}", value)
-    # No picture is looked at here, and to draw them takes a third of the time.
-    patch.setattr("capsule_id.report.gallery.png", lambda figure: b"")
 
 
 def die_in_progress(patch: pytest.MonkeyPatch, stage: str, draws: int, death: Callable[[], object]) -> None:

@@ -93,11 +93,11 @@ def test_arviz_is_missed_before_any_fit(rig: Rig, monkeypatch: pytest.MonkeyPatc
         compare_models(rig, ["lag"])
 
 
-def variant(parameters: int, density: list[float], shape: float = 0.3) -> _Variant:
+def variant(parameters: int, density: list[float], shape: float = 0.3, refits: int = 0) -> _Variant:
     """A variant of one progression with these densities of its settings."""
     nothing = cast(Any, None)
     left_out = [LeftOut(one, shape, np.zeros(1), nothing) for one in density]
-    return _Variant(parameters, nothing, ((nothing, left_out),), (0.0, 0.1))
+    return _Variant(parameters, nothing, ((nothing, left_out),), (0.0, 0.1), refits)
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_the_simplest_variant_within_two_standard_errors_is_recommended() -> Non
 
 @pytest.mark.usefixtures("tables")
 def test_an_uncertain_comparison_says_so() -> None:
-    fitted = {"one": variant(5, [1.0, 1.2, 0.9]), "other": variant(4, [0.0, -np.inf, 0.1], np.inf)}
+    fitted = {"one": variant(5, [1.0, 1.2, 0.9]), "other": variant(4, [0.0, -np.inf, 0.1], np.inf, 1)}
     choice = _choose(fitted, dict.fromkeys(fitted, ModelChoices()), 0)
     assert choice.recommended == "one"
     assert "few draws determine it (shape above 0.7): other." in choice.line

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     budget = None if args.no_sample else args.max_steps
     command = shlex.join(["fit-params", *sys.argv[1:]])
     options = Options(args.seed, args.experiments, budget, args.ess, not args.no_cache, command)
-    root = args.out if args.out is not None else Path("results")
+    root = args.out or Path("results")
     if len(rigs) > 1:
         if args.resume or args.json:
             rule, remedy = "--resume and --json are for one rig", "remove them; a repetition fits all rigs again"
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             return fit_many(rigs, options, root, args.scheduler, kinds, progress)
     if args.scheduler is not None:
         raise InputError("--scheduler is for several rigs", "one rig", "remove it, or name further folders")
-    directory = args.out if args.out is not None else root / rigs[0].name
+    directory = args.out or root / rigs[0].name
     with Progress(not args.quiet) as progress:
         return fit_one(rigs[0], options, directory, kinds, progress, resume=args.resume, as_json=args.json)
 
@@ -112,7 +112,7 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
         keep_programs()
     from capsule_id.inference.choice.compare import compare_models
 
-    with Progress(not args.quiet, "variant") as progress:
+    with Progress(not args.quiet, "step") as progress:
         choice = compare_models(rigs[0], args.compare.split(","), kinds, args.seed, progress)
     say(choice.text)
     return 0

@@ -69,10 +69,9 @@ class Choice:
             f"{self.recommended}: the simplest variant within {STANDARD_ERRORS:g} standard errors of the best "
             f"(elpd {row['difference']:.1f} ± {row['se']:.1f}). Write in [model]: {lines}"
         )
-        columns = self.table[["shape", "difference", "se"]].itertuples()
-        unsure = {str(name): far for name, *far in columns if not far[0] <= LARGEST_SHAPE}
-        rough = [name for name, far in unsure.items() if not _hopeless(*far)]
-        left = [name for name in unsure if name not in rough]
+        columns = self.table[["shape", "refits"]].itertuples()
+        unsure = [(str(name), refits) for name, shape, refits in columns if not shape <= LARGEST_SHAPE]
+        left, rough = ([name for name, refits in unsure if (refits == 0) == far] for far in (True, False))
         if left:
             said += f"\nFar behind, and therefore not fitted again without their settings: {', '.join(left)}."
         if rough:
@@ -151,7 +150,7 @@ def compare_models(
     ----------
     words : some of ``capsule_id.inference.choice.variants.WORDS``
     registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
-    progress : called with (variants done, variants, name of the variant)
+    progress : called with (steps done, steps, name of the variant): each variant is fitted, then its refits follow
 
     Raises
     ------

@@ -78,8 +78,9 @@ class LogPosterior(eqx.Module):
             for row in experiment.parameters:
                 offered.setdefault(row.name, []).append(row)
         for name, (row, *others) in offered.items():
-            shared = row.named(row.of, covering_prior([prior_of(one) for one in (row, *others)])) if others else row
-            rows.setdefault(name, override(shared, rig.priors.get(name)))
+            if others and name not in rig.priors:
+                row = row.named(row.of, covering_prior(name, [prior_of(one) for one in (row, *others)]))
+            rows.setdefault(name, override(row, rig.priors.get(name)))
         self.origin = Origin(rig, tuple(experiments), tuple(rows.values()), fixed)
         self.names = tuple(rows)
         self.are_positive = tuple(row.positive for row in rows.values())

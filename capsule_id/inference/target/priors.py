@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior
 from capsule_id.rig.model import PriorOverride
@@ -93,11 +94,15 @@ def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
     return row if stated is None else row.named(row.of, stated.prior)
 
 
-def covering_prior(priors: Sequence[Prior]) -> Prior:
-    """Return the prior of a parameter for which several experiments have defaults, in any order.
+def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:
+    """Return the prior of a parameter that several experiments share, whatever their order.
 
     Log-normal priors: the narrowest one whose central 95 % contain those of all. Normal priors about one mean: the widest.
-    Other priors are stated by the user: the first.
+
+    Raises
+    ------
+    InputError
+        If experiments state other priors that differ.
     """
     kinds, locations = {prior.kind for prior in priors}, {prior.location for prior in priors}
     if len(set(priors)) == 1:
@@ -108,4 +113,6 @@ def covering_prior(priors: Sequence[Prior]) -> Prior:
         return Prior("lognormal", float(np.exp(0.5 * (low + high))), float(np.exp(0.5 * (high - low))))
     if kinds == {"normal"} and len(locations) == 1:
         return max(priors, key=lambda prior: prior.spread)
-    return priors[0]
+    stated = " and ".join(dict.fromkeys(f"{prior.kind} {prior.location:g}, {prior.spread:g}" for prior in priors))
+    rule = f"experiments that share {name} must state one prior for it"
+    raise InputError(rule, f"{stated} (SI)", f"state the same in each of them, or state {name} in [prior]")

@@ -1,5 +1,6 @@
 """Priors against SciPy, their integrals and samples; the joint density is the sum of its parts."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ import pytest
 from scipy import integrate, stats
 
 from capsule_id.api import read_rig
+from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
@@ -83,9 +85,17 @@ def test_a_shared_parameter_has_a_prior_that_covers_those_of_all_experiments() -
     springs = [Prior("normal", 0.0, 2.0), Prior("normal", 0.0, 5.0)]
     target = LogPosterior(rig_without_tables(), [Nothing([parameter("k_cubic", prior=prior)]) for prior in springs])
     assert target.parameters[0].prior == springs[1]
-    stated = [Prior("normal", 1.0, 2.0), Prior("normal", 3.0, 5.0)]
-    target = LogPosterior(rig_without_tables(), [Nothing([parameter("P_on", prior=prior)]) for prior in stated])
-    assert target.parameters[0].prior == stated[0]
+
+
+def test_stated_priors_that_differ_are_refused_and_one_in_rig_toml_settles_it() -> None:
+    own = [Nothing([parameter("P_on", prior=Prior("normal", *stated))]) for stated in ((1.0, 2.0), (3.0, 5.0))]
+    with pytest.raises(
+        InputError, match=r"share P_on must state one prior for it, normal 1, 2 and normal 3, 5 \(SI\), state"
+    ):
+        LogPosterior(rig_without_tables(), own)
+    settled = PriorOverride(mean=2.0, sd=1.0)
+    target = LogPosterior(replace(rig_without_tables(), priors={"P_on": settled}), own)
+    assert target.parameters[0].prior == settled.prior
 
 
 def test_joint_prior_is_the_sum() -> None:
