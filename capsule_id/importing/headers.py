@@ -51,6 +51,7 @@ SPELLINGS: Mapping[str, str] = {
     "counts": "1", "count": "1", "-": "1",
 }  # fmt: skip
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*")
+_INSIDE = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*(\S.*)")
 _SEPARATED = re.compile(r"(.*?)(?:\s+/\s*|\s*,\s+|\s+in\s+)([^\s/,]\S*)")
 
 
@@ -72,7 +73,8 @@ def unit_of(text: str, dimensions: Sequence[str]) -> str | None:
 def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | None]:
     """Name and text of the unit of a header; None where it states none.
 
-    ``dimensions`` are the SI units that columns may have. A suffix such as ``_mm`` or ``/mm`` counts only if it is such a unit.
+    ``dimensions`` are the SI units that columns may have. A suffix such as ``_mm`` or ``/mm`` counts only if it is such a
+    unit, and so do brackets before further words, as in ``Force (N) Run 5``.
     """
     if header in UNITS_OF_NAMES:
         return header, UNITS_OF_NAMES[header]
@@ -82,6 +84,9 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
             return found[1], next(group for group in found.groups()[1:] if group is not None).strip()
     if unit_of(header, dimensions) is not None:
         return header, None
+    found = _INSIDE.fullmatch(header)
+    if found and unit_of(text := found[2] or found[3] or "", dimensions) is not None:
+        return f"{found[1]} {found[4]}", text.strip()
     for mark in ("_", "/"):
         parts = header.split(mark)
         for k in range(1, len(parts)):

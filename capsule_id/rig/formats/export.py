@@ -17,12 +17,14 @@ class Layout:
     missing : texts of cells without a reading, such as ``--`` or ``NaN``
     decimal : decimal mark of a text table, "." or "," (None: found in the file)
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
+    words : headers, or numbers counted from 1, of those whose texts it keeps too
     """
 
     data_from_line: int | None = None
     missing: tuple[str, ...] = ()
     decimal: str | None = None
     columns: tuple[str | int, ...] | None = None
+    words: tuple[str | int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class Export:
         missing marker; it raises ``InputError`` at the first other cell
     place : (row index or None for the header, column index) -> 1-based (line, column) in the file
     encoding : of a text
+    words : index of a column that ``Layout.words`` names -> (rows,) numbers of its texts, and the texts; None: the format
+        has no texts
     """
 
     path: Path
@@ -48,3 +52,4 @@ class Export:
     values: Callable[[int], np.ndarray]
     place: Callable[[int | None, int], tuple[int, int]]
     encoding: str = "UTF-8"
+    words: Callable[[int], tuple[np.ndarray, tuple[str, ...]]] | None = None

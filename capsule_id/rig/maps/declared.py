@@ -53,12 +53,12 @@ class ColumnMap:
     ----------
     sources : by column of the experiment
     layout : what is stated about the layout of the files
-    where : value of a column, in the file's unit, by header or number: other rows are not read
+    where : value of a column, a number in the file's unit or a text, by header or number: other rows are not read
     """
 
     sources: Mapping[str, Source]
     layout: Layout
-    where: Mapping[str, float]
+    where: Mapping[str, float | str]
 
 
 def read_map(
@@ -92,8 +92,15 @@ def read_map(
     sources = {name: _source(document, (*place, name), stated[name], rules[name]) for name in stated}
     where = _where(document, path, entry)
     named = [header for source in sources.values() for header in (source.header, source.minus) if header is not None]
-    keys = [form for key in where for form in (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))]
-    return ColumnMap(MappingProxyType(sources), replace(layout, columns=(*named, *keys)), MappingProxyType(where))
+    keys = [(form, value) for key, value in where.items() for form in _forms(key)]
+    words = tuple(form for form, value in keys if isinstance(value, str))
+    layout = replace(layout, columns=(*named, *(form for form, _ in keys)), words=words)
+    return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(where))
+
+
+def _forms(key: str) -> tuple[Header, ...]:
+    """What a key of ``where`` may be: a header, or also the number of a column."""
+    return (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))
 
 
 def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRule) -> Source:
@@ -164,8 +171,11 @@ def _decimal(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) ->
     return read_choice(document, place, entry["decimal"], (".", ",")) if "decimal" in entry else None
 
 
-def _where(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of ``where``, by header or number."""
+def _where(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> dict[str, float | str]:
+    """The numbers and texts of ``where``, by header or number."""
     place = (*path, "where")
     stated = read_table(document, place, entry.get("where", {}), "where = { <header> = <value> }")
-    return {key: _number(document, (*place, key), value) for key, value in stated.items()}
+    return {
+        key: value.strip() if isinstance(value, str) else _number(document, (*place, key), value)
+        for key, value in stated.items()
+    }

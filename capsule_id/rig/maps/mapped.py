@@ -48,6 +48,15 @@ class _Found:
 
 
 @dataclass(frozen=True)
+class _Selected:
+    """Rows that a key of ``where`` selects, those without a value, (n,) each, and some values of its column."""
+
+    rows: np.ndarray
+    unknown: np.ndarray
+    seen: Sequence[str]
+
+
+@dataclass(frozen=True)
 class _Cell:
     """Where the cells of a column stand."""
 
@@ -84,10 +93,7 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
         values[name] = _joined(
             [_scaled(part, here.pop(name), (*place, name), source) for part, here in zip(parts, found, strict=True)]
         )
-    where = {
-        key: _joined([part.find((*path, "where", key), _where_header(part, key)).values for part in parts])
-        for key in column_map.where
-    }
+    where = {key: _selected_by(parts, (*path, "where", key), value) for key, value in column_map.where.items()}
     first_rows = np.cumsum([0, *(part.rows for part in parts)])
     keep, missing, other = _kept(document, path, values, where, column_map.where)
     for name, source in column_map.sources.items():
@@ -148,24 +154,11 @@ class _Part:
 
     def find(self, place: KeyPath, header: Header) -> _Found:
         """The column ``header``, stated at ``place`` of ``rig.toml``."""
-        found = [
-            _Found(export.values(column), export, column)
-            for export in self.exports
-            if (column := self._column(place, export, header)) is not None
-        ]
-        if not found:
-            known = [name for export in self.exports for row in export.headers for name in row if name]
-            close = closest(str(header), known)
-            remedy = f'write "{close}"' if close else "write the number of the column, counted from 1"
-            value = f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}"
-            raise self.document.error(place, f"{place[-1]} must be a header of the file", value, remedy)
+        found = [_Found(export.values(column), export, column) for export, column in self._columns(place, header)]
         first = found[0]
         self._rows = first.values.size if self._rows is None else self._rows
         for each in found:
-            if each.values.size != self.rows:
-                rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {each.values.size}"
-                remedy = "map columns of equal length, or make an experiment of each file, with a clock"
-                raise self.document.error(place, rule, value, remedy)
+            self._require_rows(place, header, each.values.size)
             if each is first:
                 continue
             scale = float(np.nanmax(np.abs(first.values), initial=0.0))
@@ -174,6 +167,36 @@ class _Part:
                 value = f"a difference of {np.nanmax(np.abs(each.values - first.values)):.3g}"
                 raise self.document.error(place, rule, value, "name files that were recorded together")
         return first
+
+    def words(self, place: KeyPath, header: Header) -> np.ndarray:
+        """The texts of the column ``header``, stated at ``place`` of ``rig.toml``, (n,)."""
+        export, column = self._columns(place, header)[0]
+        if export.words is None:
+            rule = f"where takes numbers for a {export.path.suffix} file"
+            raise self.document.error(place, rule, "a text", "write a number, or export the file as CSV")
+        codes, texts = export.words(column)
+        self._require_rows(place, header, len(codes))
+        return np.array(texts)[codes]
+
+    def _require_rows(self, place: KeyPath, header: Header, rows: int) -> None:
+        """Refuse a column with another number of rows than those found before."""
+        if rows != self.rows:
+            rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {rows}"
+            remedy = "map columns of equal length, or make an experiment of each file, with a clock"
+            raise self.document.error(place, rule, value, remedy)
+
+    def _columns(self, place: KeyPath, header: Header) -> list[tuple[Export, int]]:
+        """The files that have the column ``header``, each with its index there; at least one."""
+        found = [
+            (export, column) for export in self.exports if (column := self._column(place, export, header)) is not None
+        ]
+        if not found:
+            known = [name for export in self.exports for row in export.headers for name in row if name]
+            close = closest(str(header), known)
+            remedy = f'write "{close}"' if close else "write the number of the column, counted from 1"
+            value = f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}"
+            raise self.document.error(place, f"{place[-1]} must be a header of the file", value, remedy)
+        return found
 
     def _column(self, place: KeyPath, export: Export, header: Header) -> int | None:
         """Index of a column in one file; None if the file does not have the header."""
@@ -206,6 +229,17 @@ def _where_header(part: _Part, key: str) -> Header:
     return int(key) if key.isascii() and key.isdigit() and int(key) > 0 and not stated else " ".join(key.split())
 
 
+def _selected_by(parts: Sequence[_Part], place: KeyPath, wanted: float | str) -> _Selected:
+    """The rows whose column, named by the last key of ``place``, has the value ``wanted``."""
+    key = str(place[-1])
+    if isinstance(wanted, str):
+        texts = _joined([part.words(place, _where_header(part, key)) for part in parts])
+        return _Selected(texts == wanted, texts == "", [shown(str(text)) for text in np.unique(texts)])
+    column = _joined([part.find(place, _where_header(part, key)).values for part in parts])
+    seen = [f"{value:g}" for value in np.unique(column[np.isfinite(column)])]
+    return _Selected(np.isclose(column, wanted, rtol=ROUNDING, atol=0.0), np.isnan(column), seen)
+
+
 def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.ndarray:
     """The values of a column in its stated unit."""
     values = found.values
@@ -221,24 +255,23 @@ def _kept(
     document: TomlDocument,
     path: KeyPath,
     values: Mapping[str, np.ndarray],
-    where: Mapping[str, np.ndarray],
-    wanted: Mapping[str, float],
+    where: Mapping[str, _Selected],
+    wanted: Mapping[str, float | str],
 ) -> tuple[np.ndarray | None, int, int]:
     """Which rows are used (None: all), and how many are dropped: for a missing cell, and outside ``where``."""
     if not where and not any(_blank(column).any() for column in values.values()):
         return None, 0, 0
-    unknown = np.any([np.isnan(column) for column in where.values()], axis=0) if where else np.array(False)
+    unknown = np.any([selected.unknown for selected in where.values()], axis=0) if where else np.array(False)
     inside = np.ones(next(iter(values.values())).size, bool)
-    for key, column in where.items():
-        same = np.isclose(column, wanted[key], rtol=ROUNDING, atol=0.0)
-        if not same.any():
-            seen = np.unique(column[np.isfinite(column)])
-            text = " ".join(f"{value:g}" for value in seen[:_MOST_VALUES]) + (" …" if seen.size > _MOST_VALUES else "")
+    for key, selected in where.items():
+        if not selected.rows.any():
+            seen = selected.seen
+            text = " ".join(seen[:_MOST_VALUES]) + (" …" if len(seen) > _MOST_VALUES else "")
+            value = wanted[key]
             rule = f"where must keep a row; column {shown(key)} holds {text or 'no number'}"
-            raise document.error(
-                (*path, "where", key), rule, f"{wanted[key]:g}", "write one of the values of the column"
-            )
-        inside &= same
+            found = shown(value) if isinstance(value, str) else f"{value:g}"
+            raise document.error((*path, "where", key), rule, found, "write one of the values of the column")
+        inside &= selected.rows
     empty = np.zeros_like(inside)
     for column in values.values():
         empty |= _blank(column)

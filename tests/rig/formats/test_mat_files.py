@@ -28,7 +28,8 @@ def mat_file(compressed: bool) -> bytes:
         "matrix": np.arange(6.0).reshape(2, 3),
         "text": "text",
         "complex": 1j * t,
-        "record": {"a": t},
+        "record": {"a": t, "note": "text", "deep": {"rows": np.arange(44.0).reshape(2, 22)}, "empty": []},
+        "runs": np.array([(t + 0.5,), (t + 1.5,)], [("x", object)]),
         "cell": np.array([t, "a"], object),
         "empty": np.zeros((0, 1)),
         "cube": np.zeros((2, 2, 2)),
@@ -43,11 +44,16 @@ def test_numbers_are_those_that_scipy_reads(compressed: bool) -> None:
     export, expected = read_mat(content, PATH, Layout()), loadmat(io.BytesIO(content))
     (names,) = export.headers
     vectors = ["double", "single", "one", "small", "large", "logical"]
-    assert names == (*vectors, "matrix(:,1)", "matrix(:,2)", "matrix(:,3)")
+    matrix = ("matrix(:,1)", "matrix(:,2)", "matrix(:,3)")
+    structs = ("record.a", "record.deep.rows(1,:)", "record.deep.rows(2,:)", "runs(1).x", "runs(2).x")
+    assert names == (*vectors, *matrix, *structs)
     for index, name in enumerate(vectors):
         np.testing.assert_array_equal(export.values(index), expected[name].ravel().astype(float))
     for column in range(3):
         np.testing.assert_array_equal(export.values(6 + column), expected["matrix"][:, column])
+    np.testing.assert_array_equal(export.values(9), np.arange(7.0))
+    np.testing.assert_array_equal(export.values(11), np.arange(22.0, 44.0))
+    np.testing.assert_array_equal(export.values(13), np.arange(7.0) + 1.5)
 
 
 @pytest.mark.parametrize("compressed", [False, True])

@@ -8,6 +8,9 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.export import Export, Layout
 
+#: A matrix this many times as wide as high holds its channels in rows.
+WIDE = 10
+
 
 def refuse_line(layout: Layout, path: Path) -> None:
     """Refuse the keys of text files.
@@ -27,6 +30,8 @@ def export_of_arrays(
 ) -> Export:
     """The columns of named arrays: every vector, and every column of a matrix, ``data(:,2)`` for the second.
 
+    A matrix far wider than high holds its channels in rows: ``data(2,:)`` for the second.
+
     Parameters
     ----------
     arrays : real numbers; arrays that are empty or have more than two dimensions are left out
@@ -45,11 +50,15 @@ def export_of_arrays(
         if array.size and name.isprintable() and array.ndim in (1, 2):
             own = {name: array.ravel()}
             if array.ndim == 2 and 1 not in array.shape:
-                own = {f"{name}(:,{i + 1})": column for i, column in enumerate(array.T)}
+                rows = array.shape[1] > WIDE * array.shape[0]
+                form = "({},:)" if rows else "(:,{})"
+                own = {name + form.format(i + 1): one for i, one in enumerate(array if rows else array.T)}
             columns |= own
             stated += [(units or {}).get(name, "")] * len(own)
     if not columns:
-        raise InputError(f"a {path.suffix} file must hold numeric vectors", "none", "export the readings", path)
+        raise InputError(
+            f"a {path.suffix} file must hold real numeric vectors", "none", "export the readings as vectors", path
+        )
     names = tuple(columns)
 
     def values(column: int) -> np.ndarray:

@@ -51,7 +51,9 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     wanted = [k for k in range(width) if layout.columns is None or is_wanted(k, headers, layout.columns)]
     decimal = "." if delimiter == "," else layout.decimal
     shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
-    rows = plain_rows(file, shape, wanted) or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing)
+    words = [k for k in wanted if is_wanted(k, headers, layout.words)]
+    rows = None if words else plain_rows(file, shape, wanted)
+    rows = rows or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
 
     lines = rows.lines
 
@@ -62,7 +64,7 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
         return line + 1, place_of_cell(file.line(line), delimiter, column)
 
-    return Export(path, headers, width, lines, values, place, file.encoding)
+    return Export(path, headers, width, lines, values, place, file.encoding, rows.words)
 
 
 def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:

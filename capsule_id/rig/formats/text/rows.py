@@ -41,9 +41,14 @@ class Shape:
 
 
 class Rows:
-    """Numbers of some columns of a text; a column with another cell holds the error about it."""
+    """Numbers of some columns of a text; a column with another cell holds the error about it.
 
-    def __init__(self, columns: Sequence[int]) -> None:
+    Of the columns ``words`` the texts are kept too.
+    """
+
+    def __init__(self, columns: Sequence[int], words: Sequence[int] = ()) -> None:
+        self._codes = {column: Growing(np.int32) for column in words}
+        self._texts: dict[int, dict[str, int]] = {column: {} for column in words}
         self._lines = Growing(np.int32)
         self._columns: dict[int, Growing | InputError] = {column: Growing() for column in columns}
 
@@ -64,6 +69,15 @@ class Rows:
         if isinstance(column, InputError):
             raise column
         return column.values
+
+    def words(self, index: int) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Numbers of the texts of a column, (rows,), and the texts."""
+        return self._codes[index].values, tuple(self._texts[index])
+
+    def add_words(self, index: int, texts: Sequence[str]) -> None:
+        """Append texts to a column."""
+        known = self._texts[index]
+        self._codes[index].extend(np.array([known.setdefault(text, len(known)) for text in texts], np.int32))
 
     def add_lines(self, numbers: np.ndarray | Sequence[int]) -> None:
         """Append rows by their 0-based lines."""
@@ -156,15 +170,17 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
     return rows
 
 
-def any_rows(file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str]) -> Rows:
-    """The rows of a text, with NaN at a missing marker.
+def any_rows(
+    file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str], words: Sequence[int] = ()
+) -> Rows:
+    """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
 
     Raises
     ------
     InputError
         If a row has another number of cells than the first one.
     """
-    rows = Rows(columns)
+    rows = Rows(columns, words)
     marks = dict.fromkeys(columns, shape.decimal)
     for number, text in file.blocks(shape.first):
         kept = list(_rows_in(number, text))
@@ -172,6 +188,8 @@ def any_rows(file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequ
         rows.add_lines([line for line, _ in kept])
         for column in columns:
             texts = [bare(row[column]) for row in cells]
+            if column in words:
+                rows.add_words(column, texts)
             marks[column] = marks[column] or decimal_mark(texts, missing)
 
             def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> tuple[Path, int, int]:
