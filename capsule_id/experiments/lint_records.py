@@ -5,13 +5,17 @@ from typing import Any
 
 import numpy as np
 
+from capsule_id.records.faults.bursts import noisy_stretch
 from capsule_id.records.faults.clipping import clipped_samples
-from capsule_id.records.faults.phase import phase_jump, single_spike
+from capsule_id.records.faults.phase import jump_or_noise, single_spike
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
 from capsule_id.rig.filters import TIMING_TOLERANCE, largest_offset, median_step
 from capsule_id.rig.formats.columns import in_blocks
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
+
+#: Periods before a burst of noise that a decay is cut to; with fewer it begins behind the burst.
+KEPT_PERIODS = 3
 
 
 def lint_times(table: Table[Any], used: slice) -> Iterable[Finding]:
@@ -85,7 +89,7 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
 
 
 def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone: bool = False) -> Iterable[Finding]:
-    """Report samples of a smooth oscillation that were lost without a gap in the times.
+    """Report samples of a smooth oscillation that were lost without a gap in the times, or a burst of noise.
 
     Parameters
     ----------
@@ -99,8 +103,14 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
     if largest_offset(time, step) > TIMING_TOLERANCE * step:
         return
     values = table[name][used]
-    jump = phase_jump(values, period / step, alone)
-    if jump is not None:
+    jump = jump_or_noise(values, period / step, alone)
+    if jump is None:
+        return
+    burst = noisy_stretch(values, period / step, jump.row)
+    if burst is not None:
+        rows = slice(used.start + burst.start, used.start + burst.stop)
+        yield _burst(table, name, rows, used, burst.start < KEPT_PERIODS * period / step)
+    elif not jump.noisy:
         spike = single_spike(values, jump, period / step, alone)
         row = used.start + (jump.row if spike is None else spike)
         facts = {
@@ -112,3 +122,21 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
             "rows": [row],
         }
         yield Finding("readings.jump" if spike is None else "readings.spike", "fail", facts, table.label)
+
+
+def _burst(table: Table[Any], name: str, burst: slice, used: slice, early: bool) -> Finding:
+    """A stretch of noise, and the line of ``rig.toml`` that leaves it out: an ``early`` one with what is before it."""
+    time = table["time"]
+    digits = max(0, int(np.ceil(-np.log10(median_step(time[used]))))) + 1
+    begin, end = float(time[burst.start]), float(time[min(burst.stop, used.stop - 1)])
+    facts = {
+        "file": table.file,
+        "line": int(table.rows[burst.start]),
+        "column": name,
+        "begin": begin,
+        "end": end,
+        "key": "start" if early else "stop",
+        "value": float(np.round(end if early else begin, digits)),
+        "rows": [burst.start, burst.stop - 1],
+    }
+    return Finding("readings.burst", "fail", facts, table.label)

@@ -126,6 +126,29 @@ def test_an_aliased_decay_fails_unless_a_prior_excludes_the_aliases(rate: float)
         assert again.level == "fail"
 
 
+def slow(per_period: float) -> Table:
+    """A slow pendulum, 0.35 Hz: k1 = 0.53 N/m."""
+    time = np.arange(0.0, 30.0, 1.0 / (per_period * 0.35))
+    values = bench.released(time, 20e-3, k1=bench.M1 * (2.0 * np.pi * 0.35) ** 2, c=0.01)
+    values = values + 1e-4 * np.random.default_rng(3).standard_normal(len(time))
+    return bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", values)])
+
+
+def test_a_pendulum_whose_k1_lies_outside_its_default_prior_is_not_called_aliased() -> None:
+    """Before: a record with 90 samples per period failed, because k1 = 0.5 N/m is less than 1.5 N/m."""
+    assert found(bench.rig(slow(150.0)), "decays.alias") == []
+    rig = bench.rig(slow(40.0))
+    (finding,) = found(rig, "decays.alias")
+    assert (finding.level, finding.parameters) == ("warn", ("k1",))
+    line = re.search(r"k1 = \{ median = ([0-9.]+), factor = ([0-9]+),", text(finding))
+    assert line is not None
+    stated = {"k1": PriorOverride(float(line[1]), float(line[2]))}
+    assert found(bench.rig(slow(40.0), priors=stated), "decays.alias") == []
+    # Negative control: a stated prior that the record contradicts.
+    (against,) = found(bench.rig(slow(150.0), priors={"k1": PriorOverride(bench.K1, 10.0)}), "decays.alias")
+    assert against.level == "fail"
+
+
 def test_uneven_sampling_and_fast_sampling_have_no_aliases() -> None:
     assert found(bench.rig(coarse(1000.0)), "decays.alias") == []
     table = coarse(60.0)
@@ -202,3 +225,26 @@ def test_a_spike_is_no_loss_of_samples_and_its_row_can_be_deleted() -> None:
     assert found(np.delete(time, 500), np.delete(spoiled, 500)) == []
     # Negative control: lost samples are no spike.
     assert [f.code for f in lost] == ["readings.jump"]
+
+
+@pytest.mark.parametrize("begin", [0, 40, 300])
+def test_the_line_that_names_a_burst_of_noise_leaves_it_out(begin: int) -> None:
+    """A hand that still shakes the rig, or a rattle. Before: "samples were lost"."""
+    time = np.arange(1500) / 900.0
+    rng = np.random.default_rng(5)
+    values = bench.released(time, 4e-3, c=0.6) + 2e-5 * rng.standard_normal(1500)
+    values[begin : begin + 40] += 4e-4 * rng.standard_normal(40)
+
+    def faults(rows: slice) -> list[Finding]:
+        columns = [bench.column("time", time[rows]), bench.column("x_rel", values[rows])]
+        table = bench.table("free_vibration", columns)
+        return [f for f in lint_decay(table, bench.rig(table)) if f.level == "fail"]
+
+    (finding,) = faults(slice(None))
+    assert finding.code == "readings.burst"
+    key, value = finding.facts["key"], finding.facts["value"]
+    assert f"{key} = {{ value = {value:.10g}" in text(finding)
+    assert key == ("stop" if begin == 300 else "start")
+    kept = time <= value if key == "stop" else time >= value
+    assert np.sum(kept) > 250
+    assert faults(slice(int(np.argmax(kept)), int(np.argmax(kept)) + int(np.sum(kept)))) == []

@@ -28,6 +28,11 @@ from capsule_id.views import Facts, Finding, Message, counted
 
 #: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
+#: From so many samples per period on, an alias is less probable than a k1 outside its default prior: 1 in 50 aliased
+#: records has as many.
+SAMPLES_WITHOUT_ALIAS = 100
+#: Factor of the prior that a finding proposes for k1: it holds no alias of 20 samples per period or more.
+PROPOSED_FACTOR = 10
 #: Smallest number of periods; with fewer, one peak determines the damping.
 FEWEST_PERIODS = 2
 #: Fewest block means in a period.
@@ -108,9 +113,10 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
         median, factor = stated.median, stated.factor
     k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
     # Of aliased records one in ten seems to have more samples per period: 18 Hz sampled at 17 Hz shows sixteen.
-    coarse = median_step(time) * frequency * SAMPLES_PER_PERIOD > 1.0
+    per_period = 1.0 / (median_step(time) * frequency)
+    coarse = per_period < SAMPLES_PER_PERIOD
     inside = median / factor <= k1 <= median * factor
-    if not coarse and inside:
+    if not coarse and (inside or (stated is None and per_period >= SAMPLES_WITHOUT_ALIAS)):
         return
     part = loudest_part(values)
     others = aliases(time[part], values[part], frequency)
@@ -123,8 +129,12 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
             "others": ", ".join(f"{f:.4g}" for f in others[possible][:3]),
             "k1": k1,
             "k1s": ", ".join(f"{k:.4g}" for k in stiffnesses[possible][:3]),
+            "range": (median / factor, median * factor),
+            "factor": PROPOSED_FACTOR,
         }
-        yield Finding("decays.alias", "fail", facts, table.label)
+        # The default prior is no measurement: small rigs and pendulums have a k1 outside it.
+        certain = coarse or stated is not None
+        yield Finding("decays.alias", "fail" if certain else "warn", facts, table.label, () if certain else ("k1",))
 
 
 def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Finding]:
@@ -194,6 +204,11 @@ _ALIAS = (
     "{file}: the sampling cannot tell {frequency:.4g} Hz (k1 = {k1:.4g} N/m) from {others} Hz (k1 = {k1s} N/m). Sample "
     'faster; or state what is known: k1 = {{ median = ..., factor = ..., unit = "N/m" }} in [prior], narrow enough '
     "to hold one of them only."
+)
+_DEFAULT_PRIOR = (
+    "{file}: k1 = {k1:.4g} N/m lies outside the range of its default prior, {range[0]:.3g} to {range[1]:.3g} N/m. An "
+    "oscillation of {others} Hz (k1 = {k1s} N/m) has the same samples. If k1 is near {k1:.2g} N/m, state that: "
+    'k1 = {{ median = {k1:.2g}, factor = {factor}, unit = "N/m" }} in [prior]. Else sample faster.'
 )
 
 
@@ -284,7 +299,7 @@ MESSAGES = {
             "{near} Check the unit of the times, the sampling rate, and that both records show the same rig."
         ),
     ),
-    "decays.alias": Message("aliasing", fail=_ALIAS),
+    "decays.alias": Message("aliasing", fail=_ALIAS, warn=_DEFAULT_PRIOR),
     "decays.uneven": Message(
         "sampling of a decay",
         warn=(

@@ -1,6 +1,6 @@
 """Finds samples lost without a gap in the time column: jumps of an evenly sampled smooth oscillation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -29,14 +29,24 @@ GOES_ON = 1.5
 
 @dataclass(frozen=True)
 class Jump:
-    """A jump before the sample ``row``; ``size`` relative to the amplitude there."""
+    """A jump before the sample ``row``; ``size`` relative to the amplitude there.
+
+    ``noisy``: the noise around it is so large that it may be no jump.
+    """
 
     row: int
     size: float
+    noisy: bool = False
 
 
 def phase_jump(values: np.ndarray, period: float, alone: bool = False) -> Jump | None:
-    """Return the largest jump of a smooth oscillation; None where there is none.
+    """Return the largest jump of a smooth oscillation; None where there is none. See ``jump_or_noise``."""
+    found = jump_or_noise(values, period, alone)
+    return None if found is None or found.noisy else found
+
+
+def jump_or_noise(values: np.ndarray, period: float, alone: bool = False) -> Jump | None:
+    """Return the largest jump of a smooth oscillation, else the largest one that is ``noisy``; None without both.
 
     Polynomials through the samples before and after a place agree in value and slope where no sample is lost.
 
@@ -48,16 +58,19 @@ def phase_jump(values: np.ndarray, period: float, alone: bool = False) -> Jump |
     """
     # Errors of reading in steps are correlated in a slow record, so they do not average out.
     noise = max(noise_level(values), reading_step(values))
+    noisy: list[Jump] = []
     for share, smallest in SIDES:
         side = round(share * period)
         jumps = []
         for part in pieces(len(values), 2 * side):
             jump = _jump(values[part], period, side, smallest, noise, alone)
-            jumps += [] if jump is None else [Jump(part.start + jump.row, jump.size)]
+            jumps += [] if jump is None else [replace(jump, row=part.start + jump.row)]
             release(values)
+        noisy += [jump for jump in jumps if jump.noisy]
+        jumps = [jump for jump in jumps if not jump.noisy]
         if jumps:
             return max(jumps, key=lambda jump: jump.size)
-    return None
+    return max(noisy, key=lambda jump: jump.size, default=None)
 
 
 def single_spike(values: np.ndarray, jump: Jump, period: float, alone: bool = False) -> int | None:
@@ -104,12 +117,19 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
     if alone:
         later = np.minimum(np.arange(len(deviation)) + round(GOES_ON * period), len(deviation) - 1)
         large &= amplitude[later] > AMPLITUDE_NOISE * noise
+    noisy = None
     while large.any():
         worst = int(np.argmax(np.where(large, deviation, 0.0)))
+        # The record may be noisier here than elsewhere. One jump does not change the median of the differences.
+        local = noise_level(values[worst : worst + 2 * side])
+        if deviation[worst] * noise <= JUMP_SDS * local:
+            noisy = noisy or Jump(worst + side, float(phase[worst]), noisy=True)
+            large[max(0, worst - side) : worst + side] = False
+            continue
         if not alone or not _recurs(jumps, precision, worst, period):
             return Jump(worst + side, float(phase[worst]))
         large[max(0, worst - side) : worst + side] = False
-    return None
+    return noisy
 
 
 def _recurs(jumps: np.ndarray, precision: np.ndarray, place: int, period: float) -> bool:

@@ -32,6 +32,7 @@ _MARKS = (
     ("readings.repeated", "repeated", "D", ORANGE),
     ("readings.repeated_file", "repeated", "D", ORANGE),
     ("readings.jump", "jump", "P", PURPLE),
+    ("readings.burst", "burst of noise", "P", PURPLE),
     ("readings.spike", "spike", "P", PURPLE),
 )
 #: Times that findings propose: fact, words of the legend, line style.

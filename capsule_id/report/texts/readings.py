@@ -106,6 +106,14 @@ DATA_MESSAGES: Mapping[str, Message] = {
             "are even: samples were lost. Use the record on one side of the jump only, or repeat it."
         ),
     ),
+    "readings.burst": Message(
+        "bursts of noise",
+        fail=(
+            "{file}:{line}: {column} must have the same noise throughout; from {begin:.5g} to {end:.5g} s it has more than "
+            "three times the usual noise. Add this line to the experiment in rig.toml: "
+            '{key} = {{ value = {value:.10g}, unit = "s" }}'
+        ),
+    ),
     "readings.spike": Message(
         "spikes",
         fail=(
