@@ -94,6 +94,13 @@ def test_order_of_residuals() -> None:
     assert order_p(hump, rng) < LEVEL
 
 
+def test_readings_at_one_speed_have_no_order_in_speed() -> None:
+    """Pulls at one speed that drift from row to row: that is the order of trials, not of speed."""
+    rng = np.random.default_rng(4)
+    points = experiments(np.full(40, 0.05), 0.3 + 0.05 * np.linspace(-1.0, 1.0, 40) + 0.003 * rng.standard_normal(40))
+    assert findings(points)["friction.order"].level == "ok"
+
+
 def rack(folder: Path, speed: np.ndarray, coefficient: np.ndarray, model: str = "") -> Rig:
     rig = make_rig(folder, Entry("sliding_friction", "slide", {"speed [m/s]": speed, "coefficient [1]": coefficient}))
     toml = folder / "rig.toml"

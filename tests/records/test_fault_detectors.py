@@ -316,3 +316,19 @@ def test_equal_readings_of_a_coarse_angle_are_no_repeated_rows() -> None:
     fine[5:7] = fine[2:4]
     (found,) = repeated_blocks([Readings("tilts", np.deg2rad(fine)[:, None], False, (180.0 / np.pi,))])
     assert (found.row, found.first_row, found.count) == (5, 2, 2)
+
+
+def test_coarse_trials_of_one_load_are_no_repeated_rows() -> None:
+    """Pulls read to 0.1 N, as coefficients: 64 fine numbers in all, but two or three at each load."""
+    rng = np.random.default_rng(2)
+    loads = np.repeat([5.458, 9.382, 54.51, 103.6], 16)
+    pulls = np.round(0.17 * loads * (1.0 + 0.05 * rng.standard_normal(64)) / 0.1) * 0.1
+    pulls[:12] = [1.1, 1.0, 0.9, 1.0, 0.9, 0.9, 0.9, 1.0, 0.9, 0.9, 0.9, 0.9]
+    table = Readings("pulls", np.round(pulls / loads, 5)[:, None], False)
+    assert repeated_blocks([table]) == []
+    # Negative control: eight readings at as many loads, copied.
+    loads = np.linspace(5.0, 60.0, 64)
+    fine = np.round(0.17 * loads * (1.0 + 0.05 * rng.standard_normal(64)) / loads, 5)
+    fine[40:48] = fine[10:18]
+    (found,) = repeated_blocks([Readings("pulls", fine[:, None], False)])
+    assert (found.row, found.first_row, found.count) == (40, 10, 8)

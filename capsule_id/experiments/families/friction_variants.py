@@ -151,7 +151,8 @@ def fit_variant(points: Points, model: FrictionModel, seed: int, particles: int 
     theta, best = theta_of(z), int(np.argmax(values))
     raw, sd = points.scaled(model, {name: column[best : best + 1] for name, column in theta.items()})
     own = {row.symbol: theta[row.symbol] for row in model.parameters}
-    order = np.argsort(points.speed, kind="stable")
+    # Readings at one speed have no order in speed; that of their rows is another check's.
+    order = np.lexsort((np.random.default_rng(seed).random(len(points.speed)), points.speed))
     return Variant(
         model,
         {name: float(np.mean(column)) for name, column in own.items()},

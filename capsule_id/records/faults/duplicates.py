@@ -141,9 +141,21 @@ def _longest_block(earlier: Readings, later: Readings) -> Repeated | None:
             where, start = where - back, start - back
         count = _equal_rows(earlier.values[where:], later.values[start:])
         ends[start - where] = start + count
+        if not later.record and pairs * _chance_within(later.values[start : start + count]) > CHANCE:
+            continue
         if count >= shortest and (best is None or count > best.count):
             best = Repeated(later.label, start, earlier.label, where, count)
     return best
+
+
+def _chance_within(block: np.ndarray) -> float:
+    """Probability that a block (n, columns) of single readings recurs, if its own rows show how often rows are equal.
+
+    Trials of one load that are read in coarse steps agree, even where the coefficients of the whole table look fine.
+    """
+    _, sizes = np.unique(block, axis=0, return_counts=True)
+    rows = len(block)
+    return float(np.sum(sizes * (sizes - 1)) / max(rows * (rows - 1), 1)) ** rows
 
 
 def _equal_rows(one: np.ndarray, other: np.ndarray) -> int:
