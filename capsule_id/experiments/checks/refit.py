@@ -30,7 +30,8 @@ def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]
     at = np.array([float(theta[s]) for s in symbols])
 
     def values_of(w: np.ndarray) -> np.ndarray:
-        return at * w if signed else at * np.exp(w)
+        with np.errstate(over="ignore"):  # of a parameter without information; its step is then shortened
+            return at * w if signed else at * np.exp(w)
 
     def residuals(w: np.ndarray) -> np.ndarray:
         moved = {**theta, **dict(zip(symbols, values_of(w), strict=True))}

@@ -329,7 +329,10 @@ class FreeVibration(SurfaceExperiment):
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.condensed[0]))))
 
     def noise_facts(self) -> Facts:
-        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}
+        settings = self.table.settings
+        words = ("damping", "stiffness", "drift", "noise")
+        stated = tuple(word for word in words if getattr(settings, word) is not None)
+        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines, "stated": stated}
         return {"model": "decay", **facts, **self.damping_trend()}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

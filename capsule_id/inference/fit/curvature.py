@@ -36,7 +36,11 @@ def in_batches(
 
 
 def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vector) -> Matrix:
-    """(d, d) Hessian of ``function`` ((m, d) -> (m,)) at u (d,); ``scale`` (d,) is a rough sd of each parameter."""
+    """(d, d) Hessian of a log-density ((m, d) -> (m,)) at u (d,); ``scale`` (d,) is a rough sd of each parameter.
+
+    Beside the end of its domain, such as critical damping, the density has no difference quotient. The curvature of
+    ``scale`` stands there.
+    """
     d = len(u)
     rows, columns = np.triu_indices(d)
     unit = np.diag(scale)
@@ -46,9 +50,12 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vect
         offsets = step * np.concatenate([pair, -pair, single, -single])
         values = in_batches(function, np.concatenate([u + offsets, u[None]]))
         plus, minus, cross, cross_minus = np.split(values[:-1], 4)
-        second = (plus + minus - cross - cross_minus) / (4.0 * step**2)
+        with np.errstate(invalid="ignore"):  # -inf beyond the domain
+            second = (plus + minus - cross - cross_minus) / (4.0 * step**2)
         estimates.append(second)
-    best = (RATIO**2 * estimates[0] - estimates[1]) / (RATIO**2 - 1.0)
+    with np.errstate(invalid="ignore"):
+        best = (RATIO**2 * estimates[0] - estimates[1]) / (RATIO**2 - 1.0)
+    best = np.where(np.isfinite(best), best, np.where(rows == columns, -1.0, 0.0))
     matrix = np.zeros((d, d))
     matrix[rows, columns] = best / (scale[rows] * scale[columns])
     return matrix + np.triu(matrix, 1).T

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from capsule_id.inference.fit.curvature import BATCH, hessian, in_batches, jacobian, root_of_inverse
 from capsule_id.precision import require_float64
@@ -23,6 +24,22 @@ def test_hessian_against_automatic_differentiation() -> None:
     scale = np.outer(SCALE, SCALE)
     np.testing.assert_allclose(found * scale, jax.hessian(smooth)(AT) * scale, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(found, found.T)
+
+
+def test_the_hessian_beside_the_end_of_the_domain() -> None:
+    """A decay near critical damping: the density ends at a step from the maximum (before: eigenvalues failed)."""
+
+    def ending(u: np.ndarray) -> np.ndarray:
+        values = np.asarray(jax.vmap(smooth)(u))
+        return np.where(u[:, 1] > AT[1] + 1e-9, -np.inf, values)
+
+    found, whole = hessian(ending, AT, SCALE), hessian(jax.vmap(smooth), AT, SCALE)
+    root = root_of_inverse(-found)
+    assert np.isfinite(root).all()
+    inside = np.ix_([0, 2, 3], [0, 2, 3])
+    np.testing.assert_allclose(found[inside], whole[inside])
+    assert found[1, 1] == -1.0 / SCALE[1] ** 2
+    assert (root @ root.T)[1, 1] == pytest.approx(SCALE[1] ** 2)
 
 
 def test_jacobian_against_automatic_differentiation() -> None:
