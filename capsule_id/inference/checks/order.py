@@ -1,8 +1,12 @@
-"""Order of the trials of a table: neighbouring rows whose residuals are alike are not independent."""
+"""Order of the trials: neighbouring rows, or rows of one table, whose residuals are alike are not independent."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import stats
 
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.inference.checks.regression import design
 from capsule_id.inference.checks.sampled_fit import SampledFit
@@ -16,6 +20,8 @@ PERMUTATIONS, MANY_ROWS = 10_000, 200
 FEWEST_ROWS = 6
 #: Residuals below this share of the noise, rms, are rounding, and their order means nothing.
 SMALLEST_SCATTER = 0.02
+#: Smallest factor of the sd by which tables of one kind disagree that counts, and fewest rows of a table.
+SMALLEST_FACTOR, FEWEST_TRIALS = 1.2, 2
 
 
 def check_order(s: SampledFit) -> list[Finding]:
@@ -24,10 +30,9 @@ def check_order(s: SampledFit) -> list[Finding]:
     for e in s.experiments:
         if e.time_series:
             continue
-        residuals, columns = design(e, e.local(s.values))
+        residuals, columns = _unflagged(s, e)
         # An outlier shifts the fit; without it the residuals are those of the local fit to the other rows.
-        if flagged := s.flagged.get(e.label, []):
-            residuals, columns = np.delete(residuals, flagged), np.delete(columns, flagged, axis=0)
+        if s.flagged.get(e.label):
             residuals = residuals - columns @ np.linalg.lstsq(columns, residuals, rcond=None)[0]
         if len(residuals) >= FEWEST_ROWS and np.std(residuals) > SMALLEST_SCATTER:
             tables.append((e, residuals))
@@ -49,3 +54,78 @@ def lag_1(residuals: np.ndarray, seed: int = 0) -> tuple[float, float]:
     shuffled = np.random.default_rng(seed).permuted(np.tile(residuals - np.mean(residuals), (PERMUTATIONS, 1)), axis=1)
     random = np.sum(shuffled[:, 1:] * shuffled[:, :-1], axis=1) / np.sum(shuffled**2, axis=1)
     return correlation, float((1 + np.sum(random >= correlation - 1e-12)) / (1 + PERMUTATIONS))
+
+
+def check_tables(s: SampledFit) -> list[Finding]:
+    """Check that tables of trials with the same parameters and one scatter have the same mean residual.
+
+    A permutation test of the scatter between tables. Their common scatter otherwise absorbs what differs between them.
+    """
+    alike: dict[tuple[str, ...], list[Experiment]] = {}
+    for e in s.experiments:
+        if e.bench and not e.time_series and any(row.scatter for row in e.parameters) and _means_count(s, e):
+            alike.setdefault((e.kind, *(row.name for row in e.parameters)), []).append(e)
+    groups = [members for members in alike.values() if len(members) > 1]
+    findings = []
+    for members in groups:
+        residuals = [_unflagged(s, e)[0] for e in members]
+        factor, p = between(residuals)
+        if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
+            name = next(row for row in members[0].parameters if row.physical)
+            facts = {
+                "name": name.name,
+                "estimates": [(e.label, _estimate(s, e, name.symbol)) for e in members],
+                "unit": name.unit,
+                "p": p,
+                "factor": factor,
+            }
+            findings += [Finding("trials.tables", "fail", facts, e.label) for e in members[:1]]
+    number = sum(len(members) for members in groups)
+    return findings or [Finding("trials.tables", "ok", {"number": number})] * bool(groups)
+
+
+def _means_count(s: SampledFit, e: Experiment) -> bool:
+    """Whether the mean residual of a table tells of its parameters: no offset of its own, and several trials."""
+    residuals, _ = _unflagged(s, e)
+    own = e.misfit(e.local(s.values)).design.shape[1]
+    return own == 0 and len(residuals) >= FEWEST_TRIALS and np.std(residuals) > SMALLEST_SCATTER
+
+
+def _unflagged(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals in units of the noise and their Jacobian, without flagged rows."""
+    flagged = list(s.flagged.get(e.label, []))
+    residuals, columns = design(e, e.local(s.values))
+    return np.delete(residuals, flagged), np.delete(columns, flagged, axis=0)
+
+
+def _estimate(s: SampledFit, e: Experiment, symbol: str) -> float:
+    """A parameter by one table alone, SI."""
+    return refit(e, e.local(s.values), list(s.flagged.get(e.label, [])))[symbol][0]
+
+
+def between(residuals: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float]:
+    """Factor of the sd by which tables disagree beyond their scatter, and the probability of as large a disagreement.
+
+    The factor is that of the design effect: sqrt(1 + (rows - 1) r), r the correlation of trials of one table.
+
+    Parameters
+    ----------
+    residuals : of each table (n_i,), with one scatter
+    """
+    sizes = np.array([len(each) for each in residuals])
+    values = np.concatenate(residuals)
+    values = values - np.mean(values)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+
+    def sum_between(r: np.ndarray) -> np.ndarray:
+        return np.sum(np.add.reduceat(r, starts, axis=-1) ** 2 / sizes, axis=-1)
+
+    total, found = float(values @ values), float(sum_between(values))
+    within = (total - found) / max(len(values) - len(sizes), 1)
+    # Mean number of rows for the variance between tables (Searle, Casella & McCulloch 1992, section 3.6).
+    rows = (len(values) - float(np.sum(sizes**2)) / len(values)) / (len(sizes) - 1)
+    variance = max(0.0, (found / (len(sizes) - 1) - within) / rows)
+    correlation = variance / (variance + within) if variance > 0.0 else 0.0
+    shuffled = np.random.default_rng(seed).permuted(np.tile(values, (PERMUTATIONS, 1)), axis=1)
+    p = float((1 + np.sum(sum_between(shuffled) >= found * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
+    return float(np.sqrt(1.0 + (rows - 1.0) * correlation)), p

@@ -92,9 +92,12 @@ def _decay_remedy(facts: Facts) -> str:
     cut = "Cut the record to free decay with start and stop"
     if facts["second"]:
         return f"{present}No model that a second fit offers passes. {cut}, or record again with less disturbance."
-    return (
-        f"{present}{cut}, or remove damping, stiffness, drift and noise from its entry: a second fit then chooses them."
-    )
+    if not facts["stated"]:
+        return f"{present}{cut}, or record again with less disturbance."
+    words = facts["stated"]
+    listed = " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    them = "them" if len(words) > 1 else "it"
+    return f"{present}{cut}, or remove {listed} from its entry: a second fit then chooses {them}."
 
 
 def _drift(facts: Facts) -> str:
@@ -114,6 +117,11 @@ def _drift(facts: Facts) -> str:
     return f"While the amplitude falls from {large:.2g} to {small:.2g} m, {' and '.join(parts)}."
 
 
+def _after_number(unit: str) -> str:
+    """A unit behind a number; nothing for a number without unit."""
+    return "" if unit == "1" else f" {unit}"
+
+
 def _outliers(facts: Facts) -> str:
     """The lines of the file, how far they stand off, and what they do to the estimates."""
     lines = [str(line) for line in facts["lines"]]
@@ -121,12 +129,23 @@ def _outliers(facts: Facts) -> str:
     where = f"lines {', '.join(lines[:-1])} and {lines[-1]} stand up to" if several else f"line {lines[0]} stands"
     more = f" At most {facts['most']} rows are named: look at the whole table." if len(lines) == facts["most"] else ""
     change = "; ".join(
-        f"{name} = {value:.5g} {unit} with {'them' if several else 'it'}, {without:.5g} without"
+        f"{name} = {value:.5g}{_after_number(unit)} with {'them' if several else 'it'}, {without:.5g} without"
         for name, unit, value, without in facts["estimates"]
     )
     return (
         f"{facts['file']} {where} {facts['score']:.3g} standard deviations off the others (p = {facts['p']:.1g}).{more} "
         f"{change}. Nothing was dropped: check the reading, then correct it or remove it yourself."
+    )
+
+
+def _tables_disagree(facts: Facts) -> str:
+    """The estimate of each table, and what to do."""
+    unit = _after_number(facts["unit"])
+    estimates = ", ".join(f"{value:.4g}{unit} by {label}" for label, value in facts["estimates"])
+    return (
+        f"expected tables of trials that agree; found {facts['name']} = {estimates} (p = {facts['p']:.1g}). It depends on "
+        f"what differs between them, such as load, day or speed; the sd is too small by a factor of about "
+        f"{facts['factor']:.1f}. Find the cause, or fit each table in a folder of its own."
     )
 
 
@@ -172,6 +191,11 @@ FIT_MESSAGES: Mapping[str, Message] = {
             "(p = {p:.1g}). The trials drift or come in sessions, and the sd is too small by a factor of about {factor:.1f}. "
             "Repeat the trials in random order, with the test set up anew between them."
         ),
+    ),
+    "trials.tables": Message(
+        "agreement of tables",
+        ok="{number:# table} of trials agree within their scatter",
+        fail=_tables_disagree,
     ),
     "residuals.statistics": Message(
         "residuals like noise",

@@ -9,8 +9,8 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments.families.line_replicates import lack_of_fit
-from capsule_id.inference.checks.order import lag_1
-from tests.measured.folders import Entry, make_rig
+from capsule_id.inference.checks.order import between, lag_1
+from tests.measured.folders import Entry, make_rig, quantity
 
 
 def drifting(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
@@ -44,6 +44,51 @@ def test_trials_in_order_are_named_and_in_random_order_pass(tmp_path: Path) -> N
     assert result.summary.at["mu", "trust"] == "not trusted"
     shuffled = tilts(tmp_path / "shuffled", np.random.default_rng(0).permutation(angle))
     assert [f.level for f in shuffled.findings if f.code == "trials.order"] == ["ok"]
+
+
+def test_false_alarms_and_the_factor_of_tables_that_differ() -> None:
+    rng = np.random.default_rng(1)
+    p = [between([rng.standard_normal(n) for n in (5, 4, 12)])[1] for _ in range(200)]
+    assert np.mean(np.array(p) < 0.1) == pytest.approx(0.1, abs=0.07)
+    # Correlation r = 4/5 of the trials of one table: an sd that counts them all is too small by sqrt(1 + 9 r).
+    factors = [
+        between([2.0 * rng.standard_normal() + rng.standard_normal(10) for _ in range(40)])[0] for _ in range(20)
+    ]
+    assert float(np.mean(factors)) == pytest.approx(np.sqrt(1.0 + 9.0 * 0.8), rel=0.1)
+
+
+def pulls(folder: Path, mu: tuple[float, ...]) -> Fit:
+    """Pulls with 3 % scatter at three loads; the wide prior is that which the conflict of the priors proposes."""
+    rng = np.random.default_rng(3)
+    entries = [
+        Entry(
+            "static_friction",
+            f"load_{load:g}",
+            {"force [N]": load * one * (1.0 + 0.03 * rng.standard_normal(6))},
+            {"normal_force": quantity(load, "N")},
+        )
+        for load, one in zip((5.0, 10.0, 50.0), mu, strict=False)
+    ]
+    make_rig(folder, *entries)
+    toml = folder / "rig.toml"
+    toml.write_text(toml.read_text() + '\n[prior]\npull_scatter = { scale = 0.16, unit = "1" }\n')
+    return cid.fit(cid.read_rig(folder), budget=None)
+
+
+def test_tables_of_one_surface_that_disagree_are_named(tmp_path: Path) -> None:
+    """A friction that grows with the load (before: mu = 0.200 ± 0.012, trusted; by table 0.16, 0.18 and 0.25)."""
+    result = pulls(tmp_path / "grows", (0.162, 0.177, 0.2525))
+    (found,) = [f for f in result.findings if f.code == "trials.tables"]
+    assert found.level == "fail"
+    assert "fit each table in a folder of its own" in result.text(found)
+    assert result.summary.at["mu", "trust"] == "not trusted"
+    by_table = [value for _, value in found.facts["estimates"]]
+    assert by_table == pytest.approx([0.162, 0.177, 0.2525], rel=0.05)
+    # The remedy, and tables that agree.
+    assert pulls(tmp_path / "alone", (0.162,)).clean
+    agreeing = pulls(tmp_path / "agree", (0.2, 0.2, 0.2))
+    assert [f.level for f in agreeing.findings if f.code == "trials.tables"] == ["ok"]
+    assert agreeing.clean
 
 
 def levels(rng: np.random.Generator, deviation: float) -> tuple[np.ndarray, np.ndarray]:
