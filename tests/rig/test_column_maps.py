@@ -202,7 +202,7 @@ def test_where_selects_rows_by_a_text(tmp_path: Path) -> None:
         for t, x in zip(TIME, column, strict=True)
     ]
     stated = f'file = "t.csv"\ndata_from_line = 2\n{BY_NAME}\nwhere = '
-    files = {"t.csv": "t,kind,x,day\n" + "".join(lines)}
+    files: dict[str, str | bytes] = {"t.csv": "t,kind,x,day\n" + "".join(lines)}
     for keys, factor in (('kind = "B", day = "a day"', 1.0), ('2 = "C"', 2.0), ('kind = "B", day = ""', 3.0)):
         (table,) = rig_of(tmp_path, files, f"{stated}{{ {keys} }}").tables
         np.testing.assert_allclose(table["x_rel"], 1e-3 * factor * DISP, rtol=1e-14)
