@@ -193,28 +193,6 @@ def test_where_selects_rows_by_header_or_number(tmp_path: Path) -> None:
         assert len(found) == repeated
 
 
-def test_where_selects_rows_by_a_text(tmp_path: Path) -> None:
-    """Breakaway and constant pulls in one file, told apart by a letter (before: "write a number without quotes")."""
-    both = [("B", "a day", DISP), ("C", "a day", 2.0 * DISP), ("B", "", 3.0 * DISP)]
-    lines = [
-        f"{float(t)!r},{letter},{float(x)!r},{day}\n"
-        for letter, day, column in both
-        for t, x in zip(TIME, column, strict=True)
-    ]
-    stated = f'file = "t.csv"\ndata_from_line = 2\n{BY_NAME}\nwhere = '
-    files: dict[str, str | bytes] = {"t.csv": "t,kind,x,day\n" + "".join(lines)}
-    for keys, factor in (('kind = "B", day = "a day"', 1.0), ('2 = "C"', 2.0), ('kind = "B", day = ""', 3.0)):
-        (table,) = rig_of(tmp_path, files, f"{stated}{{ {keys} }}").tables
-        np.testing.assert_allclose(table["x_rel"], 1e-3 * factor * DISP, rtol=1e-14)
-        assert len(table.rows) + table.other + table.missing == 36
-    fault = fault_of(tmp_path, {}, f'{stated}{{ kind = "D" }}')
-    assert "column 'kind' holds 'B' 'C'" in fault.rule
-    assert fault.value == "'D'"
-    savemat(tmp_path / "m.mat", {"t": TIME, "x": DISP})
-    fault = fault_of(tmp_path, {}, f'file = "m.mat"\n{BY_NAME}\nwhere = {{ x = "B" }}')
-    assert "takes numbers" in fault.rule
-
-
 def test_files_with_the_same_headers_are_put_one_below_the_other(tmp_path: Path) -> None:
     head = "Time (s),Disp (mm)\n"
     parts = [head + rows(",", columns=(TIME[:7], DISP[:7])), head + rows(",", columns=(TIME[7:], DISP[7:]))]

@@ -1,0 +1,30 @@
+"""Rows selected by a text of a column."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.io import savemat
+
+from tests.rig.test_column_maps import BY_NAME, DISP, TIME, fault_of, rig_of
+
+
+def test_where_selects_rows_by_a_text(tmp_path: Path) -> None:
+    """Breakaway and constant pulls in one file, told apart by a letter (before: "write a number without quotes")."""
+    both = [("B", "a day", DISP), ("C", "a day", 2.0 * DISP), ("B", "", 3.0 * DISP)]
+    lines = [
+        f"{float(t)!r},{letter},{float(x)!r},{day}\n"
+        for letter, day, column in both
+        for t, x in zip(TIME, column, strict=True)
+    ]
+    stated = f'file = "t.csv"\ndata_from_line = 2\n{BY_NAME}\nwhere = '
+    files: dict[str, str | bytes] = {"t.csv": "t,kind,x,day\n" + "".join(lines)}
+    for keys, factor in (('kind = "B", day = "a day"', 1.0), ('2 = "C"', 2.0), ('kind = "B", day = ""', 3.0)):
+        (table,) = rig_of(tmp_path, files, f"{stated}{{ {keys} }}").tables
+        np.testing.assert_allclose(table["x_rel"], 1e-3 * factor * DISP, rtol=1e-14)
+        assert len(table.rows) + table.other + table.missing == 36
+    fault = fault_of(tmp_path, {}, f'{stated}{{ kind = "D" }}')
+    assert "column 'kind' holds 'B' 'C'" in fault.rule
+    assert fault.value == "'D'"
+    savemat(tmp_path / "m.mat", {"t": TIME, "x": DISP})
+    fault = fault_of(tmp_path, {}, f'file = "m.mat"\n{BY_NAME}\nwhere = {{ x = "B" }}')
+    assert "takes numbers" in fault.rule
