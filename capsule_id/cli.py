@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from capsule_id import console
-from capsule_id.commands.compilation import discard_damaged
+from capsule_id.commands.compilation import discard_damaged, use_one_blas_thread
 from capsule_id.errors import InputError
 from capsule_id.interruption import INTERRUPTED, end_interrupted, interruptible
 
@@ -104,6 +104,7 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
     """
     console.prepare()
     gc.set_threshold(*_GARBAGE)
+    use_one_blas_thread()
     interrupted = f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}"
     try:
         # The parsers load NumPy: an interruption must count from before that.

@@ -1,4 +1,7 @@
-"""Options of XLA for a command, and the cache of compiled programs between commands. All act before JAX is imported."""
+"""Options of XLA and BLAS for a command, and the cache of compiled programs between commands.
+
+All act before JAX is imported, those of BLAS before NumPy.
+"""
 
 import argparse
 import hashlib
@@ -17,12 +20,24 @@ from capsule_id.inference.target.compiling import HAS_EMITTER_OPTION
 XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 # Without XLA's newer emitters of fused loops a program compiles in half the time, and runs no slower. CPU only.
 XLA_EMITTER_OPTION = "--xla_cpu_use_fusion_emitters=false" if HAS_EMITTER_OPTION else ""
+#: Variable with the number of threads of OpenBLAS, which NumPy and SciPy bring.
+BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 #: Programs that take longer than this to compile are kept, s.
 WORTH_KEEPING = 0.3
 #: Largest size of the cache, bytes; JAX removes the programs that were not used for the longest time.
 LARGEST_CACHE = 256 * 2**20
 #: Variable of JAX with the directory of the cache, and how JAX's warning about a damaged program begins.
 DIRECTORY, DAMAGED = "JAX_COMPILATION_CACHE_DIR", "Error reading persistent compilation cache entry"
+
+
+def use_one_blas_thread() -> None:
+    """Let BLAS run in the thread that calls it, unless NumPy is imported or the user has set another number.
+
+    The matrices of a fit have few columns, and its own threads occupy the cores: those of BLAS would wait for them. One
+    thread also sums in the same order on any number of cores.
+    """
+    if "numpy" not in sys.modules:
+        os.environ.setdefault(BLAS_THREADS, "1")
 
 
 def set_xla_options(loop: bool = True) -> None:

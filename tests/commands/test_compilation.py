@@ -31,6 +31,16 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
     assert compilation.os.environ["XLA_FLAGS"] == emitter
 
 
+def test_blas_takes_one_thread(tmp_path: Path) -> None:
+    """The variable is set before NumPy is imported, which reads it then; the user's own value stays."""
+    name = compilation.BLAS_THREADS
+    before = "import atexit, os, sys\nfrom capsule_id import cli\nassert 'numpy' not in sys.modules\n"
+    before += f"atexit.register(lambda: print(os.environ['{name}']))\n"
+    for own, expected in ((None, "1"), ("3", "3")):
+        done = run("--version", cwd=tmp_path, before=before, env=environment(**{name: own}))
+        assert done.stdout.split()[-1] == expected, done.stderr
+
+
 def simulated(folder: Path, cache: Path, *options: str) -> tuple[bytes, str]:
     """The table that ``simulate`` writes with a cache in ``cache``, and its standard error."""
     variables = dict.fromkeys((name for name in os.environ if name.startswith("JAX_")), None)
