@@ -7,7 +7,7 @@ Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the mini
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -27,6 +27,16 @@ require_float64()
 Residual = Callable[[jax.Array], jax.Array]
 #: A point (d,) -> residuals (n,) and their Jacobian (n, d).
 Linearise = Callable[[np.ndarray], tuple[Residuals, Jacobian]]
+
+
+@runtime_checkable
+class HasJacobian(Protocol):
+    """Residuals with a Jacobian that needs fewer tangents than parameters."""
+
+    def linearised(self, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Residuals (n,) and Jacobian (n, d) at v (d,)."""
+        ...
+
 
 FIRST_DAMPING = 1e-6
 """Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
@@ -236,7 +246,9 @@ def _linearised(residual: Residual, heavy: bool, x: np.ndarray) -> tuple[np.ndar
 
 
 def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Residuals (n,) and Jacobian (n, d) at x (d,), in one pass."""
+    """Residuals (n,) and Jacobian (n, d) at x (d,), in one pass: the residual's own ``linearised``, or forward mode."""
+    if isinstance(residual, HasJacobian):
+        return residual.linearised(x)
 
     def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         value = residual(x)

@@ -1,6 +1,6 @@
 """Groups of stacked experiments that differ only in numbers; each group is evaluated in one batch."""
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -29,6 +29,40 @@ class Group(eqx.Module):
         """Values (members,) by symbol, from the constrained values (d,); symbols in ``without`` are omitted."""
         padded = jnp.concatenate([values, jnp.zeros(1)])
         return {symbol: padded[jnp.array(entry)] for symbol, entry in self.entries if symbol not in without}
+
+    def linearised(
+        self, residuals: Callable[..., Any], values: Any, rates: Any, located: np.ndarray
+    ) -> tuple[Any, Any]:
+        """Residuals (members, n) and their Jacobian (members, n, l) with respect to the ``located`` entries of u (l,).
+
+        A tangent per symbol moves that parameter of all members at once: one member reads few of the entries.
+
+        Parameters
+        ----------
+        residuals : (experiment, values by symbol) -> (n,)
+        values, rates : (d,) constrained values and their derivatives with respect to u
+        """
+        column = np.full(len(rates) + 1, len(located))
+        column[located] = np.arange(len(located))
+        entries = {symbol: np.array(entry) for symbol, entry in self.entries}
+        moved = [symbol for symbol, entry in entries.items() if np.any(column[entry] < len(located))]
+        at = self.local(values)
+
+        def along(direction: Any) -> tuple[Any, Any]:
+            """Residuals, and their derivative along ``direction`` (symbols,)."""
+            tangents = {s: jnp.broadcast_to(x, (len(self.members),)) for s, x in zip(moved, direction, strict=True)}
+
+            def of_moved(own: dict[str, Any]) -> Any:
+                return jax.vmap(residuals)(self.experiments, {**at, **own})
+
+            return jax.jvp(of_moved, ({symbol: at[symbol] for symbol in moved},), (tangents,))
+
+        found, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(moved)))
+        index = np.stack([entries[symbol] for symbol in moved])
+        slopes = slopes * jnp.concatenate([rates, jnp.zeros(1)])[index][:, :, None]
+        jacobian = jnp.zeros((*found.shape, len(located) + 1))
+        jacobian = jacobian.at[np.arange(len(self.members)), :, column[index]].add(slopes)
+        return found, jacobian[..., :-1]
 
 
 def make_groups(experiments: Sequence[Experiment], names: Sequence[str]) -> tuple[Group, ...]:

@@ -189,6 +189,19 @@ class LogPosterior(eqx.Module):
         parts = self._per_group(lambda e, theta: e.residuals(theta), u)
         return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.priors.residuals(u, self.constrain(u))])
 
+    def linearised(self, u: Any) -> tuple[Any, Any]:
+        """Residuals (n,) as in ``residuals``, and their Jacobian (n, l) with respect to the l located entries of u."""
+        values, located = self.constrain(u), self.located
+        rates = jnp.where(self.positive, values, 1.0)
+
+        def one(experiment: Experiment, theta: ValuesBySymbol) -> Any:
+            return experiment.residuals({**theta, **self.constants})
+
+        parts = [group.linearised(one, values, rates, located) for group in self.groups]
+        slopes = jnp.diag(self.priors.rates(rates))[:, located]
+        residuals = [*(jnp.ravel(part) for part, _ in parts), self.priors.residuals(u, values)]
+        return jnp.concatenate(residuals), jnp.concatenate([*(j.reshape(-1, len(located)) for _, j in parts), slopes])
+
     def residual_owners(self, u: np.ndarray) -> list[Experiment | None]:
         """(n,) experiment of every entry of ``residuals`` at u (d,); None: a prior."""
         values, owners = self.mapping(self.theta(u)), []
@@ -255,4 +268,11 @@ class HeldResiduals(eqx.Module):
     centre: Any
 
     def __call__(self, v: Any) -> Any:
-        return self.target.residuals(self.centre.at[jnp.array(self.target.located)].set(v))
+        return self.target.residuals(self._whole(v))
+
+    def linearised(self, v: Any) -> tuple[Any, Any]:
+        """Residuals (n,) and their Jacobian (n, l) at v (l,)."""
+        return self.target.linearised(self._whole(v))
+
+    def _whole(self, v: Any) -> Any:
+        return self.centre.at[jnp.array(self.target.located)].set(v)

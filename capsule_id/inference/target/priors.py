@@ -63,6 +63,10 @@ class Priors(eqx.Module):
         """(value - centre)/width for each parameter."""
         return (xp.where(self.lognormal, u, value) - self.centre) / self.width
 
+    def rates(self, value_rates: Any, xp: ModuleType = jnp) -> Any:
+        """Derivative of each of ``residuals`` with respect to u, from those of the values."""
+        return xp.where(self.lognormal, 1.0, value_rates) / self.width
+
 
 def prior_of(row: Parameter) -> Prior:
     """Return the prior of ``row``.

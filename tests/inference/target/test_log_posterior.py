@@ -1,9 +1,12 @@
 """Priors against SciPy, their integrals and samples; the joint density is the sum of its parts."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,13 +15,14 @@ from scipy import integrate, stats
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.base import Experiment, ValuesBySymbol, no_design
 from capsule_id.experiments.dynamic_friction.declaration import PUSH_SCATTER
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
+from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.static_friction.declaration import TILT_SD
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.parameters import TABLE, Prior, parameter
+from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
+from capsule_id.parameters import TABLE, Parameter, Prior, parameter
 from capsule_id.rig.model import PriorOverride
 from capsule_id.synthetic import Truth, synthesize
 from tests.capsule_cases import jit_quickly
@@ -168,6 +172,43 @@ def test_residuals_by_both_routes(twin: tuple[LogPosterior, tuple[Experiment, ..
     u = at_truth(target)
     batched = np.sort(np.asarray(jit_quickly(lambda u: target.residuals(u))(u)))
     np.testing.assert_allclose(batched, np.sort(target.plain_residuals(u)), rtol=1e-8, atol=1e-9)
+
+
+def assert_same_jacobian(target: LogPosterior, u: np.ndarray) -> None:
+    """One tangent per symbol gives the derivatives that forward mode gives with one per parameter of the rig."""
+    located = target.located
+    held = HeldResiduals(target, jnp.asarray(u))
+    expected = np.asarray(jit_quickly(jax.jacfwd(lambda v: held(v)))(u[located]))
+    residuals, jacobian = jit_quickly(lambda v: held.linearised(v))(u[located])
+    np.testing.assert_allclose(residuals, held(u[located]), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(jacobian, expected, rtol=1e-11, atol=1e-11 * np.max(np.abs(expected)))
+    assert np.all(np.any(expected != 0.0, axis=0))
+
+
+def test_jacobian_by_both_routes(twin: tuple[LogPosterior, tuple[Experiment, ...]]) -> None:
+    assert_same_jacobian(twin[0], at_truth(twin[0], 1.1))
+
+
+class Products(Nothing):
+    """Two residuals that depend on parameters which members of one group may lack."""
+
+    factor: float
+
+    def __init__(self, rows: Sequence[Parameter], factor: float) -> None:
+        super().__init__(rows)
+        self.factor = factor
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        raw = xp.stack([self.factor * theta["k1"] * theta["c"], theta["c"] * xp.exp(theta.get("lag", 0.0))])
+        return (Misfit(raw, 1.0, 0.0, no_design(2, xp)),)
+
+
+def test_jacobian_where_a_member_of_a_group_lacks_a_parameter() -> None:
+    k1, c, lag = parameter("k1"), parameter("c", prior=PRIORS["normal"][0]), PRIORS["normal"][0]
+    rows = [[k1, c, parameter("lag", "a", lag)], [k1, c], [k1, c, parameter("lag", "b", lag)]]
+    target = LogPosterior(rig_without_tables(), [Products(row, 1.0 + i) for i, row in enumerate(rows)])
+    assert [len(group.members) for group in target.groups] == [3]
+    assert_same_jacobian(target, np.linspace(0.3, 0.9, target.dimension))
 
 
 def test_overdamped_decays_have_no_density(twin: tuple[LogPosterior, tuple[Experiment, ...]]) -> None:
