@@ -35,9 +35,12 @@ def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
     start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
     x_rel, rate, Y2 = np.concatenate([start + STEP * np.diag(size), start - STEP * np.diag(size)]).T
     time = np.asarray(run.true_time(theta))
-    times = np.linspace(time[0], time[-1], INSTANTS + 1)
+    instants = np.linspace(time[0], time[-1], INSTANTS + 1)[1:]
+    # As many samples as the record has: then one compiled program serves all batches of its motions.
+    times = np.union1d(time, instants)
     t = run.simulated(theta, *run.capsule(theta), times, (x_rel, rate + Y2, np.zeros(6), Y2))
-    states = np.stack([t.x_rel, t.Y1 - t.Y2, t.Y2], axis=-1)[:, 1:] / (2.0 * STEP * size)
+    states = np.stack([t.x_rel, t.Y1 - t.Y2, t.Y2], axis=-1)[:, np.searchsorted(times, instants)]
+    states = states / (2.0 * STEP * size)
     if not np.isfinite(states).all():
         return float("inf")
     factors = np.linalg.norm(np.swapaxes(states[:3] - states[3:], 0, 1), 2, axis=(1, 2))
