@@ -326,6 +326,8 @@ def test_coarse_trials_of_one_load_are_no_repeated_rows() -> None:
     pulls[:12] = [1.1, 1.0, 0.9, 1.0, 0.9, 0.9, 0.9, 1.0, 0.9, 0.9, 0.9, 0.9]
     table = Readings("pulls", np.round(pulls / loads, 5)[:, None], False)
     assert repeated_blocks([table]) == []
+    both = Readings("pulls", np.stack([np.round(pulls, 1), np.round(loads, 3)], axis=1), False)
+    assert repeated_blocks([both]) == []
     # Negative control: eight readings at as many loads, copied.
     loads = np.linspace(5.0, 60.0, 64)
     fine = np.round(0.17 * loads * (1.0 + 0.05 * rng.standard_normal(64)) / loads, 5)

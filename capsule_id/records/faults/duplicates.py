@@ -93,8 +93,16 @@ def chance_of_equality(readings: Readings) -> float:
         if readings.record and len(values) >= SHORTEST_RECORD:
             width = WIDTH * noise_level(values)
         # A step of 0 is that of float64.
-        chance *= min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
+        own = min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
+        chance *= own if readings.record else max(own, _set_share(values, readings.values))
     return chance
+
+
+def _set_share(column: np.ndarray, rows: np.ndarray) -> float:
+    """Share of the pairs of rows that agree in one column (n,) but not in all: a setting such as a load recurs."""
+    counts = [np.unique(each, axis=0, return_counts=True)[1] for each in (column, rows)]
+    alike, equal = (int(np.sum(n * (n - 1))) for n in counts)
+    return (alike - equal) / max(len(column) * (len(column) - 1), 1)
 
 
 def repeated_blocks(tables: Sequence[Readings]) -> list[Repeated]:
