@@ -97,6 +97,8 @@ def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
     """The assignments of file columns to each set of columns of a kind."""
     dimensions = sorted({rule.si for rule in kind.columns.values()})
     for columns in kind.sets:
+        if any(set(columns) < set(larger) for larger in kind.sets):  # it needs a line of [model]
+            continue
         wanted = [*columns, *kind.channels, *kind.optional]
         needed = set(columns) - {TIME}
         scores = np.full((len(wanted), len(found.columns)), -1e3)

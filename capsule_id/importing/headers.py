@@ -28,6 +28,7 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "acceleration": ("acceleration", "acc", "accel", "accelerometer", "beschleunigung", "a"),
     "current": ("current", "strom", "i", "courant", "amps", "coil"),
     "force": ("force", "kraft", "f", "load", "friction", "weight", "pull"),
+    "normal_force": ("normal", "normalkraft"),
     "angle": ("angle", "tilt", "winkel", "inclination", "neigung", "theta", "alpha"),
     "height": ("height", "hoehe", "höhe", "h"),
     "length": ("length", "laenge", "länge", "l", "board"),
@@ -99,7 +100,7 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
 def fits_name(name: str, column: str) -> int:
     """3 for the name of the column itself, 2 for one of its words, 0 for another name."""
     bare = name.strip().lower()
-    if bare == column.lower():
+    if re.sub(r"[\W_]+", "_", bare) == column.lower():
         return 3
     words = re.split(r"[\W_]+", bare)
     return 2 if any(word in words for word in WORDS.get(column, ())) else 0

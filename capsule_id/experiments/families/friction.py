@@ -8,8 +8,10 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Values
+from capsule_id.rig.domains import POSITIVE
+from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Table
-from capsule_id.rig.schema import GroundSettings
+from capsule_id.rig.schema import ColumnRule, GroundSettings
 from capsule_id.views import Message, counted
 
 if TYPE_CHECKING:
@@ -22,6 +24,32 @@ class SurfaceSettings(GroundSettings):
     """``direction``: towards the support spring ("forward") or away from it; it matters where mu_back is free."""
 
     direction: Literal["forward", "backward"] = "forward"
+
+
+#: Column of the normal force of every trial, where it differs from trial to trial.
+NORMAL_FORCE_COLUMN = ColumnRule("N", POSITIVE)
+
+
+def check_normal_force(entry: Entry[Any]) -> None:
+    """Require a force beside a column of normal forces, and refuse another statement of the normal force.
+
+    Raises
+    ------
+    InputError
+        At the entry or its setting.
+    """
+    columns = entry.table.columns
+    if "normal_force" not in columns:
+        return
+    if "force" not in columns:
+        raise entry.error(
+            "", "the column normal_force needs the column force", " ".join(columns), "remove normal_force"
+        )
+    for key in ("normal_force", "N0"):
+        if (*entry.path, key) in entry.document.keys:
+            raise entry.error(
+                key, f"{key} must not stand beside the column normal_force", "both", f"remove {key}", True
+            )
 
 
 CAPTIONS = {

@@ -27,6 +27,9 @@ def check_variants(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> 
     ordered by speed.
     """
     del fit
+    experiments = [e for e in experiments if e.speeds_known]
+    if not experiments:
+        return []
     in_use = replace(experiments[0].friction, direction="both")
     if in_use.law is not CoulombStribeck or sum(e.n for e in experiments if e.role != "static") < FEWEST_SLIDES:
         return []

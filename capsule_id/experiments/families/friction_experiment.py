@@ -89,6 +89,11 @@ class FrictionExperiment(GroundExperiment):
         return self.friction.masses
 
     @property
+    def speeds_known(self) -> bool:
+        """Whether each reading has a speed, so that laws that depend on it can be compared."""
+        return True
+
+    @property
     def backward(self) -> bool:
         """Whether the capsule slides away from the support spring, which is downhill for slope > 0."""
         return self.friction.direction == "backward"

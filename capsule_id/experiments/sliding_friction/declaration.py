@@ -6,7 +6,9 @@ from capsule_id.experiments.families.friction import (
     CAPTIONS,
     MASSES_OF_FREE,
     MESSAGES,
+    NORMAL_FORCE_COLUMN,
     SurfaceSettings,
+    check_normal_force,
     check_scatter,
     friction_estimates,
     friction_panels,
@@ -15,6 +17,8 @@ from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
+from capsule_id.rig.entry import Entry
+from capsule_id.rig.model import Table
 from capsule_id.rig.schema import ColumnRule
 
 SLIDING_SCATTER = scatter(
@@ -22,8 +26,46 @@ SLIDING_SCATTER = scatter(
 )
 
 
+def _masses(table: Table[SurfaceSettings]) -> tuple[str, ...]:
+    # The force overcomes the weight along the slope too.
+    weighed = "normal_force" not in table.columns or "slope" in table.settings.ground
+    return ("m1", "m2") if "force" in table.columns and weighed else ()
+
+
+def _check_speed(entry: Entry[SurfaceSettings]) -> None:
+    """Refuse readings without speeds under a law that depends on the speed.
+
+    Raises
+    ------
+    InputError
+        At the entry.
+    """
+    model = entry.document.data.get("model", {})
+    law = model if isinstance(model, dict) else {}
+    if "speed" in entry.table.columns or (law.get("friction") == "constant" and "viscous" not in law.get("free", [])):
+        return
+    rule = "sliding readings without a speed need a friction that does not depend on it"
+    remedy = 'add the column speed, or write friction = "constant" in [model]'
+    raise entry.error("", rule, " ".join(entry.table.columns), remedy)
+
+
+def _check_viscous(entry: Entry[SurfaceSettings]) -> None:
+    """Refuse a viscous part beside normal forces of every row.
+
+    Raises
+    ------
+    InputError
+        At the entry.
+    """
+    model = entry.document.data.get("model", {})
+    if "normal_force" in entry.table.columns and isinstance(model, dict) and "viscous" in model.get("free", []):
+        rule = "a column normal_force and a viscous part are not fitted together"
+        raise entry.error("", rule, "both", "make an experiment with its own N0 of each load, or remove viscous")
+
+
 TEMPLATE = """\
-#: Steady sliding, a row per point: mu and v_s. Columns: speed [m/s], and force [N] or coefficient [1].
+#: Steady sliding, a row per point: mu and v_s. Columns: speed [m/s], and force [N] or coefficient [1]; normal_force [N]
+#: beside force where it differs from row to row. With friction = "constant" in [model] the speed may be absent.
 # [[experiment]]
 # kind = "sliding_friction"
 # file = "sliding_friction.csv"
@@ -38,10 +80,13 @@ KIND = Kind(
         "speed": ColumnRule("m/s", POSITIVE),
         "force": ColumnRule("N", POSITIVE),
         "coefficient": ColumnRule("1", POSITIVE),
+        "normal_force": NORMAL_FORCE_COLUMN,
     },
-    sets=(("speed", "force"), ("speed", "coefficient")),
+    sets=(("speed", "force"), ("speed", "coefficient"), ("force",), ("coefficient",)),
+    optional=("normal_force",),
     settings=SurfaceSettings,
-    masses=lambda table: ("m1", "m2") if "force" in table.columns else (),
+    rules=(check_normal_force, _check_speed, _check_viscous),
+    masses=_masses,
     masses_of_free=MASSES_OF_FREE,
     parameters=(SLIDING_SCATTER,),
     make=made_by("capsule_id.experiments.sliding_friction.experiment:SlidingFriction"),

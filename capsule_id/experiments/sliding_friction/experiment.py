@@ -21,6 +21,8 @@ from capsule_id.rig.model import Rig, Table
 class SlidingFriction(FrictionExperiment):
     """Steady sliding, y = mu_d(v) for a coefficient. A force is N mu_d(v) and the weight along the slope.
 
+    N is that of the weight, or stated for every row. Without a speed the friction must not depend on it.
+
     The variance has reading errors of y and of v (through the slope of the friction law) and relative scatter of mu.
     """
 
@@ -28,6 +30,8 @@ class SlidingFriction(FrictionExperiment):
     values: np.ndarray
     speed_sd: float
     values_sd: float
+    #: (n,), N; None: that of the weight
+    normal_force: np.ndarray | None
     quantity: str = eqx.field(static=True)
 
     role = "sliding"
@@ -37,9 +41,15 @@ class SlidingFriction(FrictionExperiment):
         self.about = About(table, rig, (*friction.parameters, SLIDING_SCATTER, *ground_parameters(table, rig)))
         self.ground = ground_of(table)
         self.quantity = "force" if "force" in table.columns else "coefficient"
-        self.speed, self.values = table["speed"], table[self.quantity]
-        self.speed_sd = table.columns["speed"].reading_sd
+        self.values = table[self.quantity]
+        self.speed = table["speed"] if self.speeds_known else np.zeros(len(self.values))
+        self.speed_sd = table.columns["speed"].reading_sd if self.speeds_known else 0.0
+        self.normal_force = table["normal_force"] if "normal_force" in table.columns else None
         self.values_sd = table.columns[self.quantity].reading_sd
+
+    @property
+    def speeds_known(self) -> bool:
+        return "speed" in self.table.columns
 
     @property
     def scatters(self) -> tuple[str]:
@@ -47,7 +57,8 @@ class SlidingFriction(FrictionExperiment):
 
     @property
     def masses(self) -> tuple[str, ...]:
-        return ("m1", "m2") if self.quantity == "force" else super().masses
+        weighed = self.normal_force is None or "slope" in self.ground
+        return ("m1", "m2") if self.quantity == "force" and weighed else super().masses
 
     @property
     def observed(self) -> np.ndarray:
@@ -55,8 +66,10 @@ class SlidingFriction(FrictionExperiment):
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         theta = {**theta, **self.ground_at(theta)}
-        law = self.friction.force(theta) if self.quantity == "force" else self.friction.coefficient(theta)
-        predicted, slope = (xp.asarray(values) for values in _value_and_slope(law, self.speed))
+        of_weight = self.quantity == "force" and self.normal_force is None
+        law = self.friction.force(theta) if of_weight else self.friction.coefficient(theta)
+        normal = 1.0 if self.normal_force is None else self.normal_force
+        predicted, slope = (normal * xp.asarray(values) for values in _value_and_slope(law, self.speed))
         variance = self.values_sd**2 + (slope * self.speed_sd) ** 2
         raw = self.values - predicted - (self.along(theta) if self.quantity == "force" else 0.0)
         return (Misfit(raw, variance, predicted, no_design(self.n, xp)),)
@@ -65,7 +78,8 @@ class SlidingFriction(FrictionExperiment):
         """Measured points (speed, coefficient)."""
         if self.quantity == "coefficient":
             return self.speed, self.values
-        return self.speed, (self.values - self.stated_along) / self.stated_normal_force
+        normal = self.stated_normal_force if self.normal_force is None else self.normal_force
+        return self.speed, (self.values - self.stated_along) / normal
 
     def point_errors(self) -> tuple[np.ndarray, float]:
         """The reading error of the speed is left out: it enters through the slope of the law."""

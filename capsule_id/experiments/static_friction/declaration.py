@@ -9,7 +9,9 @@ import numpy as np
 from capsule_id.experiments.families.friction import (
     CAPTIONS,
     MESSAGES,
+    NORMAL_FORCE_COLUMN,
     SurfaceSettings,
+    check_normal_force,
     check_scatter,
     friction_estimates,
     friction_panels,
@@ -81,7 +83,8 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
 
 def _masses(table: Table[TiltSettings]) -> tuple[str, ...]:
     # The pull overcomes the weight along the slope too.
-    weighed = table.settings.normal_force is None or "slope" in table.settings.ground
+    stated = table.settings.normal_force is not None or "normal_force" in table.columns
+    weighed = not stated or "slope" in table.settings.ground
     return ("m1", "m2") if "force" in table.columns and weighed else ()
 
 
@@ -102,7 +105,7 @@ TEMPLATE = """\
 #: Tilts of the board until the capsule slips: mu. Column: angle [deg]; or height [mm] and length [mm] with
 #: length_is = "board" (the sloping side) or "base" (the side on the floor).
 #: Or force [N]: the pull along the track at which the capsule slips. The normal force follows from the weight, slope
-#: and N0, or is stated by normal_force = { value = 6.3, unit = "N" }.
+#: and N0, or is stated by normal_force = { value = 6.3, unit = "N" }, or for every row in a column normal_force [N].
 # [[experiment]]
 # kind = "static_friction"
 # file = "static_friction.csv"
@@ -119,11 +122,13 @@ KIND = Kind(
         "height": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
         "length": ColumnRule("m", POSITIVE, usual=(5e-3, 5.0)),
         "force": ColumnRule("N", POSITIVE),
+        "normal_force": NORMAL_FORCE_COLUMN,
     },
     sets=(("angle",), ("height", "length"), ("force",)),
+    optional=("normal_force",),
     masses=_masses,
     settings=TiltSettings,
-    rules=(_check_tilt, _check_ground),
+    rules=(check_normal_force, _check_tilt, _check_ground),
     parameters=(TILT_SD, PULL_SCATTER),
     make=made_by("capsule_id.experiments.static_friction.experiment:StaticFriction"),
     template=TEMPLATE,

@@ -91,12 +91,14 @@ class StaticFriction(FrictionExperiment):
 class StaticPulls(FrictionExperiment):
     """Pulls along the track: force_i = mu_0 N (1 + N(0, pull_scatter^2)) + (m1 + m2) g sin(slope) + reading error.
 
-    N is stated, or follows from weight, slope and N0. The weight along the slope is negative for a pull downhill.
+    N is stated for all trials or for each, or follows from weight, slope and N0. The weight along the slope is negative
+    for a pull downhill.
     """
 
     force: np.ndarray
     reading_sd: float
-    normal_force: float | None
+    #: () or (n,), N; None: that of the weight
+    normal_force: np.ndarray | None
 
     role = "static"
 
@@ -105,7 +107,8 @@ class StaticPulls(FrictionExperiment):
         self.ground = ground_of(table)
         self.about = About(table, rig, (*friction.parameters_at_rest, PULL_SCATTER, *ground_parameters(table, rig)))
         self.force, self.reading_sd = table["force"], table.columns["force"].reading_sd
-        self.normal_force = table.settings.normal_force
+        stated = table["normal_force"] if "normal_force" in table.columns else table.settings.normal_force
+        self.normal_force = None if stated is None else np.asarray(stated)
 
     @property
     def masses(self) -> tuple[str, ...]:

@@ -1,0 +1,80 @@
+"""Friction against load: a normal force in every row, sliding without a speed, and what does not go with them."""
+
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capsule_id as cid
+from capsule_id.errors import InputError
+from capsule_id.rig.model import Rig
+from tests.measured.folders import Entry, make_rig, named_line, quantity
+
+LOAD = np.repeat([5.458, 9.382, 54.51, 103.6], 6)
+CONSTANT = 'friction = "constant"'
+
+
+def rig(folder: Path, entry: Entry, model: str = CONSTANT) -> Rig:
+    with suppress(InputError):  # without ``model``
+        make_rig(folder, entry)
+    toml = folder / "rig.toml"
+    toml.write_text(f"{toml.read_text()}\n[model]\n{model}\n")
+    return cid.read_rig(folder)
+
+
+def table(
+    kind: str, mu: float, further: dict[str, np.ndarray] | None = None, settings: dict[str, str] | None = None
+) -> Entry:
+    force = mu * LOAD * (1.0 + 0.03 * np.random.default_rng(3).standard_normal(len(LOAD)))
+    return Entry(kind, "table", {"force [N]": force, "normal_force [N]": LOAD, **(further or {})}, settings or {})
+
+
+@pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
+def test_forces_at_several_loads_give_one_coefficient(tmp_path: Path, kind: str) -> None:
+    """Before: one experiment for each load, and no experiment for sliding without a speed."""
+    result = cid.fit(rig(tmp_path, table(kind, 0.21)), budget=None)
+    row = result.summary.loc["mu"]
+    assert row["map"] == pytest.approx(0.21, abs=4.0 * row["standard_error"])
+    assert row["standard_error"] == pytest.approx(0.21 * 0.03 / np.sqrt(len(LOAD)), rel=0.5)
+    assert row["paper"] == pytest.approx(0.21, rel=0.02)
+    assert result.clean
+    assert [f for f in result.findings if f.code.startswith("friction.")] == []
+
+
+def test_loads_with_speeds_are_those_of_one_coefficient(tmp_path: Path) -> None:
+    speed = {"speed [m/s]": np.geomspace(0.01, 0.5, len(LOAD))}
+    entry = table("sliding_friction", 0.21, speed)
+    columns = {"speed [m/s]": speed["speed [m/s]"], "coefficient [1]": entry.columns["force [N]"] / LOAD}
+    one = cid.fit(rig(tmp_path / "force", entry), budget=None).summary.loc["mu"]
+    other = cid.fit(rig(tmp_path / "ratio", Entry("sliding_friction", "table", columns)), budget=None).summary.loc["mu"]
+    assert one["map"] == pytest.approx(other["map"], rel=1e-6)
+    assert one["standard_error"] == pytest.approx(other["standard_error"], rel=1e-3)
+
+
+def test_a_law_that_depends_on_speed_needs_it_and_the_remedy_works(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="sliding readings without a speed") as caught:
+        make_rig(tmp_path, table("sliding_friction", 0.21))
+    assert CONSTANT in caught.value.remedy
+    assert named_line(caught.value) == "[[experiment]]"
+    rig(tmp_path, table("sliding_friction", 0.21), CONSTANT)
+    with pytest.raises(InputError, match="sliding readings without a speed"):
+        rig(tmp_path / "viscous", table("sliding_friction", 0.21), f'{CONSTANT}\nfree = ["viscous"]')
+
+
+@pytest.mark.parametrize(
+    ("settings", "rule"),
+    [
+        ({"normal_force": quantity(6.0, "N")}, "must not stand beside"),
+        ({"N0": quantity(6.0, "N")}, "must not stand beside"),
+    ],
+)
+def test_two_normal_forces_are_refused(tmp_path: Path, settings: dict[str, str], rule: str) -> None:
+    with pytest.raises(InputError, match=rule):
+        make_rig(tmp_path, table("static_friction", 0.21, settings=settings))
+
+
+def test_a_normal_force_needs_a_force(tmp_path: Path) -> None:
+    columns = {"speed [m/s]": LOAD / 100.0, "coefficient [1]": 0.2 + LOAD / 1000.0, "normal_force [N]": LOAD}
+    with pytest.raises(InputError, match="needs the column force"):
+        make_rig(tmp_path, Entry("sliding_friction", "table", columns))
