@@ -4,6 +4,7 @@ experiments -> fit of the bench tests in closed form -> divide runs that amplify
 """
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
@@ -57,17 +58,21 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
     closed = [e for e in target.experiments if not e.event_driven]
     if len(closed) == len(target.experiments):
         return PointStage(target, point_fit(target, seed), BenchFit(), seed)
-    bench = BenchFit()
-    if not closed:
-        known = _paper_values(target, registry)
-    else:
-        alone = LogPosterior(target.rig, closed)
-        fit = point_fit(alone, seed)
-        own = sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET) if sampled else None
-        bench, known = BenchFit(fit, own), dict(fit.values)
+    alone = LogPosterior(target.rig, closed) if closed else None
+    bench = None if alone is None else point_fit(alone, seed)
+    known = _paper_values(target, registry) if bench is None else dict(bench.values)
     target, findings = cut_unpredictable(target, known)
-    target, joint, wavering = _fit_with_right_starts(target, known, seed)
-    return PointStage(target, joint, bench, seed, (*findings, *wavering))
+    # The joint fit takes one core most of the time: the bench is sampled on another one.
+    with ThreadPoolExecutor(1) as beside:
+        own = beside.submit(_bench_sample, alone, bench, seed) if alone and bench and sampled else None
+        target, joint, wavering = _fit_with_right_starts(target, known, seed)
+        bench_fit = BenchFit(bench, None if own is None else own.result())
+    return PointStage(target, joint, bench_fit, seed, (*findings, *wavering))
+
+
+def _bench_sample(alone: LogPosterior, fit: PointFit, seed: int) -> Posterior:
+    """Sample the bench tests ``alone`` about their ``fit``."""
+    return sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET)
 
 
 def _fit_with_right_starts(
