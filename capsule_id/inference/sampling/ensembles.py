@@ -42,7 +42,7 @@ DEFAULT_ESS = 4000.0
 #: Convergence requires a split R-hat of at most this for every parameter.
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks.
-FIRST_CHECK, CHECK_EVERY = 120, 30
+FIRST_CHECK, CHECK_EVERY = 60, 20
 #: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well, so that
 #: the Laplace approximation is tried as it is.
 LARGE = 9
@@ -63,7 +63,7 @@ DEFAULT_BUDGET = 20_000
 #: needed because a short pilot estimates the autocorrelation time only roughly.
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
 #: Steps of each measured move (short, long).
-PILOT_STEPS, LONG_PILOT_STEPS = 100, 300
+PILOT_STEPS, LONG_PILOT_STEPS = 60, 300
 #: Name of the first move.
 FIRST = "block independence + differential evolution"
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
