@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import capsule_id as cid
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.families.friction_model import FrictionModel, other_laws
 from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.lint import lint
@@ -248,3 +250,40 @@ def test_the_line_that_names_a_burst_of_noise_leaves_it_out(begin: int) -> None:
     kept = time <= value if key == "stop" else time >= value
     assert np.sum(kept) > 250
     assert faults(slice(int(np.argmax(kept)), int(np.argmax(kept)) + int(np.sum(kept)))) == []
+
+
+@pytest.mark.parametrize("stated", [(), ("stiffness",), ("damping", "noise")])
+def test_remedies_name_only_the_words_that_the_entry_states(tmp_path: Path, stated: tuple[str, ...]) -> None:
+    """Before: "remove damping, stiffness, drift and noise from its entry" of an entry without any of them."""
+    values = {"damping": "viscous", "stiffness": "linear", "noise": "white"}
+    lines = "\n".join(f'{word} = "{values[word]}"' for word in stated)
+    time = np.arange(400) / 2000.0
+    (e,) = make_experiments(read_rig(write(tmp_path / "rig", time, decay(time, 1), lines), KINDS))
+    white = {"record": "a", "Q": 99.0, "lags": 20, "p": 1e-9, **e.noise_facts()}
+    coloured = text(Finding("residuals.white", "fail", white, "a"))
+    halves = {
+        "label": "a",
+        "name": "k1",
+        "first": 1.0,
+        "second": 2.0,
+        "z": 9.0,
+        "unit": "N/m",
+        "model": "viscous damping",
+    }
+    apart = text(Finding("decays.halves", "fail", {**halves, "stated": white["stated"]}, "a"))
+    for word in ("damping", "stiffness", "drift", "noise"):
+        assert (word in coloured.partition("or remove ")[2].partition(" from its entry")[0]) == (word in stated)
+    assert ("Remove stiffness from its entry, or state start" in apart) == ("stiffness" in stated)
+    assert ("State start and stop" in apart) == ("stiffness" not in stated)
+
+
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("noise", ["white", "ar1"])
+def test_the_remedy_of_a_run_names_other_laws_and_no_noise_that_is_stated(constant: bool, noise: str) -> None:
+    """Before: "state noise = ar1" where it is stated, and "check friction law" without a line to write."""
+    model = FrictionModel(constant=constant)
+    facts = {"record": "run", "Q": 99.0, "lags": 20, "p": 1e-9, "model": "capsule", "noise": noise, "law": model.name}
+    advice = text(Finding("residuals.white", "fail", {**facts, "other_laws": other_laws(model)}, "run"))
+    assert ('state noise = "ar1"' in advice) == (noise == "white")
+    assert ('compare it with friction = "constant" or free = ["ratio"] in [model]' in advice) == (not constant)
+    assert 'free = ["ratio"]' not in "".join(other_laws(FrictionModel(free=("ratio",))))

@@ -6,7 +6,7 @@ import equinox as eqx
 from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.experiments.families.friction_model import GroundExperiment
+from capsule_id.experiments.families.friction_model import GroundExperiment, other_laws
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
@@ -68,4 +68,5 @@ class CapsuleForward(GroundExperiment):
         return self.friction.force({**theta, **self.ground_at(theta)})
 
     def noise_facts(self) -> Facts:
-        return {"model": "capsule"}
+        noise = getattr(self.table.settings, "noise", None)
+        return {"model": "capsule", "noise": noise, "law": self.friction.name, "other_laws": other_laws(self.friction)}

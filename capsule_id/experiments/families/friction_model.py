@@ -209,6 +209,15 @@ def _weight(theta: ValuesBySymbol) -> Any:
     return normal_force(theta["m1"], theta["m2"], theta["g"], theta.get("slope"), theta.get("N0"))
 
 
+def other_laws(friction: FrictionModel) -> tuple[str, ...]:
+    """Lines of ``[model]`` that state simple laws other than ``friction``; () for a law of a user's own."""
+    if friction.law is not CoulombStribeck:
+        return ()
+    constant = () if friction.constant else ('friction = "constant"',)
+    ratio = () if friction.constant or "ratio" in friction.free else ('free = ["ratio"]',)
+    return (*constant, *ratio)
+
+
 #: Default friction law: eq. (1) of the paper.
 EQUATION_1 = FrictionModel()
 

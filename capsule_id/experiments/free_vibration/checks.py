@@ -89,7 +89,7 @@ def check_halves(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Findin
         size = float(abs(z[name]))
         if size > HALVES_DISAGREE:
             facts = {"label": e.label, "name": name, "first": first[name], "second": second[name], "z": size}
-            facts |= {"unit": parameter(name).unit, "model": e.model_name}
+            facts |= {"unit": parameter(name).unit, "model": e.model_name, "stated": e.stated_words}
             findings.append(Finding("decays.halves", "fail" if size > HALVES_FAIL else "warn", facts, e.label))
     if compared and not findings:
         findings.append(Finding("decays.halves", "ok", {"labels": ", ".join(compared)}))

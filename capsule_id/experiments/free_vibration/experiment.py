@@ -173,6 +173,12 @@ class FreeVibration(SurfaceExperiment):
         return second_models(records, readings)
 
     @property
+    def stated_words(self) -> tuple[str, ...]:
+        """Keys of the model that the entry states; a second fit leaves them as they are."""
+        words = ("damping", "stiffness", "drift", "noise")
+        return tuple(word for word in words if getattr(self.table.settings, word) is not None)
+
+    @property
     def replaced(self) -> bool:
         """Whether a second fit has chosen the model."""
         return self.about.screened is not None
@@ -329,11 +335,8 @@ class FreeVibration(SurfaceExperiment):
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.condensed[0]))))
 
     def noise_facts(self) -> Facts:
-        settings = self.table.settings
-        words = ("damping", "stiffness", "drift", "noise")
-        stated = tuple(word for word in words if getattr(settings, word) is not None)
-        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines, "stated": stated}
-        return {"model": "decay", **facts, **self.damping_trend()}
+        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}
+        return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend()}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return decay_comparison(self, theta, draws)

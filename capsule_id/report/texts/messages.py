@@ -74,14 +74,20 @@ def _coloured_residuals(facts: Facts) -> str:
         f"(p = {facts['p']:.1g}). The model lacks an effect or the noise is coloured, and the intervals are not to be "
         "trusted."
     )
-    remedy = {
-        "capsule": (
-            "Look at the residuals and the phase portrait, check spring, gap and friction law, or state "
-            'noise = "ar1" (coloured noise) where the sensor filters.'
-        ),
-        "decay": _decay_remedy(facts),
-    }.get(facts.get("model", ""), "Look at the residuals.")
+    remedy = {"capsule": _capsule_remedy(facts), "decay": _decay_remedy(facts)}.get(
+        facts.get("model", ""), "Look at the residuals."
+    )
     return " ".join(filter(None, [seen, _drift(facts), remedy]))
+
+
+def _capsule_remedy(facts: Facts) -> str:
+    """What to compare: the friction law, of which the fit knows one alone, and the noise."""
+    advice = "Look at the residuals and the phase portrait, check spring and gap."
+    if laws := facts.get("other_laws", ()):
+        advice += f" The fit has {facts['law']}; compare it with {' or '.join(laws)} in [model]."
+    if facts.get("noise") == "white":
+        advice += ' Where the sensor filters, state noise = "ar1" (coloured noise).'
+    return advice
 
 
 def _decay_remedy(facts: Facts) -> str:
@@ -92,7 +98,7 @@ def _decay_remedy(facts: Facts) -> str:
     cut = "Cut the record to free decay with start and stop"
     if facts["second"]:
         return f"{present}No model that a second fit offers passes. {cut}, or record again with less disturbance."
-    if not facts["stated"]:
+    if not facts.get("stated"):
         return f"{present}{cut}, or record again with less disturbance."
     words = facts["stated"]
     listed = " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))

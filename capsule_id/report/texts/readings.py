@@ -103,7 +103,8 @@ DATA_MESSAGES: Mapping[str, Message] = {
         "lost samples",
         fail=(
             "{file}:{line}: {column} must be smooth; it jumps at {time:.5g} s by {size:.2g} of its amplitude, and the times "
-            "are even: samples were lost. Use the record on one side of the jump only, or repeat it."
+            "are even: samples were lost, or the rig was struck or moved. Use the record on one side of the jump only, "
+            "or repeat it."
         ),
     ),
     "readings.burst": Message(
