@@ -141,7 +141,7 @@ def sample(
                 report(done, ENSEMBLES * goal, schedule.move)
             located = np.stack([sampler.chain[:goal] for sampler in samplers])
             if goal == last or _converged(located, ess):
-                draws, lp = target.restore(located, restore_seed)
+                draws, lp = _completed(target, located, restore_seed)
                 if _converged(draws, ess):
                     break
         if chains is not None:
@@ -164,6 +164,19 @@ def sample(
         steps=draws.shape[1] * schedule.thin,
         thin=schedule.thin,
     )
+
+
+def _completed(target: Target, located: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draws (ensemble, draw, walker, d) with scatters, and their log-posterior, from ``located`` draws.
+
+    A walker that stays where it is keeps its scatters too: its chain is that of proposals which each bring a draw of
+    their scatters, accepted without regard to it.
+    """
+    shape = located.shape[:-1]
+    places, index = np.unique(located.reshape(-1, located.shape[-1]), axis=0, return_inverse=True)
+    draws, lp = target.restore(places, seed)
+    index = index.reshape(shape)
+    return draws[index], lp[index]
 
 
 def _converged(draws: np.ndarray, ess: float) -> bool:

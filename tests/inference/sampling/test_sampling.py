@@ -121,6 +121,39 @@ def test_log_density_belongs_to_the_draws(posterior: Posterior) -> None:
     np.testing.assert_allclose(posterior.lp.ravel(), KNOWN.parts(flat)[:, 0], rtol=1e-9, atol=1e-9)
 
 
+class WithScatter(Gaussian):
+    """A further parameter that the sampler integrates out: normal about the first one, with sd ``OWN``."""
+
+    OWN = 1e-3
+
+    def __init__(self, mean: np.ndarray, sigma: np.ndarray) -> None:
+        super().__init__(mean, sigma)
+        self.names, self.restored = (*self.names, "scatter"), 0
+
+    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        u, lp = super().restore(draws, seed)
+        self.restored = len(draws)
+        z = np.random.default_rng(seed).standard_normal(len(draws))
+        return np.column_stack([u, u[:, 0] + self.OWN * z]), lp - 0.5 * z**2
+
+
+def test_a_walker_that_stays_keeps_its_scatters() -> None:
+    """Each place is completed once, and the joint draws have the joint distribution."""
+    target = WithScatter(KNOWN.mean, KNOWN.sigma)
+    draws = sample(target, 3).draws
+    located = draws[..., :-1].reshape(-1, target.dimension)
+    assert target.restored == len(np.unique(located, axis=0)) < len(located)
+    stayed = np.all(draws[:, 1:, :, :-1] == draws[:, :-1, :, :-1], axis=-1)
+    kept = draws[:, 1:, :, -1] == draws[:, :-1, :, -1]
+    np.testing.assert_array_equal(stayed, kept)
+    mean = np.append(KNOWN.mean, KNOWN.mean[0])
+    joint = np.block([[KNOWN.sigma, KNOWN.sigma[:, :1]], [KNOWN.sigma[:1], KNOWN.sigma[:1, :1] + target.OWN**2]])
+    assert np.max(np.abs(scores(draws, Gaussian(mean, joint)))) < LIMIT
+    wrong = joint.copy()
+    wrong[-1, -1] += 0.1 * joint[-1, -1]
+    assert np.max(np.abs(scores(draws, Gaussian(mean, wrong)))) > LIMIT  # negative control
+
+
 def test_interrupted_chains_go_on(tmp_path: Path) -> None:
     """Stopped after half the budget and taken up again: the draws stored before are kept, the whole still passes."""
     half = draw(5, budget=60, store=tmp_path / "chains.h5")
