@@ -10,6 +10,7 @@ from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.declaration import MESSAGES
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
+from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.second_fit.screening import (
     BIC_MARGIN,
     Ranking,
@@ -45,6 +46,16 @@ def ar1(rho: float) -> np.ndarray:
 
 
 DRY = {"F_dry": 0.03 * SPRING_FORCE}
+
+
+def test_a_fit_from_where_the_rod_does_not_swing_starts_from_rough_estimates() -> None:
+    """A spring that softens too far, as a noisy half of a record gives (before: internal failure, residuals not finite)."""
+    screening, model = Screening(record(0.0)), DecayModel(cubic=True)
+    near = screening.scaled({"k1": bench.K1, "c": C, "k_cubic": -1.5 * bench.K1 / RELEASE**2})
+    found, rough = screening.fit(model, near)[0], screening.fit(model)[0]
+    for name in ("k1", "c", "k_cubic"):
+        assert np.isfinite(found.errors[name])
+        assert found.values[name] == pytest.approx(rough.values[name], abs=0.1 * rough.errors[name])
 
 
 def test_a_viscous_decay_keeps_its_model() -> None:

@@ -232,14 +232,13 @@ def _second_fit(facts: Facts) -> str:
 def _halves(facts: Facts) -> str:
     """The parameter whose halves disagree most, the effect that this indicates, and remedies."""
     damping = facts["name"] in ("c", *DAMPING.values())
-    effect = "The damping" if damping else "The stiffness"
     key = "damping" if damping else "stiffness"
     leave = f"Remove {key} from its entry, or state" if key in facts["stated"] else "State"
     values = f"the first half gives {facts['first']:.4g}, the second {facts['second']:.4g} {facts['unit']}"
     return (
         f"{facts['label']}: expected the same {facts['name']} in both halves of the record; {values} ({facts['z']:.1f} joint "
-        f"sd apart). {effect} depends on the amplitude or on the time in a way that the fitted model lacks ({facts['model']}). "
-        f"{leave} start and stop for the amplitudes of interest."
+        f"sd apart). The {key} depends on the amplitude or on the time in a way that the fitted model lacks "
+        f"({facts['model']}). {leave} start and stop for the amplitudes of interest."
     )
 
 

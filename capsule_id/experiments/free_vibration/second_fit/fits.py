@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 EVALUATIONS, STEP = 40, 1e-5
 #: Replaces the effect of an unknown that the record does not depend on.
 UNKNOWN = 1e-12
+#: Replaces residuals, relative to the scatter of the readings, where the model has no motion.
+UNFIT = 1e3
 #: Starts of a fit with dry friction: rounds of one batch each, standard deviations of their scaled unknowns (F_dry:
 #: logarithm) after the first round, and number of starts that are fitted.
 DRY_ROUNDS, DRY_FITS = 8, 3
@@ -208,7 +210,10 @@ class Screening:
         return moved.reshape(-1, len(NAMES))
 
     def fit(self, model: DecayModel, near: np.ndarray | None = None) -> tuple[Screened, np.ndarray]:
-        """Fit ``model`` from the scaled values ``near``; return also the scaled values found."""
+        """Fit ``model`` from the scaled values ``near``; return also the scaled values found.
+
+        Where the model has no motion at ``near``, as beyond critical damping, the fit starts from rough estimates.
+        """
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
         sloped = float(model.drift == "linear")
 
@@ -229,10 +234,13 @@ class Screening:
             whole = np.tile(start, (len(NAMES) + 1, 1))
             whole[: len(free) + 1, free] = np.concatenate([z[None], z + STEP * np.diag(sign)])
             points = whitened(whole)[: len(free) + 1]
+            points = np.where(np.isfinite(points), points, UNFIT)
             jacobians[z.tobytes()] = (points[1:] - points[:1]).T / (STEP * sign)
             return points[0]
 
         low, high = np.array([BOUNDS[NAMES[i]] for i in free]).T
+        if near is not None and (residuals(np.clip(start[free], low + 1e-3, high - 1e-3)) == UNFIT).any():
+            return self.fit(model)
         starts = [start]
         if near is None and "dry" in model.damping:
             offered = self.dry_starts(start)
