@@ -27,6 +27,7 @@ from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, leas
 from capsule_id.inference.fit.point_fit import AGREEMENT, dispersed_starts
 from capsule_id.inference.fit.variance_shares import variance_shares
 from capsule_id.inference.result import PointFit
+from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.views import counted
@@ -85,6 +86,7 @@ def joint_fit(
     starts = _choose_starts(target, known, seed, first or {}) if starts is None else starts
     ends: list[_End] = []
     for start in starts:
+        release_memory()
         before = max(ends, key=lambda end: end.value, default=None)
         if before is not None and _suffice(target, ends, before.value):
             break
