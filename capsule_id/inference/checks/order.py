@@ -69,6 +69,8 @@ def check_tables(s: SampledFit) -> list[Finding]:
     findings = []
     for members in groups:
         residuals = [_unflagged(s, e)[0] for e in members]
+        if np.std(np.concatenate(residuals)) <= SMALLEST_SCATTER:
+            continue
         factor, p = between(residuals)
         if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
             name = next(row for row in members[0].parameters if row.physical)
@@ -88,7 +90,7 @@ def _means_count(s: SampledFit, e: Experiment) -> bool:
     """Whether the mean residual of a table tells of its parameters: no offset of its own, and several trials."""
     residuals, _ = _unflagged(s, e)
     own = e.misfit(e.local(s.values)).design.shape[1]
-    return own == 0 and len(residuals) >= FEWEST_TRIALS and np.std(residuals) > SMALLEST_SCATTER
+    return own == 0 and len(residuals) >= FEWEST_TRIALS
 
 
 def _unflagged(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
