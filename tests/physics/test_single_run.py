@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from capsule_id.parameters import Parameter, Prior
+from capsule_id.physics.drives.recorded import RecordedDrive
 from capsule_id.physics.exact.engine import SHORTEST
 from capsule_id.physics.exact.one_function import as_one_function
+from capsule_id.physics.friction import Scaled
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
 from tests.capsule_cases import Cases, states_of
 from tests.general_cases import read_general_cases
@@ -73,3 +75,24 @@ def test_a_law_of_the_user_may_hold_any_operation() -> None:
     t = simulate(p, E, np.linspace(0.0, 0.4, 20), friction=Scattered(2.0))
     assert int(t.status) == Status.OK
     assert float(t.X2[-1]) != 0.0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ScatteredForce(RecordedDrive):
+    """A drive of the user with a scatter."""
+
+    def _line(self, index: Any) -> tuple[Any, Any, Any]:
+        begin, value, slope = super()._line(index)
+        return begin, value * jnp.zeros(2).at[jnp.ravel(index) % 1].add(1.0)[0], slope
+
+
+def test_no_part_of_the_user_is_put_into_one_function() -> None:
+    """A law inside another one, and a drive: XLA refused both."""
+    p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
+    times = np.linspace(0.0, 0.4, 20)
+    inside = simulate(p, E, times, friction=Scaled(Scattered(2.0), 0.5))
+    driven = simulate(p, ScatteredForce(times, 4.0 * np.cos(34.56 * times)), times)
+    for t in (inside, driven):
+        assert int(t.status) == Status.OK
+        assert float(t.X2[-1]) != 0.0
