@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from tests.rig.test_column_maps import BY_NAME, DISP, TIME, fault_of, rig_of
+from tests.rig.test_column_maps import BY_NAME, DISP, TIME, assert_read, fault_of, rig_of
 
 
 def test_where_selects_rows_by_a_text(tmp_path: Path) -> None:
@@ -28,3 +28,19 @@ def test_where_selects_rows_by_a_text(tmp_path: Path) -> None:
     savemat(tmp_path / "m.mat", {"t": TIME, "x": DISP})
     fault = fault_of(tmp_path, {}, f'file = "m.mat"\n{BY_NAME}\nwhere = {{ x = "B" }}')
     assert "takes numbers" in fault.rule
+
+
+def test_a_text_column_of_files_side_by_side_must_be_the_same(tmp_path: Path) -> None:
+    """As a column of numbers must; before, that of the first file was taken."""
+    kinds = ["B"] * 12 + ["C"] * 3
+    x, t = np.append(DISP, DISP[:3]), np.append(TIME, TIME[:3])
+    files: dict[str, str | bytes] = {
+        "a.csv": "t,kind\n" + "".join(f"{float(a)!r},{kind}\n" for a, kind in zip(t, kinds, strict=True)),
+        "b.csv": "x,kind\n" + "".join(f"{float(a)!r},{kind}\n" for a, kind in zip(x, kinds, strict=True)),
+    }
+    stated = f'files = ["a.csv", "b.csv"]\ndata_from_line = 2\n{BY_NAME}\nwhere = {{ kind = "B" }}'
+    assert_read(rig_of(tmp_path, files, stated))
+    files["b.csv"] = str(files["b.csv"]).replace("C", "B", 1)
+    fault = fault_of(tmp_path, files, stated)
+    assert "must be the same" in fault.rule
+    assert fault.value == "'C' and 'B'"

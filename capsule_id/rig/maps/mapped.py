@@ -170,13 +170,19 @@ class _Part:
 
     def words(self, place: KeyPath, header: Header) -> np.ndarray:
         """The texts of the column ``header``, stated at ``place`` of ``rig.toml``, (n,)."""
-        export, column = self._columns(place, header)[0]
-        if export.words is None:
-            rule = f"where takes numbers for a {export.path.suffix} file"
-            raise self.document.error(place, rule, "a text", "write a number, or export the file as CSV")
-        codes, texts = export.words(column)
-        self._require_rows(place, header, len(codes))
-        return np.array(texts)[codes]
+        found: list[np.ndarray] = []
+        for export, column in self._columns(place, header):
+            if export.words is None:
+                rule = f"where takes numbers for a {export.path.suffix} file"
+                raise self.document.error(place, rule, "a text", "write a number, or export the file as CSV")
+            codes, texts = export.words(column)
+            self._require_rows(place, header, len(codes))
+            found.append(np.array(texts)[codes])
+            if differ := np.flatnonzero(found[-1] != found[0]).tolist():
+                rule, row = f"{shown(header)} must be the same in all files that have it", differ[0]
+                value = f"{shown(str(found[0][row]))} and {shown(str(found[-1][row]))}"
+                raise self.document.error(place, rule, value, "name files that were recorded together")
+        return found[0]
 
     def _require_rows(self, place: KeyPath, header: Header, rows: int) -> None:
         """Refuse a column with another number of rows than those found before."""
