@@ -1,6 +1,7 @@
 """MATLAB files: read as SciPy reads them, and damaged ones end in a clean error."""
 
 import io
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -72,3 +73,14 @@ def test_every_changed_or_missing_byte_reads_or_is_refused(compressed: bool) -> 
             assert all(str(fault).isprintable() for fault in faults)
             refused += len(faults)
     assert refused > len(content) // 2
+
+
+def test_a_large_array_of_structs_without_fields_ends_soon() -> None:
+    def element(kind: int, data: bytes) -> bytes:
+        return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    parts = [element(6, struct.pack("<II", 2, 0)), element(5, struct.pack("<ii", 2**30, 2**30)), element(1, b"none")]
+    parts += [element(5, struct.pack("<i", 32)), element(1, b"")]
+    content = mat_file(False)
+    export = read_mat(content + element(14, b"".join(parts)), PATH, Layout())
+    assert export.headers == read_mat(content, PATH, Layout()).headers

@@ -123,7 +123,7 @@ def _fields(
     if length < 1:
         raise ValueError("a struct with fields without names")
     fields = [names[i : i + length].split(b"\0")[0].decode("ascii", "replace") for i in range(0, len(names), length)]
-    for k in range(number):
+    for k in range(number if fields else 0):
         index = f"({k + 1})" if number > 1 else ""
         for field in fields:
             kind, element = next(parts, (-1, b""))
