@@ -8,6 +8,9 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment
+from capsule_id.experiments.families.friction_variants import candidates
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, named_line, quantity
 
@@ -78,3 +81,43 @@ def test_a_normal_force_needs_a_force(tmp_path: Path) -> None:
     columns = {"speed [m/s]": LOAD / 100.0, "coefficient [1]": 0.2 + LOAD / 1000.0, "normal_force [N]": LOAD}
     with pytest.raises(InputError, match="needs the column force"):
         make_rig(tmp_path, Entry("sliding_friction", "table", columns))
+
+
+def experiment(
+    folder: Path, entry: Entry, model: str = CONSTANT, head: dict[str, str] | None = None
+) -> FrictionExperiment:
+    with suppress(InputError):  # without ``model``
+        make_rig(folder, entry, head=head)
+    toml = folder / "rig.toml"
+    toml.write_text(f"{toml.read_text()}\n[model]\n{model}\n")
+    (made,) = make_experiments(cid.read_rig(folder))
+    assert isinstance(made, FrictionExperiment)
+    return made
+
+
+@pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
+def test_the_error_of_the_normal_force_counts(tmp_path: Path, kind: str) -> None:
+    """Its sd was read and ignored."""
+    rng, sd = np.random.default_rng(4), 0.3
+    true = np.repeat(LOAD, 40)
+    columns = {"force [N]": 0.21 * true, "normal_force [N]": true + sd * rng.standard_normal(len(true))}
+    made = experiment(tmp_path, Entry(kind, "table", columns, {"normal_force_sd": quantity(sd, "N")}))
+    (misfit,) = made.misfits({"mu": 0.21}, np)
+    spread = np.std(misfit.raw / np.sqrt(misfit.fixed_variance))
+    assert spread == pytest.approx(1.0, rel=4.0 / np.sqrt(2.0 * len(true)))
+    speed, coefficient = made.paper_points()
+    relative, _ = made.point_errors()
+    assert np.std((coefficient / 0.21 - 1.0) / relative) == pytest.approx(1.0, rel=0.1)
+    assert np.all(speed == 0.0)
+
+
+def test_no_law_is_proposed_that_is_refused(tmp_path: Path) -> None:
+    """A viscous part and a normal force of every row: the comparison took the weight for it."""
+    head = {name: quantity(0.5, "kg", 0.01) for name in ("m1", "m2")}
+    speed = {"speed [m/s]": np.geomspace(0.01, 0.5, len(LOAD))}
+    entry = table("sliding_friction", 0.21, speed)
+    made = experiment(tmp_path / "row", entry, head=head)
+    assert not any("viscous" in model.free for model in candidates([made]))
+    weighed = Entry(entry.kind, entry.label, {name: x for name, x in entry.columns.items() if "normal" not in name})
+    made = experiment(tmp_path / "weight", weighed, head=head)
+    assert any("viscous" in model.free for model in candidates([made]))

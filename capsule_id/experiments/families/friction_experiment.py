@@ -15,6 +15,7 @@ from capsule_id.experiments.families.friction_checks import check_variants, vari
 from capsule_id.experiments.families.friction_model import FrictionModel, GroundExperiment
 from capsule_id.experiments.families.inclined import weight_along
 from capsule_id.physics.friction import CoulombStribeck, normal_force, slide_distance
+from capsule_id.rig.model import Table
 from capsule_id.views import Comparison, Curve, Finding, Points
 
 #: Lower bound of v_s in the paper's fit, m/s.
@@ -131,6 +132,12 @@ class FrictionExperiment(GroundExperiment):
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return friction_comparison([self], theta, draws)
+
+
+def stated_normal_forces(table: Table[Any]) -> tuple[np.ndarray | None, float]:
+    """Return the column ``normal_force``, (n,) N, or None, and its reading error, N."""
+    column = table.columns.get("normal_force")
+    return (None, 0.0) if column is None else (column.values, column.reading_sd)
 
 
 def friction_comparison(

@@ -72,7 +72,9 @@ def candidates(experiments: "Sequence[FrictionExperiment]") -> list[FrictionMode
     """Return the laws that the experiments can tell apart, the law in use included, the simplest first."""
     in_use = replace(experiments[0].friction, direction="both")
     models = [FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",))]
-    if experiments[0].rig.m1 is not None and experiments[0].rig.m2 is not None:
+    # A viscous part over a normal force of every row is refused, so it is not proposed either.
+    per_row = any("normal_force" in e.table.columns for e in experiments if e.role == "sliding")
+    if experiments[0].rig.m1 is not None and experiments[0].rig.m2 is not None and not per_row:
         models += [FrictionModel(free=("viscous",), constant=True), FrictionModel(free=("ratio", "viscous"))]
     if len({e.friction.direction for e in experiments}) > 1:
         models += [replace(model, free=("mu_back", *model.free)) for model in models]

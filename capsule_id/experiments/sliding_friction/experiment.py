@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.families.friction_experiment import FrictionExperiment
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment, stated_normal_forces
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit
@@ -23,7 +23,8 @@ class SlidingFriction(FrictionExperiment):
 
     N is that of the weight, or stated for every row. Without a speed the friction must not depend on it.
 
-    The variance has reading errors of y and of v (through the slope of the friction law) and relative scatter of mu.
+    The variance has reading errors of y, of v (through the slope of the friction law) and of N (through the
+    coefficient), and relative scatter of mu.
     """
 
     speed: np.ndarray
@@ -32,6 +33,7 @@ class SlidingFriction(FrictionExperiment):
     values_sd: float
     #: (n,), N; None: that of the weight
     normal_force: np.ndarray | None
+    normal_force_sd: float
     quantity: str = eqx.field(static=True)
 
     role = "sliding"
@@ -44,7 +46,7 @@ class SlidingFriction(FrictionExperiment):
         self.values = table[self.quantity]
         self.speed = table["speed"] if self.speeds_known else np.zeros(len(self.values))
         self.speed_sd = table.columns["speed"].reading_sd if self.speeds_known else 0.0
-        self.normal_force = table["normal_force"] if "normal_force" in table.columns else None
+        self.normal_force, self.normal_force_sd = stated_normal_forces(table)
         self.values_sd = table.columns[self.quantity].reading_sd
 
     @property
@@ -69,8 +71,9 @@ class SlidingFriction(FrictionExperiment):
         of_weight = self.quantity == "force" and self.normal_force is None
         law = self.friction.force(theta) if of_weight else self.friction.coefficient(theta)
         normal = 1.0 if self.normal_force is None else self.normal_force
-        predicted, slope = (normal * xp.asarray(values) for values in _value_and_slope(law, self.speed))
-        variance = self.values_sd**2 + (slope * self.speed_sd) ** 2
+        value, slope = (xp.asarray(values) for values in _value_and_slope(law, self.speed))
+        predicted = normal * value
+        variance = self.values_sd**2 + (normal * slope * self.speed_sd) ** 2 + (value * self.normal_force_sd) ** 2
         raw = self.values - predicted - (self.along(theta) if self.quantity == "force" else 0.0)
         return (Misfit(raw, variance, predicted, no_design(self.n, xp)),)
 
@@ -84,7 +87,8 @@ class SlidingFriction(FrictionExperiment):
     def point_errors(self) -> tuple[np.ndarray, float]:
         """The reading error of the speed is left out: it enters through the slope of the law."""
         along = self.stated_along if self.quantity == "force" else 0.0
-        return self.values_sd / (self.values - along), 1.0
+        of_normal = 0.0 if self.normal_force is None else self.normal_force_sd / self.normal_force
+        return np.hypot(self.values_sd / (self.values - along), of_normal), 1.0
 
     def starts(self) -> dict[str, Start]:
         return {**self.rough_starts(), "sliding_scatter": Start(0.02, 0.3)}

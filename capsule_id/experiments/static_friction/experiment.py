@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.families.friction_experiment import FrictionExperiment
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment, stated_normal_forces
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -92,13 +92,14 @@ class StaticPulls(FrictionExperiment):
     """Pulls along the track: force_i = mu_0 N (1 + N(0, pull_scatter^2)) + (m1 + m2) g sin(slope) + reading error.
 
     N is stated for all trials or for each, or follows from weight, slope and N0. The weight along the slope is negative
-    for a pull downhill.
+    for a pull downhill. The reading error of N counts too.
     """
 
     force: np.ndarray
     reading_sd: float
     #: () or (n,), N; None: that of the weight
     normal_force: np.ndarray | None
+    normal_force_sd: float
 
     role = "static"
 
@@ -107,8 +108,9 @@ class StaticPulls(FrictionExperiment):
         self.ground = ground_of(table)
         self.about = About(table, rig, (*friction.parameters_at_rest, PULL_SCATTER, *ground_parameters(table, rig)))
         self.force, self.reading_sd = table["force"], table.columns["force"].reading_sd
-        stated = table["normal_force"] if "normal_force" in table.columns else table.settings.normal_force
-        self.normal_force = None if stated is None else np.asarray(stated)
+        self.normal_force, self.normal_force_sd = stated_normal_forces(table)
+        if table.settings.normal_force is not None:
+            self.normal_force = np.asarray(table.settings.normal_force)
 
     @property
     def masses(self) -> tuple[str, ...]:
@@ -127,9 +129,11 @@ class StaticPulls(FrictionExperiment):
         normal: Any = self.normal_force
         if normal is None:
             normal = normal_force(theta["m1"], theta["m2"], theta["g"], **self.ground_at(theta))
-        friction: Any = normal * self.friction.coefficient(theta).forward(0.0)
+        coefficient: Any = self.friction.coefficient(theta).forward(0.0)
+        friction = normal * coefficient
         expected = friction + self.along(theta)
-        return (Misfit(self.force - expected, self.reading_sd**2, friction, no_design(self.n, xp)),)
+        variance = self.reading_sd**2 + (coefficient * self.normal_force_sd) ** 2
+        return (Misfit(self.force - expected, variance, friction, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Points by the paper's formula: mu = force/N at speed 0, without the weight along the slope."""
@@ -137,7 +141,8 @@ class StaticPulls(FrictionExperiment):
         return np.zeros(self.n), (self.force - self.stated_along) / normal
 
     def point_errors(self) -> tuple[np.ndarray, float]:
-        return self.reading_sd / (self.force - self.stated_along), 1.0
+        of_normal = 0.0 if self.normal_force is None else self.normal_force_sd / self.normal_force
+        return np.hypot(self.reading_sd / (self.force - self.stated_along), of_normal), 1.0
 
     def starts(self) -> dict[str, Start]:
         # Pulls have no speed that could start v_s.
