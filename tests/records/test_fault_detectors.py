@@ -9,7 +9,7 @@ from scipy import signal
 from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
-from capsule_id.records.faults.phase import phase_jump
+from capsule_id.records.faults.phase import jump_or_noise, phase_jump
 from capsule_id.records.faults.release import find_free_decay
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
 from tests.experiments.bench import K1, M1, C, released
@@ -334,3 +334,17 @@ def test_coarse_trials_of_one_load_are_no_repeated_rows() -> None:
     fine[40:48] = fine[10:18]
     (found,) = repeated_blocks([Readings("pulls", fine[:, None], False)])
     assert (found.row, found.first_row, found.count) == (40, 10, 8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_noisy_place_is_no_jump(seed: int) -> None:
+    """Eight times the usual noise for a third of a period (before: a jump of 1 %)."""
+    t = np.arange(3000.0)
+    noise = 1e-3 * np.random.default_rng(seed).standard_normal(3000) * np.where(np.abs(t - 1000.0) < 18.0, 8.0, 1.0)
+    values = np.exp(-t / 1500.0) * np.cos(2.0 * np.pi * t / 100.0) + noise
+    assert phase_jump(values, 100.0, alone=True) is None
+    lost = np.delete(values, slice(2025, 2028))  # negative control
+    jump = jump_or_noise(lost, 100.0, alone=True)
+    assert jump is not None
+    assert not jump.noisy
+    assert abs(jump.row - 2025) < 25
