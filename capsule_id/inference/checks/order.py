@@ -65,12 +65,10 @@ def check_tables(s: SampledFit) -> list[Finding]:
     for e in s.experiments:
         if e.bench and not e.time_series and any(row.scatter for row in e.parameters) and _means_count(s, e):
             alike.setdefault((e.kind, *(row.name for row in e.parameters)), []).append(e)
-    groups = [members for members in alike.values() if len(members) > 1]
+    several = [(m, [_unflagged(s, e)[0] for e in m]) for m in alike.values() if len(m) > 1]
+    groups = [(m, residuals) for m, residuals in several if np.std(np.concatenate(residuals)) > SMALLEST_SCATTER]
     findings = []
-    for members in groups:
-        residuals = [_unflagged(s, e)[0] for e in members]
-        if np.std(np.concatenate(residuals)) <= SMALLEST_SCATTER:
-            continue
+    for members, residuals in groups:
         factor, p = between(residuals)
         if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
             name = next(row for row in members[0].parameters if row.physical)
@@ -81,13 +79,13 @@ def check_tables(s: SampledFit) -> list[Finding]:
                 "p": p,
                 "factor": factor,
             }
-            findings += [Finding("trials.tables", "fail", facts, e.label) for e in members[:1]]
-    number = sum(len(members) for members in groups)
+            findings.append(Finding("trials.tables", "fail", facts, members[0].label))
+    number = sum(len(members) for members, _ in groups)
     return findings or [Finding("trials.tables", "ok", {"number": number})] * bool(groups)
 
 
 def _means_count(s: SampledFit, e: Experiment) -> bool:
-    """Whether the mean residual of a table tells of its parameters: no offset of its own, and several trials."""
+    """Whether an error of the parameters shifts the mean residual of a table: it has no offset, and several trials."""
     residuals, _ = _unflagged(s, e)
     own = e.misfit(e.local(s.values)).design.shape[1]
     return own == 0 and len(residuals) >= FEWEST_TRIALS

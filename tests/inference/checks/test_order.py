@@ -55,6 +55,14 @@ def test_false_alarms_and_the_factor_of_tables_that_differ() -> None:
         between([2.0 * rng.standard_normal() + rng.standard_normal(10) for _ in range(40)])[0] for _ in range(20)
     ]
     assert float(np.mean(factors)) == pytest.approx(np.sqrt(1.0 + 9.0 * 0.8), rel=0.1)
+    # Few tables: mean squares 56 between and 4 within of three tables with three rows, r = 52/64; and with other sizes.
+    few = [np.array([-2.0, 0.0, 2.0]) + shift for shift in (-np.sqrt(56.0 / 3.0), 0.0, np.sqrt(56.0 / 3.0))]
+    assert between(few)[0] == pytest.approx(np.sqrt(1.0 + 2.0 * 52.0 / 64.0))
+    one, other = np.array([1.0, 3.0]), np.array([-1.0, -2.0, 0.0, -1.0, -1.0, -1.0])
+    mean_rows, within = 8.0 - (4.0 + 36.0) / 8.0, 4.0 / 6.0
+    variance = (13.5 - within) / mean_rows
+    expected = np.sqrt(1.0 + (mean_rows - 1.0) * variance / (variance + within))
+    assert between([one, other])[0] == pytest.approx(expected)
 
 
 def pulls(folder: Path, mu: tuple[float, ...]) -> Fit:
