@@ -1,5 +1,6 @@
 """Detectors of faulty readings: each finds its fault in a decay, and finds nothing without it."""
 
+from collections.abc import Callable
 from time import process_time
 
 import numpy as np
@@ -41,8 +42,9 @@ def test_the_reading_step_is_the_spacing_of_the_levels() -> None:
 @pytest.mark.parametrize("level", [0.95, 0.85])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("make", [decay, encoder])
-def test_clipped_tops_are_found_and_smooth_ones_are_not(make: object, level: float, sign: float) -> None:
-    assert callable(make)
+def test_clipped_tops_are_found_and_smooth_ones_are_not(
+    make: Callable[[], np.ndarray], level: float, sign: float
+) -> None:
     clear = sign * make()
     limit = level * np.max(np.abs(clear))
     (found,) = clipped_samples(np.clip(clear, -limit, limit), SAMPLES)
@@ -182,7 +184,7 @@ def test_coloured_noise_is_no_jump(correlation: float) -> None:
     found = 0
     for _ in range(20):
         shocks = np.sqrt(1.0 - correlation**2) * rng.standard_normal(1500)
-        noise = signal.lfilter([1.0], [1.0, -correlation], shocks)[300:]
+        noise = np.asarray(signal.lfilter([1.0], [1.0, -correlation], shocks))[300:]
         found += phase_jump(decay(noise=0.0) + 0.03 * noise, SAMPLES) is not None
     assert found <= 1
 
