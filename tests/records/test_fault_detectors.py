@@ -42,9 +42,7 @@ def test_the_reading_step_is_the_spacing_of_the_levels() -> None:
 @pytest.mark.parametrize("level", [0.95, 0.85])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("make", [decay, encoder])
-def test_clipped_tops_are_found_and_smooth_ones_are_not(
-    make: Callable[[], np.ndarray], level: float, sign: float
-) -> None:
+def test_clipped_tops_and_no_smooth_ones_are_found(make: Callable[[], np.ndarray], level: float, sign: float) -> None:
     clear = sign * make()
     limit = level * np.max(np.abs(clear))
     (found,) = clipped_samples(np.clip(clear, -limit, limit), SAMPLES)
