@@ -35,6 +35,7 @@ from capsule_id.physics.exact.events import (
     mode_at,
     motion_at,
 )
+from capsule_id.physics.exact.one_function import as_one_function
 from capsule_id.physics.exact.taylor import (
     CapsuleState,
     Constants,
@@ -49,7 +50,7 @@ from capsule_id.physics.exact.taylor import (
     size,
     trusted,
 )
-from capsule_id.physics.friction import FrictionLaw, sliding_friction
+from capsule_id.physics.friction import FrictionLaw, Scaled, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Initial, Status, Trajectory, admissible
 from capsule_id.precision import require_float64
 
@@ -307,7 +308,14 @@ def _folding(structure: Any) -> Callable[..., Trajectory]:
     return run_leaves
 
 
+def _is_own(part: Drive | FrictionLaw) -> bool:
+    """Whether a drive or law, and every law inside it, is one of this package."""
+    own = type(part).__module__.startswith("capsule_id.")
+    return own and (not isinstance(part, Scaled) or _is_own(part.law))
+
+
 _run = jax.jit(_run_folded)
+_run_single = as_one_function(run)
 
 
 def kernel(max_steps: int) -> Kernel:
@@ -325,7 +333,10 @@ def kernel(max_steps: int) -> Kernel:
             return _run(p, e, law, initial, times, t_end, bound)
         length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
         padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
-        t = _run(p, e, law, initial, padded, t_end, bound)
+        # The samples of several lanes are scattered; a law or drive of the user may hold any operation.
+        single = L == 1 and _is_own(e) and _is_own(law)
+        given = p, e, law, initial, padded, t_end, bound
+        t = _run_single(*given)[0] if single else _run(*given)
         return replace(t, **{name: getattr(t, name)[:, :n] for name in ("times", "X1", "Y1", "X2", "Y2")})
 
     return simulate_exact
