@@ -33,7 +33,7 @@ SHORT = {
     "05": "WIDTHS = 2",
     "06": "RUNS, SAMPLES = (1,), 1000",
     "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
-    "08": "DRAWS, POINTS = 24, 16",
+    "08": "DRAWS, POINTS = 100, 16",
 }
 #: Chapters that compile large programs and run them for milliseconds: their short studies are not optimised.
 NOT_OPTIMISED = {"06"}

@@ -17,6 +17,7 @@ from capsule_id.rig.formats.binary.arrays import export_of_arrays
 from capsule_id.rig.formats.binary.hdf5 import read_hdf5
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.limits import LARGEST_CONTENT, refuse_large
+from capsule_id.views import counted
 
 _MATRIX, _COMPRESSED = 14, 15  # types of data elements
 _STRUCT = 2  # class of arrays with fields
@@ -128,5 +129,5 @@ def _fields(
         for field in fields:
             kind, element = next(parts, (-1, b""))
             if kind < 0:
-                raise ValueError(f"a struct without some of its {number * len(fields)} fields")
+                raise ValueError(f"a struct without some of its {counted(number * len(fields), 'field')}")
             yield from _arrays(kind, element, order, f"{name}{index}.{field}", depth + 1)
