@@ -45,17 +45,18 @@ def hessian(function: Callable[[np.ndarray], np.ndarray], u: Vector, scale: Vect
     rows, columns = np.triu_indices(d)
     unit = np.diag(scale)
     pair, single = unit[rows] + unit[columns], unit[rows] - unit[columns]
-    estimates = []
+    estimates, beyond = [], np.zeros(len(rows), dtype=bool)
     for step in (STEP, RATIO * STEP):
         offsets = step * np.concatenate([pair, -pair, single, -single])
         values = in_batches(function, np.concatenate([u + offsets, u[None]]))
         plus, minus, cross, cross_minus = np.split(values[:-1], 4)
-        with np.errstate(invalid="ignore"):  # -inf beyond the domain
-            second = (plus + minus - cross - cross_minus) / (4.0 * step**2)
-        estimates.append(second)
-    with np.errstate(invalid="ignore"):
-        best = (RATIO**2 * estimates[0] - estimates[1]) / (RATIO**2 - 1.0)
-    best = np.where(np.isfinite(best), best, np.where(rows == columns, -1.0, 0.0))
+        parts = np.stack([plus, minus, cross, cross_minus])
+        # Beyond the domain the density is -inf; a NaN is a defect, and stays.
+        beyond |= np.any(np.isneginf(parts), axis=0)
+        plus, minus, cross, cross_minus = np.where(np.isneginf(parts), 0.0, parts)
+        estimates.append((plus + minus - cross - cross_minus) / (4.0 * step**2))
+    best = (RATIO**2 * estimates[0] - estimates[1]) / (RATIO**2 - 1.0)
+    best = np.where(beyond, np.where(rows == columns, -1.0, 0.0), best)
     matrix = np.zeros((d, d))
     matrix[rows, columns] = best / (scale[rows] * scale[columns])
     return matrix + np.triu(matrix, 1).T

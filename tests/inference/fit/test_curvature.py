@@ -42,6 +42,17 @@ def test_the_hessian_beside_the_end_of_the_domain() -> None:
     assert (root @ root.T)[1, 1] == pytest.approx(SCALE[1] ** 2)
 
 
+def test_a_density_that_is_no_number_shows() -> None:
+    """Only -inf is the end of a domain."""
+
+    def defective(u: np.ndarray) -> np.ndarray:
+        return np.where(u[:, 1] > AT[1] + 1e-9, np.nan, np.asarray(jax.vmap(smooth)(u)))
+
+    found = hessian(defective, AT, SCALE)
+    assert np.isnan(found[1]).all()
+    assert np.isfinite(found[np.ix_([0, 2, 3], [0, 2, 3])]).all()
+
+
 def test_jacobian_against_automatic_differentiation() -> None:
     def function(u: np.ndarray) -> np.ndarray:
         return np.array([np.sin(u[0] * u[1]), np.exp(u[2]), u[3] ** 3 * u[0]])
