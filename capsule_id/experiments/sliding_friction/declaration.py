@@ -1,6 +1,8 @@
 """Steady sliding: columns and template."""
 
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 from capsule_id.experiments.families.friction import (
     CAPTIONS,
@@ -32,6 +34,12 @@ def _masses(table: Table[SurfaceSettings]) -> tuple[str, ...]:
     return ("m1", "m2") if "force" in table.columns and weighed else ()
 
 
+def _stated_law(entry: Entry[SurfaceSettings]) -> Mapping[str, Any]:
+    """The keys of ``[model]``; none where it is no table, which its own reader refuses."""
+    model = entry.document.data.get("model", {})
+    return model if isinstance(model, dict) else {}
+
+
 def _check_speed(entry: Entry[SurfaceSettings]) -> None:
     """Refuse readings without speeds under a law that depends on the speed.
 
@@ -40,8 +48,7 @@ def _check_speed(entry: Entry[SurfaceSettings]) -> None:
     InputError
         At the entry.
     """
-    model = entry.document.data.get("model", {})
-    law = model if isinstance(model, dict) else {}
+    law = _stated_law(entry)
     if "speed" in entry.table.columns or (law.get("friction") == "constant" and "viscous" not in law.get("free", [])):
         return
     rule = "sliding readings without a speed need a friction that does not depend on it"
@@ -57,8 +64,7 @@ def _check_viscous(entry: Entry[SurfaceSettings]) -> None:
     InputError
         At the entry.
     """
-    model = entry.document.data.get("model", {})
-    if "normal_force" in entry.table.columns and isinstance(model, dict) and "viscous" in model.get("free", []):
+    if "normal_force" in entry.table.columns and "viscous" in _stated_law(entry).get("free", []):
         rule = "a column normal_force and a viscous part are not fitted together"
         raise entry.error("", rule, "both", "make an experiment with its own N0 of each load, or remove viscous")
 
