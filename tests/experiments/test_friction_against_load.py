@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -91,8 +92,7 @@ def experiment(
     toml = folder / "rig.toml"
     toml.write_text(f"{toml.read_text()}\n[model]\n{model}\n")
     (made,) = make_experiments(cid.read_rig(folder))
-    assert isinstance(made, FrictionExperiment)
-    return made
+    return cast(FrictionExperiment, made)
 
 
 @pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])

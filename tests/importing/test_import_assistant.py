@@ -9,6 +9,7 @@ import pytest
 
 import capsule_id
 from capsule_id import cli
+from capsule_id.importing.headers import name_and_unit
 from tests.importing.spoiled_exports import Spoiled, spoiled_exports
 from tests.measured.sources import measured_file
 
@@ -160,6 +161,18 @@ def decay_rows(separator: str = ",", digits: int = 4) -> str:
     time = np.arange(400) * 5e-4
     values = 2.5 * np.exp(-12.0 * time) * np.cos(113.0 * time)
     return "".join(f"{t:.{digits}f}{separator}{x:.3f}\n" for t, x in zip(time, values, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("header", "found"),
+    [
+        ("Force (N) Run 5", ("Force Run 5", "N")),
+        ("x [mm] top", ("x top", "mm")),
+        ("Force (left) Run 5", ("Force (left) Run 5", None)),
+    ],
+)
+def test_brackets_before_further_words_hold_a_unit_if_it_is_one(header: str, found: tuple[str, str | None]) -> None:
+    assert name_and_unit(header, ["N", "m", "s"]) == found
 
 
 @pytest.mark.parametrize("header", ["Time,CH1\ns,mm\n", "Time (s),LVDT [mm]\n", "t/s,LVDT/mm\n"])

@@ -1,5 +1,7 @@
 """Displacement after many periods: against a plain run, in derivatives, and where a run fails."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +52,8 @@ def test_a_factor_scales_any_law_alike() -> None:
     law = CoulombStribeck(mu=0.3, N=2.6, v_s=0.1, mu_back=0.4, ratio=0.7, viscous=0.2)
     own, general = scaled(law, 1.3), Scaled(law, 1.3)
     speed = np.linspace(0.0, 1.0, 5)
-    assert isinstance(own, CoulombStribeck)
+    # Eq. (1) keeps its own Taylor recursion.
+    assert own == replace(law, N=1.3 * 2.6, viscous=1.3 * 0.2)
     for direction in ("forward", "backward"):
         expected = 1.3 * getattr(law, direction)(speed)
         for made in (own, general, scaled(general, 1.0)):

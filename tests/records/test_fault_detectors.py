@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from time import process_time
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
 from capsule_id.records.faults.phase import jump_or_noise, phase_jump
 from capsule_id.records.faults.release import find_free_decay
-from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
+from capsule_id.records.faults.timing import Gaps, dropouts, find_gaps, frozen_samples, time_rounding
 from tests.experiments.bench import K1, M1, C, released
 
 RATE = 2000.0
@@ -102,8 +103,7 @@ def test_a_peak_that_sticks_is_not_clipped() -> None:
 
 def test_gaps_are_multiples_of_the_sampling_step() -> None:
     kept = np.delete(TIME, [*range(300, 310), 700])
-    gaps = find_gaps(kept)
-    assert gaps is not None
+    gaps = cast(Gaps, find_gaps(kept))
     assert gaps.rows.tolist() == [299, 689]
     assert gaps.lost.tolist() == [10, 1]
     assert find_gaps(TIME) is None
