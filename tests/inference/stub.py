@@ -47,6 +47,7 @@ class Gaussian:
 
     OFF, WIDE = 0.5, 1.3
     fingerprint = "a known normal density"
+    can_be_emulated = False
 
     def __init__(self, mean: np.ndarray, sigma: np.ndarray, blocks: Sequence[np.ndarray] | None = None) -> None:
         self.mean, self.sigma = mean, sigma
@@ -63,6 +64,12 @@ class Gaussian:
         d = v - self.mean
         pairs = zip(self.blocks, self.precisions, strict=True)
         return np.stack([-0.5 * np.einsum("wi,ij,wj->w", d[:, b], p, d[:, b]) for b, p in pairs], axis=1)
+
+    def motions(self, v: np.ndarray) -> list[np.ndarray]:
+        return [self.parts(v)]
+
+    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> "Gaussian":
+        raise NotImplementedError
 
     def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Nothing was integrated out."""

@@ -60,5 +60,13 @@ class TrialsExperiment(CapsuleForward):
         """Log-density of the readings of each setting given the parameters and all others; not finite where none."""
 
     @abstractmethod
+    def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> Float[np.ndarray, "draws k"]:
+        """The numbers of every draw for which the likelihood runs the capsule; not finite where a run fails."""
+
+    @abstractmethod
+    def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: Float[np.ndarray, "draws k"]) -> Self:
+        """Return the same trials with an emulator of the motions, fitted to ``motions_of_draws`` of ``draws``."""
+
+    @abstractmethod
     def without(self, setting: int) -> Self:
         """Return the experiment without the trials of one setting."""

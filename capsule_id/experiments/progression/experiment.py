@@ -7,21 +7,22 @@ sessions and the response to s_j, so that s_j enters linearly and is integrated 
 the model's mean velocity at setting b that all trials of the setting share.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol
+from capsule_id.experiments.emulator import Emulator
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.progression.batches import batched
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import (
     AMPLITUDE,
@@ -35,7 +36,6 @@ from capsule_id.experiments.progression.left_out import conditional_densities
 from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.physics.batches import pool
 from capsule_id.physics.displacement import Displacement, displacement
 from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.drives.pulses import Pulses
@@ -47,8 +47,8 @@ from capsule_id.views import Comparison
 
 #: Scales of the half-normal priors of trial_sd and discrepancy, relative to the largest reading.
 TRIAL_PRIOR, DISCREPANCY_PRIOR = 0.05, 0.1
-#: Draws of one compiled batch.
-DRAWS_OF_A_BATCH = 16
+#: Parameters that change no motion.
+OF_TRIALS = ("trial_scatter", "trial_sd", "discrepancy")
 #: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
 DAMPING_RATIO, FRICTION = 0.1, 0.3
 
@@ -63,6 +63,7 @@ class Progression(TrialsExperiment):
     reading_variance : m^2
     force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
     has_lag : whether the lag is a parameter
+    emulator : of ``responses``; None: they are exact
     """
 
     session: np.ndarray
@@ -76,9 +77,11 @@ class Progression(TrialsExperiment):
 
     checks = (check_discrepancy,)
     reaction: float = eqx.field(static=True)
+    emulator: Emulator | None
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction, self.smoothing, self.ground = friction, None, ground_of(table)
+        self.emulator = None
         self.drive, self.reaction = table.settings.drive, rig.model.share_of_reaction
         self.distance = table["distance"]
         self.reading_variance = table.columns["distance"].reading_sd ** 2
@@ -162,6 +165,9 @@ class Progression(TrialsExperiment):
 
     def responses(self, theta: ValuesBySymbol) -> tuple[Any, Any]:
         """(settings,) mean of X2 over sessions, m, and its change per standard deviation of a session, m."""
+        if self.emulator is not None:
+            mean, per_sd = jnp.split(self.emulator(theta), 2)
+            return mean, per_sd
         sd, settings = theta["session_sd"], jnp.concatenate([self.settings, self.settings])
         sign = np.repeat([1.0, -1.0], len(self.settings))
         upper, lower = jnp.split(self.displacements(theta, sd * sign, settings), 2)
@@ -176,13 +182,22 @@ class Progression(TrialsExperiment):
         self, draws: Sequence[ValuesBySymbol], s: np.ndarray, settings: np.ndarray
     ) -> np.ndarray:
         """(draws, rows) X2, m, at each draw with friction multiplied by exp(s), s (draws, rows)."""
-        return _batched(_displacements_at, self, draws, s, settings)
+        return batched(_displacements_at, self, draws, s, settings)
 
     def responses_of_draws(self, draws: Sequence[ValuesBySymbol]) -> tuple[np.ndarray, np.ndarray]:
         """``responses`` at each draw, (draws, settings) each."""
-        found = _batched(_responses_at, self, draws, np.zeros((len(draws), 0)), self.settings)
+        found = batched(_responses_at, self, draws, np.zeros((len(draws), 0)), self.settings)
         mean, per_sd = np.split(found, 2, axis=1)
         return mean, per_sd
+
+    def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
+        return np.concatenate(self.responses_of_draws(draws), axis=1)
+
+    def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
+        positive = {row.symbol: row.positive for row in self.parameters if row.symbol not in OF_TRIALS}
+        varied = {mass: True for mass in self.masses if len({draw[mass] for draw in draws}) > 1}
+        emulator = Emulator({**positive, **varied}, draws, motions)
+        return eqx.tree_at(lambda e: e.emulator, self, emulator, is_leaf=lambda x: x is None)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
         return (self.misfit_of(theta, *self.responses(theta), xp),)
@@ -299,31 +314,6 @@ class Progression(TrialsExperiment):
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         return progression_panels(self, theta, draws)
-
-
-def _batched(
-    function: Callable[..., Any],
-    e: Progression,
-    draws: Sequence[ValuesBySymbol],
-    s: np.ndarray,
-    settings: np.ndarray,
-) -> np.ndarray:
-    """``function(e, theta, s, settings)`` at every draw and row of ``s``, in batches of one size, on all cores."""
-    symbols = tuple(name for name in draws[0] if np.ndim(draws[0][name]) == 0)
-    rows = np.concatenate([np.array([[draw[name] for name in symbols] for draw in draws]), s], axis=1)
-    padded = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % DRAWS_OF_A_BATCH, axis=0)])
-    parts = np.split(padded, len(padded) // DRAWS_OF_A_BATCH)
-    found = pool().map(lambda part: np.asarray(_of_rows(function, e, symbols, part, settings)), parts)
-    return np.concatenate(list(found))[: len(rows)]
-
-
-@eqx.filter_jit
-def _of_rows(function: Callable[..., Any], e: Progression, symbols: tuple[str, ...], rows: Any, settings: Any) -> Any:
-    def one(row: Any) -> Any:
-        theta = dict(zip(symbols, row[: len(symbols)], strict=True))
-        return function(e, theta, row[len(symbols) :], settings)
-
-    return jax.vmap(one)(rows)
 
 
 def _displacements_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from emcee import State
@@ -24,8 +24,9 @@ from capsule_id.inference.sampling.diagnostics import (
     pooled_time,
     split_rhat,
 )
+from capsule_id.inference.sampling.emulation import Places, emulation
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
-from capsule_id.inference.sampling.moves import Moves, block_move, other_moves
+from capsule_id.inference.sampling.moves import Moves, block_move, delayed_move, other_moves
 from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
 from capsule_id.inference.sampling.refinement import NO_MASS, refined
 
@@ -64,8 +65,9 @@ DEFAULT_BUDGET = 20_000
 DRAWS_PER_TAU, MAX_THIN = 5.0, 15
 #: Steps of each measured move (short, long).
 PILOT_STEPS, LONG_PILOT_STEPS = 60, 300
-#: Name of the first move.
+#: Name of the first move, and of that of an emulated posterior with its number of steps.
 FIRST = "block independence + differential evolution"
+DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 40
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
 #: Other kinds of moves are tried only where the block proposal stays above this, in steps.
@@ -76,7 +78,7 @@ FAIR_TAU = 100.0
 class Schedule:
     """Density of the first walkers, move, thinning and burn-in of the recorded run, chosen by the pilot run."""
 
-    start: BlockProposal
+    start: BlockProposal | Places
     move: str
     moves: Moves
     measured: Mapping[str, float]
@@ -95,11 +97,18 @@ class Target(Protocol):
     normal_priors: np.ndarray
 
     @property
+    def can_be_emulated(self) -> bool: ...
+
+    @property
     def fingerprint(self) -> str:
         """Equal for equal densities: saved draws of another density are not resumed."""
         ...
 
     def parts(self, v: np.ndarray) -> np.ndarray: ...
+
+    def motions(self, v: np.ndarray) -> list[np.ndarray]: ...
+
+    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
 
     def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]: ...
 
@@ -189,22 +198,28 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
 def pilot(target: Target, seed: int) -> Schedule:
     """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
     random = np.random.RandomState(seed)
-    proposal = adapted_proposal(target, random)
-    ensemble = Ensemble(target.parts, _initial(target, proposal, random), block_move(proposal))
-    moves, measured = {FIRST: block_move(proposal), **other_moves()}, dict[str, float]()
+    if target.can_be_emulated:
+        emulated, proposal, begin = emulation(target, *laplace_proposal(target), random)
+        name, first = DELAYED, delayed_move(emulated.parts, proposal, DELAYED_STEPS)
+    else:
+        proposal = adapted_proposal(target, random)
+        begin, name, first = proposal, FIRST, block_move(proposal)
+    ensemble = Ensemble(target.parts, _initial(target, begin, random), first)
+    moves, measured = {name: first, **other_moves()}, dict[str, float]()
     # The most promising move runs first, briefly, then longer. The other moves come last, because they are slow.
-    plan = [(FIRST, PILOT_STEPS), (FIRST, LONG_PILOT_STEPS), *((name, LONG_PILOT_STEPS) for name in other_moves())]
+    plan = [(name, PILOT_STEPS), (name, LONG_PILOT_STEPS), *((name, LONG_PILOT_STEPS) for name in other_moves())]
     for name, steps in plan:
         if name in other_moves() and min(measured.values()) < FAIR_TAU:
             break
         ensemble = Ensemble(target.parts, ensemble.state, moves[name]).run(steps)
         measured[name] = float(np.max(ensemble_time(ensemble.chain[None])))
-        if measured[name] < GOOD_TAU:
+        # A longer measurement of delayed acceptance takes longer than what it could save.
+        if measured[name] < (FAIR_TAU if name == DELAYED else GOOD_TAU):
             break
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
-    return Schedule(proposal, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
+    return Schedule(begin, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
 
 
 def adapted_proposal(
@@ -214,13 +229,18 @@ def adapted_proposal(
 
     A proposal ``first`` that is adapted to a similar density takes its place, and needs ``NEAR`` rounds only.
     """
-    large = [len(block) >= LARGE for block in target.blocks]
+    laplace, large = laplace_proposal(target)
     if first is not None:
         return refined(target.parts, first, target.normal_priors, random, large, NEAR)
+    return refined(target.parts, laplace, target.normal_priors, random, large)
+
+
+def laplace_proposal(target: Target) -> tuple[BlockProposal, list[bool]]:
+    """The Laplace approximation as a proposal, and for each block whether it is large."""
+    large = [len(block) >= LARGE for block in target.blocks]
     narrow = np.isin(np.arange(target.dimension), np.concatenate([[], *compress(target.blocks, large)]))
     laplace = np.where(np.outer(narrow, narrow), target.covariance, OVERDISPERSION**2 * target.covariance)
-    first = block_proposal(target.blocks, target.centre, laplace, large)
-    return refined(target.parts, first, target.normal_priors, random, large)
+    return block_proposal(target.blocks, target.centre, laplace, large), large
 
 
 def _checks(done: int, last: int) -> Iterator[int]:
@@ -260,7 +280,7 @@ def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend
     return Ensemble(target.parts, burnt_in, schedule.moves, backend)
 
 
-def _initial(target: Target, density: BlockProposal, random: np.random.RandomState) -> State:
+def _initial(target: Target, density: BlockProposal | Places, random: np.random.RandomState) -> State:
     """Walkers drawn from ``density``, each at a finite log-posterior."""
     walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
     u = np.empty((0, target.dimension))

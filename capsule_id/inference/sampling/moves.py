@@ -1,5 +1,6 @@
 """Ensemble moves; a pilot run chooses among them by measured autocorrelation time."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import emcee
@@ -30,25 +31,75 @@ class BlockMove(emcee.moves.Move):
         proposal = self.proposal
         drawn = proposal.draw(model.random, len(state.coords))
         new = np.where(np.isfinite(drawn), drawn, state.coords)
-        _, blobs = model.compute_log_prob_fn(new)
-        # emcee drops the axis where there is one block only.
-        old = np.asarray(state.blobs)
         factors = proposal.log_density(state.coords) - proposal.log_density(new)
-        old_parts, new_parts = old.reshape(factors.shape), np.reshape(blobs, factors.shape)
-        accepted = np.log(model.random.uniform(size=factors.shape)) < new_parts - old_parts + factors
-        coords = state.coords.copy()
-        for i, block in enumerate(proposal.blocks):
-            # A draw outside the domain has the density 0.
-            accepted[:, i] &= np.all(np.isfinite(drawn[:, block]), axis=1)
-            coords[:, block] = np.where(accepted[:, i, None], new[:, block], coords[:, block])
-        parts = np.where(accepted, new_parts, old_parts)
-        new_state = emcee.State(coords, log_prob=np.sum(parts, axis=1), blobs=parts.reshape(old.shape))
-        return new_state, np.mean(accepted, axis=1)
+        # A draw outside the domain has the density 0.
+        inside = [np.all(np.isfinite(drawn[:, block]), axis=1) for block in proposal.blocks]
+        return accept(model, state, new, np.where(np.stack(inside, axis=1), factors, -np.inf), proposal.blocks)
+
+
+class DelayedMove(emcee.moves.Move):
+    """Delayed acceptance of all blocks of parameters (Christen & Fox 2005): proposals from an emulated posterior.
+
+    A step is a chain of ``steps`` block moves on the emulated posterior. The exact posterior accepts its end, or not.
+    An error of the emulator costs acceptance only: the chain converges to the exact posterior.
+
+    Parameters
+    ----------
+    parts : (w, d) -> (w, blocks), emulated log-density of each block
+    proposal : see ``BlockMove``
+    """
+
+    def __init__(self, parts: Callable[[np.ndarray], np.ndarray], proposal: BlockProposal, steps: int) -> None:
+        self.parts, self.steps, self.blocks = parts, steps, proposal.blocks
+        self._inner = BlockMove(proposal)
+
+    def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
+        """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
+
+        def log_density(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            found = self.parts(v)
+            return np.sum(found, axis=1), found
+
+        emulated = model._replace(compute_log_prob_fn=log_density)
+        total, before = log_density(state.coords)
+        end = emcee.State(state.coords, log_prob=total, blobs=before)
+        for _ in range(self.steps):
+            end, _ = self._inner.propose(emulated, end)
+        return accept(model, state, end.coords, before - end.blobs, self.blocks)
+
+
+def accept(
+    model: Any, state: emcee.State, new: np.ndarray, factors: np.ndarray, blocks: Sequence[np.ndarray]
+) -> tuple[emcee.State, np.ndarray]:
+    """Accept or refuse each block of the proposals ``new`` (w, d) by Metropolis–Hastings.
+
+    Return the new state and the share of accepted blocks, (w,).
+
+    Parameters
+    ----------
+    factors : (w, blocks) log of the proposal density of the old place over that of the new one
+    """
+    _, blobs = model.compute_log_prob_fn(new)
+    # emcee drops the axis where there is one block only.
+    old = np.asarray(state.blobs)
+    old_parts, new_parts = old.reshape(factors.shape), np.reshape(blobs, factors.shape)
+    accepted = np.log(model.random.uniform(size=factors.shape)) < new_parts - old_parts + factors
+    coords = state.coords.copy()
+    for i, block in enumerate(blocks):
+        coords[:, block] = np.where(accepted[:, i, None], new[:, block], coords[:, block])
+    parts = np.where(accepted, new_parts, old_parts)
+    new_state = emcee.State(coords, log_prob=np.sum(parts, axis=1), blobs=parts.reshape(old.shape))
+    return new_state, np.mean(accepted, axis=1)
 
 
 def block_move(proposal: BlockProposal) -> Moves:
     """Block moves, with one step in ten by differential evolution, which needs no covariance."""
     return [(BlockMove(proposal), 0.9), (emcee.moves.DEMove(), 0.1)]
+
+
+def delayed_move(parts: Callable[[np.ndarray], np.ndarray], proposal: BlockProposal, steps: int) -> Moves:
+    """Delayed acceptance, with one step in ten by differential evolution, which needs no emulator."""
+    return [(DelayedMove(parts, proposal, steps), 0.9), (emcee.moves.DEMove(), 0.1)]
 
 
 def other_moves() -> dict[str, Moves]:

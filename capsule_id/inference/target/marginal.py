@@ -8,6 +8,7 @@ drawn exactly from their conditional distributions: a node, drawn by weight, of 
 
 import hashlib
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.families.friction_model import EQUATION_1
+from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.inference.fit.curvature import BATCH, in_batches
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.compiling import COMPILE
@@ -104,6 +106,33 @@ class MarginalPosterior:
     def theta(self, u: np.ndarray) -> np.ndarray:
         """(..., d) constrained values from the whole u (..., d)."""
         return self.target.theta(u)
+
+    @property
+    def can_be_emulated(self) -> bool:
+        """Whether there are motions to compute, and all of them are trials of a few numbers each."""
+        slow = [e for e in self.target.experiments if e.event_driven]
+        return bool(slow) and all(isinstance(e, TrialsExperiment) for e in slow)
+
+    def motions(self, v: np.ndarray) -> list[np.ndarray]:
+        """Motions of every experiment with trials at located u (w, dimension), (w, k) each."""
+        return [e.motions_of_draws(draws) for e, draws in self._trials(v)]
+
+    def emulated(self, v: np.ndarray, motions: Sequence[np.ndarray]) -> "MarginalPosterior":
+        """The posterior with emulators of the motions, fitted to ``motions`` at located u (w, dimension)."""
+        pairs = zip(self._trials(v), motions, strict=True)
+        emulated = {e.label: e.with_emulator(draws, own) for (e, draws), own in pairs}
+        experiments = [emulated.get(e.label, e) for e in self.target.experiments]
+        changed = copy(self)
+        changed.target = LogPosterior(self.target.rig, experiments)
+        return changed
+
+    def _trials(self, v: np.ndarray) -> list[tuple[TrialsExperiment, list[ValuesBySymbol]]]:
+        """Every experiment with trials, and its values by symbol at located u (w, dimension); scatters are 1."""
+        u = np.zeros((len(v), len(self.names)))
+        u[:, self._located] = v
+        values = [self.target.mapping(theta) for theta in self.target.theta(u)]
+        trials = [e for e in self.target.experiments if isinstance(e, TrialsExperiment)]
+        return [(e, [e.local(one) for one in values]) for e in trials]
 
     def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Complete located ``draws`` (..., dimension) with scatters: return u (..., d) and its log-posterior.

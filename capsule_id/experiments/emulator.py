@@ -1,0 +1,74 @@
+"""Emulator of the motions of an experiment: a smooth function of its parameters, fitted to exact motions.
+
+Ridge regression on random Fourier features (A. Rahimi, B. Recht, *Random features for large-scale kernel machines*,
+Advances in Neural Information Processing Systems 20, 2007, 1177). It approximates Gaussian-process regression with a
+Matérn kernel of smoothness 5/2. The sampler uses it for proposals only; exact motions decide on every one of them.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+#: Number of features, correlation length in sds of the training inputs, and ridge penalty of a weight.
+FEATURES, LENGTH, RIDGE = 1500, 8.0, 1e-3
+#: Degrees of freedom of the random frequencies: twice the smoothness of the kernel.
+FREEDOM = 5.0
+
+
+class Emulator(eqx.Module):
+    """Motions (k,) as a function of parameters (p,) by symbol.
+
+    Attributes
+    ----------
+    symbols, positive : (p,) inputs; positive ones enter by their logarithms
+    centre, scale : (p,) mean and sd of the training inputs
+    frequencies, phases : (p, features) and (features,)
+    weights : (features + 1 + p, k)
+    """
+
+    symbols: tuple[str, ...] = eqx.field(static=True)
+    positive: tuple[bool, ...] = eqx.field(static=True)
+    centre: np.ndarray
+    scale: np.ndarray
+    frequencies: np.ndarray
+    phases: np.ndarray
+    weights: np.ndarray
+
+    def __init__(
+        self, positive: Mapping[str, bool], draws: Sequence[Mapping[str, Any]], motions: Float[np.ndarray, "n k"]
+    ) -> None:
+        """Fit to the ``motions`` at ``draws``; rows that are not finite are left out.
+
+        Parameters
+        ----------
+        positive : inputs by symbol, and whether each is positive
+        """
+        self.symbols, self.positive = tuple(positive), tuple(positive.values())
+        x = np.array([[draw[symbol] for symbol in self.symbols] for draw in draws], dtype=float)
+        x = np.where(self.positive, np.log(np.where(self.positive, x, 1.0)), x)
+        known = np.all(np.isfinite(motions), axis=1)
+        x, y = x[known], motions[known]
+        self.centre, self.scale = np.mean(x, axis=0), np.std(x, axis=0)
+        rng = np.random.default_rng(0)
+        spread = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, FEATURES)) / LENGTH
+        self.frequencies = spread * rng.standard_normal((x.shape[1], FEATURES))
+        self.phases = rng.uniform(0.0, 2.0 * np.pi, FEATURES)
+        f = self._features(x, np)
+        self.weights = np.linalg.solve(f.T @ f + RIDGE * np.eye(f.shape[1]), f.T @ y)
+
+    def __call__(self, theta: Mapping[str, Any]) -> Any:
+        """Motions (k,) at parameters by symbol, () each."""
+        values = [theta[symbol] for symbol in self.symbols]
+        pairs = zip(values, self.positive, strict=True)
+        x = jnp.stack([jnp.log(value) if positive else jnp.asarray(value) for value, positive in pairs])
+        return (self._features(x[None], jnp) @ self.weights)[0]
+
+    def _features(self, x: Any, xp: Any) -> Any:
+        """(n, features + 1 + p) of inputs (n, p)."""
+        z = (x - self.centre[None]) / self.scale[None]
+        waves = xp.cos(z @ self.frequencies + self.phases[None])
+        return xp.concatenate([waves, xp.ones((len(z), 1)), z], axis=1)
