@@ -5,6 +5,7 @@ from typing import Any
 
 import emcee
 import numpy as np
+from emcee.model import Model
 
 from capsule_id.inference.sampling.proposal import BlockProposal
 
@@ -60,7 +61,7 @@ class DelayedMove(emcee.moves.Move):
             found = self.parts(v)
             return np.sum(found, axis=1), found
 
-        emulated = model._replace(compute_log_prob_fn=log_density)
+        emulated = Model(model.log_prob_fn, log_density, model.map_fn, model.random)
         total, before = log_density(state.coords)
         end = emcee.State(state.coords, log_prob=total, blobs=before)
         for _ in range(self.steps):
