@@ -11,8 +11,8 @@ from scipy import signal
 from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
-from capsule_id.records.faults.phase import jump_or_noise, phase_jump
-from capsule_id.records.faults.release import find_free_decay
+from capsule_id.records.faults.phase import Jump, jump_or_noise, phase_jump
+from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.records.faults.timing import Gaps, dropouts, find_gaps, frozen_samples, time_rounding
 from tests.experiments.bench import K1, M1, C, released
 
@@ -148,8 +148,7 @@ def test_a_frozen_channel_keeps_its_value() -> None:
 @pytest.mark.parametrize("place", [40, 70, 110, 150])
 def test_lost_samples_show_as_a_jump(lost: int, place: int) -> None:
     values = np.delete(decay(place), slice(place, place + lost))
-    jump = phase_jump(values, SAMPLES)
-    assert jump is not None
+    jump = cast(Jump, phase_jump(values, SAMPLES))
     assert abs(jump.row - place) <= 10
     assert phase_jump(decay(place), SAMPLES) is None
     assert phase_jump(encoder(), SAMPLES) is None
@@ -157,8 +156,7 @@ def test_lost_samples_show_as_a_jump(lost: int, place: int) -> None:
 
 def test_few_lost_samples_show_in_a_quiet_record() -> None:
     values = np.delete(decay(noise=1e-4), slice(80, 83))
-    jump = phase_jump(values, SAMPLES)
-    assert jump is not None
+    jump = cast(Jump, phase_jump(values, SAMPLES))
     assert abs(jump.row - 80) <= 5
 
 
@@ -169,8 +167,7 @@ def test_a_jump_of_an_oversampled_record_is_found_by_fft() -> None:
     x = np.exp(-time / 8.0) * np.cos(2.0 * np.pi * time) + 1e-3 * np.random.default_rng(0).standard_normal(time.size)
     began = process_time()
     assert phase_jump(x, period) is None
-    jump = phase_jump(np.delete(x, slice(lost, lost + 4000)), period)
-    assert jump is not None
+    jump = cast(Jump, phase_jump(np.delete(x, slice(lost, lost + 4000)), period))
     assert abs(jump.row - lost) < 0.1 * period
     assert process_time() - began < 20.0
 
@@ -193,15 +190,13 @@ def test_the_release_is_found_after_rest(held: bool) -> None:
     time = np.arange(round(before * RATE) + len(TIME)) / RATE
     rest = np.full(round(before * RATE), 2.0 if held else 0.0) + 0.02 * np.random.default_rng(1).standard_normal(2600)
     values = np.concatenate([rest, decay()])
-    found = find_free_decay(time, values)
-    assert found is not None
+    found = cast(FreeDecay, find_free_decay(time, values))
     assert before - 0.05 * PERIOD <= found.start <= before + 0.6 * PERIOD
     assert found.rest == found.start - time[0]
     assert found.stop is None
     assert found.period == pytest.approx(PERIOD, rel=0.05)
     inside = time >= found.start
-    again = find_free_decay(time[inside], values[inside])
-    assert again is not None
+    again = cast(FreeDecay, find_free_decay(time[inside], values[inside]))
     assert again.rest == 0.0
 
 
@@ -270,8 +265,7 @@ def test_a_second_excitation_ends_the_decay() -> None:
     assert found.stop is not None
     assert 0.25 - PERIOD <= found.stop <= 0.25 + 0.1 * PERIOD
     inside = time <= found.stop
-    again = find_free_decay(time[inside], values[inside])
-    assert again is not None
+    again = cast(FreeDecay, find_free_decay(time[inside], values[inside]))
     assert again.stop is None
 
 
