@@ -64,9 +64,11 @@ class DelayedMove(emcee.moves.Move):
         emulated = Model(model.log_prob_fn, log_density, model.map_fn, model.random)
         total, before = log_density(state.coords)
         end = emcee.State(state.coords, log_prob=total, blobs=before)
-        for _ in range(self.steps):
-            end, _ = self._inner.propose(emulated, end)
-        return accept(model, state, end.coords, before - end.blobs, self.blocks)
+        with np.errstate(invalid="ignore"):  # a place without emulated density stays, until another move leaves it
+            for _ in range(self.steps):
+                end, _ = self._inner.propose(emulated, end)
+            factors = before - end.blobs
+        return accept(model, state, end.coords, factors, self.blocks)
 
 
 def accept(

@@ -6,16 +6,19 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.emulator import Emulator
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
-from capsule_id.inference.result import Posterior
+from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import ensembles, moves
+from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
 from capsule_id.inference.sampling.ensembles import DELAYED, sample
+from capsule_id.inference.sampling.proposal import block_proposal
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.marginal import MarginalPosterior
 from tests.inference.sampling.test_sampling import LIMIT, scores
 from tests.inference.stub import Gaussian
+from tests.inference.three_settings import THETA, three_settings
 
 MEAN, SIGMA = np.array([1.0, -2.0, 0.5]), np.array([[1.0, 0.6, 0.0], [0.6, 2.0, 0.0], [0.0, 0.0, 0.5]])
 BLOCKS = [np.array([0, 1]), np.array([2])]
@@ -65,23 +68,40 @@ def test_an_emulator_follows_a_function_and_leaves_out_what_is_not_known() -> No
     assert np.all(errors < 0.04)
 
 
-def test_a_progression_is_emulated_near_its_draws(tmp_path: Path) -> None:
-    """Motions of new draws within a tenth of their sd; parameters of the scatters have no part in it."""
-    design = RobotDesign(1e-3 * np.array([60.0, 100.0]), np.full(2, 0.3), sessions=2)
-    synthesize_robot(tmp_path / "rig", 1, design)
-    e = cast(Progression, make_experiments(read_rig(tmp_path / "rig"))[0])
-    rng = np.random.default_rng(0)
-    scatters = {"g": 9.81, "session_sd": 0.05, "trial_scatter": 0.04, "trial_sd": 1e-3, "discrepancy": 2e-4}
-    varied = ("k1", "c", "mu", "P_on")
-    draws = [
-        {**ROBOT, **scatters, **{name: ROBOT[name] * np.exp(0.02 * rng.standard_normal()) for name in varied}}
-        for _ in range(240)
-    ]
-    motions = e.motions_of_draws(draws)
-    emulated = e.with_emulator(draws[:200], motions[:200])
-    assert e.emulator is None
-    assert emulated.emulator is not None
-    assert not {"trial_scatter", "trial_sd", "discrepancy"} & set(emulated.emulator.symbols)
-    found = np.array([np.concatenate(emulated.responses(draw)) for draw in draws[200:]])
-    errors = np.std(found - motions[200:], axis=0) / np.std(motions, axis=0)
-    assert np.all(errors[:2] < 0.1)
+def test_the_posterior_of_a_progression_is_emulated_near_its_draws(tmp_path: Path) -> None:
+    """Motions and log-densities of new draws; parameters of the scatters have no part in the emulator."""
+    rig = three_settings(tmp_path / "rig")
+    target = LogPosterior(rig, make_experiments(rig))
+    u = target.unconstrain(np.array([THETA[name.partition("[")[0]] for name in target.names]))
+    none = np.zeros((1, target.dimension))
+    sd = np.where(np.isin(target.names, ("m1", "m2")), 1e-3, 0.02)
+    flags = np.zeros((2, 1), dtype=bool)
+    fit = PointFit(target.names, u, {}, np.diag(sd**2), {}, none, none, np.zeros(1), *flags)
+    exact = MarginalPosterior(target, fit)
+    assert exact.can_be_emulated
+    v = exact.centre + np.random.default_rng(0).standard_normal((340, exact.dimension)) * sd[: exact.dimension]
+    (motions,) = exact.motions(v)
+    emulated = exact.emulated(v[:300], [motions[:300]])
+    (e,) = emulated.target.experiments
+    emulator = cast(Emulator, cast(Progression, e).emulator)
+    assert {"k1", "mu", "P_on", "lag", "session_sd"} <= set(emulator.symbols)
+    assert not {"trial_scatter", "trial_sd", "discrepancy", "g"} & set(emulator.symbols)
+    # The exact density is untouched, and no longer that of the emulator.
+    known, found = exact.parts(v[300:]), emulated.parts(v[300:])
+    assert not np.array_equal(known, found)
+    assert np.std(found - known) < 0.1 * np.std(known)
+    assert np.std(exact.emulated(v[:300], [motions[:300][::-1]]).parts(v[300:]) - known) > 0.5 * np.std(known)
+
+
+def test_a_place_without_emulated_density_stays() -> None:
+    """Both densities are -inf there, their ratio is no number; the step warns of nothing and accepts nothing."""
+
+    def nowhere(v: np.ndarray) -> np.ndarray:
+        return np.full((len(v), 1), -np.inf)
+
+    exact = Gaussian(MEAN, SIGMA)
+    random = np.random.RandomState(0)
+    proposal = block_proposal(exact.blocks, MEAN, SIGMA)
+    start = initial_state(proposal.draw(random, 8), random)
+    ensemble = Ensemble(exact.parts, start, [(moves.DelayedMove(nowhere, proposal, 2), 1.0)]).run(3)
+    np.testing.assert_array_equal(ensemble.state.coords, start.coords)
