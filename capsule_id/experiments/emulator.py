@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 #: Number of features, correlation length in sds of the training inputs, and ridge penalty of a weight.
-FEATURES, LENGTH, RIDGE = 1500, 8.0, 1e-3
+FEATURES, LENGTH, RIDGE = 3000, 8.0, 1e-3
 #: Degrees of freedom of the random frequencies: twice the smoothness of the kernel.
 FREEDOM = 5.0
 

@@ -105,7 +105,10 @@ def readings_and_draws(number: int) -> tuple[Any, WeightedDraws]:
     log_weight = posterior - stats.t.logpdf(theta, 6.0, 0.3, 0.8) + 7.0
     values = [{"theta": one} for one in theta]
     nothing = cast(Any, None)
-    return e, WeightedDraws(nothing, nothing, nothing, log_weight[:, None], {"theta": 0}, np.arange(number), values)
+    size = np.zeros((2, 1))
+    return e, WeightedDraws(
+        nothing, nothing, nothing, log_weight[:, None], size, {"theta": 0}, np.arange(number), values
+    )
 
 
 def test_readings_left_out_have_their_predictive_density() -> None:
@@ -162,7 +165,7 @@ def test_a_refit_without_a_reading_gives_its_predictive_density(monkeypatch: pyt
         asked.append(experiments)
         return experiments
 
-    def drawn(experiments: list[Any], _: object, __: object, first: Any) -> WeightedDraws:
+    def drawn(experiments: list[Any], _: object, __: object, first: Any, ___: object) -> WeightedDraws:
         firsts.append(first)
         width = 0.1 if len(firsts) == 1 else 0.6
         theta = 0.2 + width * np.random.default_rng(1).standard_t(6.0, 20_000)
@@ -170,7 +173,7 @@ def test_a_refit_without_a_reading_gives_its_predictive_density(monkeypatch: pyt
         weight = stats.norm.logpdf(theta, np.mean(left), len(left) ** -0.5) - stats.t.logpdf(theta, 6.0, 0.2, width)
         values = [{"theta": one} for one in theta]
         found = cast(Any, "adapted")
-        return replace(draws, log_weight=weight[:, None], inside=np.arange(20_000), values=values, proposal=found)
+        return replace(draws, log_weight=weight[:, None], inside=np.arange(20_000), values=values, drawn_from=found)
 
     monkeypatch.setattr(leave_out, "LogPosterior", posterior)
     monkeypatch.setattr(leave_out, "weighted_draws", drawn)

@@ -34,7 +34,8 @@ def draws_near_the_truth(target: LogPosterior, *_: object) -> WeightedDraws:
     values = [target.mapping(theta) for theta in target.theta(u)]
     nothing = cast(Any, None)
     block = dict.fromkeys(target.names, 0)
-    return WeightedDraws(target, nothing, nothing, np.zeros((40, 1)), block, np.arange(40), values)
+    weight, size = np.zeros((40, 1)), np.zeros((2, 1))
+    return WeightedDraws(target, nothing, nothing, weight, size, block, np.arange(40), values)
 
 
 @pytest.fixture

@@ -70,3 +70,7 @@ class TrialsExperiment(CapsuleForward):
     @abstractmethod
     def without(self, setting: int) -> Self:
         """Return the experiment without the trials of one setting."""
+
+    @abstractmethod
+    def motions_without(self, motions: Float[np.ndarray, "draws k"], setting: int) -> Float[np.ndarray, "draws m"]:
+        """Those of ``motions_of_draws`` that the experiment without one setting has."""

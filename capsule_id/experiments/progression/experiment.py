@@ -309,6 +309,9 @@ class Progression(TrialsExperiment):
             ),
         )
 
+    def motions_without(self, motions: np.ndarray, setting: int) -> np.ndarray:
+        return np.delete(motions, [setting, len(self.settings) + setting], axis=1)
+
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return self.comparisons(theta, draws)[0]
 

@@ -27,6 +27,7 @@ from capsule_id.inference.choice.variants import variants_of
 from capsule_id.inference.fit.joint_fit import joint_fit
 from capsule_id.inference.pipeline import check_readings, second_models
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target.marginal import trials_of
 from capsule_id.rig.model import ModelChoices, Rig
 from capsule_id.views import counted
 
@@ -188,10 +189,11 @@ def _fit_variant(rig: Rig, registry: Registry, seed: int) -> _Variant:
     draws = weighted_draws(target, joint_fit(target, {}, seed), seed)
     rng = np.random.default_rng(seed)
     evidence, errors = np.array([log_evidence(block, rng) for block in draws.log_weight.T]).T
+    evidence, errors = evidence + draws.log_size[0], np.hypot(errors, draws.log_size[1])
     return _Variant(
         target.dimension,
         draws,
-        tuple((e, leave_settings_out(e, draws)) for e in target.experiments if isinstance(e, TrialsExperiment)),
+        tuple((e, leave_settings_out(e, draws)) for e in trials_of(target)),
         (float(np.sum(evidence)), float(np.linalg.norm(errors))),
     )
 

@@ -1,7 +1,8 @@
 """Expected log predictive density of settings left out, by Pareto-smoothed importance sampling (PSIS-LOO).
 
-Independent draws of the sampler's adapted proposal are weighted by the posterior. For each draw the readings of a
-setting are normal given all other readings. Division by their density leaves the setting out.
+Draws of a density near the posterior are weighted by the posterior: of the emulated posterior where there is one, else
+independent draws of the sampler's adapted proposal. For each draw the readings of a setting are normal given all other
+readings. Division by their density leaves the setting out.
 (A. Vehtari, A. Gelman, J. Gabry, *Practical Bayesian model evaluation using leave-one-out cross-validation and WAIC*,
 Statistics and Computing 27, 2017, 1413.)
 """
@@ -16,14 +17,16 @@ from jaxtyping import Float
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
+from capsule_id.inference.choice.evidence import log_evidence
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.sampling.ensembles import adapted_proposal
+from capsule_id.inference.sampling.emulation import Emulation, Known, emulation
+from capsule_id.inference.sampling.ensembles import adapted_proposal, laplace_proposal
 from capsule_id.inference.sampling.proposal import BlockProposal
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior
+from capsule_id.inference.target.marginal import MarginalPosterior, trials_of
 
-#: Draws of the proposal.
-DRAWS = 4096
+#: Draws of a proposal, and of an emulated posterior, whose weights are more equal.
+DRAWS, EMULATED_DRAWS = 4096, 2048
 #: Importance weights with a larger Pareto shape are not reliable.
 LARGEST_SHAPE = 0.7
 #: Largest number of adaptations of the proposal without a setting, each from the one before.
@@ -34,20 +37,23 @@ NEGLIGIBLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class WeightedDraws:
-    """Independent draws of the proposal that the sampler adapts to a posterior.
+    """Draws of a density near a posterior.
 
     Attributes
     ----------
     target, fit : posterior, and the point fit that the adaptation began with
-    log_weight : (n, blocks) log of posterior over proposal density of each block of parameters; -inf outside
+    drawn_from : the adapted proposal, or the emulated posterior
+    log_weight : (n, blocks) log of posterior over the density drawn from, each block of parameters; -inf outside
+    log_size : (2, blocks) log of the integral of the density drawn from, and its standard error; 0 for a proposal
     block : block of each parameter by name
     inside, values : indices (m,) of the draws inside the posterior, and their values by name
     """
 
     target: LogPosterior
     fit: PointFit
-    proposal: BlockProposal
+    drawn_from: BlockProposal | Emulation
     log_weight: np.ndarray
+    log_size: np.ndarray
     block: Mapping[str, int]
     inside: np.ndarray
     values: list[dict[str, float]]
@@ -91,20 +97,47 @@ def psislw() -> Callable[[np.ndarray], tuple[Any, Any]]:
         raise InputError(rule, "not installed", remedy) from None
 
 
-def weighted_draws(target: LogPosterior, fit: PointFit, seed: int, first: BlockProposal | None = None) -> WeightedDraws:
-    """Draws of the proposal that the sampler adapts to ``target`` from the Laplace approximation, or from ``first``."""
+def weighted_draws(
+    target: LogPosterior, fit: PointFit, seed: int, first: BlockProposal | None = None, known: Known | None = None
+) -> WeightedDraws:
+    """Draws of a density near ``target``.
+
+    Parameters
+    ----------
+    first : proposal that is adapted to a similar posterior; default: the adaptation begins with the Laplace approximation
+    known : exact motions near the posterior, where it can be emulated
+    """
     marginal, random = MarginalPosterior(target, fit), np.random.RandomState(seed)
-    proposal = adapted_proposal(marginal, random, first)
-    v = proposal.draw(random, DRAWS)
-    known = np.stack([np.all(np.isfinite(v[:, block]), axis=1) for block in marginal.blocks], axis=1)
-    v = np.where(np.isfinite(v), v, np.nanmean(v, axis=0))
-    log_weight = np.where(known, marginal.parts(v) - proposal.log_density(v), -np.inf)
+    if marginal.can_be_emulated:
+        laplace, large = laplace_proposal(marginal)
+        drawn_from = emulation(marginal, first or laplace, large, random, known)
+        v = drawn_from.draw(EMULATED_DRAWS, random)
+        log_weight, log_size = marginal.parts(v) - drawn_from.target.parts(v), _log_size(drawn_from, random)
+    else:
+        drawn_from = adapted_proposal(marginal, random, first)
+        v, density = _known_draws(drawn_from, random)
+        log_weight, log_size = marginal.parts(v) - density, np.zeros((2, len(marginal.blocks)))
     inside = np.flatnonzero(np.all(np.isfinite(log_weight), axis=1))
     u, _ = marginal.restore(v[inside], seed)
     located = np.flatnonzero(~target.integrated)
     label = {target.names[i]: k for k, block in enumerate(marginal.blocks) for i in located[block]}
     values = [target.mapping(theta) for theta in target.theta(u)]
-    return WeightedDraws(target, fit, proposal, log_weight, label, inside, values)
+    return WeightedDraws(target, fit, drawn_from, log_weight, log_size, label, inside, values)
+
+
+def _known_draws(proposal: BlockProposal, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    """``DRAWS`` draws (w, d) and their log-densities (w, blocks); +inf where a block has overflowed, at another place."""
+    v = proposal.draw(random, DRAWS)
+    known = np.stack([np.all(np.isfinite(v[:, block]), axis=1) for block in proposal.blocks], axis=1)
+    v = np.where(np.isfinite(v), v, np.nanmean(v, axis=0))
+    return v, np.where(known, proposal.log_density(v), np.inf)
+
+
+def _log_size(emulated: Emulation, random: np.random.RandomState) -> np.ndarray:
+    """(2, blocks) log-evidence of an emulated posterior and its standard error."""
+    v, density = _known_draws(emulated.proposal, random)
+    rng = np.random.default_rng(random.randint(2**31))
+    return np.array([log_evidence(block, rng) for block in (emulated.target.parts(v) - density).T]).T
 
 
 def leave_settings_out(e: TrialsExperiment, draws: WeightedDraws) -> list[LeftOut]:
@@ -116,18 +149,32 @@ def leave_settings_out(e: TrialsExperiment, draws: WeightedDraws) -> list[LeftOu
 def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, seed: int) -> LeftOut:
     """Leave out one setting of ``e`` by draws of the posterior without it.
 
-    Its proposal is adapted further, up to ``ADAPTATIONS`` times, while the shape is too large.
+    The density drawn from is adapted further, up to ``ADAPTATIONS`` times, while the shape is too large.
     """
-    target, proposal = draws.target, draws.proposal
+    target, (first, known) = draws.target, _without(draws, e, setting)
     experiments = [e.without(setting) if each is e else each for each in target.experiments]
     smaller = LogPosterior(target.rig, experiments)
     tried = list[LeftOut]()
     while len(tried) < ADAPTATIONS and not any(one.shape <= LARGEST_SHAPE for one in tried):
-        left = weighted_draws(smaller, draws.fit, seed, proposal)
+        left = weighted_draws(smaller, draws.fit, seed, first, known)
         density = e.densities_of_settings([e.local(values) for values in left.values])[:, setting]
         tried.append(_left_out(left.of(e), density, left, 0.0))
-        proposal = left.proposal
+        first, known = _adapted(left.drawn_from)
     return min(tried, key=lambda one: one.shape)
+
+
+def _adapted(drawn_from: BlockProposal | Emulation) -> tuple[BlockProposal, Known | None]:
+    """What the next adaptation begins with."""
+    return (drawn_from.proposal, drawn_from.known) if isinstance(drawn_from, Emulation) else (drawn_from, None)
+
+
+def _without(draws: WeightedDraws, e: TrialsExperiment, setting: int) -> tuple[BlockProposal, Known | None]:
+    """What the adaptation to the posterior without one setting begins with."""
+    first, known = _adapted(draws.drawn_from)
+    if known is None:
+        return first, None
+    pairs = zip(trials_of(draws.target), known.motions, strict=True)
+    return first, Known(known.v, [e.motions_without(own, setting) if one is e else own for one, own in pairs])
 
 
 def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws, power: float) -> LeftOut:

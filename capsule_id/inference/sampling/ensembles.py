@@ -199,8 +199,9 @@ def pilot(target: Target, seed: int) -> Schedule:
     """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
     random = np.random.RandomState(seed)
     if target.can_be_emulated:
-        emulated, proposal, begin = emulation(target, *laplace_proposal(target), random)
-        name, first = DELAYED, delayed_move(emulated.parts, proposal, DELAYED_STEPS)
+        emulated = emulation(target, *laplace_proposal(target), random)
+        begin, name = emulated.start, DELAYED
+        first = delayed_move(emulated.target.parts, emulated.proposal, DELAYED_STEPS)
     else:
         proposal = adapted_proposal(target, random)
         begin, name, first = proposal, FIRST, block_move(proposal)

@@ -1,16 +1,25 @@
 """Ensemble moves; a pilot run chooses among them by measured autocorrelation time."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import emcee
 import numpy as np
-from emcee.model import Model
 
 from capsule_id.inference.sampling.proposal import BlockProposal
 
 #: emcee's moves with their weights.
 Moves = list[tuple[Any, float]]
+#: (w, d) -> (w, blocks), log-density of each block.
+Parts = Callable[[np.ndarray], np.ndarray]
+
+
+class Walkers(NamedTuple):
+    """Walkers at coords (w, d), with the log-density of each block there and that of the proposal, (w, blocks) each."""
+
+    coords: np.ndarray
+    parts: np.ndarray
+    proposed: np.ndarray
 
 
 class BlockMove(emcee.moves.Move):
@@ -29,13 +38,23 @@ class BlockMove(emcee.moves.Move):
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
+        log_density = _exact(model, self.proposal.blocks)
+        parts = _parts(state.blobs, self.proposal.blocks)
+        before = Walkers(state.coords, parts, self.proposal.log_density(state.coords))
+        after, accepted = self.step(log_density, before, model.random)
+        return _state(state, after.coords, after.parts), np.mean(accepted, axis=1)
+
+    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
         proposal = self.proposal
-        drawn = proposal.draw(model.random, len(state.coords))
-        new = np.where(np.isfinite(drawn), drawn, state.coords)
-        factors = proposal.log_density(state.coords) - proposal.log_density(new)
+        drawn = proposal.draw(random, len(before.coords))
+        new = np.where(np.isfinite(drawn), drawn, before.coords)
+        proposed = proposal.log_density(new)
         # A draw outside the domain has the density 0.
-        inside = [np.all(np.isfinite(drawn[:, block]), axis=1) for block in proposal.blocks]
-        return accept(model, state, new, np.where(np.stack(inside, axis=1), factors, -np.inf), proposal.blocks)
+        inside = np.stack([np.all(np.isfinite(drawn[:, block]), axis=1) for block in proposal.blocks], axis=1)
+        factors = np.where(inside, before.proposed - proposed, -np.inf)
+        coords, parts, accepted = accept(random, before, new, log_density(new), factors, proposal.blocks)
+        return Walkers(coords, parts, np.where(accepted, proposed, before.proposed)), accepted
 
 
 class DelayedMove(emcee.moves.Move):
@@ -46,53 +65,65 @@ class DelayedMove(emcee.moves.Move):
 
     Parameters
     ----------
-    parts : (w, d) -> (w, blocks), emulated log-density of each block
+    emulated : (w, d) -> (w, blocks), emulated log-density of each block
     proposal : see ``BlockMove``
     """
 
-    def __init__(self, parts: Callable[[np.ndarray], np.ndarray], proposal: BlockProposal, steps: int) -> None:
-        self.parts, self.steps, self.blocks = parts, steps, proposal.blocks
+    def __init__(self, emulated: Parts, proposal: BlockProposal, steps: int) -> None:
+        self.emulated, self.proposal, self.steps = emulated, proposal, steps
         self._inner = BlockMove(proposal)
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
-
-        def log_density(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            found = self.parts(v)
-            return np.sum(found, axis=1), found
-
-        emulated = Model(model.log_prob_fn, log_density, model.map_fn, model.random)
-        total, before = log_density(state.coords)
-        end = emcee.State(state.coords, log_prob=total, blobs=before)
+        blocks = self.proposal.blocks
+        begin = Walkers(state.coords, self.emulated(state.coords), self.proposal.log_density(state.coords))
         with np.errstate(invalid="ignore"):  # a place without emulated density stays, until another move leaves it
+            end = begin
             for _ in range(self.steps):
-                end, _ = self._inner.propose(emulated, end)
-            factors = before - end.blobs
-        return accept(model, state, end.coords, factors, self.blocks)
+                end, _ = self._inner.step(self.emulated, end, model.random)
+            factors = begin.parts - end.parts
+        before = Walkers(state.coords, _parts(state.blobs, blocks), begin.proposed)
+        found = _exact(model, blocks)(end.coords)
+        coords, parts, accepted = accept(model.random, before, end.coords, found, factors, blocks)
+        return _state(state, coords, parts), np.mean(accepted, axis=1)
 
 
 def accept(
-    model: Any, state: emcee.State, new: np.ndarray, factors: np.ndarray, blocks: Sequence[np.ndarray]
-) -> tuple[emcee.State, np.ndarray]:
+    random: np.random.RandomState,
+    before: Walkers,
+    new: np.ndarray,
+    new_parts: np.ndarray,
+    factors: np.ndarray,
+    blocks: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Accept or refuse each block of the proposals ``new`` (w, d) by Metropolis–Hastings.
 
-    Return the new state and the share of accepted blocks, (w,).
+    Return coordinates (w, d) and log-densities (w, blocks) after it, and which blocks are accepted, (w, blocks).
 
     Parameters
     ----------
+    new_parts : (w, blocks) log-density of each block at ``new``
     factors : (w, blocks) log of the proposal density of the old place over that of the new one
     """
-    _, blobs = model.compute_log_prob_fn(new)
-    # emcee drops the axis where there is one block only.
-    old = np.asarray(state.blobs)
-    old_parts, new_parts = old.reshape(factors.shape), np.reshape(blobs, factors.shape)
-    accepted = np.log(model.random.uniform(size=factors.shape)) < new_parts - old_parts + factors
-    coords = state.coords.copy()
+    accepted = np.log(random.uniform(size=factors.shape)) < new_parts - before.parts + factors
+    coords = before.coords.copy()
     for i, block in enumerate(blocks):
         coords[:, block] = np.where(accepted[:, i, None], new[:, block], coords[:, block])
-    parts = np.where(accepted, new_parts, old_parts)
-    new_state = emcee.State(coords, log_prob=np.sum(parts, axis=1), blobs=parts.reshape(old.shape))
-    return new_state, np.mean(accepted, axis=1)
+    return coords, np.where(accepted, new_parts, before.parts), accepted
+
+
+def _exact(model: Any, blocks: Sequence[np.ndarray]) -> Parts:
+    """The density that emcee samples, block by block."""
+    return lambda v: _parts(model.compute_log_prob_fn(v)[1], blocks)
+
+
+def _parts(blobs: Any, blocks: Sequence[np.ndarray]) -> np.ndarray:
+    """(w, blocks); emcee drops the axis where there is one block only."""
+    return np.reshape(blobs, (-1, len(blocks)))
+
+
+def _state(before: emcee.State, coords: np.ndarray, parts: np.ndarray) -> emcee.State:
+    return emcee.State(coords, log_prob=np.sum(parts, axis=1), blobs=parts.reshape(np.shape(before.blobs)))
 
 
 def block_move(proposal: BlockProposal) -> Moves:
@@ -100,9 +131,9 @@ def block_move(proposal: BlockProposal) -> Moves:
     return [(BlockMove(proposal), 0.9), (emcee.moves.DEMove(), 0.1)]
 
 
-def delayed_move(parts: Callable[[np.ndarray], np.ndarray], proposal: BlockProposal, steps: int) -> Moves:
-    """Delayed acceptance, with one step in ten by differential evolution, which needs no emulator."""
-    return [(DelayedMove(parts, proposal, steps), 0.9), (emcee.moves.DEMove(), 0.1)]
+def delayed_move(emulated: Parts, proposal: BlockProposal, steps: int, other: float = 0.1) -> Moves:
+    """Delayed acceptance, with a share of ``other`` steps by differential evolution, which needs no emulator."""
+    return [(DelayedMove(emulated, proposal, steps), 1.0 - other), (emcee.moves.DEMove(), other)]
 
 
 def other_moves() -> dict[str, Moves]:

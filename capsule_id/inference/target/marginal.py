@@ -29,6 +29,8 @@ from capsule_id.inference.target.quadrature import NODES, Grid, add_to_blocks, c
 #: Smallest and largest distance from the point fit of the walkers that determine the nodes, in standard deviations.
 #: The largest is wide because few trials give the heavy tails of Student's t.
 NEAREST, FARTHEST = 0.5, 500.0
+#: Number of nodes of an emulated posterior: its errors are larger than those of the sums.
+EMULATED_NODES = 16
 #: Largest distance where scatters act together: only one scatter is integrated out there, and motions far from the
 #: point fit take very many steps.
 FARTHEST_WITH_KINKS = 20.0
@@ -124,6 +126,7 @@ class MarginalPosterior:
         experiments = [emulated.get(e.label, e) for e in self.target.experiments]
         changed = copy(self)
         changed.target = LogPosterior(self.target.rig, experiments)
+        changed.grid = self.grid.coarser(EMULATED_NODES)
         return changed
 
     def _trials(self, v: np.ndarray) -> list[tuple[TrialsExperiment, list[ValuesBySymbol]]]:
@@ -131,8 +134,7 @@ class MarginalPosterior:
         u = np.zeros((len(v), len(self.names)))
         u[:, self._located] = v
         values = [self.target.mapping(theta) for theta in self.target.theta(u)]
-        trials = [e for e in self.target.experiments if isinstance(e, TrialsExperiment)]
-        return [(e, [e.local(one) for one in values]) for e in trials]
+        return [(e, [e.local(one) for one in values]) for e in trials_of(self.target)]
 
     def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Complete located ``draws`` (..., dimension) with scatters: return u (..., d) and its log-posterior.
@@ -185,6 +187,11 @@ class MarginalPosterior:
         farthest = FARTHEST_WITH_KINKS if kinked else FARTHEST
         radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, BATCH - 1)])
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
+
+
+def trials_of(target: LogPosterior) -> list[TrialsExperiment]:
+    """Its experiments with trials, whose motions can be emulated."""
+    return [e for e in target.experiments if isinstance(e, TrialsExperiment)]
 
 
 def density_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:

@@ -52,6 +52,11 @@ class Grid:
         """Return the grid shifted by this fraction of the step."""
         return replace(self, start=self.start + by * self.step)
 
+    def coarser(self, nodes: int) -> "Grid":
+        """Return a grid of ``nodes`` nodes, at most as many as now, on the same interval."""
+        nodes = min(nodes, self.nodes)
+        return replace(self, step=self.step * (self.nodes - 1) / (nodes - 1), nodes=nodes)
+
 
 def position(t: Any, bend: Any, xp: ModuleType = jnp) -> Any:
     """Return u at t."""

@@ -11,6 +11,7 @@ from capsule_id.experiments.emulator import Emulator
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import ensembles, moves
+from capsule_id.inference.sampling.emulation import Emulation, Known, Places
 from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
 from capsule_id.inference.sampling.ensembles import DELAYED, sample
 from capsule_id.inference.sampling.proposal import block_proposal
@@ -47,7 +48,7 @@ def test_a_wrong_emulator_does_not_change_the_posterior(monkeypatch: pytest.Monk
 
     # Negative control: proposals are accepted without regard to the density that they come from.
     accept = moves.accept
-    monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:3], np.zeros_like(args[3]), args[4]))
+    monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:4], np.zeros_like(args[4]), args[5]))
     assert np.max(np.abs(scores(draw().draws, Gaussian(MEAN, SIGMA)))) > LIMIT
 
 
@@ -79,18 +80,18 @@ def test_the_posterior_of_a_progression_is_emulated_near_its_draws(tmp_path: Pat
     fit = PointFit(target.names, u, {}, np.diag(sd**2), {}, none, none, np.zeros(1), *flags)
     exact = MarginalPosterior(target, fit)
     assert exact.can_be_emulated
-    v = exact.centre + np.random.default_rng(0).standard_normal((340, exact.dimension)) * sd[: exact.dimension]
+    v = exact.centre + np.random.default_rng(0).standard_normal((640, exact.dimension)) * sd[: exact.dimension]
     (motions,) = exact.motions(v)
-    emulated = exact.emulated(v[:300], [motions[:300]])
+    emulated = exact.emulated(v[:600], [motions[:600]])
     (e,) = emulated.target.experiments
     emulator = cast(Emulator, cast(Progression, e).emulator)
     assert {"k1", "mu", "P_on", "lag", "session_sd"} <= set(emulator.symbols)
     assert not {"trial_scatter", "trial_sd", "discrepancy", "g"} & set(emulator.symbols)
     # The exact density is untouched, and no longer that of the emulator.
-    known, found = exact.parts(v[300:]), emulated.parts(v[300:])
+    known, found = exact.parts(v[600:]), emulated.parts(v[600:])
     assert not np.array_equal(known, found)
     assert np.std(found - known) < 0.1 * np.std(known)
-    assert np.std(exact.emulated(v[:300], [motions[:300][::-1]]).parts(v[300:]) - known) > 0.5 * np.std(known)
+    assert np.std(exact.emulated(v[:600], [motions[:600][::-1]]).parts(v[600:]) - known) > 0.5 * np.std(known)
 
 
 def test_a_place_without_emulated_density_stays() -> None:
@@ -105,3 +106,16 @@ def test_a_place_without_emulated_density_stays() -> None:
     start = initial_state(proposal.draw(random, 8), random)
     ensemble = Ensemble(exact.parts, start, [(moves.DelayedMove(nowhere, proposal, 2), 1.0)]).run(3)
     np.testing.assert_array_equal(ensemble.state.coords, start.coords)
+
+
+def test_draws_go_on_from_the_start() -> None:
+    """As many as wanted, of the emulated density; the first ones are the start."""
+    target = Gaussian(MEAN, SIGMA, BLOCKS)
+    random = np.random.RandomState(0)
+    proposal = block_proposal(target.blocks, MEAN, SIGMA)
+    start = Places(random.multivariate_normal(MEAN, SIGMA, 500))
+    found = Emulation(target, Known(start.v, []), proposal, start).draw(1200, random)
+    assert found.shape == (1200, 3)
+    np.testing.assert_array_equal(found[:500], start.v)
+    assert not np.any(np.all(found[500:1000] == start.v, axis=1))
+    np.testing.assert_allclose(np.cov(found[500:].T), SIGMA, atol=0.25)
