@@ -15,6 +15,8 @@ from jaxtyping import Float
 
 #: Number of features, correlation length in sds of the training inputs, and ridge penalty of a weight.
 FEATURES, LENGTH, RIDGE = 3000, 8.0, 1e-3
+#: Rows of a block of the normal equations.
+ROWS = 2048
 #: Degrees of freedom of the random frequencies: twice the smoothness of the kernel.
 FREEDOM = 5.0
 
@@ -57,8 +59,13 @@ class Emulator(eqx.Module):
         spread = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, FEATURES)) / LENGTH
         self.frequencies = spread * rng.standard_normal((x.shape[1], FEATURES))
         self.phases = rng.uniform(0.0, 2.0 * np.pi, FEATURES)
-        f = self._features(x, np)
-        self.weights = np.linalg.solve(f.T @ f + RIDGE * np.eye(f.shape[1]), f.T @ y)
+        size = FEATURES + 1 + x.shape[1]
+        square, product = RIDGE * np.eye(size), np.zeros((size, y.shape[1]))
+        for i in range(0, len(x), ROWS):  # all rows at once would need gigabytes
+            f = self._features(x[i : i + ROWS], np)
+            square += f.T @ f
+            product += f.T @ y[i : i + ROWS]
+        self.weights = np.linalg.solve(square, product)
 
     def __call__(self, theta: Mapping[str, Any]) -> Any:
         """Motions (k,) at parameters by symbol, () each."""

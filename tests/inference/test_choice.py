@@ -54,10 +54,11 @@ def joint_density(e: Progression) -> float:
 def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
     """p(y_b | y_rest) = p(y) / p(y_rest); the rest is also the experiment without the setting."""
     (e,) = cast(list[Progression], make_experiments(rig))
-    found = conditional_densities(e, [THETA, THETA])
+    found, motions = conditional_densities(e, [THETA, THETA]), e.motions_of_draws([THETA])
     for setting in range(len(e.settings)):
         smaller = e.without(setting)
         assert smaller.n == e.n - 3
+        np.testing.assert_allclose(e.motions_without(motions, setting), smaller.motions_of_draws([THETA]), rtol=1e-9)
         np.testing.assert_allclose(found[:, setting], joint_density(e) - joint_density(smaller), rtol=1e-6)
 
 

@@ -297,7 +297,7 @@ class Progression(TrialsExperiment):
         session = self.session[kept]
         session = session[:, session.any(axis=0)]
         return eqx.tree_at(
-            lambda e: (e.distance, e.settings, e.setting, e.session, e.groups, e.time),
+            lambda e: (e.distance, e.settings, e.setting, e.session, e.groups, e.time, e.emulator),
             self,
             (
                 distance,
@@ -306,7 +306,9 @@ class Progression(TrialsExperiment):
                 session,
                 TrialGroups(distance, membership, session),
                 np.delete(self.time, setting),
+                None,
             ),
+            is_leaf=lambda x: x is None,
         )
 
     def motions_without(self, motions: np.ndarray, setting: int) -> np.ndarray:

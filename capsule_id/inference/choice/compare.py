@@ -189,7 +189,7 @@ def _fit_variant(rig: Rig, registry: Registry, seed: int) -> _Variant:
     draws = weighted_draws(target, joint_fit(target, {}, seed), seed)
     rng = np.random.default_rng(seed)
     evidence, errors = np.array([log_evidence(block, rng) for block in draws.log_weight.T]).T
-    evidence, errors = evidence + draws.log_size[0], np.hypot(errors, draws.log_size[1])
+    evidence, errors = evidence + draws.log_normalisation[0], np.hypot(errors, draws.log_normalisation[1])
     return _Variant(
         target.dimension,
         draws,

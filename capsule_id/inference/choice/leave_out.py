@@ -19,13 +19,13 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.inference.choice.evidence import log_evidence
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.sampling.emulation import Emulation, Known, emulation
+from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, emulation
 from capsule_id.inference.sampling.ensembles import adapted_proposal, laplace_proposal
 from capsule_id.inference.sampling.proposal import BlockProposal
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior, trials_of
 
-#: Draws of a proposal, and of an emulated posterior, whose weights are more equal.
+#: Draws of a proposal; draws of an emulated posterior, fewer because their weights vary less.
 DRAWS, EMULATED_DRAWS = 4096, 2048
 #: Importance weights with a larger Pareto shape are not reliable.
 LARGEST_SHAPE = 0.7
@@ -44,7 +44,7 @@ class WeightedDraws:
     target, fit : posterior, and the point fit that the adaptation began with
     drawn_from : the adapted proposal, or the emulated posterior
     log_weight : (n, blocks) log of posterior over the density drawn from, each block of parameters; -inf outside
-    log_size : (2, blocks) log of the integral of the density drawn from, and its standard error; 0 for a proposal
+    log_normalisation : (2, blocks) log of the integral of the density drawn from, and its standard error; 0 for a proposal
     block : block of each parameter by name
     inside, values : indices (m,) of the draws inside the posterior, and their values by name
     """
@@ -53,7 +53,7 @@ class WeightedDraws:
     fit: PointFit
     drawn_from: BlockProposal | Emulation
     log_weight: np.ndarray
-    log_size: np.ndarray
+    log_normalisation: np.ndarray
     block: Mapping[str, int]
     inside: np.ndarray
     values: list[dict[str, float]]
@@ -98,7 +98,11 @@ def psislw() -> Callable[[np.ndarray], tuple[Any, Any]]:
 
 
 def weighted_draws(
-    target: LogPosterior, fit: PointFit, seed: int, first: BlockProposal | None = None, known: Known | None = None
+    target: LogPosterior,
+    fit: PointFit,
+    seed: int,
+    first: BlockProposal | None = None,
+    known: ExactMotions | None = None,
 ) -> WeightedDraws:
     """Draws of a density near ``target``.
 
@@ -112,17 +116,20 @@ def weighted_draws(
         laplace, large = laplace_proposal(marginal)
         drawn_from = emulation(marginal, first or laplace, large, random, known)
         v = drawn_from.draw(EMULATED_DRAWS, random)
-        log_weight, log_size = marginal.parts(v) - drawn_from.target.parts(v), _log_size(drawn_from, random)
+        log_weight, log_normalisation = (
+            marginal.parts(v) - drawn_from.target.parts(v),
+            _log_normalisation(drawn_from, random),
+        )
     else:
         drawn_from = adapted_proposal(marginal, random, first)
         v, density = _known_draws(drawn_from, random)
-        log_weight, log_size = marginal.parts(v) - density, np.zeros((2, len(marginal.blocks)))
+        log_weight, log_normalisation = marginal.parts(v) - density, np.zeros((2, len(marginal.blocks)))
     inside = np.flatnonzero(np.all(np.isfinite(log_weight), axis=1))
     u, _ = marginal.restore(v[inside], seed)
     located = np.flatnonzero(~target.integrated)
     label = {target.names[i]: k for k, block in enumerate(marginal.blocks) for i in located[block]}
     values = [target.mapping(theta) for theta in target.theta(u)]
-    return WeightedDraws(target, fit, drawn_from, log_weight, log_size, label, inside, values)
+    return WeightedDraws(target, fit, drawn_from, log_weight, log_normalisation, label, inside, values)
 
 
 def _known_draws(proposal: BlockProposal, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +140,7 @@ def _known_draws(proposal: BlockProposal, random: np.random.RandomState) -> tupl
     return v, np.where(known, proposal.log_density(v), np.inf)
 
 
-def _log_size(emulated: Emulation, random: np.random.RandomState) -> np.ndarray:
+def _log_normalisation(emulated: Emulation, random: np.random.RandomState) -> np.ndarray:
     """(2, blocks) log-evidence of an emulated posterior and its standard error."""
     v, density = _known_draws(emulated.proposal, random)
     rng = np.random.default_rng(random.randint(2**31))
@@ -163,18 +170,18 @@ def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, s
     return min(tried, key=lambda one: one.shape)
 
 
-def _adapted(drawn_from: BlockProposal | Emulation) -> tuple[BlockProposal, Known | None]:
+def _adapted(drawn_from: BlockProposal | Emulation) -> tuple[BlockProposal, ExactMotions | None]:
     """What the next adaptation begins with."""
     return (drawn_from.proposal, drawn_from.known) if isinstance(drawn_from, Emulation) else (drawn_from, None)
 
 
-def _without(draws: WeightedDraws, e: TrialsExperiment, setting: int) -> tuple[BlockProposal, Known | None]:
+def _without(draws: WeightedDraws, e: TrialsExperiment, setting: int) -> tuple[BlockProposal, ExactMotions | None]:
     """What the adaptation to the posterior without one setting begins with."""
     first, known = _adapted(draws.drawn_from)
     if known is None:
         return first, None
     pairs = zip(trials_of(draws.target), known.motions, strict=True)
-    return first, Known(known.v, [e.motions_without(own, setting) if one is e else own for one, own in pairs])
+    return first, ExactMotions(known.v, [e.motions_without(own, setting) if one is e else own for one, own in pairs])
 
 
 def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws, power: float) -> LeftOut:

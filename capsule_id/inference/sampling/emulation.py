@@ -1,8 +1,9 @@
 """Emulation of a posterior whose motions take long: exact motions near the posterior, and emulators fitted to them.
 
 Each round adds exact motions about draws of the emulated posterior of the round before, so that the emulators learn where
-the posterior is. They do not see a part of it where an emulated density is far too small. The last rounds therefore draw
-by delayed acceptance, which leaves the emulated posterior, and from the wide proposal too. (J. A. Christen, C. Fox, *Markov
+the posterior is. An emulator whose density is far too small in some region gets no draws there, so that these rounds do not
+correct it. The last rounds therefore use walkers of delayed acceptance, which can enter such regions, and draws of the
+proposal, which has heavier tails. (J. A. Christen, C. Fox, *Markov
 chain Monte Carlo using an approximation*, Journal of Computational and Graphical Statistics 14, 2005, 795.)
 """
 
@@ -11,7 +12,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 
 from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
-from capsule_id.inference.sampling.moves import block_move, delayed_move
+from capsule_id.inference.sampling.moves import Moves, block_move, delayed_moves
 from capsule_id.inference.sampling.proposal import BlockProposal
 from capsule_id.inference.sampling.refinement import NO_MASS, effective_size, refined
 from capsule_id.inference.sampling.transport import LARGEST_MAP, Transported
@@ -24,9 +25,9 @@ STEPS = 40
 CHECKED, ENOUGH = 256, 0.6
 #: New places of exact motions near each draw of a round, and their distance from it in standard deviations of the draws.
 PLACES, NOISE = 2, 0.4
-#: Last rounds, their walkers, their steps of delayed acceptance, and the share of steps by differential evolution.
-LAST_ROUNDS, WALKERS, LAST_STEPS, OTHER = 2, 128, 15, 0.5
-#: Draws of the wide proposal count where the emulated log-posterior is at most this far below that of the walkers.
+#: Rounds of delayed acceptance, their walkers, their steps, and the share of steps by differential evolution.
+DELAYED_ROUNDS, WALKERS, DELAYED_STEPS, OTHER = 3, 128, 20, 0.5
+#: Draws of the proposal are kept if their emulated log-posterior is at most this far below the median of the walkers.
 FAR = 15.0
 #: Rounds that adapt the proposal to the emulated posterior of a later round, and maps that follow each of the last ones.
 AGAIN, MAPS = 3, 2
@@ -54,23 +55,23 @@ class Places(NamedTuple):
         return self.v[random.choice(len(self.v), size, replace=size > len(self.v))]
 
 
-class Known(NamedTuple):
+class ExactMotions(NamedTuple):
     """Exact motions (w, k) of every experiment with trials at v (w, d)."""
 
     v: np.ndarray
     motions: list[np.ndarray]
 
-    def more(self, target: Emulable, v: np.ndarray) -> "Known":
+    def more(self, target: Emulable, v: np.ndarray) -> "ExactMotions":
         """With the motions at further v (w, d)."""
         pairs = zip(self.motions, target.motions(v), strict=True)
-        return Known(np.concatenate([self.v, v]), [np.concatenate(pair) for pair in pairs])
+        return ExactMotions(np.concatenate([self.v, v]), [np.concatenate(pair) for pair in pairs])
 
 
 class Emulation(NamedTuple):
     """An emulated posterior, the motions that it knows, the proposal that is adapted to it, and draws of it."""
 
     target: Emulable
-    known: Known
+    known: ExactMotions
     proposal: BlockProposal
     start: Places
 
@@ -78,9 +79,8 @@ class Emulation(NamedTuple):
         """``number`` draws (w, d) of the emulated posterior, by chains that go on from ``start``."""
         found = [self.start.v]
         while sum(map(len, found)) < number:
-            state = initial_state(found[-1], random)
-            ensemble = Ensemble(self.target.parts, state, block_move(self.proposal)).run(STEPS, store=False)
-            found.append(ensemble.state.coords)
+            chain = _chain(self.target, found[-1], block_move(self.proposal), random)
+            found.append(chain.run(STEPS, store=False).state.coords)
         return np.concatenate(found)[:number]
 
 
@@ -89,7 +89,7 @@ def emulation(
     first: BlockProposal,
     large: list[bool],
     random: np.random.RandomState,
-    known: Known | None = None,
+    known: ExactMotions | None = None,
 ) -> Emulation:
     """Emulate ``target``.
 
@@ -104,7 +104,7 @@ def emulation(
     RuntimeError
         If hardly any draw has finite motions, or a finite log-density.
     """
-    adaptations, last_rounds = (None, LAST_ROUNDS) if known is None else (AGAIN, 0)
+    adaptations, last_rounds = (None, DELAYED_ROUNDS) if known is None else (AGAIN, 0)
     known, proposal = known or _first_motions(target, first, random), first
     for _ in range(ROUNDS):
         emulated = target.emulated(*known)
@@ -115,22 +115,25 @@ def emulation(
         known = known.more(target, np.concatenate([_around(drawn, random) for _ in range(PLACES)]))
         if np.any(np.isfinite(log_weight)) and effective_size(log_weight) >= ENOUGH * len(checked):
             break
+    walkers = drawn[np.all(np.isfinite(target.parts(drawn)), axis=1)][: max(WALKERS, 2 * drawn.shape[1])]
     for _ in range(last_rounds):
         emulated = target.emulated(*known)
         proposal, drawn = _follow(emulated, proposal, drawn, large, random)
-        known = known.more(target, _last_places(target, emulated, proposal, drawn, random))
+        moves = delayed_moves(emulated.parts, proposal, drawn, STEPS, OTHER)
+        walkers = _chain(target, walkers, moves, random).run(DELAYED_STEPS, store=False).state.coords
+        known = known.more(target, _last_places(emulated, proposal, walkers, random))
     emulated = target.emulated(*known)
     proposal, drawn = _follow(emulated, proposal, drawn, large, random)
     return Emulation(emulated, known, proposal, Places(drawn))
 
 
-def _first_motions(target: Emulable, first: BlockProposal, random: np.random.RandomState) -> Known:
+def _first_motions(target: Emulable, first: BlockProposal, random: np.random.RandomState) -> ExactMotions:
     v = first.draw(random, FIRST_DRAWS)
     v = v[np.all(np.isfinite(v), axis=1)]
     motions = target.motions(v)
     if any(np.sum(np.all(np.isfinite(own), axis=1)) < 2 * v.shape[1] for own in motions):
         raise RuntimeError(NO_MASS)
-    return Known(v, motions)
+    return ExactMotions(v, motions)
 
 
 def _draws(target: Emulable, proposal: BlockProposal, random: np.random.RandomState) -> np.ndarray:
@@ -140,21 +143,24 @@ def _draws(target: Emulable, proposal: BlockProposal, random: np.random.RandomSt
     v = v[np.all(np.isfinite(target.parts(v)), axis=1)][:DRAWS]
     if len(v) < 2 * v.shape[1]:
         raise RuntimeError(NO_MASS)
-    return Ensemble(target.parts, initial_state(v, random), block_move(proposal)).run(STEPS, store=False).state.coords
+    return _chain(target, v, block_move(proposal), random).run(STEPS, store=False).state.coords
+
+
+def _chain(target: Emulable, v: np.ndarray, moves: Moves, random: np.random.RandomState) -> Ensemble:
+    """Walkers at v (w, d). Each chain gets random numbers of its own: chains with the same ones come together."""
+    own = np.random.RandomState(random.randint(2**32, dtype=np.uint64))
+    return Ensemble(target.parts, initial_state(v, own), moves)
 
 
 def _around(v: np.ndarray, random: np.random.RandomState) -> np.ndarray:
-    """Draws v (w, d) with noise: an emulator must know what lies about its posterior, to give it its place."""
-    return v + NOISE * random.multivariate_normal(np.zeros(v.shape[1]), np.cov(v.T), len(v))
+    """Draws v (w, d) with normal noise: the emulator needs motions around the posterior too, not only inside it."""
+    return v + NOISE * random.multivariate_normal(np.zeros(v.shape[1]), np.atleast_2d(np.cov(v.T)), len(v))
 
 
 def _last_places(
-    target: Emulable, emulated: Emulable, proposal: BlockProposal, v: np.ndarray, random: np.random.RandomState
+    emulated: Emulable, proposal: BlockProposal, walkers: np.ndarray, random: np.random.RandomState
 ) -> np.ndarray:
-    """Places about walkers of ``target`` that began with draws v (w, d) of ``emulated``, and draws of ``proposal``."""
-    move = delayed_move(emulated.parts, proposal, STEPS, OTHER)
-    ensemble = Ensemble(target.parts, initial_state(v[:WALKERS], random), move).run(LAST_STEPS, store=False)
-    walkers = ensemble.state.coords
+    """Places about ``walkers`` (w, d) of delayed acceptance, and draws of the wide proposal."""
     wide = proposal.draw(random, 2 * DRAWS)
     wide = wide[np.all(np.isfinite(wide), axis=1)]
     least = np.median(np.sum(emulated.parts(walkers), axis=1)) - FAR
@@ -170,7 +176,7 @@ def _follow(
     Draws of a chain determine a map better than weighted draws: few of these hold most of the weight.
     """
     for _ in range(MAPS):
-        ensemble = Ensemble(target.parts, initial_state(v, random), block_move(proposal)).run(STEPS)
+        ensemble = _chain(target, v, block_move(proposal), random).run(STEPS)
         v = ensemble.state.coords
         drawn = np.concatenate([v, ensemble.chain[STEPS // 2]])
         equal = np.full(len(drawn), 1.0 / len(drawn))

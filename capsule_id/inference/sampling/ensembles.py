@@ -26,7 +26,7 @@ from capsule_id.inference.sampling.diagnostics import (
 )
 from capsule_id.inference.sampling.emulation import Places, emulation
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
-from capsule_id.inference.sampling.moves import Moves, block_move, delayed_move, other_moves
+from capsule_id.inference.sampling.moves import Moves, block_move, delayed_moves, other_moves
 from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
 from capsule_id.inference.sampling.refinement import NO_MASS, refined
 
@@ -201,7 +201,7 @@ def pilot(target: Target, seed: int) -> Schedule:
     if target.can_be_emulated:
         emulated = emulation(target, *laplace_proposal(target), random)
         begin, name = emulated.start, DELAYED
-        first = delayed_move(emulated.target.parts, emulated.proposal, DELAYED_STEPS)
+        first = delayed_moves(emulated.target.parts, emulated.proposal, begin.v, DELAYED_STEPS)
     else:
         proposal = adapted_proposal(target, random)
         begin, name, first = proposal, FIRST, block_move(proposal)
@@ -269,7 +269,7 @@ def _advance(samplers: Sequence[Ensemble], goal: int, thin: int) -> Iterator[int
 def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
     """Return one ensemble: burnt in from its own start, or resumed from ``backend``.
 
-    The starts are independent draws from the adapted proposal.
+    The starts are draws of the adapted proposal, or of the emulated posterior.
     """
     last = None if backend is None else backend.last_state()
     if last is not None:

@@ -8,6 +8,8 @@ import numpy as np
 
 from capsule_id.inference.sampling.proposal import BlockProposal
 
+#: Share of the delayed moves whose inner chain is a random walk, its number of steps, and a step in sds of the posterior.
+LOCAL, WALK, SHORT = 0.3, 5, 0.15
 #: emcee's moves with their weights.
 Moves = list[tuple[Any, float]]
 #: (w, d) -> (w, blocks), log-density of each block.
@@ -34,14 +36,16 @@ class BlockMove(emcee.moves.Move):
     """
 
     def __init__(self, proposal: BlockProposal) -> None:
-        self.proposal = proposal
+        self.proposal, self.blocks = proposal, proposal.blocks
+
+    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
+        return Walkers(coords, log_density(coords), self.proposal.log_density(coords))
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
-        log_density = _exact(model, self.proposal.blocks)
-        parts = _parts(state.blobs, self.proposal.blocks)
+        parts = _parts(state.blobs, self.blocks)
         before = Walkers(state.coords, parts, self.proposal.log_density(state.coords))
-        after, accepted = self.step(log_density, before, model.random)
+        after, accepted = self.step(_exact(model, self.blocks), before, model.random)
         return _state(state, after.coords, after.parts), np.mean(accepted, axis=1)
 
     def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
@@ -57,35 +61,61 @@ class BlockMove(emcee.moves.Move):
         return Walkers(coords, parts, np.where(accepted, proposed, before.proposed)), accepted
 
 
+class RandomWalk:
+    """Metropolis steps of all blocks of parameters, each accepted separately.
+
+    Parameters
+    ----------
+    blocks : indices of the parameters of each block
+    covariance : (d, d) of a step; only the blocks are used
+    """
+
+    def __init__(self, blocks: Sequence[np.ndarray], covariance: np.ndarray) -> None:
+        self.blocks = blocks
+        self._roots = [np.linalg.cholesky(covariance[np.ix_(block, block)]) for block in blocks]
+
+    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
+        parts = log_density(coords)
+        return Walkers(coords, parts, np.zeros_like(parts))
+
+    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
+        new = before.coords.copy()
+        for block, root in zip(self.blocks, self._roots, strict=True):
+            new[:, block] += random.standard_normal((len(new), len(block))) @ root.T
+        coords, parts, moved = accept(random, before, new, log_density(new), before.proposed, self.blocks)
+        return Walkers(coords, parts, before.proposed), moved
+
+
 class DelayedMove(emcee.moves.Move):
     """Delayed acceptance of all blocks of parameters (Christen & Fox 2005): proposals from an emulated posterior.
 
-    A step is a chain of ``steps`` block moves on the emulated posterior. The exact posterior accepts its end, or not.
+    A step is a chain of ``steps`` inner steps on the emulated posterior. The exact posterior accepts its end, or not.
     An error of the emulator costs acceptance only: the chain converges to the exact posterior.
 
     Parameters
     ----------
     emulated : (w, d) -> (w, blocks), emulated log-density of each block
-    proposal : see ``BlockMove``
+    inner : steps that leave the emulated posterior unchanged
     """
 
-    def __init__(self, emulated: Parts, proposal: BlockProposal, steps: int) -> None:
-        self.emulated, self.proposal, self.steps = emulated, proposal, steps
-        self._inner = BlockMove(proposal)
+    def __init__(self, emulated: Parts, inner: BlockMove | RandomWalk, steps: int) -> None:
+        self.emulated, self.inner, self.steps = emulated, inner, steps
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
-        blocks = self.proposal.blocks
-        begin = Walkers(state.coords, self.emulated(state.coords), self.proposal.log_density(state.coords))
-        with np.errstate(invalid="ignore"):  # a place without emulated density stays, until another move leaves it
+        blocks = self.inner.blocks
+        begin = self.inner.begin(self.emulated, state.coords)
+        with np.errstate(invalid="ignore"):  # a walker at the emulated density 0 stays, until another move takes it on
             end = begin
             for _ in range(self.steps):
-                end, _ = self._inner.step(self.emulated, end, model.random)
+                end, _ = self.inner.step(self.emulated, end, model.random)
             factors = begin.parts - end.parts
-        before = Walkers(state.coords, _parts(state.blobs, blocks), begin.proposed)
-        found = _exact(model, blocks)(end.coords)
-        coords, parts, accepted = accept(model.random, before, end.coords, found, factors, blocks)
-        return _state(state, coords, parts), np.mean(accepted, axis=1)
+            before = Walkers(state.coords, _parts(state.blobs, blocks), begin.proposed)
+            found = _exact(model, blocks)(end.coords)
+            coords, parts, accepted = accept(model.random, before, end.coords, found, factors, blocks)
+        moved = [np.any(end.coords[:, block] != begin.coords[:, block], axis=1) for block in blocks]
+        return _state(state, coords, parts), np.mean(accepted & np.stack(moved, axis=1), axis=1)
 
 
 def accept(
@@ -131,9 +161,23 @@ def block_move(proposal: BlockProposal) -> Moves:
     return [(BlockMove(proposal), 0.9), (emcee.moves.DEMove(), 0.1)]
 
 
-def delayed_move(emulated: Parts, proposal: BlockProposal, steps: int, other: float = 0.1) -> Moves:
-    """Delayed acceptance, with a share of ``other`` steps by differential evolution, which needs no emulator."""
-    return [(DelayedMove(emulated, proposal, steps), 1.0 - other), (emcee.moves.DEMove(), other)]
+def delayed_moves(emulated: Parts, proposal: BlockProposal, near: np.ndarray, steps: int, other: float = 0.1) -> Moves:
+    """Delayed acceptance by chains of ``steps`` block moves, and of short random walks, with some differential evolution.
+
+    A walker where the emulated density is too small rejects almost every distant proposal. The error of an emulator is
+    nearly the same at a place nearby, so that a short walk is accepted.
+
+    Parameters
+    ----------
+    near : (n, d) draws; the steps of a walk have a share of their covariance
+    other : share of steps by differential evolution, which needs no emulator
+    """
+    walk = RandomWalk(proposal.blocks, SHORT**2 * np.atleast_2d(np.cov(near.T)))
+    return [
+        (DelayedMove(emulated, BlockMove(proposal), steps), (1.0 - LOCAL) * (1.0 - other)),
+        (DelayedMove(emulated, walk, WALK), LOCAL * (1.0 - other)),
+        (emcee.moves.DEMove(), other),
+    ]
 
 
 def other_moves() -> dict[str, Moves]:

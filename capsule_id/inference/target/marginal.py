@@ -24,13 +24,22 @@ from capsule_id.inference.fit.curvature import BATCH, in_batches
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.compiling import COMPILE
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.quadrature import NODES, Grid, add_to_blocks, choose_grid, log_stretch, position
+from capsule_id.inference.target.quadrature import (
+    NO_MASS,
+    NODES,
+    Grid,
+    add_to_blocks,
+    choose_grid,
+    log_stretch,
+    position,
+)
 
 #: Smallest and largest distance from the point fit of the walkers that determine the nodes, in standard deviations.
 #: The largest is wide because few trials give the heavy tails of Student's t.
 NEAREST, FARTHEST = 0.5, 500.0
-#: Number of nodes of an emulated posterior: its errors are larger than those of the sums.
-EMULATED_NODES = 16
+#: Numbers of nodes to try for an emulated posterior, and the largest error of its log-integrals: those of the emulator are
+#: larger. They are compared at this number of places, where the log-density is at most ``NO_MASS`` below the best.
+EMULATED_NODES, EMULATED_ERROR, PLACES = (16, 32, 64, 128), 0.02, 512
 #: Largest distance where scatters act together: only one scatter is integrated out there, and motions far from the
 #: point fit take very many steps.
 FARTHEST_WITH_KINKS = 20.0
@@ -126,8 +135,17 @@ class MarginalPosterior:
         experiments = [emulated.get(e.label, e) for e in self.target.experiments]
         changed = copy(self)
         changed.target = LogPosterior(self.target.rig, experiments)
-        changed.grid = self.grid.coarser(EMULATED_NODES)
+        known = v[-PLACES:]
+        density = np.sum(changed.parts(known), axis=1)
+        known = known[density > np.max(density) - NO_MASS]
+        grids = [self.grid.coarser(nodes) for nodes in EMULATED_NODES]
+        changed.grid = next((grid for grid in grids if changed._agrees(grid, known)), self.grid)
         return changed
+
+    def _agrees(self, grid: Grid, v: np.ndarray) -> bool:
+        """Whether shifting the nodes by half their distance changes no log-integral by more than ``EMULATED_ERROR``."""
+        integral, shifted = self._terms(v, grid)[2], self._terms(v, grid.shifted(0.5))[2]
+        return bool(np.all(np.abs(integral - shifted) < EMULATED_ERROR))
 
     def _trials(self, v: np.ndarray) -> list[tuple[TrialsExperiment, list[ValuesBySymbol]]]:
         """Every experiment with trials, and its values by symbol at located u (w, dimension); scatters are 1."""

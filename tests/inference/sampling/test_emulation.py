@@ -1,5 +1,6 @@
 """Delayed acceptance: the exact density is sampled although the emulator is wrong; emulators of a progression."""
 
+from copy import copy
 from pathlib import Path
 from typing import cast
 
@@ -11,7 +12,7 @@ from capsule_id.experiments.emulator import Emulator
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import ensembles, moves
-from capsule_id.inference.sampling.emulation import Emulation, Known, Places
+from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, Places
 from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
 from capsule_id.inference.sampling.ensembles import DELAYED, sample
 from capsule_id.inference.sampling.proposal import block_proposal
@@ -50,6 +51,19 @@ def test_a_wrong_emulator_does_not_change_the_posterior(monkeypatch: pytest.Monk
     accept = moves.accept
     monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:4], np.zeros_like(args[4]), args[5]))
     assert np.max(np.abs(scores(draw().draws, Gaussian(MEAN, SIGMA)))) > LIMIT
+
+
+def test_short_walks_keep_the_exact_posterior() -> None:
+    """Alone, with the wrong emulator. Negative control: the emulated posterior itself."""
+    wrong, exact = Emulable(MEAN, SIGMA, BLOCKS).emulated(np.empty((0, 3)), [np.empty((0, 1))]), Gaussian(MEAN, SIGMA, BLOCKS)
+    random = np.random.RandomState(0)
+    start = initial_state(random.multivariate_normal(MEAN, SIGMA, 64), random)
+    walk = moves.RandomWalk(BLOCKS, 0.5 * SIGMA)
+    for density, agrees in ((exact, True), (wrong, False)):
+        ensemble = Ensemble(density.parts, start, [(moves.DelayedMove(wrong.parts, walk, 4), 1.0)]).run(3000)
+        four = np.stack(np.split(ensemble.chain, 4, axis=1))
+        assert (np.max(np.abs(scores(four, exact))) < LIMIT) == agrees
+        assert 0.2 < np.mean(ensemble.acceptance) <= 1.0
 
 
 def test_an_emulator_follows_a_function_and_leaves_out_what_is_not_known() -> None:
@@ -91,6 +105,12 @@ def test_the_posterior_of_a_progression_is_emulated_near_its_draws(tmp_path: Pat
     known, found = exact.parts(v[600:]), emulated.parts(v[600:])
     assert not np.array_equal(known, found)
     assert np.std(found - known) < 0.1 * np.std(known)
+    # Its sums have fewer nodes, not too few.
+    fine, coarse = copy(emulated), copy(emulated)
+    fine.grid, coarse.grid = exact.grid, exact.grid.coarser(5)
+    assert emulated.grid.nodes < exact.grid.nodes
+    assert np.max(np.abs(fine.parts(v[600:]) - found)) < 0.02
+    assert np.max(np.abs(coarse.parts(v[600:]) - found)) > 0.02
     assert np.std(exact.emulated(v[:600], [motions[:600][::-1]]).parts(v[600:]) - known) > 0.5 * np.std(known)
 
 
@@ -104,7 +124,7 @@ def test_a_place_without_emulated_density_stays() -> None:
     random = np.random.RandomState(0)
     proposal = block_proposal(exact.blocks, MEAN, SIGMA)
     start = initial_state(proposal.draw(random, 8), random)
-    ensemble = Ensemble(exact.parts, start, [(moves.DelayedMove(nowhere, proposal, 2), 1.0)]).run(3)
+    ensemble = Ensemble(exact.parts, start, [(moves.DelayedMove(nowhere, moves.BlockMove(proposal), 2), 1.0)]).run(3)
     np.testing.assert_array_equal(ensemble.state.coords, start.coords)
 
 
@@ -114,8 +134,11 @@ def test_draws_go_on_from_the_start() -> None:
     random = np.random.RandomState(0)
     proposal = block_proposal(target.blocks, MEAN, SIGMA)
     start = Places(random.multivariate_normal(MEAN, SIGMA, 500))
-    found = Emulation(target, Known(start.v, []), proposal, start).draw(1200, random)
-    assert found.shape == (1200, 3)
+    found = Emulation(target, ExactMotions(start.v, []), proposal, start).draw(1500, random)
+    assert found.shape == (1500, 3)
     np.testing.assert_array_equal(found[:500], start.v)
-    assert not np.any(np.all(found[500:1000] == start.v, axis=1))
+    # Successive chains have random numbers of their own.
+    first, second = found[500:1000], found[1000:]
+    assert not np.any(np.all(first == second, axis=1))
+    assert np.max(np.abs([np.corrcoef(a, b)[0, 1] for a, b in zip(first.T, second.T, strict=True)])) < 0.2
     np.testing.assert_allclose(np.cov(found[500:].T), SIGMA, atol=0.25)
