@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 
 import nbformat
@@ -34,7 +35,10 @@ SHORT = {
     "06": "RUNS, SAMPLES = (1,), 1000",
     "07": "K2_POINTS, F_POINTS, P_D_POINTS = 55, 17, 31",
     "08": "DRAWS, POINTS = 100, 16",
+    "09": 'SETTINGS, ESS, WORDS = 5, 1000, ["lag"]',
 }
+#: A short study ends before the first cell with this tag, whose smallest version takes minutes.
+LONG = "minutes"
 #: Chapters that compile large programs and run them for milliseconds: their short studies are not optimised.
 NOT_OPTIMISED = {"06"}
 #: First cell in a kernel that has run another notebook.
@@ -150,8 +154,9 @@ def running_kernel(folder: Path) -> Iterator[AsyncKernelManager]:
 
 
 def run_short(name: str, folder: Path, kernel: AsyncKernelManager) -> None:
-    """A notebook with a smaller study runs to the end, with all figures and without warnings."""
+    """A notebook with a smaller study runs to its end or to its first ``LONG`` cell, with all figures, without warnings."""
     notebook = read(name)
+    notebook.cells = list(takewhile(lambda cell: LONG not in cell.metadata.get("tags", []), notebook.cells))
     if name[:2] in SHORT:
         shorten(notebook, SHORT[name[:2]])
     kept = figures(notebook)

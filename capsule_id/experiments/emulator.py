@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 #: Number of features, correlation length in sds of the training inputs, and ridge penalty of a weight.
-FEATURES, LENGTH, RIDGE = 3000, 8.0, 1e-3
+FEATURES, LENGTH, RIDGE = 2000, 8.0, 1e-3
 #: Rows of a block of the normal equations.
 ROWS = 2048
 #: Degrees of freedom of the random frequencies: twice the smoothness of the kernel.

@@ -26,7 +26,7 @@ CHECKED, ENOUGH = 256, 0.6
 #: New places of exact motions near each draw of a round, and their distance from it in standard deviations of the draws.
 PLACES, NOISE = 2, 0.4
 #: Rounds of delayed acceptance, their walkers, their steps, and the share of steps by differential evolution.
-DELAYED_ROUNDS, WALKERS, DELAYED_STEPS, OTHER = 3, 128, 20, 0.5
+DELAYED_ROUNDS, WALKERS, DELAYED_STEPS, OTHER = 2, 128, 20, 0.5
 #: Draws of the proposal are kept if their emulated log-posterior is at most this far below the median of the walkers.
 FAR = 15.0
 #: Rounds that adapt the proposal to the emulated posterior of a later round, and maps that follow each of the last ones.

@@ -153,7 +153,7 @@ def _parts(blobs: Any, blocks: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _state(before: emcee.State, coords: np.ndarray, parts: np.ndarray) -> emcee.State:
-    return emcee.State(coords, log_prob=np.sum(parts, axis=1), blobs=parts.reshape(np.shape(before.blobs)))
+    return emcee.State(coords, log_prob=np.sum(parts, axis=1), blobs=parts.reshape(np.asarray(before.blobs).shape))
 
 
 def block_move(proposal: BlockProposal) -> Moves:

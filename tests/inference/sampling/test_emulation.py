@@ -55,7 +55,10 @@ def test_a_wrong_emulator_does_not_change_the_posterior(monkeypatch: pytest.Monk
 
 def test_short_walks_keep_the_exact_posterior() -> None:
     """Alone, with the wrong emulator. Negative control: the emulated posterior itself."""
-    wrong, exact = Emulable(MEAN, SIGMA, BLOCKS).emulated(np.empty((0, 3)), [np.empty((0, 1))]), Gaussian(MEAN, SIGMA, BLOCKS)
+    wrong, exact = (
+        Emulable(MEAN, SIGMA, BLOCKS).emulated(np.empty((0, 3)), [np.empty((0, 1))]),
+        Gaussian(MEAN, SIGMA, BLOCKS),
+    )
     random = np.random.RandomState(0)
     start = initial_state(random.multivariate_normal(MEAN, SIGMA, 64), random)
     walk = moves.RandomWalk(BLOCKS, 0.5 * SIGMA)
