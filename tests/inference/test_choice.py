@@ -19,10 +19,13 @@ from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_
 from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
 from capsule_id.inference.choice.variants import variants_of
 from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, Places
+from capsule_id.inference.sampling.proposal import block_proposal
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import density_of
 from capsule_id.rig.model import ModelChoices, Rig
 from tests.experiments import bench
+from tests.inference.stub import Gaussian
 from tests.inference.three_settings import THETA, three_settings
 
 
@@ -230,6 +233,32 @@ def test_the_evidence_of_a_bench_test_is_that_of_quadrature() -> None:
     exact = total - density(fit.u[None])[0]
     found, errors = np.array([log_evidence(own, rng) for own in draws.log_weight.T]).T
     assert np.sum(found) == pytest.approx(exact, abs=4.0 * np.linalg.norm(errors) + 0.01)
+
+
+def test_the_evidence_of_an_emulated_posterior_is_that_of_the_closed_form() -> None:
+    """The integral of each block; the density at the mean stands for its unknown constant."""
+    mean, sigma, blocks = np.array([1.0, -2.0, 0.5]), np.diag([1.0, 2.0, 0.5]), [np.array([0, 1]), np.array([2])]
+    target = Gaussian(mean, sigma, blocks)
+    wide = block_proposal(blocks, mean + 0.3, 1.5 * sigma)
+    emulated = Emulation(cast(Any, target), ExactMotions(mean[None], []), wide, Places(mean[None]))
+    value, error = leave_out._log_normalisation(emulated, np.random.RandomState(0))
+    sizes = np.array([0.5 * np.linalg.slogdet(2.0 * np.pi * sigma[np.ix_(b, b)])[1] for b in blocks])
+    assert np.all(error < 0.05)
+    assert np.all(np.abs(value - target.parts(mean[None])[0] - sizes) < 4.0 * np.maximum(error, 0.01))
+
+
+def test_motions_that_are_known_serve_a_setting_left_out(rig: Rig) -> None:
+    """The refit begins with the motions of all other settings and the proposal of all."""
+    target = LogPosterior(rig, make_experiments(rig))
+    (e,) = target.experiments
+    motions = np.arange(12.0).reshape(2, 6)
+    nothing = cast(Any, None)
+    emulated = Emulation(nothing, ExactMotions(np.zeros((2, 3)), [motions]), cast(Any, "proposal"), nothing)
+    draws = replace(readings_and_draws(3)[1], target=target, drawn_from=emulated)
+    first, known = leave_out._without(draws, cast(Progression, e), 1)
+    assert first == "proposal"
+    assert known is not None
+    np.testing.assert_array_equal(known.motions[0], motions[:, [0, 2, 3, 5]])
 
 
 def test_no_evidence_where_few_draws_are_inside() -> None:
