@@ -257,8 +257,7 @@ def test_motions_that_are_known_serve_a_setting_left_out(rig: Rig) -> None:
     draws = replace(readings_and_draws(3)[1], target=target, drawn_from=emulated)
     first, known = leave_out._without(draws, cast(Progression, e), 1)
     assert first == "proposal"
-    assert known is not None
-    np.testing.assert_array_equal(known.motions[0], motions[:, [0, 2, 3, 5]])
+    np.testing.assert_array_equal(cast(ExactMotions, known).motions[0], motions[:, [0, 2, 3, 5]])
 
 
 def test_no_evidence_where_few_draws_are_inside() -> None:

@@ -202,8 +202,7 @@ def test_the_release_is_found_after_rest(held: bool) -> None:
 
 def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
     for make in (decay, encoder):
-        found = find_free_decay(TIME, make())
-        assert found is not None
+        found = cast(FreeDecay, find_free_decay(TIME, make()))
         assert (found.start, found.rest, found.stop) == (0.0, 0.0, None)
 
 
@@ -217,17 +216,14 @@ def pushed(slowing: float, release: float = 0.3 * PERIOD) -> np.ndarray:
 @pytest.mark.parametrize("slowing", [1.0, 1.4])
 def test_a_slow_push_to_the_first_turning_point_is_no_free_decay(slowing: float) -> None:
     time, values = TIME[:800], pushed(slowing)
-    found = find_free_decay(time, values, displacement=True)
-    assert found is not None
+    found = cast(FreeDecay, find_free_decay(time, values, displacement=True))
     assert found.pushed
     assert found.rest == found.start == pytest.approx(0.3 * PERIOD * slowing, abs=0.05 * PERIOD)
     inside = time >= found.start
-    again = find_free_decay(time[inside], values[inside], displacement=True)
-    assert again is not None
+    again = cast(FreeDecay, find_free_decay(time[inside], values[inside], displacement=True))
     assert (again.pushed, again.rest) == (False, 0.0)
     # Velocities and accelerations do not show it.
-    other = find_free_decay(time, values)
-    assert other is not None
+    other = cast(FreeDecay, find_free_decay(time, values))
     assert not other.pushed
 
 
@@ -241,8 +237,7 @@ def test_a_decay_recorded_from_any_phase_is_not_pushed() -> None:
             x = rubbed(time + rng.uniform(0.0, PERIOD), forces, 2e-3, 0.0, 40).x_rel
             rho = rng.choice([0.0, 0.9, 0.98])
             noise = np.asarray(signal.lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time))))
-            free = find_free_decay(time, np.asarray(x) + 4e-5 * noise, displacement=True)
-            assert free is not None
+            free = cast(FreeDecay, find_free_decay(time, np.asarray(x) + 4e-5 * noise, displacement=True))
             found += free.pushed
     assert found == 0
 
@@ -252,19 +247,17 @@ def test_a_drift_of_the_zero_is_no_rest() -> None:
     time = TIME[::4]
     noise = 0.02 * np.random.default_rng(0).standard_normal(len(time))
     for size in (-0.4, 0.4):
-        found = find_free_decay(time, released(time, 2.0, c=1.0) + size * np.exp(-4.0 * time) + noise)
-        assert found is not None
+        found = cast(FreeDecay, find_free_decay(time, released(time, 2.0, c=1.0) + size * np.exp(-4.0 * time) + noise))
         assert (found.start, found.rest) == (0.0, 0.0)
 
 
 def test_a_second_excitation_ends_the_decay() -> None:
     values = np.concatenate([decay(1)[:500], decay(2)])
     time = np.arange(len(values)) / RATE
-    found = find_free_decay(time, values)
-    assert found is not None
-    assert found.stop is not None
-    assert 0.25 - PERIOD <= found.stop <= 0.25 + 0.1 * PERIOD
-    inside = time <= found.stop
+    found = cast(FreeDecay, find_free_decay(time, values))
+    stop = cast(float, found.stop)
+    assert 0.25 - PERIOD <= stop <= 0.25 + 0.1 * PERIOD
+    inside = time <= stop
     again = cast(FreeDecay, find_free_decay(time[inside], values[inside]))
     assert again.stop is None
 
@@ -338,7 +331,6 @@ def test_a_noisy_place_is_no_jump(seed: int) -> None:
     values = np.exp(-t / 1500.0) * np.cos(2.0 * np.pi * t / 100.0) + noise
     assert phase_jump(values, 100.0, alone=True) is None
     lost = np.delete(values, slice(2025, 2028))  # negative control
-    jump = jump_or_noise(lost, 100.0, alone=True)
-    assert jump is not None
+    jump = cast(Jump, jump_or_noise(lost, 100.0, alone=True))
     assert not jump.noisy
     assert abs(jump.row - 2025) < 25

@@ -116,10 +116,8 @@ def weighted_draws(
         laplace, large = laplace_proposal(marginal)
         drawn_from = emulation(marginal, first or laplace, large, random, known)
         v = drawn_from.draw(EMULATED_DRAWS, random)
-        log_weight, log_normalisation = (
-            marginal.parts(v) - drawn_from.target.parts(v),
-            _log_normalisation(drawn_from, random),
-        )
+        log_weight = marginal.parts(v) - drawn_from.target.parts(v)
+        log_normalisation = _log_normalisation(drawn_from, random)
     else:
         drawn_from = adapted_proposal(marginal, random, first)
         v, density = _known_draws(drawn_from, random)

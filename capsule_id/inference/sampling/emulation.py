@@ -26,7 +26,7 @@ CHECKED, ENOUGH = 256, 0.6
 #: New places of exact motions near each draw of a round, and their distance from it in standard deviations of the draws.
 PLACES, NOISE = 2, 0.4
 #: Rounds of delayed acceptance, their walkers, their steps, and the share of steps by differential evolution.
-DELAYED_ROUNDS, WALKERS, DELAYED_STEPS, OTHER = 2, 128, 20, 0.5
+DELAYED_ROUNDS, WALKERS, EXACT_STEPS, OTHER = 2, 128, 20, 0.5
 #: Draws of the proposal are kept if their emulated log-posterior is at most this far below the median of the walkers.
 FAR = 15.0
 #: Rounds that adapt the proposal to the emulated posterior of a later round, and maps that follow each of the last ones.
@@ -115,12 +115,12 @@ def emulation(
         known = known.more(target, np.concatenate([_around(drawn, random) for _ in range(PLACES)]))
         if np.any(np.isfinite(log_weight)) and effective_size(log_weight) >= ENOUGH * len(checked):
             break
-    walkers = drawn[np.all(np.isfinite(target.parts(drawn)), axis=1)][: max(WALKERS, 2 * drawn.shape[1])]
+    walkers = _inside(target, drawn)[: max(WALKERS, 2 * drawn.shape[1])] if last_rounds else drawn
     for _ in range(last_rounds):
         emulated = target.emulated(*known)
         proposal, drawn = _follow(emulated, proposal, drawn, large, random)
         moves = delayed_moves(emulated.parts, proposal, drawn, STEPS, OTHER)
-        walkers = _chain(target, walkers, moves, random).run(DELAYED_STEPS, store=False).state.coords
+        walkers = _chain(target, walkers, moves, random).run(EXACT_STEPS, store=False).state.coords
         known = known.more(target, _last_places(emulated, proposal, walkers, random))
     emulated = target.emulated(*known)
     proposal, drawn = _follow(emulated, proposal, drawn, large, random)
@@ -139,11 +139,16 @@ def _first_motions(target: Emulable, first: BlockProposal, random: np.random.Ran
 def _draws(target: Emulable, proposal: BlockProposal, random: np.random.RandomState) -> np.ndarray:
     """``DRAWS`` draws of ``target``: the last places of as many walkers that begin with draws of ``proposal``."""
     v = proposal.draw(random, 2 * DRAWS)
-    v = v[np.all(np.isfinite(v), axis=1)]
-    v = v[np.all(np.isfinite(target.parts(v)), axis=1)][:DRAWS]
+    v = _inside(target, v[np.all(np.isfinite(v), axis=1)])[:DRAWS]
+    return _chain(target, v, block_move(proposal), random).run(STEPS, store=False).state.coords
+
+
+def _inside(target: Emulable, v: np.ndarray) -> np.ndarray:
+    """Those of v (w, d) where the density of ``target`` is not 0, enough for the walkers of a chain."""
+    v = v[np.all(np.isfinite(target.parts(v)), axis=1)]
     if len(v) < 2 * v.shape[1]:
         raise RuntimeError(NO_MASS)
-    return _chain(target, v, block_move(proposal), random).run(STEPS, store=False).state.coords
+    return v
 
 
 def _chain(target: Emulable, v: np.ndarray, moves: Moves, random: np.random.RandomState) -> Ensemble:

@@ -29,6 +29,7 @@ from capsule_id.inference.target.quadrature import (
     NODES,
     Grid,
     add_to_blocks,
+    agree,
     choose_grid,
     log_stretch,
     position,
@@ -37,12 +38,12 @@ from capsule_id.inference.target.quadrature import (
 #: Smallest and largest distance from the point fit of the walkers that determine the nodes, in standard deviations.
 #: The largest is wide because few trials give the heavy tails of Student's t.
 NEAREST, FARTHEST = 0.5, 500.0
-#: Numbers of nodes to try for an emulated posterior, and the largest error of its log-integrals: those of the emulator are
-#: larger. They are compared at this number of places, where the log-density is at most ``NO_MASS`` below the best.
-EMULATED_NODES, EMULATED_ERROR, PLACES = (16, 32, 64, 128), 0.02, 512
 #: Largest distance where scatters act together: only one scatter is integrated out there, and motions far from the
 #: point fit take very many steps.
 FARTHEST_WITH_KINKS = 20.0
+#: Numbers of nodes to try for an emulated posterior, and the largest error of its log-integrals: the errors of the emulator
+#: are larger. Grids are compared at this number of places, where the log-density is at most ``NO_MASS`` below the best.
+EMULATED_NODES, EMULATED_ERROR, PLACES = (16, 32, 64, 128), 0.02, 512
 
 
 @dataclass(frozen=True)
@@ -137,15 +138,11 @@ class MarginalPosterior:
         changed.target = LogPosterior(self.target.rig, experiments)
         known = v[-PLACES:]
         density = np.sum(changed.parts(known), axis=1)
-        known = known[density > np.max(density) - NO_MASS]
+        mass = np.repeat((density >= np.max(density) - NO_MASS)[:, None], len(self._scatter), axis=1)
         grids = [self.grid.coarser(nodes) for nodes in EMULATED_NODES]
-        changed.grid = next((grid for grid in grids if changed._agrees(grid, known)), self.grid)
+        fine = (grid for grid in grids if agree(changed._terms, grid, known, mass, EMULATED_ERROR))
+        changed.grid = next(fine, self.grid)
         return changed
-
-    def _agrees(self, grid: Grid, v: np.ndarray) -> bool:
-        """Whether shifting the nodes by half their distance changes no log-integral by more than ``EMULATED_ERROR``."""
-        integral, shifted = self._terms(v, grid)[2], self._terms(v, grid.shifted(0.5))[2]
-        return bool(np.all(np.abs(integral - shifted) < EMULATED_ERROR))
 
     def _trials(self, v: np.ndarray) -> list[tuple[TrialsExperiment, list[ValuesBySymbol]]]:
         """Every experiment with trials, and its values by symbol at located u (w, dimension); scatters are 1."""

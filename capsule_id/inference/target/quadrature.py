@@ -101,7 +101,7 @@ def choose_grid(
     # Wright's omega solves t - exp(bend - t) = u: t = u + omega(bend - u).
     start, end = low + wrightomega(bend - low), high + wrightomega(bend - high)
     grids = [Grid(start, (end - start) / (nodes - 1), bend, nodes) for nodes in NODES]
-    return next((grid for grid in grids[:-1] if _agree(terms, grid, probes, mass)), grids[-1])
+    return next((grid for grid in grids[:-1] if agree(terms, grid, probes, mass)), grids[-1])
 
 
 def _windows(
@@ -137,7 +137,13 @@ def _windows(
     return low, core, low + width, posterior > posterior[0] - NO_MASS
 
 
-def _agree(terms: Terms, grid: Grid, probes: Float[np.ndarray, "w ..."], mass: Bool[np.ndarray, "w scatters"]) -> bool:
-    """Whether shifting the nodes by half their distance leaves every integral with posterior mass unchanged."""
+def agree(
+    terms: Terms,
+    grid: Grid,
+    probes: Float[np.ndarray, "w ..."],
+    mass: Bool[np.ndarray, "w scatters"],
+    tolerance: float = TOLERANCE,
+) -> bool:
+    """Whether shifting the nodes by half their distance leaves every log-integral with posterior mass unchanged."""
     integral, shifted = terms(probes, grid)[2][mass], terms(probes, grid.shifted(0.5))[2][mass]
-    return bool(np.all(np.abs(integral - shifted) < TOLERANCE + ROUNDING * np.abs(integral)))
+    return bool(np.all(np.abs(integral - shifted) < tolerance + ROUNDING * np.abs(integral)))
