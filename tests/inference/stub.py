@@ -71,11 +71,12 @@ class Gaussian:
     def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> "Gaussian":
         raise NotImplementedError
 
-    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Nothing was integrated out."""
-        del seed
-        flat = draws.reshape(-1, self.dimension)
-        return draws, np.sum(self.parts(flat), axis=1).reshape(draws.shape[:-1])
+    def factors(self, v: np.ndarray) -> np.ndarray:
+        """Nothing was integrated out: only the parts are kept."""
+        return self.parts(v)[..., None]
+
+    def whole(self, located: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return located, np.sum(factors[..., 0], axis=-1)
 
     def theta(self, u: np.ndarray) -> np.ndarray:
         return u

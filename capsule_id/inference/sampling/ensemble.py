@@ -4,7 +4,6 @@ emcee keeps the state of a run only in ``run_mcmc``. Saving after every draw req
 must keep its own state between calls.
 """
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from copy import copy
 from typing import Any
@@ -13,7 +12,7 @@ import emcee
 import h5py
 import numpy as np
 
-from capsule_id.inference.sampling.moves import Moves
+from capsule_id.inference.sampling.moves import Moves, Parts
 from capsule_id.interruption import stop_if_interrupted
 
 
@@ -22,19 +21,17 @@ class Ensemble:
 
     Parameters
     ----------
-    parts : (w, d) -> (w, blocks), the log-density of each block; their sum is the log-density
+    parts : log-density of each block, and what else is kept of it; the log-density is the sum over the blocks
     state : positions of the walkers and state of their random numbers
     moves : see ``capsule_id.inference.sampling.moves``
     backend : storage of the draws; None: in memory
     """
 
-    def __init__(
-        self, parts: Callable[[np.ndarray], np.ndarray], state: emcee.State, moves: Moves, backend: Any = None
-    ) -> None:
+    def __init__(self, parts: Parts, state: emcee.State, moves: Moves, backend: Any = None) -> None:
         def log_density(v: np.ndarray) -> np.ndarray:
-            """(w, 1 + blocks): log-density, then the blocks, which emcee stores as blobs for ``BlockMove``."""
-            found = parts(v)
-            return np.concatenate([np.sum(found, axis=1, keepdims=True), found], axis=1)
+            """(w, 1 + blocks k): log-density, then the parts, which emcee stores as blobs for ``BlockMove``."""
+            found = np.atleast_3d(parts(v))
+            return np.concatenate([np.sum(found[..., 0], axis=1, keepdims=True), found.reshape(len(v), -1)], axis=1)
 
         walkers, dimension = state.coords.shape
         self.state = state
@@ -53,6 +50,12 @@ class Ensemble:
     def chain(self) -> np.ndarray:
         """(draw, walker, d) stored draws."""
         return np.asarray(self._sampler.get_chain())
+
+    @property
+    def parts(self) -> np.ndarray:
+        """(draw, walker, blocks k) parts of the stored draws, in one axis."""
+        blobs = np.asarray(self._sampler.get_blobs())
+        return blobs.reshape(*blobs.shape[:2], -1)
 
     @property
     def acceptance(self) -> np.ndarray:

@@ -110,7 +110,9 @@ class Target(Protocol):
 
     def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
 
-    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]: ...
+    def factors(self, v: np.ndarray) -> np.ndarray: ...
+
+    def whole(self, located: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
     def theta(self, u: np.ndarray) -> np.ndarray: ...
 
@@ -135,7 +137,7 @@ def sample(
     """
     report = progress or (lambda done, total, text: None)
     report(0, 1, "pilot")
-    pilot_seed, restore_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 2))
+    pilot_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 1))
     schedule = pilot(target, pilot_seed)
     with nullcontext() if store is None else ChainStore(store, f"{target.fingerprint} {seed}") as chains:
         backends = [None if chains is None else chains.backend(f"ensemble_{i}") for i in range(ENSEMBLES)]
@@ -148,11 +150,9 @@ def sample(
                 if chains is not None:
                     chains.between_draws()
                 report(done, ENSEMBLES * goal, schedule.move)
-            located = np.stack([sampler.chain[:goal] for sampler in samplers])
-            if goal == last or _converged(located, ess):
-                draws, lp = _completed(target, located, restore_seed)
-                if _converged(draws, ess):
-                    break
+            draws, lp = _completed(target, samplers, goal)
+            if _converged(draws, ess):
+                break
         if chains is not None:
             chains.save()
         acceptance = np.stack([sampler.acceptance for sampler in samplers])
@@ -175,17 +175,14 @@ def sample(
     )
 
 
-def _completed(target: Target, located: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draws (ensemble, draw, walker, d) with scatters, and their log-posterior, from ``located`` draws.
+def _completed(target: Target, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first ``goal`` draws (ensemble, draw, walker, d) with scatters, and their log-posterior.
 
-    A walker that stays where it is keeps its scatters too: its chain is that of proposals which each bring a draw of
-    their scatters, accepted without regard to it.
+    Each proposal brings a draw of its scatters, which is accepted without regard to it.
     """
-    shape = located.shape[:-1]
-    places, index = np.unique(located.reshape(-1, located.shape[-1]), axis=0, return_inverse=True)
-    draws, lp = target.restore(places, seed)
-    index = index.reshape(shape)
-    return draws[index], lp[index]
+    located = np.stack([sampler.chain[:goal] for sampler in samplers])
+    factors = np.stack([sampler.parts[:goal] for sampler in samplers])
+    return target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
 
 
 def _converged(draws: np.ndarray, ess: float) -> bool:
@@ -273,12 +270,12 @@ def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend
     """
     last = None if backend is None else backend.last_state()
     if last is not None:
-        return Ensemble(target.parts, last, schedule.moves, backend)
+        return Ensemble(target.factors, last, schedule.moves, backend)
     start = _initial(target, schedule.start, np.random.RandomState(seed))
-    burnt_in = Ensemble(target.parts, start, schedule.moves).run(schedule.burn_in, store=False).state
+    burnt_in = Ensemble(target.factors, start, schedule.moves).run(schedule.burn_in, store=False).state
     if backend is not None:
         backend.reset(*start.coords.shape)
-    return Ensemble(target.parts, burnt_in, schedule.moves, backend)
+    return Ensemble(target.factors, burnt_in, schedule.moves, backend)
 
 
 def _initial(target: Target, density: BlockProposal | Places, random: np.random.RandomState) -> State:

@@ -12,12 +12,12 @@ from capsule_id.inference.sampling.proposal import BlockProposal
 LOCAL, WALK, SHORT = 0.3, 5, 0.15
 #: emcee's moves with their weights.
 Moves = list[tuple[Any, float]]
-#: (w, d) -> (w, blocks), log-density of each block.
+#: (w, d) -> (w, blocks), log-density of each block; or (w, blocks, k), log-density and what else is kept of each block.
 Parts = Callable[[np.ndarray], np.ndarray]
 
 
 class Walkers(NamedTuple):
-    """Walkers at coords (w, d), with the log-density of each block there and that of the proposal, (w, blocks) each."""
+    """Walkers at coords (w, d), with their ``Parts``, and the log-density of each block in the proposal, (w, blocks)."""
 
     coords: np.ndarray
     parts: np.ndarray
@@ -128,32 +128,35 @@ def accept(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Accept or refuse each block of the proposals ``new`` (w, d) by Metropolis–Hastings.
 
-    Return coordinates (w, d) and log-densities (w, blocks) after it, and which blocks are accepted, (w, blocks).
+    Return coordinates (w, d) and ``Parts`` after it, and which blocks are accepted, (w, blocks).
 
     Parameters
     ----------
-    new_parts : (w, blocks) log-density of each block at ``new``
+    new_parts : ``Parts`` at ``new``
     factors : (w, blocks) log of the proposal density of the old place over that of the new one
     """
-    accepted = np.log(random.uniform(size=factors.shape)) < new_parts - before.parts + factors
+    old, found = (np.reshape(parts, (*factors.shape, -1)) for parts in (before.parts, new_parts))
+    accepted = np.log(random.uniform(size=factors.shape)) < found[..., 0] - old[..., 0] + factors
     coords = before.coords.copy()
     for i, block in enumerate(blocks):
         coords[:, block] = np.where(accepted[:, i, None], new[:, block], coords[:, block])
-    return coords, np.where(accepted, new_parts, before.parts), accepted
+    parts = np.where(accepted[..., None], found, old)
+    return coords, parts.reshape(np.shape(new_parts)), accepted
 
 
 def _exact(model: Any, blocks: Sequence[np.ndarray]) -> Parts:
-    """The density that emcee samples, block by block."""
+    """The density that emcee samples, block by block, with what is kept."""
     return lambda v: _parts(model.compute_log_prob_fn(v)[1], blocks)
 
 
 def _parts(blobs: Any, blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """(w, blocks); emcee drops the axis where there is one block only."""
-    return np.reshape(blobs, (-1, len(blocks)))
+    """(w, blocks, k) from the form in which emcee stores it."""
+    return np.reshape(blobs, (len(blobs), len(blocks), -1))
 
 
 def _state(before: emcee.State, coords: np.ndarray, parts: np.ndarray) -> emcee.State:
-    return emcee.State(coords, log_prob=np.sum(parts, axis=1), blobs=parts.reshape(np.asarray(before.blobs).shape))
+    log_prob = np.sum(parts[..., 0], axis=1)
+    return emcee.State(coords, log_prob=log_prob, blobs=parts.reshape(np.asarray(before.blobs).shape))
 
 
 def block_move(proposal: BlockProposal) -> Moves:

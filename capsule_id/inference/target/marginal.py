@@ -2,8 +2,8 @@
 
 Each scatter belongs to the readings of one kind or one record. Given all other parameters the scatters are therefore
 independent, and each integral is one-dimensional. A sum over equidistant nodes in u = log(scatter) converges faster
-than any power of the node distance. The integrated posterior has light tails and few dimensions. Scatters are then
-drawn exactly from their conditional distributions: a node, drawn by weight, of a randomly shifted grid.
+than any power of the node distance. The integrated posterior has light tails and few dimensions. The same sums give an
+exact draw of the scatters from their conditional distributions: a node, drawn by weight, of a randomly shifted grid.
 """
 
 import hashlib
@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.families.friction_model import EQUATION_1
@@ -77,6 +78,7 @@ class MarginalPosterior:
     blocks : indices, among the located parameters, of each factor of the posterior
     centre, covariance : (dimension,), (dimension, dimension) Laplace approximation of u
     normal_priors : (2, dimension) centre and width of the prior of u where it is normal; NaN elsewhere
+    kept : (2, scatters) block of each scatter and its place among the scatters of that block, see ``factors``
     """
 
     def __init__(self, target: LogPosterior, fit: PointFit) -> None:
@@ -89,13 +91,17 @@ class MarginalPosterior:
         self.normal_priors = np.where(priors.lognormal, np.stack([priors.centre, priors.width]), np.nan)
         own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
         self.blocks = [block for block in own if len(block)]
+        # A scatter whose block has no located parameter depends on nothing: it is drawn with the first block.
+        own_block = np.where(self._label[self._scatter] < len(self.blocks), self._label[self._scatter], 0)
+        before = np.tril(own_block[:, None] == own_block, -1)
+        self.kept = np.stack([own_block, np.sum(before, axis=1)])
         self.grid = choose_grid(self._terms, fit.u[self._scatter], self._label[self._scatter], self._probes())
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of names, friction laws and all numbers of the density."""
+        """SHA-256 of names, friction laws, the layout of ``factors`` and all numbers of the density."""
         laws = {getattr(e, "friction", EQUATION_1).source for e in self.target.experiments}
-        digest = hashlib.sha256(repr((self.names, sorted(laws))).encode())
+        digest = hashlib.sha256(repr((self.names, sorted(laws), self.kept.tolist())).encode())
         for leaf in jax.tree.leaves(self.target):
             digest.update(np.ascontiguousarray(leaf).tobytes())
         return digest.hexdigest()
@@ -151,32 +157,58 @@ class MarginalPosterior:
         values = [self.target.mapping(theta) for theta in self.target.theta(u)]
         return [(e, [e.local(one) for one in values]) for e in trials_of(self.target)]
 
-    def restore(self, draws: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Complete located ``draws`` (..., dimension) with scatters: return u (..., d) and its log-posterior.
+    def factors(self, v: np.ndarray) -> np.ndarray:
+        """(w, blocks, 2 + k) of the located u (w, dimension), block by block, for the sampler.
+
+        Log-posterior; then one draw of the block's scatters: log-posterior with them, and their u. A place has always the
+        same draw, as if drawn at random: its random numbers are a hash of all its digits.
+        """
+        return self._drawn(v, uniform_at(v, 2 * len(self._scatter)))
+
+    def whole(self, located: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The whole u (..., d) and its log-posterior (...) from the located u (..., dimension) and their ``factors``."""
+        u = np.empty((*located.shape[:-1], len(self.names)))
+        block, place = self.kept
+        u[..., self._located], u[..., self._scatter] = located, factors[..., block, 2 + place]
+        return u, np.sum(factors[..., 1], axis=-1)
+
+    def restore(self, v: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Complete located ``v`` (w, dimension) with random draws of the scatters: return u (w, d) and its log-posterior."""
+        random = np.random.default_rng(seed).uniform(size=(len(v), 2 * len(self._scatter)))
+        return self.whole(v, self._drawn(v, random))
+
+    def _drawn(self, v: np.ndarray, random: np.ndarray) -> np.ndarray:
+        """``factors`` with two random numbers per scatter, (w, 2 scatters) in [0, 1).
 
         A scatter is a node, drawn by weight, of a randomly shifted grid. This draw is as exact as the sum over the
         nodes, because the sum does not depend on the shift.
         """
-        flat, scatters = draws.reshape(-1, self.dimension), len(self._scatter)
-        random = np.random.default_rng(seed).uniform(size=(len(flat), 2 * scatters))
-        grid = self.grid
+        grid, label, blocks = self.grid, self._label[self._scatter], len(self.blocks)
+        size = self._layout.blocks
 
         def one(rows: np.ndarray) -> np.ndarray:
-            """(BATCH, scatters + 1) scatters and log-posterior of rows: located u and 2 random numbers per scatter."""
-            v, shift, chance = np.split(rows, [self.dimension, self.dimension + scatters], axis=1)
+            """(BATCH, 2 size + scatters) log-posterior of each block without and with its scatters, and the scatters."""
+            v, shift, chance = np.split(rows, [self.dimension, self.dimension + len(label)], axis=1)
             shifted = grid.shifted(shift - 0.5)
-            known, terms, _ = self._terms(v, shifted)
+            known, terms, integrals = self._terms(v, shifted)
             sums = np.cumsum(np.exp(terms - np.max(terms, axis=-1, keepdims=True)), axis=-1)
             node = np.sum(sums < chance[..., None] * sums[..., -1:], axis=-1)
             t = shifted.start + node * grid.step
             chosen = np.take_along_axis(terms, node[..., None], axis=-1)[..., 0] - log_stretch(t, grid.bend, np)
-            total = np.sum(known, axis=1) + np.sum(chosen, axis=1)
-            return np.concatenate([position(t, grid.bend, np), total[:, None]], axis=1)
+            sums_by_block = [add_to_blocks(known, label, values) for values in (integrals, chosen)]
+            return np.concatenate([*sums_by_block, position(t, grid.bend, np)], axis=1)
 
-        restored = in_batches(one, np.concatenate([flat, random], axis=1))
-        u = np.empty((len(flat), len(self.names)))
-        u[:, self._located], u[:, self._scatter] = flat, restored[:, :-1]
-        return u.reshape(*draws.shape[:-1], -1), restored[:, -1].reshape(draws.shape[:-1])
+        parts, density, scatters = np.split(
+            in_batches(one, np.concatenate([v, random], axis=1)), [size, 2 * size], axis=1
+        )
+        block, place = self.kept
+        found = np.zeros((len(v), blocks, 2 + np.max(place, initial=-1) + 1))
+        # Blocks without located parameters add a constant to the density, and their scatters belong to the first.
+        found[:, :, 0] = np.where(np.isfinite(parts), parts, -np.inf)[:, :blocks]
+        found[:, :, 1] = density[:, :blocks]
+        found[:, 0, 1] += np.sum(density[:, blocks:], axis=1)
+        found[:, block, 2 + place] = scatters
+        return found
 
     def _terms(self, v: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Evaluate ``conditional`` at (w, dimension), in batches."""
@@ -202,6 +234,12 @@ class MarginalPosterior:
         farthest = FARTHEST_WITH_KINKS if kinked else FARTHEST
         radius = np.concatenate([[0.0], np.geomspace(NEAREST, farthest, BATCH - 1)])
         return self.centre + np.tile(radius, 2)[:, None] * direction @ np.linalg.cholesky(self.covariance).T
+
+
+def uniform_at(v: Float[np.ndarray, "w d"], number: int) -> Float[np.ndarray, "w number"]:
+    """Numbers uniform in [0, 1) that a place determines: bits of the hash of all its digits."""
+    hashes = b"".join(hashlib.shake_128(row.tobytes()).digest(8 * number) for row in v)
+    return (np.frombuffer(hashes, np.uint64).reshape(len(v), number) >> 11) * 2.0**-53
 
 
 def trials_of(target: LogPosterior) -> list[TrialsExperiment]:

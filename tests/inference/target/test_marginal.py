@@ -18,7 +18,7 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.inference.fit.curvature import BATCH, hessian, root_of_inverse
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior, conditional, density_of
+from capsule_id.inference.target.marginal import MarginalPosterior, conditional, density_of, uniform_at
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import Truth, synthesize
@@ -246,6 +246,29 @@ def test_nothing_to_integrate_out() -> None:
     marginal = MarginalPosterior(target, approximate(target, {"K": 2.0}))
     u = np.log(np.array([[1.9], [2.0], [2.1]]))
     np.testing.assert_allclose(marginal.batch(u), np.asarray(target.batch(jnp.asarray(u))), rtol=1e-13)
-    whole, lp = marginal.restore(u, 3)
+    whole, lp = marginal.whole(u, marginal.factors(u))
     np.testing.assert_array_equal(whole, u)
     np.testing.assert_allclose(lp, marginal.batch(u), rtol=1e-13)
+
+
+def test_factors_are_the_parts_with_a_draw_of_the_scatters(marginal: MarginalPosterior) -> None:
+    """Each place has one draw of its scatters, which differs from that of the next place."""
+    target, v = marginal.target, walkers(marginal, 64)
+    factors = marginal.factors(v)
+    np.testing.assert_allclose(factors[..., 0], marginal.parts(v), rtol=0.0, atol=LIMIT)
+    u, lp = marginal.whole(v, factors)
+    np.testing.assert_array_equal(u[:, ~target.scatter], v)
+    np.testing.assert_allclose(lp, np.asarray(target.batch(jnp.asarray(u))), rtol=0.0, atol=1e-7)
+    np.testing.assert_array_equal(marginal.factors(v[::-1]), factors[::-1])
+    assert len(np.unique(u[:, target.scatter], axis=0)) == len(v)
+
+
+def test_numbers_of_a_place_are_uniform_and_independent() -> None:
+    """Also where places differ in the last digit only; equal places have equal numbers."""
+    v = 1.0 + 2.0**-52 * np.arange(4000.0)[:, None]
+    found = uniform_at(np.hstack([v, v]), 3)
+    for column in found.T:
+        assert stats.kstest(column, "uniform").pvalue > 1e-3
+    pairs = np.corrcoef(np.hstack([found[:-1], found[1:]]), rowvar=False)
+    assert np.max(np.abs(pairs - np.eye(6))) < 4.0 / np.sqrt(4000.0)
+    np.testing.assert_array_equal(uniform_at(np.hstack([v, v])[7:8], 3), found[7:8])
