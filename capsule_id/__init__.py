@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from capsule_id.experiments.progression.twin import synthesize_robot as synthesize_robot
     from capsule_id.importing.entry import propose_entry as propose_entry
     from capsule_id.inference.choice.compare import compare_models as compare_models
+    from capsule_id.inference.choice.compare import compare_points as compare_points
     from capsule_id.motions.bias import smoothing_bias as smoothing_bias
     from capsule_id.motions.operating import draws_diagram as draws_diagram
     from capsule_id.motions.response import Response as Response
@@ -83,6 +84,7 @@ _MODULE_OF = {
     "CapsuleParameters": "capsule_id.physics.model",
     "compare": "capsule_id.api",
     "compare_models": "capsule_id.inference.choice.compare",
+    "compare_points": "capsule_id.inference.choice.compare",
     "continuation": "capsule_id.motions.sweep",
     "diagram": "capsule_id.motions.sweep",
     "draws_diagram": "capsule_id.motions.operating",

@@ -52,7 +52,7 @@ def test_help_is_quick_and_light(tmp_path: Path, name: str, words: tuple[str, ..
         (("a", "--seed", ""), "--seed"),
         (("a", "--max-steps", "0"), "--max-steps"),
         (("a", "--ess", "0"), "--ess"),
-        ((str(DATA), "--compare", "lag", "--no-sample", "--out", "x"), "remove --out, --no-sample"),
+        ((str(DATA), "--compare", "lag", "--json", "--out", "x"), "remove --out, --json"),
         ((str(DATA), "--compare", "lag", "--json", "--resume"), "remove --json, --resume"),
         ((str(DATA), "--compare", "lag", "--experiments", "bench", "--ess", "9"), "remove --experiments, --ess"),
         ((str(DATA), "--compare", "lag", "--max-steps", "9"), "remove --max-steps"),

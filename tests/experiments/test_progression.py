@@ -15,6 +15,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
+from capsule_id.experiments.progression.sessions import Sessions, parameters_of
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.displacement import displacement
@@ -41,7 +42,8 @@ def progression(folder: Path) -> Progression:
     return cast(Progression, experiment)
 
 
-THETA = {**ROBOT, "g": 9.81, **SCATTERS}
+#: The first session has two settings and is a parameter, the second has one.
+THETA = {**ROBOT, "g": 9.81, "session_1": 0.7, **SCATTERS}
 
 
 def plain_displacement(s: float, period: float, count: float) -> float:
@@ -56,14 +58,15 @@ def test_the_likelihood_is_that_of_correlated_normal_readings(folder: Path) -> N
     e = progression(folder)
     table = e.table
     sd = SCATTERS["session_sd"]
+    alone = table["session"] == 2.0
     ends = np.array(
         [
-            [plain_displacement(s, *row) for s in (sd, -sd)]
-            for row in zip(table["period"], table["periods"], strict=True)
+            [plain_displacement(s, period, count) for s in ((sd, -sd) if linear else 2 * (0.7 * sd,))]
+            for period, count, linear in zip(table["period"], table["periods"], alone, strict=True)
         ]
     )
     mean, slope = ends.mean(axis=1), 0.5 * (ends[:, 0] - ends[:, 1])
-    same_session = table["session"][:, None] == table["session"]
+    same_session = np.outer(alone, alone)
     same_setting = table["period"][:, None] == table["period"]
     time = table["period"] * table["periods"]
     noise = 5e-4**2 + SCATTERS["trial_sd"] ** 2 + (SCATTERS["trial_scatter"] * mean) ** 2
@@ -75,6 +78,11 @@ def test_the_likelihood_is_that_of_correlated_normal_readings(folder: Path) -> N
     assert e.profile(THETA)(SCATTERS) == pytest.approx(float(log_likelihood(THETA)), abs=1e-6)
     other = {**SCATTERS, "discrepancy": 1e-3}
     assert e.profile(THETA)(other) == pytest.approx(float(log_likelihood({**THETA, **other})), abs=1e-6)
+    # The motion is held linear in the sd of the sessions, and the logarithm of the density has a slope there.
+    other = {**SCATTERS, "session_sd": 0.065}
+    changed = float(log_likelihood({**THETA, **other}))
+    assert abs(changed - expected) > 0.05
+    assert e.profile(THETA)(other) == pytest.approx(changed, abs=0.2 * abs(changed - expected))
 
 
 @pytest.mark.parametrize("sessions", [1, 2, 5])
@@ -89,6 +97,7 @@ def test_sums_over_groups_give_the_density_of_the_trials(sessions: int) -> None:
     distance, mean, per_sd, disc = rng.normal(size=n), *rng.normal(size=(2, settings)), 0.3 * np.ones(settings)
     fixed = 0.01 + rng.uniform(size=settings) ** 2
     groups = TrialGroups(distance, setting, session)
+    own = np.unique(np.stack([b, j], axis=1), axis=0)[:, 0]
     assert groups.count.shape[0] == (4 if sessions == 5 else 1)
     shared = (b[:, None] == b) * 0.09 + (j[:, None] == j) * np.outer(per_sd[b], per_sd[b])
     expected = [
@@ -96,7 +105,7 @@ def test_sums_over_groups_give_the_density_of_the_trials(sessions: int) -> None:
         for row in scatters
     ]
     for xp in (np, jnp):
-        found = TrialMisfit(groups, mean, per_sd, fixed, disc).log_density(scatters, xp)
+        found = TrialMisfit(groups, mean[own], per_sd[own], fixed[own], disc[own]).log_density(scatters, xp)
         np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-11)
 
 
@@ -125,6 +134,31 @@ def test_without_a_column_a_session_is_a_block_of_equal_settings(folder: Path, t
     blocks = progression(tmp_path)
     np.testing.assert_array_equal(np.argmax(blocks.session, axis=1), [0, 0, 0, 1, 1, 1, 2, 2, 2, 3])
     assert blocks.setting.shape == (10, 3)
+    assert blocks.sessions.symbols == ()
+
+
+def test_a_session_with_several_settings_is_a_parameter() -> None:
+    """Two settings in session 3, one of them in session 1 too: cases, runs, and what a session changes."""
+    setting, session = np.eye(3)[[0, 0, 1, 2, 1]], np.eye(4)[[3, 1, 3, 0, 2]]
+    found = parameters_of(setting, session)
+    np.testing.assert_array_equal(found, [-1, -1, -1, 0])
+    sessions = Sessions(setting, session, found)
+    assert sessions.symbols == ("session_1",)
+    np.testing.assert_array_equal(sessions.setting, [0, 0, 1, 1, 2])
+    np.testing.assert_array_equal(np.argmax(sessions.rows, axis=1), [1, 0, 3, 4, 2])
+    theta = {"session_sd": 0.1, "session_1": -2.0}
+    np.testing.assert_allclose(sessions.log_friction(theta), [0.1, -0.2, 0.1, -0.2, 0.1, -0.1, -0.1, -0.1])
+    np.testing.assert_array_equal(sessions.setting_of_run, [0, 0, 1, 1, 2, 0, 1, 2])
+    mean, per_sd = sessions.responses(np.arange(8.0))
+    np.testing.assert_array_equal(mean, [2.5, 1.0, 4.0, 3.0, 5.5])
+    np.testing.assert_array_equal(per_sd, [-2.5, 0.0, -2.0, 0.0, -1.5])
+    # Trials share a session only where it enters linearly.
+    np.testing.assert_array_equal(sessions.linear @ sessions.linear.T, np.eye(5))
+    # No more parameters than there are rows for; the sessions with the most settings have them.
+    many = np.repeat(np.arange(10), 2)
+    crowded = np.append(many, 9)
+    found = parameters_of(np.eye(3)[np.append(np.tile([0, 1], 10), 2)], np.eye(10)[crowded])
+    np.testing.assert_array_equal(found, [0, 1, 2, 3, 4, 5, 6, -1, -1, 7])
 
 
 def test_the_sampler_integrates_the_absolute_scatter_alone(folder: Path) -> None:
@@ -160,7 +194,13 @@ def test_a_fault_is_named_and_its_remedy_works(
 def test_the_discrepancy_is_compared_with_scatter_and_motion(folder: Path, relative: float, level: str) -> None:
     e = progression(folder)
     rms = float(np.sqrt(np.mean((e.distance / (e.setting @ e.time)) ** 2)))
-    values = {**ROBOT, **SCATTERS, "trial_sd[progression]": 1e-3, "discrepancy[progression]": relative * rms}
+    values = {
+        **ROBOT,
+        **SCATTERS,
+        "session_1[progression]": 0.7,
+        "trial_sd[progression]": 1e-3,
+        "discrepancy[progression]": relative * rms,
+    }
     (finding,) = check_discrepancy([e], cast(Any, SimpleNamespace(values={**values, "g": 9.81}, draws=[])))
     assert (finding.code, finding.level, finding.experiment) == ("progression.discrepancy", level, e.label)
     assert finding.facts["size"] == pytest.approx(1e3 * relative * rms)

@@ -1,12 +1,15 @@
 """Comparison of models: what is fitted, tables, recommendation, and what is refused first."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import multivariate_normal, norm
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
@@ -14,7 +17,7 @@ from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.choice import compare, leave_out
-from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models
+from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models, compare_points
 from capsule_id.inference.choice.leave_out import LeftOut, WeightedDraws
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
@@ -28,7 +31,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
 
 def draws_near_the_truth(target: LogPosterior, *_: object) -> WeightedDraws:
     """Equal weights, one block."""
-    own = {"trial_sd": 1e-3, "discrepancy": 2e-4}
+    own = {"trial_sd": 1e-3, "discrepancy": 2e-4, "session_1": THETA["session_1"]}
     truth = np.array([THETA.get(name, own.get(name.split("[")[0])) for name in target.names])
     u = target.unconstrain(truth) + 0.01 * np.random.default_rng(0).standard_normal((40, target.dimension))
     values = [target.mapping(theta) for theta in target.theta(u)]
@@ -165,7 +168,47 @@ def test_variants_are_refitted_unless_they_are_hopeless(
     )
 
 
+def a_point_fit(maximum: Mapping[str, float]) -> Callable[..., Any]:
+    """In place of ``joint_fit``: the maximum by friction law and free parameters, sds of 0.1."""
+
+    def fit(target: LogPosterior, *_: object) -> Any:
+        choices = target.rig.model
+        best = maximum.get(" ".join([choices.friction, *choices.free]), 0.0)
+        covariance = 0.01 * np.eye(target.dimension)
+        return SimpleNamespace(log_posterior=np.array([best - 7.0, best]), covariance=covariance)
+
+    return fit
+
+
+def test_points_are_compared_by_the_normal_approximation(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One more parameter with an sd of 0.1 must raise the log-posterior by 1.38 to leave the evidence as it is."""
+    monkeypatch.setattr(compare, "joint_fit", a_point_fit({"stribeck ratio lag": 10.0, "stribeck ratio": 3.0}))
+    seen = list[tuple[int, int, str]]()
+    choice = compare_points(rig, ["lag"], default_registry(), 0, lambda *step: seen.append(step))
+    assert seen == [(0, 2, "as stated"), (1, 2, "no lag")]
+    assert choice.recommended == "as stated"
+    own = choice.table.loc["as stated"]
+    normal = multivariate_normal(np.zeros(int(own["parameters"])), 0.01)
+    assert own["log_evidence"] == pytest.approx(10.0 - float(normal.logpdf(normal.mean)))
+    per_parameter = -float(norm(0.0, 0.1).logpdf(0.0))
+    assert choice.table.loc["no lag", "difference"] == pytest.approx(-7.0 - per_parameter)
+    assert "The readings speak against: no lag (-5.6)." in choice.text
+    assert 'free = ["ratio", "lag"]' in choice.line
+    assert "A rough comparison" in choice.text
+
+
+def test_the_simplest_variant_with_nearly_the_best_evidence_is_recommended(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compare, "joint_fit", a_point_fit({"stribeck ratio lag": 10.0, "stribeck ratio": 9.0}))
+    choice = compare_points(rig, ["lag"])
+    assert choice.recommended == "no lag"
+    assert "speak against" not in choice.text
+
+
 def test_too_few_settings_are_named(tmp_path: Path) -> None:
     synthesize_robot(tmp_path / "rig", 1, RobotDesign(PERIODS[:2], np.full(2, 0.3)))
     with pytest.raises(InputError, match="needs 3 settings or more in progression, to leave each one out, 2 settings"):
         compare_models(read_rig(tmp_path / "rig"), ["lag"])
+    with pytest.raises(InputError, match="needs 3 settings or more"):
+        compare_points(read_rig(tmp_path / "rig"), ["lag"])

@@ -10,7 +10,9 @@ from capsule_id.rig.model import Rig
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
 #: Values of the parameters of the progression by symbol.
-THETA = {**ROBOT, "g": 9.81, "session_sd": 0.05, "trial_scatter": 0.04, "trial_sd": 1e-3, "discrepancy": 2e-4}
+THETA = {
+    **ROBOT, "g": 9.81, "session_sd": 0.05, "session_1": 0.5, "trial_scatter": 0.04, "trial_sd": 1e-3, "discrepancy": 2e-4,
+}  # fmt: skip
 
 
 def three_settings(folder: Path) -> Rig:

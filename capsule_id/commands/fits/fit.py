@@ -51,7 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--compare",
         metavar="WORDS",
-        help="compare models instead of a fit: some of friction,reaction,lag,cubic; needs a progression",
+        help="compare models instead of a fit: some of friction,reaction,lag,cubic; needs a progression. With --no-sample "
+        "roughly, by the point fits alone",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     add_cache_argument(parser)
@@ -101,7 +102,7 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
     """Print the comparison of models; 0."""
     if len(rigs) > 1:
         raise InputError("--compare takes one rig", counted(len(rigs), "rig"), "name one folder")
-    unused = {"out": None, "scheduler": None, "json": False, "no_sample": False, "resume": False}
+    unused = {"out": None, "scheduler": None, "json": False, "resume": False}
     unused |= {"experiments": "all", "max_steps": DEFAULT_MAX_STEPS, "ess": DEFAULT_ESS}
     ignored = [f"--{name}" for name, default in unused.items() if getattr(args, name) != default]
     if ignored:
@@ -110,9 +111,10 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
     set_xla_options()
     if not args.no_cache:
         keep_programs()
-    from capsule_id.inference.choice.compare import compare_models
+    from capsule_id.inference.choice.compare import compare_models, compare_points
 
+    compare = compare_points if args.no_sample else compare_models
     with Progress(not args.quiet, "step") as progress:
-        choice = compare_models(rigs[0], args.compare.split(","), kinds, args.seed, progress)
+        choice = compare(rigs[0], args.compare.split(","), kinds, args.seed, progress)
     say(choice.text)
     return 0

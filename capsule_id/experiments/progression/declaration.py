@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.parameters import Prior, scatter
+from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Table
@@ -21,6 +21,14 @@ SESSION_SD = scatter(
 TRIAL_SCATTER = scatter(
     "trial_scatter", "1", "relative scatter of the displacement of a trial", r"s_\mathrm{trial}",
     Prior("halfnormal", 0.0, 0.1),
+)  # fmt: skip
+#: Sessions with several settings, in the order of their first trials; no table has more of them as parameters.
+SESSIONS = tuple(
+    nuisance(
+        f"session_{j}", "1", f"friction of session {j} with several settings: its logarithm over session_sd", f"z_{j}",
+        Prior("normal", 0.0, 1.0),
+    )
+    for j in range(1, 9)
 )  # fmt: skip
 #: These two have priors from the readings.
 TRIAL_SD = scatter("trial_sd", "m", "absolute scatter of the displacement of a trial", r"\sigma_\mathrm{trial}")
@@ -144,7 +152,7 @@ KIND = Kind(
     settings=ProgressionSettings,
     rules=(_check_drive, _check_periods),
     masses=lambda table: ("m1", "m2"),
-    parameters=(SESSION_SD, TRIAL_SCATTER, TRIAL_SD, DISCREPANCY),
+    parameters=(SESSION_SD, *SESSIONS, TRIAL_SCATTER, TRIAL_SD, DISCREPANCY),
     bench=False,
     make=made_by("capsule_id.experiments.progression.experiment:Progression"),
     template=TEMPLATE,

@@ -2,9 +2,9 @@
 
     distance_i = X2(setting, friction exp(s_j)) (1 + trial scatter) + discrepancy_b v t_b + trial sd + reading error
 
-Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2). X2 at s = ± session_sd gives the mean over
-sessions and the response to s_j, so that s_j enters linearly and is integrated out. So is the discrepancy, an error of
-the model's mean velocity at setting b that all trials of the setting share.
+Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see ``capsule_id.experiments.progression.sessions``.
+The discrepancy is an error of the model's mean velocity at setting b that all trials of the setting share. It enters
+linearly and is integrated out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,12 +28,15 @@ from capsule_id.experiments.progression.declaration import (
     AMPLITUDE,
     DISCREPANCY,
     SESSION_SD,
+    SESSIONS,
     TRIAL_SCATTER,
     TRIAL_SD,
 )
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.left_out import conditional_densities
 from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
+from capsule_id.experiments.progression.sessions import Sessions, parameters_of
+from capsule_id.experiments.progression.starts import starts_of
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.displacement import Displacement, displacement
@@ -49,8 +52,8 @@ from capsule_id.views import Comparison
 TRIAL_PRIOR, DISCREPANCY_PRIOR = 0.05, 0.1
 #: Parameters that change no motion.
 OF_TRIALS = ("trial_scatter", "trial_sd", "discrepancy")
-#: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
-DAMPING_RATIO, FRICTION = 0.1, 0.3
+#: Step of the derivative with respect to ``session_sd``, relative.
+SESSION_STEP = 0.1
 
 
 class Progression(TrialsExperiment):
@@ -60,13 +63,16 @@ class Progression(TrialsExperiment):
     ----------
     settings : (settings, 4) period, s, number of periods, duty, amplitude, N or A; see ``trials.settings_of``
     session : (n, sessions) 1 where a row belongs to it
+    parameter : (sessions,) index of the parameter of a session, see ``parameters_of``
     reading_variance : m^2
     force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
     has_lag : whether the lag is a parameter
-    emulator : of ``responses``; None: they are exact
+    emulator : of ``runs``; None: they are exact
     """
 
     session: np.ndarray
+    parameter: np.ndarray
+    sessions: Sessions
     groups: TrialGroups
     reading_variance: float
     force: float
@@ -91,7 +97,9 @@ class Progression(TrialsExperiment):
         self.settings, index = np.unique(rows, axis=0, return_inverse=True)
         self.setting, self.time = np.eye(len(self.settings))[index], self.settings[:, 0] * self.settings[:, 1]
         self.session = sessions_of(table, rows)
-        self.groups = TrialGroups(self.distance, self.setting, self.session)
+        self.parameter = parameters_of(self.setting, self.session)
+        self.sessions = Sessions(self.setting, self.session, self.parameter)
+        self.groups = TrialGroups(self.distance, self.setting, self.sessions.linear)
         stated = {name: getattr(table.settings, name) for name in (AMPLITUDE[self.drive], "lag")}
         exact = {name: q.value if q is not None and q.sd == 0.0 else 0.0 for name, q in stated.items()}
         self.force, self.lag = exact[AMPLITUDE[self.drive]], exact["lag"]
@@ -120,6 +128,7 @@ class Progression(TrialsExperiment):
         return (
             *rows,
             SESSION_SD,
+            *(row.named(self.label) for row in SESSIONS[: len(self.sessions.symbols)]),
             TRIAL_SCATTER,
             TRIAL_SD.named(self.label, Prior("halfnormal", 0.0, max(TRIAL_PRIOR * largest, floor))),
             DISCREPANCY.named(self.label, Prior("halfnormal", 0.0, max(DISCREPANCY_PRIOR * speed, 1e-9))),
@@ -163,15 +172,21 @@ class Progression(TrialsExperiment):
             return p, Excitation(force, 2.0 * np.pi / period, 0.0, self.reaction)
         return p, Pulses(force, period, duty, lag=theta["lag"] if self.has_lag else self.lag, reaction=self.reaction)
 
-    def responses(self, theta: ValuesBySymbol) -> tuple[Any, Any]:
-        """(settings,) mean of X2 over sessions, m, and its change per standard deviation of a session, m."""
+    def runs(self, theta: ValuesBySymbol) -> Any:
+        """(runs,) X2 of the runs of ``sessions``, m."""
         if self.emulator is not None:
-            mean, per_sd = jnp.split(self.emulator(theta), 2)
-            return mean, per_sd
-        sd, settings = theta["session_sd"], jnp.concatenate([self.settings, self.settings])
-        sign = np.repeat([1.0, -1.0], len(self.settings))
-        upper, lower = jnp.split(self.displacements(theta, sd * sign, settings), 2)
-        return 0.5 * (upper + lower), 0.5 * (upper - lower)
+            return self.emulator(self._inputs(theta))
+        settings = jnp.asarray(self.settings)[self.sessions.setting_of_run]
+        return self.displacements(theta, self.sessions.log_friction(theta), settings)
+
+    def responses(self, theta: ValuesBySymbol) -> tuple[Any, Any]:
+        """(cases,) mean of X2, m, and its change per standard deviation of a session, m; see ``Sessions.responses``."""
+        return self.sessions.responses(self.runs(theta))
+
+    def _inputs(self, theta: ValuesBySymbol) -> dict[str, Any]:
+        """Inputs of an emulator: sessions enter by the logarithm of their friction."""
+        sessions = {symbol: theta["session_sd"] * theta[symbol] for symbol in self.sessions.symbols}
+        return {**theta, **sessions}
 
     def displacements(self, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
         """X2, m, at rows of ``settings`` (rows, 4) with friction multiplied by exp(s), s (rows,)."""
@@ -184,19 +199,14 @@ class Progression(TrialsExperiment):
         """(draws, rows) X2, m, at each draw with friction multiplied by exp(s), s (draws, rows)."""
         return batched(_displacements_at, self, draws, s, settings)
 
-    def responses_of_draws(self, draws: Sequence[ValuesBySymbol]) -> tuple[np.ndarray, np.ndarray]:
-        """``responses`` at each draw, (draws, settings) each."""
-        found = batched(_responses_at, self, draws, np.zeros((len(draws), 0)), self.settings)
-        mean, per_sd = np.split(found, 2, axis=1)
-        return mean, per_sd
-
     def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
-        return np.concatenate(self.responses_of_draws(draws), axis=1)
+        return batched(_runs_at, self, draws, np.zeros((len(draws), 0)), self.settings)
 
     def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
-        positive = {row.symbol: row.positive for row in self.parameters if row.symbol not in OF_TRIALS}
+        without = OF_TRIALS if np.any(self.sessions.sign) else (*OF_TRIALS, "session_sd")
+        positive = {row.symbol: row.positive for row in self.parameters if row.symbol not in without}
         varied = {mass: True for mass in self.masses if len({draw[mass] for draw in draws}) > 1}
-        emulator = Emulator({**positive, **varied}, draws, motions)
+        emulator = Emulator({**positive, **varied}, [self._inputs(draw) for draw in draws], motions)
         return eqx.tree_at(lambda e: e.emulator, self, emulator, is_leaf=lambda x: x is None)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
@@ -209,57 +219,39 @@ class Progression(TrialsExperiment):
         """Likelihood of the trials at the responses ``mean`` and ``per_sd`` of ``responses``."""
         mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
         variance = self.reading_variance + (theta["trial_scatter"] * mean) ** 2
-        return TrialMisfit(self.groups, mean, per_sd, variance, theta["discrepancy"] * self.time)
+        time = xp.asarray(self.time)[xp.asarray(self.sessions.setting).astype(int)]
+        return TrialMisfit(self.groups, mean, per_sd, variance, theta["discrepancy"] * time)
 
     def misfit_of(self, theta: ValuesBySymbol, mean: Any, per_sd: Any, xp: ModuleType = jnp) -> Misfit:
         """The misfit at the responses ``mean`` and ``per_sd`` of ``responses``."""
         mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
-        expected = self.setting @ mean
-        design = xp.concatenate(
-            [(self.setting @ per_sd)[:, None] * self.session, theta["discrepancy"] * self.setting * self.time[None]],
-            axis=1,
-        )
+        rows, discrepancy = self.sessions.rows, theta["discrepancy"] * self.setting * self.time[None]
+        expected = rows @ mean
+        design = xp.concatenate([(rows @ per_sd)[:, None] * self.sessions.linear, discrepancy], axis=1)
         variance = self.reading_variance + (theta["trial_scatter"] * expected) ** 2
         return Misfit(self.distance - expected, variance, xp.ones(len(self.distance)), design)
 
     def profile(self, theta: ValuesBySymbol) -> Any:
-        """The log-likelihood as a function of values of the scatters by symbol, the motions held at ``theta``."""
+        """The log-likelihood as a function of values of the scatters by symbol, the motions linear in ``session_sd``."""
         mean, per_sd = (np.asarray(x) for x in self.responses(theta))
+        sd, slope = theta["session_sd"], 0.0
+        if self.sessions.symbols:
+            more = self.responses({**theta, "session_sd": (1.0 + SESSION_STEP) * sd})[0]
+            slope = (np.asarray(more) - mean) / (SESSION_STEP * sd)
 
         def log_likelihood(scatters: ValuesBySymbol) -> float:
             own = {**theta, **scatters}
-            scale = own["session_sd"] / theta["session_sd"]
-            return float(self.trials_of(own, mean, scale * per_sd, np).log_density(own["trial_sd"], np))
+            moved = mean + (own["session_sd"] - sd) * slope
+            return float(
+                self.trials_of(own, moved, own["session_sd"] / sd * per_sd, np).log_density(own["trial_sd"], np)
+            )
 
         return log_likelihood
 
     # -- starting points and the report -------------------------------------------------------------------------------
 
     def starts(self) -> dict[str, Start]:
-        m1, m2 = self.rig.mass("m1"), self.rig.mass("m2")
-        k1 = m1 * (2.0 * np.pi / float(np.median(self.settings[:, 0]))) ** 2
-        largest = float(np.max(np.abs(self.distance)))
-        priors = {row.symbol: row.prior for row in self.parameters}
-        starts = {
-            "k1": Start(k1, 0.7),
-            "c": Start(2.0 * DAMPING_RATIO * float(np.sqrt(k1 * m1)), 1.0),
-            "mu": Start(FRICTION, 0.5),
-            "mu_back": Start(FRICTION, 0.5),
-            "v_s": Start(0.3, 1.0),
-            "ratio": Start(0.7, 0.3),
-            "lag": Start(0.05 * float(np.median(self.settings[:, 0])), 1.0),
-            "session_sd": Start(0.05, 0.3),
-            "trial_scatter": Start(0.05, 0.3),
-            f"trial_sd[{self.label}]": Start(max(0.01 * largest, float(np.sqrt(self.reading_variance))), 0.3),
-            f"discrepancy[{self.label}]": Start(0.5 * _scale(priors["discrepancy"]), 0.3),
-        }
-        for name in self.mirrored:
-            prior = priors[name]
-            assert prior is not None, "the amplitude has the stated prior"
-            friction = FRICTION * (m1 + m2) * self.rig.g.value
-            starts[name] = Start(prior.location if abs(prior.location) > prior.spread else friction, 0.5 * prior.spread)
-        known = {row.name for row in self.parameters}
-        return {name: start for name, start in starts.items() if name in known}
+        return starts_of(self)
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
         """Total error of a trial relative to its scatter, at the median setting."""
@@ -294,17 +286,22 @@ class Progression(TrialsExperiment):
     def without(self, setting: int) -> "Progression":
         kept = self.setting[:, setting] == 0.0
         distance, membership = self.distance[kept], np.delete(self.setting[kept], setting, axis=1)
-        session = self.session[kept]
-        session = session[:, session.any(axis=0)]
+        some = self.session[kept].any(axis=0)
+        session, parameter = self.session[kept][:, some], self.parameter[some]
+        sessions = Sessions(membership, session, parameter)
         return eqx.tree_at(
-            lambda e: (e.distance, e.settings, e.setting, e.session, e.groups, e.time, e.emulator),
+            lambda e: (
+                *(e.distance, e.settings, e.setting, e.session, e.parameter, e.sessions, e.groups, e.time, e.emulator),
+            ),
             self,
             (
                 distance,
                 np.delete(self.settings, setting, axis=0),
                 membership,
                 session,
-                TrialGroups(distance, membership, session),
+                parameter,
+                sessions,
+                TrialGroups(distance, membership, sessions.linear),
                 np.delete(self.time, setting),
                 None,
             ),
@@ -312,7 +309,7 @@ class Progression(TrialsExperiment):
         )
 
     def motions_without(self, motions: np.ndarray, setting: int) -> np.ndarray:
-        return np.delete(motions, [setting, len(self.settings) + setting], axis=1)
+        return motions[:, np.asarray(self.sessions.setting_of_run) != setting]
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return self.comparisons(theta, draws)[0]
@@ -325,9 +322,9 @@ def _displacements_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: A
     return e.displacements(theta, s, settings)
 
 
-def _responses_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
+def _runs_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
     del s, settings
-    return jnp.concatenate(e.responses(theta))
+    return e.runs(theta)
 
 
 @eqx.filter_jit
@@ -336,8 +333,3 @@ def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any)
     law = scaled(e.law(theta), jnp.exp(s))
     r0 = equilibrium(p) if "slope" in e.ground else 0.0
     return displacement(p, drive, law, settings[:, 0], settings[:, 1], r0)
-
-
-def _scale(prior: Prior | None) -> float:
-    assert prior is not None, "the experiment states its prior"
-    return prior.spread

@@ -1,6 +1,6 @@
-"""Density of the trials of a progression from sums over groups: the trials of one setting in one session.
+"""Density of the trials of a progression from sums over cases: the trials of one setting in one session.
 
-Trials of a group differ only by their own scatter, so their number, mean and spread are sufficient. Groups that share a
+Trials of a case differ only by their own scatter, so their number, mean and spread are sufficient. Cases that share a
 setting or a session, directly or through others, form a component; components are independent given the parameters.
 The discrepancy of a setting is integrated out first, then the sessions of a component, of which there are few.
 """
@@ -20,25 +20,25 @@ from capsule_id.experiments.linear import LOG_2PI, marginal_log_density
 
 
 class TrialGroups(eqx.Module):
-    """Groups (components, g) of trials; a component with fewer than g groups is padded with empty ones.
+    """Cases (components, g) of trials; a component with fewer than g cases is padded with empty ones.
 
     Attributes
     ----------
     count, mean, spread : (components, g) number of trials, mean, m, and sum of squares about it, m^2
-    setting : (components, g) index of the setting
-    own_setting : (components, g, b) 1 where the group belongs to a setting of its component
-    own_session : (components, g, s) 1 where the group belongs to a session of its component
+    case : (components, g) index of the case
+    own_setting : (components, g, b) 1 where the case belongs to a setting of its component
+    own_session : (components, g, s) 1 where the case belongs to a session of its component
     """
 
     count: np.ndarray
     mean: np.ndarray
     spread: np.ndarray
-    setting: np.ndarray
+    case: np.ndarray
     own_setting: np.ndarray
     own_session: np.ndarray
 
     def __init__(self, distance: Float[np.ndarray, " n"], setting: np.ndarray, session: np.ndarray) -> None:
-        """Group trials by their distance, m, and memberships (n, settings) and (n, sessions)."""
+        """Group trials by their distance, m, and memberships (n, settings) and (n, sessions); cases in that order."""
         rows = np.stack([np.argmax(setting, axis=1), np.argmax(session, axis=1)], axis=1)
         pairs, group = np.unique(rows, axis=0, return_inverse=True)
         settings, number = setting.shape[1], setting.shape[1] + session.shape[1]
@@ -47,12 +47,12 @@ class TrialGroups(eqx.Module):
         members = [np.flatnonzero(label == k) for k in np.unique(label)]
         shape = len(members), max(map(len, members))
         self.count, self.mean, self.spread = (np.zeros(shape) for _ in range(3))
-        self.setting = np.zeros(shape, dtype=int)
+        self.case = np.zeros(shape, dtype=int)
         for k, found in enumerate(members):
             x = [distance[group == one] for one in found]
             filled = k, slice(len(found))
             self.count[filled], self.mean[filled] = list(map(len, x)), list(map(np.mean, x))
-            self.spread[filled], self.setting[filled] = [len(one) * np.var(one) for one in x], pairs[found, 0]
+            self.spread[filled], self.case[filled] = [len(one) * np.var(one) for one in x], found
         self.own_setting, self.own_session = (_members(pairs[:, i], members, shape[1]) for i in range(2))
 
 
@@ -71,7 +71,7 @@ class TrialMisfit:
 
     Attributes
     ----------
-    expected, per_sd, fixed_variance, discrepancy : (settings,) mean displacement, m, its change per standard deviation
+    expected, per_sd, fixed_variance, discrepancy : (cases,) mean displacement, m, its change per standard deviation
         of a session, m, variance of a trial without ``trial_sd``, m^2, standard deviation of the discrepancy, m
     """
 
@@ -85,7 +85,7 @@ class TrialMisfit:
         """Natural, normalised log-density of the trials at ``scatter`` (...), m; (...)."""
         groups, scatter = self.groups, xp.asarray(scatter)
         # The log-posterior stores all numbers of experiments as floats. Axes: scatter k, component c, group g.
-        index = xp.asarray(groups.setting).astype(int)
+        index = xp.asarray(groups.case).astype(int)
         y, a = groups.mean - self.expected[index], self.per_sd[index][..., None] * groups.own_session
         v = self.fixed_variance[index][None] + scatter.reshape(-1, 1, 1) ** 2
         w, count = groups.count[None] / v, xp.broadcast_to(groups.count, v.shape)
