@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.progression import experiment as module
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
@@ -107,6 +108,22 @@ def test_sums_over_groups_give_the_density_of_the_trials(sessions: int) -> None:
     for xp in (np, jnp):
         found = TrialMisfit(groups, mean[own], per_sd[own], fixed[own], disc[own]).log_density(scatters, xp)
         np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-11)
+
+
+def test_sessions_that_differ_much_are_no_linear_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the truth the trials scatter as stated; about a linear term they scatter more, and are far less probable."""
+    design = RobotDesign(1e-3 * np.arange(40.0, 150.0, 10.0), np.full(11, 0.3), session_sd=0.13, trial_sd=5e-4)
+    synthesize_robot(tmp_path / "rig", 6, design)
+    z = dict(zip(("session_1", "session_2"), np.random.default_rng(6).standard_normal(2), strict=True))
+    truth = {**THETA, **z, "session_sd": 0.13, "trial_sd": 5e-4, "discrepancy": 1e-9}
+    e = progression(tmp_path / "rig")
+    assert e.sessions.symbols == tuple(z)
+    monkeypatch.setattr(module, "parameters_of", lambda *_: np.full(2, -1))
+    linear = progression(tmp_path / "rig")
+    assert linear.sessions.symbols == ()
+    misfit = e.misfit_of(truth, *e.responses(truth), np).at(5e-4, np)
+    assert 0.5 < np.mean((misfit.raw / misfit.sd) ** 2) < 1.5
+    assert float(e.log_likelihood(truth)) > float(linear.log_likelihood(truth)) + 10.0
 
 
 def test_new_values_need_no_new_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,13 +27,13 @@ LONGEST_STEP = 0.7
 LEAST_DECREASE, MAX_STEPS = 3e-3, 10
 
 
-def descend(target: LogPosterior, u: np.ndarray) -> LeastSquaresFit:
-    """Minimise half the squared residuals over the located parameters from u (d,); the scatters stay."""
+def descend(target: LogPosterior, u: np.ndarray, most: int = MAX_STEPS) -> LeastSquaresFit:
+    """Minimise half the squared residuals over the located parameters from u (d,) in ``most`` steps; the scatters stay."""
     located = target.located
     scale = np.where(target.positive, 1.0, target.prior_sd)[located]
     step, u = DIFFERENCE * scale, u.copy()
     steps = 0
-    while steps < MAX_STEPS:
+    while steps < most:
         steps += 1
         stop_if_interrupted()
         points = np.repeat(u[None], len(located) + 1, axis=0)

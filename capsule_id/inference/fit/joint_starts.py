@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from capsule_id.inference.fit import difference_descent
 from capsule_id.inference.fit.curvature import BATCH, in_batches
 from capsule_id.inference.fit.point_fit import dispersed_starts
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -18,6 +19,9 @@ from capsule_id.inference.target.marginal import density_of
 STARTS, MAX_STARTS = 3, 8
 #: Number of candidates.
 CANDIDATES = 1024
+#: Where motions have kinks: number of the best candidates, and of others, that descend before the starting points are
+#: chosen; and their steps.
+CONTENDERS, FIRST_STEPS = 16, 6
 #: Perturb a random half of the parameters, by a log-sd that is log-uniform between these two.
 PROBABILITY_TO_PERTURB, SMALLEST_LOG_SD, LARGEST_LOG_SD = 0.5, 3e-3, 0.3
 
@@ -46,12 +50,30 @@ def choose_starts(
     # Copies of the centre would agree with it without a proof.
     candidates = np.concatenate([centre[None], candidates[np.any(candidates != centre, axis=1)]])
     value = weigh(target, candidates)
+    if any(e.has_joint_scatters for e in target.experiments):
+        candidates[1:], value[1:] = _descended(target, candidates[1:], value[1:])
     ranked = 1 + np.argsort(-value[1:])[: MAX_STARTS - 1]
     ranked = ranked[np.isfinite(value[ranked])]
     if not known and mirrored.any() and len(ranked) >= STARTS:
         return candidates[ranked]
     early = np.append(ranked[: STARTS - 1], 0)
     return candidates[[*early[np.argsort(-value[early], kind="stable")], *ranked[STARTS - 1 :]]]
+
+
+def _descended(target: LogPosterior, candidates: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Candidates (m, d) and their log-posterior (m,), of which the best have descended a few steps.
+
+    A motion with kinks has narrow maxima: the best of random candidates often lie near a wrong one.
+    """
+    candidates, value = candidates.copy(), value.copy()
+    ranked = np.argsort(-value)[np.sort(np.isfinite(value))[::-1]]
+    # The best ones often lie near one maximum, so that worse ones descend too.
+    chosen = np.append(ranked[:CONTENDERS], ranked[CONTENDERS :: max(len(ranked) // CONTENDERS, 1)])
+    for i in chosen:
+        candidates[i, target.located] = difference_descent.descend(target, candidates[i], FIRST_STEPS).x[0]
+    if len(chosen):
+        value[chosen] = weigh(target, candidates[chosen])
+    return candidates, value
 
 
 def weigh(target: LogPosterior, u: np.ndarray) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import cast
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +13,11 @@ from jax.tree_util import Partial
 from scipy import optimize
 
 from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.inference.checks.modes import check_starts
 from capsule_id.inference.fit import joint_fit as module
+from capsule_id.inference.fit import joint_starts
 from capsule_id.inference.fit.joint_fit import (
     LEAST_INCREASE,
     _at_another_maximum,
@@ -33,6 +37,7 @@ from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity
 from tests.experiments import bench
 from tests.forced_runs import TRUTH, recorded, table
+from tests.inference.three_settings import three_settings
 
 #: What a bench would tell: every shared parameter within 2 %.
 KNOWN = ("k1", "c", "mu", "v_s", "K", "k2[stiff]")
@@ -83,6 +88,27 @@ def test_the_likeliest_candidates_about_a_wrong_bench_lead_to_the_maximum() -> N
     assert value[0] >= value[1]
     ends = np.stack([_descend(target, start).u for start in starts[:2]])
     np.testing.assert_allclose(weigh(target, ends), np.max(fit.log_posterior), atol=0.1)
+
+
+def test_where_motions_have_kinks_candidates_descend_before_they_are_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All starts have descended; one of the candidates that were not among the best comes out first."""
+    rig = three_settings(tmp_path / "rig")
+    target = LogPosterior(rig, make_experiments(rig))
+    seen = list[np.ndarray]()
+
+    def descend(_: LogPosterior, u: np.ndarray, most: int) -> Any:
+        assert most == joint_starts.FIRST_STEPS
+        seen.append(u)
+        lag = np.array(target.names)[target.located] == "lag"
+        return SimpleNamespace(x=np.where(lag, float(len(seen)), u[target.located])[None])
+
+    monkeypatch.setattr(joint_starts.difference_descent, "descend", descend)
+    monkeypatch.setattr(joint_starts, "weigh", lambda _, u: u[:, target.names.index("lag")])
+    starts = choose_starts(target, {}, 0, {})
+    assert len(seen) >= 2 * joint_starts.CONTENDERS
+    np.testing.assert_array_equal(starts[:, target.names.index("lag")], np.arange(len(seen), 0.0, -1.0)[: len(starts)])
 
 
 @pytest.mark.parametrize(("pull", "converged"), [(0.1, True), (0.5, False)])
