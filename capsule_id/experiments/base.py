@@ -153,6 +153,11 @@ class Experiment(eqx.Module):
         return False
 
     @property
+    def scaled_by(self) -> dict[str, tuple[str, ...]]:
+        """Names of the parameters of which only the product with a scatter changes the motion, by name of that scatter."""
+        return {}
+
+    @property
     def mirrored(self) -> tuple[str, ...]:
         """Names of the parameters whose sign is unknown: the point fit tries both."""
         return ()

@@ -14,10 +14,12 @@ from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression import experiment as module
 from capsule_id.experiments.progression.checks import check_discrepancy
+from capsule_id.experiments.progression.declaration import KIND
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.sessions import Sessions, parameters_of
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
+from capsule_id.inference.fit.joint_fit import _rescaled
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives.pulses import Pulses
@@ -124,6 +126,31 @@ def test_sessions_that_differ_much_are_no_linear_term(tmp_path: Path, monkeypatc
     misfit = e.misfit_of(truth, *e.responses(truth), np).at(5e-4, np)
     assert 0.5 < np.mean((misfit.raw / misfit.sd) ** 2) < 1.5
     assert float(e.log_likelihood(truth)) > float(linear.log_likelihood(truth)) + 10.0
+
+
+def test_a_scatter_and_what_it_scales_move_together(tmp_path: Path) -> None:
+    """Two sessions whose frictions differ by the same, with a session sd that is five times too small."""
+    synthesize_robot(tmp_path / "rig", 1, RobotDesign(1e-3 * np.array([60.0, 80.0, 100.0, 120.0]), np.full(4, 0.3)))
+    rig = read_rig(tmp_path / "rig")
+    target = LogPosterior(rig, [progression(tmp_path / "rig")])
+    known = {**THETA, "session_1": 6.0, "session_2": -4.0, "session_sd": 0.02}
+    values = np.array([known[name.split("[")[0]] for name in target.names])
+    u = target.unconstrain(values)
+    moved = target.mapping(target.theta(_rescaled(target, u)))
+    for name in ("session_1[progression]", "session_2[progression]"):
+        assert moved["session_sd"] * moved[name] == pytest.approx(0.02 * known[name.split("[")[0]])
+    assert 0.05 < moved["session_sd"] < 0.2
+    assert np.all(_rescaled(target, _rescaled(target, u)) == pytest.approx(_rescaled(target, u), abs=0.16))
+
+
+@pytest.mark.parametrize(("sessions", "warned"), [(8, False), (9, True)])
+def test_more_sessions_than_parameters_are_named(tmp_path: Path, sessions: int, warned: bool) -> None:
+    periods = 1e-3 * np.linspace(60.0, 100.0, 2 * sessions)
+    synthesize_robot(tmp_path / "rig", 1, RobotDesign(periods, np.full(2 * sessions, 0.3), sessions=sessions))
+    rig = read_rig(tmp_path / "rig")
+    found = [one.facts for one in KIND.lint[0](rig.tables[0], rig) if one.code == "progression.sessions"]
+    assert found == ([{"several": 9, "most": 8}] if warned else [])
+    assert len(progression(tmp_path / "rig").sessions.symbols) == 8
 
 
 def test_new_values_need_no_new_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

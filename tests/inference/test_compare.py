@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from capsule_id.api import read_rig
+from capsule_id.cli import fit_params
 from capsule_id.errors import InputError
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
@@ -175,7 +176,8 @@ def a_point_fit(maximum: Mapping[str, float]) -> Callable[..., Any]:
         choices = target.rig.model
         best = maximum.get(" ".join([choices.friction, *choices.free]), 0.0)
         covariance = 0.01 * np.eye(target.dimension)
-        return SimpleNamespace(log_posterior=np.array([best - 7.0, best]), covariance=covariance)
+        maxima, stalled = np.array([best - 7.0, best]), np.array([True, False])
+        return SimpleNamespace(log_posterior=maxima, stalled=stalled, covariance=covariance)
 
     return fit
 
@@ -189,6 +191,7 @@ def test_points_are_compared_by_the_normal_approximation(rig: Rig, monkeypatch: 
     assert choice.recommended == "as stated"
     own = choice.table.loc["as stated"]
     normal = multivariate_normal(np.zeros(int(own["parameters"])), 0.01)
+    assert own["converged"]
     assert own["log_evidence"] == pytest.approx(10.0 - float(normal.logpdf(normal.mean)))
     per_parameter = -float(norm(0.0, 0.1).logpdf(0.0))
     assert choice.table.loc["no lag", "difference"] == pytest.approx(-7.0 - per_parameter)
@@ -206,9 +209,19 @@ def test_the_simplest_variant_with_nearly_the_best_evidence_is_recommended(
     assert "speak against" not in choice.text
 
 
+def test_the_command_compares_by_points_where_nothing_is_to_be_sampled(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("compare_points", "compare_models"):
+        monkeypatch.setattr(compare, name, lambda *_, name=name: SimpleNamespace(text=name))
+    for words, called in (([], "compare_models"), (["--no-sample"], "compare_points")):
+        assert fit_params([str(rig.folder), "--compare", "lag", "--quiet", *words]) == 0
+        assert capsys.readouterr().out.strip() == called
+
+
 def test_too_few_settings_are_named(tmp_path: Path) -> None:
     synthesize_robot(tmp_path / "rig", 1, RobotDesign(PERIODS[:2], np.full(2, 0.3)))
-    with pytest.raises(InputError, match="needs 3 settings or more in progression, to leave each one out, 2 settings"):
+    with pytest.raises(InputError, match="needs 3 settings or more in progression, 2 settings"):
         compare_models(read_rig(tmp_path / "rig"), ["lag"])
     with pytest.raises(InputError, match="needs 3 settings or more"):
         compare_points(read_rig(tmp_path / "rig"), ["lag"])

@@ -22,7 +22,7 @@ TRIAL_SCATTER = scatter(
     "trial_scatter", "1", "relative scatter of the displacement of a trial", r"s_\mathrm{trial}",
     Prior("halfnormal", 0.0, 0.1),
 )  # fmt: skip
-#: Sessions with several settings, in the order of their first trials; no table has more of them as parameters.
+#: Sessions with several settings, in the order of the numbers in the column; no table has more of them as parameters.
 SESSIONS = tuple(
     nuisance(
         f"session_{j}", "1", f"friction of session {j} with several settings: its logarithm over session_sd", f"z_{j}",
@@ -83,13 +83,19 @@ def _check_periods(entry: Entry[ProgressionSettings]) -> None:
 
 
 def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
-    """Warn where a table has few settings."""
+    """Warn where a table has few settings, or more sessions with several settings than there are parameters for."""
     del rig
     drive = [name for name in ("period", "f", "duty", "P_on", "P_d", "current") if name in table.columns]
-    settings = len(np.unique(np.stack([table[name] for name in drive], axis=1), axis=0))
+    setting = np.unique(np.stack([table[name] for name in drive], axis=1), axis=0, return_inverse=True)[1]
+    settings = 1 + int(np.max(setting))
     if settings < FEWEST_SETTINGS:
         facts = {"settings": settings, "wanted": FEWEST_SETTINGS}
         yield Finding("progression.settings", "warn", facts, table.label)
+    if "session" in table.columns:
+        pairs = np.unique(np.stack([table["session"], setting], axis=1), axis=0)
+        several = int(np.sum(np.unique(pairs[:, 0], return_counts=True)[1] > 1))
+        if several > len(SESSIONS):
+            yield Finding("progression.sessions", "warn", {"several": several, "most": len(SESSIONS)}, table.label)
 
 
 TEMPLATE = """\
@@ -127,6 +133,12 @@ MESSAGES = {
             + ". Expected a model that explains most of the motion; its parameters have no meaning here. Check reaction, the "
             "sign and size of the amplitude and the units, or compare models with --compare friction,reaction,lag,cubic."
         ),
+    ),
+    "progression.sessions": Message(
+        "sessions",
+        warn="{several:# session} with several settings, and only {most} of them have their friction as a parameter. The "
+        "others enter as a linear term, which is rough where sessions differ by 10 % or more: give the table of each day "
+        "or place its own entry",
     ),
     "progression.settings": Message(
         "settings",

@@ -148,6 +148,10 @@ class Progression(TrialsExperiment):
         return True
 
     @property
+    def scaled_by(self) -> dict[str, tuple[str, ...]]:
+        return {"session_sd": tuple(f"{symbol}[{self.label}]" for symbol in self.sessions.symbols)}
+
+    @property
     def mirrored(self) -> tuple[str, ...]:
         return (AMPLITUDE[self.drive],) if self.amplitude_from == "prior" else ()
 
@@ -227,7 +231,7 @@ class Progression(TrialsExperiment):
         mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
         rows, discrepancy = self.sessions.rows, theta["discrepancy"] * self.setting * self.time[None]
         expected = rows @ mean
-        design = xp.concatenate([(rows @ per_sd)[:, None] * self.sessions.linear, discrepancy], axis=1)
+        design = xp.concatenate([(rows @ per_sd)[:, None] * self.sessions.shared, discrepancy], axis=1)
         variance = self.reading_variance + (theta["trial_scatter"] * expected) ** 2
         return Misfit(self.distance - expected, variance, xp.ones(len(self.distance)), design)
 

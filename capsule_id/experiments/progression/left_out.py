@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def conditional_densities(e: "Progression", draws: Sequence[ValuesBySymbol]) -> Float[np.ndarray, "draws settings"]:
-    """Log-densities at each draw: the trials are jointly normal, sessions and discrepancies integrated out."""
+    """Log-densities at each draw: the trials are jointly normal, discrepancies and linear sessions integrated out."""
     means, per_sd = e.sessions.responses(e.motions_of_draws(draws))
     rows = [np.flatnonzero(column) for column in e.setting.T]
     return np.stack([_conditional(e, *one, rows) for one in zip(draws, means, per_sd, strict=True)])

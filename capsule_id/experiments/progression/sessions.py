@@ -2,7 +2,7 @@
 
 Session j has friction multiplied by exp(session_sd z_j), z_j ~ N(0, 1). Where a session has several settings, its
 trials determine z_j well, and the motion is no straight line in it: z_j is a parameter. A session with one setting
-enters linearly, by runs at z = ± 1, and is integrated out; the rest of its motion cannot be told from a discrepancy.
+enters linearly, by runs at z = ± 1, and is integrated out. The error of this is one of its setting, as a discrepancy is.
 """
 
 from typing import Any
@@ -23,7 +23,8 @@ class Sessions(eqx.Module):
     ----------
     rows : (n, cases) 1 where a trial belongs to a case
     setting : (cases,) index of its setting
-    linear : (n, s) 1 where a trial shares a session that enters linearly; the others have a column per case, with no effect
+    linear : (n, s) 1 where a trial belongs to a session that enters linearly; the other cases have a column each
+    shared : (n, r) the columns of ``linear`` of sessions that enter linearly
     case, sign : (runs,) index of the case; z of a session that enters linearly, else 0
     own : (runs, parameters) 1 where z is this parameter
     second : (cases,) index of the run at the other end; of the same run where z is a parameter
@@ -32,6 +33,7 @@ class Sessions(eqx.Module):
     rows: np.ndarray
     setting: np.ndarray
     linear: np.ndarray
+    shared: np.ndarray
     case: np.ndarray
     sign: np.ndarray
     own: np.ndarray
@@ -52,6 +54,7 @@ class Sessions(eqx.Module):
         shared = np.stack([cases[:, 1], np.where(of < 0, -1, cases[:, 0])], axis=1)
         link = np.unique(shared, axis=0, return_inverse=True)[1]
         self.linear = np.eye(1 + int(np.max(link)))[link[case]]
+        self.shared = self.linear[:, np.unique(link[of < 0])]
         self.case = np.concatenate([first, linear])
         self.sign = np.concatenate([np.where(of < 0, 1.0, 0.0), -np.ones(len(linear))])
         self.own = 1.0 * (of[self.case][:, None] == np.arange(1 + max(-1, int(np.max(parameter)))))

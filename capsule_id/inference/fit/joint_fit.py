@@ -55,6 +55,8 @@ NOISE_RATIO_OF_A_GOOD_FIT, ENOUGH_THAT_AGREE = 1.2, 4
 SCATTER_SEARCH = 6.0
 #: Settings of the search over scatters that act together, natural logarithm.
 JOINT_SEARCH = {"xatol": 1e-3, "fatol": 1e-4, "maxiter": 2000}
+#: Factors by which a scatter moves together with what it multiplies.
+FACTORS = np.geomspace(0.1, 10.0, 32)
 
 
 @dataclass(frozen=True)
@@ -220,12 +222,32 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
         shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
         for i, value in scatters.items():
             u[i] = value
+        u = _rescaled(target, u)
         still = bool(moved < SMALL_MOVE_IN_SD and shift < SMALL_MOVE_IN_SD)
         if still or fit.cost[0] > limit:
             break
     assert fit is not None, "there is at least one round"
     converged = (still or bool(fit.cost[0] > limit)) and _is_converged(fit)
     return _End(u, fit, converged, float(weigh(target, u[None])[0]))
+
+
+def _rescaled(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """The best of u (d,) and of points that have the same motion, with a scatter and what it multiplies moved together.
+
+    Neither can move alone where the readings know their product.
+    """
+    scaled = dict[str, set[str]]()
+    for e in target.experiments:
+        for name, own in e.scaled_by.items():
+            scaled.setdefault(name, set()).update(own)
+    for name, own in scaled.items():
+        if own:
+            points = np.repeat(u[None], len(FACTORS), axis=0)
+            points[:, target.names.index(name)] += np.log(FACTORS)
+            points[:, np.isin(target.names, sorted(own))] /= FACTORS[:, None]
+            value = weigh(target, points)
+            u = points[np.argmax(value)] if np.max(value) > weigh(target, u[None])[0] else u
+    return u
 
 
 def _is_converged(fit: LeastSquaresFit) -> bool:

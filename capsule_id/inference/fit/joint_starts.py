@@ -69,10 +69,14 @@ def _descended(target: LogPosterior, candidates: np.ndarray, value: np.ndarray) 
     ranked = np.argsort(-value)[np.sort(np.isfinite(value))[::-1]]
     # The best ones often lie near one maximum, so that worse ones descend too.
     chosen = np.append(ranked[:CONTENDERS], ranked[CONTENDERS :: max(len(ranked) // CONTENDERS, 1)])
-    for i in chosen:
-        candidates[i, target.located] = difference_descent.descend(target, candidates[i], FIRST_STEPS).x[0]
     if len(chosen):
-        value[chosen] = weigh(target, candidates[chosen])
+        ends = candidates[chosen]
+        for u in ends:
+            u[target.located] = difference_descent.descend(target, u, FIRST_STEPS).x[0]
+        reached = weigh(target, ends)
+        # Squares may fall while the log-posterior does too, because the scatter of a trial depends on the motion.
+        higher = reached > value[chosen]
+        candidates[chosen[higher]], value[chosen[higher]] = ends[higher], reached[higher]
     return candidates, value
 
 

@@ -191,7 +191,9 @@ class MarginalPosterior:
             v, shift, chance = np.split(rows, [self.dimension, self.dimension + len(label)], axis=1)
             shifted = grid.shifted(shift - 0.5)
             known, terms, integrals = self._terms(v, shifted)
-            sums = np.cumsum(np.exp(terms - np.max(terms, axis=-1, keepdims=True)), axis=-1)
+            highest = np.max(terms, axis=-1, keepdims=True)
+            # A place without density keeps a draw, which no walker takes.
+            sums = np.cumsum(np.exp(terms - np.where(np.isfinite(highest), highest, 0.0)), axis=-1)
             node = np.sum(sums < chance[..., None] * sums[..., -1:], axis=-1)
             t = shifted.start + node * grid.step
             chosen = np.take_along_axis(terms, node[..., None], axis=-1)[..., 0] - log_stretch(t, grid.bend, np)
