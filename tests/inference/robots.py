@@ -13,7 +13,6 @@ from capsule_id.experiments.progression.twin import ROBOT, RobotDesign
 from capsule_id.inference.choice.compare import PointChoice, compare_points
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
-from capsule_id.rig.model import Rig
 from tests.inference.calibration import Outcome, normal_score
 
 #: Truths are log-uniform within this factor of the robot's twin.
@@ -49,32 +48,27 @@ def random_robot(rng: np.random.Generator, periods: np.ndarray) -> tuple[RobotDe
     return RobotDesign(periods, np.full(len(periods), 0.3), session_sd=session_sd, trial_sd=TRIAL_SD), values
 
 
-def random_rig(folder: Path, seed: int, periods: np.ndarray) -> tuple[Rig, dict[str, float]]:
-    """A robot with a right model, and its true values by name.
-
-    The discrepancy of a twin is 0, the end of its prior, which no central interval holds: it has no true value here.
-    """
-    design, values = random_robot(np.random.default_rng([seed, 0]), periods)
-    cid.synthesize_robot(folder / f"robot_{seed}", seed, design, values)
-    truth = json.loads((folder / f"robot_{seed}.truth.json").read_text(encoding="utf-8"))["parameters"]
-    truth |= {"trial_scatter": design.trial_scatter, "trial_sd[progression]": TRIAL_SD}
-    return read_rig(folder / f"robot_{seed}"), truth
-
-
 def study(
     folder: Path, seeds: Sequence[int], periods: np.ndarray, budget: int = DEFAULT_BUDGET, ess: float = 400.0
 ) -> Iterator[Outcome]:
-    """One robot per seed: its truth, its readings and its chains all follow from that seed."""
+    """One robot per seed: its truth, its readings and its chains all follow from that seed.
+
+    The discrepancy of a twin is 0, the end of its prior, which no central interval holds: it has no score.
+    """
     for seed in seeds:
-        rig, truth = random_rig(folder, seed, periods)
-        result = cid.fit(rig, seed, budget=budget, ess=ess)
+        design, values = random_robot(np.random.default_rng([seed, 0]), periods)
+        rig = folder / f"robot_{seed}"
+        cid.synthesize_robot(rig, seed, design, values)
+        truth = json.loads((folder / f"robot_{seed}.truth.json").read_text(encoding="utf-8"))["parameters"]
+        truth |= {"trial_scatter": design.trial_scatter, "trial_sd[progression]": TRIAL_SD}
+        result = cid.fit(read_rig(rig), seed, budget=budget, ess=ess)
         posterior = cast(Posterior, result.posterior)
         z = {name: normal_score(posterior, name, truth[name]) for name in posterior.names if name in truth}
         yield Outcome(z, tuple((f.code, f.experiment) for f in result.findings if f.level == "fail"))
 
 
-def found_by_points(folder: Path, law: str, seed: int, periods: np.ndarray) -> PointChoice:
-    """Comparison of the variants of a wrong law by point fits, on a random robot."""
+def found_by_points(folder: Path, law: str, seed: int, periods: np.ndarray) -> tuple[PointChoice, dict[str, float]]:
+    """Comparison of the variants of a wrong law by point fits, on a random robot, and its true values."""
     rng = np.random.default_rng([seed, 0])
     design, values = random_robot(rng, periods)
     if law == "asymmetry":
@@ -83,4 +77,4 @@ def found_by_points(folder: Path, law: str, seed: int, periods: np.ndarray) -> P
         values["lag"] = ROBOT["lag"]
     rig, wrong = folder / f"{law}_{seed}", WRONG_LAWS[law]
     cid.synthesize_robot(rig, seed, design, values, model=wrong.model)
-    return compare_points(read_rig(rig), wrong.words, seed=seed)
+    return compare_points(read_rig(rig), wrong.words, seed=seed), {**ROBOT, **values}

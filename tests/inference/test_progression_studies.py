@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.experiments import make_experiments
+from capsule_id.inference.choice import compare
 from capsule_id.inference.fit import joint_starts
 from capsule_id.inference.fit.joint_fit import joint_fit
+from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from tests.inference.calibration import summarise
-from tests.inference.robots import WRONG_LAWS, found_by_points, random_rig, study
+from tests.inference.robots import WRONG_LAWS, found_by_points, study
 
 #: Of 25 settings, and of the small versions.
 PERIODS, FEW = 1e-3 * np.arange(35.0, 160.0, 5.0), 1e-3 * np.arange(40.0, 150.0, 15.0)
@@ -21,18 +22,6 @@ def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Enough for the seeds of the small versions."""
     for name, value in (("CANDIDATES", 256), ("CONTENDERS", 2), ("FIRST_STEPS", 3)):
         monkeypatch.setattr(joint_starts, name, value)
-
-
-@pytest.mark.usefixtures("few_starts")
-def test_the_point_fit_of_a_robot_is_near_the_truth(tmp_path: Path) -> None:
-    """A small version of the next test: one robot, and no sample."""
-    rig, truth = random_rig(tmp_path, 1, FEW)
-    target = LogPosterior(rig, make_experiments(rig))
-    fit = joint_fit(target, {}, 1)
-    u = target.unconstrain(np.array([truth.get(name, fit.values[name]) for name in target.names]))
-    z = ((fit.u - u) / np.sqrt(np.diag(fit.covariance)))[target.located]
-    assert np.count_nonzero(z) == 9
-    assert np.max(np.abs(z)) < 4.0, z
 
 
 @pytest.mark.slow
@@ -46,17 +35,31 @@ def test_twenty_robots(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_starts")
-def test_a_missing_lag_is_found(tmp_path: Path) -> None:
-    """A small version of the next test."""
-    choice = found_by_points(tmp_path, "lag", 10, FEW)
+def test_a_missing_lag_is_found_and_the_right_fit_is_near_the_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A small version of both studies: one robot, and no sample."""
+    fits = list[tuple[LogPosterior, PointFit]]()
+
+    def fitted(target: LogPosterior, known: dict[str, float], seed: int) -> PointFit:
+        fits.append((target, joint_fit(target, known, seed)))
+        return fits[-1][1]
+
+    monkeypatch.setattr(compare, "joint_fit", fitted)
+    choice, truth = found_by_points(tmp_path, "lag", 10, FEW)
     assert choice.recommended == "free lag"
     assert "The readings speak against: as stated" in choice.text
+    target, fit = fits[-1]
+    u = target.unconstrain(np.array([truth.get(name, fit.values[name]) for name in target.names]))
+    z = ((fit.u - u) / np.sqrt(np.diag(fit.covariance)))[target.located]
+    assert np.count_nonzero(z) == 9
+    assert np.max(np.abs(z)) < 4.0, z
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", WRONG_LAWS)
 def test_wrong_laws_are_found_by_points(law: str, tmp_path: Path) -> None:
     """In nine of ten robots."""
-    recommended = [found_by_points(tmp_path, law, seed, PERIODS).recommended for seed in range(10, 20)]
+    recommended = [found_by_points(tmp_path, law, seed, PERIODS)[0].recommended for seed in range(10, 20)]
     print(law, recommended)
     assert recommended.count(WRONG_LAWS[law].right) >= 9
