@@ -195,9 +195,9 @@ def test_points_are_compared_by_the_normal_approximation(rig: Rig, monkeypatch: 
     assert own["log_evidence"] == pytest.approx(10.0 - float(normal.logpdf(normal.mean)))
     per_parameter = -float(norm(0.0, 0.1).logpdf(0.0))
     assert choice.table.loc["no lag", "difference"] == pytest.approx(-7.0 - per_parameter)
-    assert "The readings speak against: no lag (-5.6)." in choice.text
+    assert "Rejected: no lag (-5.6)." in choice.text
     assert 'free = ["ratio", "lag"]' in choice.line
-    assert "A rough comparison" in choice.text
+    assert "This comparison is rough" in choice.text
 
 
 def test_the_simplest_variant_with_nearly_the_best_evidence_is_recommended(
@@ -206,7 +206,7 @@ def test_the_simplest_variant_with_nearly_the_best_evidence_is_recommended(
     monkeypatch.setattr(compare, "joint_fit", a_point_fit({"stribeck ratio lag": 10.0, "stribeck ratio": 9.0}))
     choice = compare_points(rig, ["lag"])
     assert choice.recommended == "no lag"
-    assert "speak against" not in choice.text
+    assert "Rejected" not in choice.text
 
 
 def test_the_command_compares_by_points_where_nothing_is_to_be_sampled(

@@ -48,7 +48,7 @@ def test_a_missing_lag_is_found_and_the_right_fit_is_near_the_truth(
     monkeypatch.setattr(compare, "joint_fit", fitted)
     choice, truth = found_by_points(tmp_path, "lag", 10, FEW)
     assert choice.recommended == "free lag"
-    assert "The readings speak against: as stated" in choice.text
+    assert "Rejected: as stated" in choice.text
     target, fit = fits[-1]
     u = target.unconstrain(np.array([truth.get(name, fit.values[name]) for name in target.names]))
     z = ((fit.u - u) / np.sqrt(np.diag(fit.covariance)))[target.located]

@@ -1,6 +1,7 @@
 """The label of a record is that of the model, its period alone, or "undecided"; with a probability of 0.9 it is right."""
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ import pytest
 from capsule_id.experiments.forced_run.twin import GAP_SD, SAMPLES
 from capsule_id.motions.response import response
 from capsule_id.physics.model import CapsuleParameters, Excitation
+from capsule_id.records.contacts import Contacts
 from capsule_id.records.label import UNDECIDED, measured_motion
-from capsule_id.records.repeat import find_period
+from capsule_id.records.mean_velocity import MeanVelocity
+from capsule_id.records.repeat import Repeat, find_period
 from tests.records.runs import FRESH, LONGER, Known, fresh, longer, noisier, reference, scattered, table_of
 
 
@@ -47,8 +50,7 @@ def test_longer_periods_and_aperiodic_motions() -> None:
 def test_mean_velocities_are_those_of_the_model() -> None:
     for case in reference():
         motion = case.nominal
-        velocity = motion.evidence.mean_velocity
-        assert velocity is not None
+        velocity = cast(MeanVelocity, motion.evidence.mean_velocity)
         # 2 s of a motion that is settled to some 1e-6 of its speed
         assert abs(motion.mean_velocity - case.mean_velocity) < 4.0 * velocity.velocity_sd + 1e-3 * abs(
             case.mean_velocity
@@ -82,14 +84,12 @@ def test_ten_times_the_noise_makes_no_label_wrong() -> None:
 def test_the_probability_is_that_of_the_label() -> None:
     case = next(case for case in reference() if case.name == "fig11_Pd_1.2")
     evidence = case.nominal.evidence
-    assert evidence.repeat is not None
-    assert evidence.mean_velocity is not None
-    assert evidence.contacts is not None
-    parts = [evidence.repeat.probability, evidence.mean_velocity.probability, evidence.contacts.probability]
+    steps = evidence.repeat, evidence.mean_velocity, evidence.contacts
+    parts = [cast(Repeat | MeanVelocity | Contacts, step).probability for step in steps]
     assert case.nominal.probability == pytest.approx(np.prod(parts))
     assert case.nominal.probability > 0.99
     partial = case.motion(only=("x_rel", "current"))
-    assert (partial.label, partial.probability) == ("P-1", partial.evidence.repeat.probability)  # type: ignore[union-attr]
+    assert (partial.label, partial.probability) == ("P-1", cast(Repeat, partial.evidence.repeat).probability)
 
 
 def scattered_outcomes(cases: tuple[Known, ...], seed: int) -> list[str]:
@@ -156,8 +156,7 @@ def test_without_acceleration_the_stated_gap_has_to_do() -> None:
     assert wrong(found) == {}
     assert list(found.values()).count("right") >= 8
     case = next(case for case in reference() if case.name == "fig11_Pd_1.2")
-    contacts = case.motion(only=channels).evidence.contacts
-    assert contacts is not None
+    contacts = cast(Contacts, case.motion(only=channels).evidence.contacts)
     assert contacts.spikes == ()
     assert contacts.impact_line is None
 

@@ -68,7 +68,7 @@ class PointChoice:
             f"({behind[self.recommended]:.1f}). Write in [model]: {self._model}"
         )
         rejected = [f"{name} ({value:.1f})" for name, value in behind.to_dict().items() if value < -STRONG]
-        return f"{said}\nThe readings speak against: {', '.join(rejected)}." if rejected else said
+        return f"{said}\nRejected: {', '.join(rejected)}." if rejected else said
 
     @property
     def _model(self) -> str:
@@ -81,8 +81,8 @@ class PointChoice:
     def text(self) -> str:
         """The table, the recommendation, and how rough both are."""
         rough = (
-            "A rough comparison: a normal approximation at the best point found of each variant. Displacements have kinks; "
-            "compare without --no-sample before you rely on it."
+            "This comparison is rough: it uses a normal approximation at the best point of each variant. Compare without "
+            "--no-sample before you choose."
         )
         return "\n".join([self.table.round(2).to_string(), self.line, rough])
 
@@ -256,7 +256,7 @@ def compare_points(
 
 
 def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tuple[dict[str, ModelChoices], Registry]:
-    """Variants by name, and the kinds that read ``rig``, once its progressions are known to suffice."""
+    """Variants by name, and the kinds that read ``rig``; an ``InputError`` where its progressions do not suffice."""
     choices, kinds = variants_of(rig, words), registry or default_registry()
     made = [e for e in make_experiments(rig, "all", kinds) if isinstance(e, TrialsExperiment)]
     if not made:

@@ -222,8 +222,8 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
         shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
         for i, value in scatters.items():
             u[i] = value
-        u = _rescaled(target, u)
-        still = bool(moved < SMALL_MOVE_IN_SD and shift < SMALL_MOVE_IN_SD)
+        before, u = u, _rescaled(target, u)
+        still = bool(moved < SMALL_MOVE_IN_SD and shift < SMALL_MOVE_IN_SD and np.array_equal(before, u))
         if still or fit.cost[0] > limit:
             break
     assert fit is not None, "there is at least one round"
@@ -232,9 +232,9 @@ def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> 
 
 
 def _rescaled(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """The best of u (d,) and of points that have the same motion, with a scatter and what it multiplies moved together.
+    """The best of u (d,) and of points with the same motion, at which a scatter and what it multiplies have changed.
 
-    Neither can move alone where the readings know their product.
+    The readings determine only their product, so that a change of one alone is always worse.
     """
     scaled = dict[str, set[str]]()
     for e in target.experiments:

@@ -66,7 +66,8 @@ def _descended(target: LogPosterior, candidates: np.ndarray, value: np.ndarray) 
     A motion with kinks has narrow maxima: the best of random candidates often lie near a wrong one.
     """
     candidates, value = candidates.copy(), value.copy()
-    ranked = np.argsort(-value)[np.sort(np.isfinite(value))[::-1]]
+    ranked = np.argsort(-value)
+    ranked = ranked[np.isfinite(value[ranked])]
     # The best ones often lie near one maximum, so that worse ones descend too.
     chosen = np.append(ranked[:CONTENDERS], ranked[CONTENDERS :: max(len(ranked) // CONTENDERS, 1)])
     if len(chosen):

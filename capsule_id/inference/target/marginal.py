@@ -160,8 +160,8 @@ class MarginalPosterior:
     def factors(self, v: np.ndarray) -> np.ndarray:
         """(w, blocks, 2 + k) of the located u (w, dimension), block by block, for the sampler.
 
-        Log-posterior; then one draw of the block's scatters: log-posterior with them, and their u. A place has always the
-        same draw, as if drawn at random: its random numbers are a hash of all its digits.
+        Log-posterior; then one draw of the block's scatters: log-posterior with them, and their u. A place always has the
+        same draw, because its random numbers are a hash of its coordinates.
         """
         return self._drawn(v, uniform_at(v, 2 * len(self._scatter)))
 
@@ -192,7 +192,7 @@ class MarginalPosterior:
             shifted = grid.shifted(shift - 0.5)
             known, terms, integrals = self._terms(v, shifted)
             highest = np.max(terms, axis=-1, keepdims=True)
-            # A place without density keeps a draw, which no walker takes.
+            # No walker accepts a place without density: its draw has no effect.
             sums = np.cumsum(np.exp(terms - np.where(np.isfinite(highest), highest, 0.0)), axis=-1)
             node = np.sum(sums < chance[..., None] * sums[..., -1:], axis=-1)
             t = shifted.start + node * grid.step
@@ -239,7 +239,7 @@ class MarginalPosterior:
 
 
 def uniform_at(v: Float[np.ndarray, "w d"], number: int) -> Float[np.ndarray, "w number"]:
-    """Numbers uniform in [0, 1) that a place determines: bits of the hash of all its digits."""
+    """Numbers uniform in [0, 1) that depend on the place alone: bits of a hash of its coordinates."""
     hashes = b"".join(hashlib.shake_128(row.tobytes()).digest(8 * number) for row in v)
     return (np.frombuffer(hashes, np.uint64).reshape(len(v), number) >> 11) * 2.0**-53
 
