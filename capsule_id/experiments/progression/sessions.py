@@ -57,7 +57,7 @@ class Sessions(eqx.Module):
         self.shared = self.linear[:, np.unique(link[of < 0])]
         self.case = np.concatenate([first, linear])
         self.sign = np.concatenate([np.where(of < 0, 1.0, 0.0), -np.ones(len(linear))])
-        self.own = 1.0 * (of[self.case][:, None] == np.arange(1 + max(-1, int(np.max(parameter)))))
+        self.own = 1.0 * (of[self.case][:, None] == np.arange(1 + int(np.max(parameter))))
         self.second = first.copy()
         self.second[linear] = len(cases) + np.arange(len(linear))
 
