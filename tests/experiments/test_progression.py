@@ -1,5 +1,6 @@
 """Progressions: the likelihood against SciPy, sessions, the start on its own, faults of a folder with their remedies."""
 
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -7,17 +8,18 @@ from typing import Any, cast
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.progression import experiment as module
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import KIND
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.sessions import Sessions, parameters_of
+from capsule_id.experiments.progression.sessions import NODES, Sessions, parameters_of
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.fit.joint_fit import _rescaled
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -57,25 +59,42 @@ def plain_displacement(s: float, period: float, count: float) -> float:
     return float(simulate(p, drive, np.array([0.0, period * count])).X2[-1])
 
 
-def test_the_likelihood_is_that_of_correlated_normal_readings(folder: Path) -> None:
+def integrated(
+    trials: list[np.ndarray], X2: list[np.ndarray], variance: list[np.ndarray], shared: float, z: np.ndarray
+) -> float:
+    """Log-density of the ``trials`` of one setting by SciPy, each session integrated by a sum over z.
+
+    Parameters
+    ----------
+    X2, variance : displacement and variance of a trial in each session at z; of one number where it is known
+    shared : variance of the discrepancy
+    """
+    y, sizes = np.concatenate(trials), [len(own) for own in trials]
+    places = list(product(*(range(len(x)) for x in X2)))
+    log_weight = [[-0.5 * z**2 - logsumexp(-0.5 * z**2), np.zeros(1)][len(x) == 1] for x in X2]
+    density = []
+    for place in places:
+        at = list(enumerate(place))
+        mean = np.repeat([X2[j][i] for j, i in at], sizes)
+        covariance = shared + np.diag(np.repeat([variance[j][i] for j, i in at], sizes))
+        density.append(multivariate_normal(mean, covariance).logpdf(y) + sum(log_weight[j][i] for j, i in at))
+    return float(logsumexp(density))
+
+
+def test_the_likelihood_is_that_of_plain_runs(folder: Path) -> None:
+    """One session is a parameter, the other is integrated out, with lines between its runs."""
     e = progression(folder)
-    table = e.table
-    sd = SCATTERS["session_sd"]
-    alone = table["session"] == 2.0
-    ends = np.array(
-        [
-            [plain_displacement(s, period, count) for s in ((sd, -sd) if linear else 2 * (0.7 * sd,))]
-            for period, count, linear in zip(table["period"], table["periods"], alone, strict=True)
-        ]
-    )
-    mean, slope = ends.mean(axis=1), 0.5 * (ends[:, 0] - ends[:, 1])
-    same_session = np.outer(alone, alone)
-    same_setting = table["period"][:, None] == table["period"]
-    time = table["period"] * table["periods"]
-    noise = 5e-4**2 + SCATTERS["trial_sd"] ** 2 + (SCATTERS["trial_scatter"] * mean) ** 2
-    covariance = np.diag(noise) + same_session * np.outer(slope, slope)
-    covariance += same_setting * SCATTERS["discrepancy"] ** 2 * np.outer(time, time)
-    expected = multivariate_normal(mean, covariance).logpdf(table["distance"])
+    table, sd, z = e.table, SCATTERS["session_sd"], np.linspace(-6.0, 6.0, 401)
+    expected = 0.0
+    for period in PERIODS:
+        own = table["period"] == period
+        count, (session,) = float(table["periods"][own][0]), set(table["session"][own])
+        nodes = NODES if session == 2.0 else 0.7 * np.ones(1)
+        runs = [plain_displacement(sd * node, period, count) for node in nodes]
+        X2 = make_interp_spline(NODES, runs, k=1)(z) if session == 2.0 else np.array(runs)
+        noise = 5e-4**2 + SCATTERS["trial_sd"] ** 2 + (SCATTERS["trial_scatter"] * X2) ** 2
+        shared = (SCATTERS["discrepancy"] * period * count) ** 2
+        expected += integrated([table["distance"][own]], [X2], [noise], shared, z)
     log_likelihood = jit_quickly(e.log_likelihood)
     assert float(log_likelihood(THETA)) == pytest.approx(expected, abs=0.02)
     assert e.profile(THETA)(SCATTERS) == pytest.approx(float(log_likelihood(THETA)), abs=1e-6)
@@ -88,44 +107,75 @@ def test_the_likelihood_is_that_of_correlated_normal_readings(folder: Path) -> N
     assert e.profile(THETA)(other) == pytest.approx(changed, abs=0.2 * abs(changed - expected))
 
 
-@pytest.mark.parametrize("sessions", [1, 2, 5])
-def test_sums_over_groups_give_the_density_of_the_trials(sessions: int) -> None:
-    """The trials of settings and sessions at random, in one component and in several, against SciPy."""
-    rng = np.random.default_rng(sessions)
-    n, settings, scatters = 23, 4, np.array([[1e-3, 0.02], [0.1, 1.0]])
-    b = np.concatenate([np.arange(settings), rng.integers(settings, size=n - settings)])
-    # Of five sessions the first setting has two of its own and each other setting one: four components.
-    j = rng.integers(sessions, size=n) if sessions < 5 else np.where(b == 0, rng.integers(2, size=n), 1 + b)
-    setting, session = np.eye(settings)[b], np.eye(sessions)[j]
-    distance, mean, per_sd, disc = rng.normal(size=n), *rng.normal(size=(2, settings)), 0.3 * np.ones(settings)
-    fixed = 0.01 + rng.uniform(size=settings) ** 2
-    groups = TrialGroups(distance, setting, session)
-    own = np.unique(np.stack([b, j], axis=1), axis=0)[:, 0]
-    assert groups.count.shape[0] == (4 if sessions == 5 else 1)
-    shared = (b[:, None] == b) * 0.09 + (j[:, None] == j) * np.outer(per_sd[b], per_sd[b])
+@pytest.mark.parametrize("lone", [(), (0,), (1, 3), (0, 1, 2)])
+def test_sums_over_groups_give_the_density_of_the_trials(lone: tuple[int, ...]) -> None:
+    """Two settings in two sessions each, of which some are integrated out, against SciPy."""
+    rng, scatters, z = np.random.default_rng(5), np.array([[0.1], [0.7]]), np.linspace(-6.0, 6.0, 201)
+    b, j = np.repeat([0, 0, 1, 1], [3, 2, 1, 4]), np.repeat([0, 1, 2, 3], [3, 2, 1, 4])
+    parameter = np.array([-1 if k in lone else k for k in range(4)])
+    sessions = Sessions(np.eye(2)[b], np.eye(4)[j], parameter)
+    distance, at_nodes = rng.normal(size=10), rng.normal(size=(4, len(NODES)))
+    at_nodes = np.where(sessions.alone[:, None] > 0.0, at_nodes, at_nodes[:, :1])
+    groups, discrepancy = TrialGroups(distance, sessions), np.array([0.3, 0.8])
+    assert len(groups.grid) == {0: 0, 1: 1, 2: 1, 3: 101}[len(lone)]
+    X2 = [make_interp_spline(NODES, x, k=1)(z) if k in lone else x[:1] for k, x in enumerate(at_nodes)]
     expected = [
-        [multivariate_normal(mean[b], shared + np.diag(fixed[b] + t**2)).logpdf(distance) for t in row]
-        for row in scatters
+        [
+            integrated(
+                [distance[j == k] for k in own], [X2[k] for k in own], [0.04 + t**2 + 0.0 * X2[k] for k in own], d**2, z
+            )
+            for own, d in zip(([0, 1], [2, 3]), discrepancy, strict=True)
+        ]
+        for t in scatters[:, 0]
     ]
     for xp in (np, jnp):
-        found = TrialMisfit(groups, mean[own], per_sd[own], fixed[own], disc[own]).log_density(scatters, xp)
-        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-11)
+        trials = TrialMisfit(groups, at_nodes, 0.04, 0.0, discrepancy)
+        np.testing.assert_allclose(np.asarray(trials.of_settings(scatters, xp))[:, 0], expected, rtol=1e-4)
+        found = np.asarray(trials.log_density(scatters, xp))
+        np.testing.assert_allclose(found, np.sum(expected, axis=1, keepdims=True), rtol=1e-4)
 
 
-def test_sessions_that_differ_much_are_no_linear_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the truth the trials scatter as stated; about a linear term they scatter more, and are far less probable."""
-    design = RobotDesign(1e-3 * np.arange(40.0, 150.0, 10.0), np.full(11, 0.3), session_sd=0.13, trial_sd=5e-4)
+def test_the_scatter_of_a_trial_follows_its_displacement() -> None:
+    """A session that is integrated out, with trials near one end of what it can explain."""
+    distance, z = np.array([-1.0, -1.04]), np.linspace(-6.0, 6.0, 2001)
+    sessions = Sessions(np.ones((2, 1)), np.ones((2, 1)), np.array([-1]))
+    X2 = np.array([[0.0, -0.5, -1.2]])
+    trials = TrialMisfit(TrialGroups(distance, sessions), X2, 1e-4, 0.05, np.array([0.01]))
+    own = make_interp_spline(NODES, X2[0], k=1)(z)
+    expected = integrated([distance], [own], [1e-4 + (0.05 * own) ** 2], 1e-4, z)
+    assert float(trials.log_density(0.0)) == pytest.approx(expected, abs=0.02)
+    constant = integrated([distance], [own], [1e-4 + (0.05 * 0.5) ** 2 + 0.0 * own], 1e-4, z)
+    assert abs(constant - expected) > 0.2
+
+
+def test_runs_between_the_outer_ones_matter(tmp_path: Path) -> None:
+    """Sessions that differ by 20 %, against 41 exact runs of each; a line through the outer runs is worse."""
+    design = RobotDesign(1e-3 * np.arange(60.0, 120.0, 5.0), np.full(12, 0.3), sessions=12, session_sd=0.2)
     synthesize_robot(tmp_path / "rig", 6, design)
-    z = dict(zip(("session_1", "session_2"), np.random.default_rng(6).standard_normal(2), strict=True))
-    truth = {**THETA, **z, "session_sd": 0.13, "trial_sd": 5e-4, "discrepancy": 1e-9}
     e = progression(tmp_path / "rig")
-    assert e.sessions.symbols == tuple(z)
-    monkeypatch.setattr(module, "parameters_of", lambda *_: np.full(2, -1))
-    linear = progression(tmp_path / "rig")
-    assert linear.sessions.symbols == ()
-    misfit = e.misfit_of(truth, *e.responses(truth), np).at(5e-4, np)
-    assert 0.5 < np.mean((misfit.raw / misfit.sd) ** 2) < 1.5
-    assert float(e.log_likelihood(truth)) > float(linear.log_likelihood(truth)) + 10.0
+    theta, z, fine = {**THETA, "session_sd": 0.2}, np.linspace(-5.0, 5.0, 41), np.linspace(-5.0, 5.0, 401)
+    assert e.sessions.symbols == ()
+    runs = e.displacements_of_draws([theta], 0.2 * np.tile(z, 12)[None], np.repeat(e.settings, 41, axis=0))
+    X2 = np.asarray(e.responses(theta))
+    middle = 0.5 * (X2[:, :1] + X2[:, 2:])
+    expected = [
+        integrated(
+            [e.distance[own > 0.0]],
+            [x],
+            [e.reading_variance + theta["trial_sd"] ** 2 + (theta["trial_scatter"] * x) ** 2],
+            (theta["discrepancy"] * time) ** 2,
+            fine,
+        )
+        for own, time, x in zip(
+            e.setting.T, e.time, make_interp_spline(z, runs.reshape(12, 41).T, k=1)(fine).T, strict=True
+        )
+    ]
+    with_three, with_two = (
+        np.asarray(e.trials_of(theta, own, np).of_settings(theta["trial_sd"], np)) - expected
+        for own in (X2, np.concatenate([X2[:, :1], middle, X2[:, 2:]], axis=1))
+    )
+    assert np.sqrt(np.mean(with_three**2)) < 0.6
+    assert np.sqrt(np.mean(with_two**2)) > 0.9
 
 
 def test_a_scatter_and_what_it_scales_move_together(tmp_path: Path) -> None:
@@ -178,31 +228,32 @@ def test_without_a_column_a_session_is_a_block_of_equal_settings(folder: Path, t
     blocks = progression(tmp_path)
     np.testing.assert_array_equal(np.argmax(blocks.session, axis=1), [0, 0, 0, 1, 1, 1, 2, 2, 2, 3])
     assert blocks.setting.shape == (10, 3)
-    assert blocks.sessions.symbols == ()
+    # The first setting has two sessions.
+    assert blocks.sessions.symbols == ("session_1", "session_2")
 
 
-def test_a_session_with_several_settings_is_a_parameter() -> None:
+def test_a_session_with_several_settings_or_a_shared_one_is_a_parameter() -> None:
     """Two settings in session 3, one of them in session 1 too: cases, runs, and what a session changes."""
-    setting, session = np.eye(3)[[0, 0, 1, 2, 1]], np.eye(4)[[3, 1, 3, 0, 2]]
+    setting, session = np.eye(3)[[0, 0, 1, 2, 1]], np.eye(4)[[3, 1, 3, 0, 3]]
     found = parameters_of(setting, session)
-    np.testing.assert_array_equal(found, [-1, -1, -1, 0])
+    np.testing.assert_array_equal(found, [-1, 0, -1, 1])
     sessions = Sessions(setting, session, found)
-    assert sessions.symbols == ("session_1",)
-    np.testing.assert_array_equal(sessions.setting, [0, 0, 1, 1, 2])
-    np.testing.assert_array_equal(np.argmax(sessions.rows, axis=1), [1, 0, 3, 4, 2])
-    theta = {"session_sd": 0.1, "session_1": -2.0}
-    np.testing.assert_allclose(sessions.log_friction(theta), [0.1, -0.2, 0.1, -0.2, 0.1, -0.1, -0.1, -0.1])
-    np.testing.assert_array_equal(sessions.setting_of_run, [0, 0, 1, 1, 2, 0, 1, 2])
-    mean, per_sd = sessions.responses(np.arange(8.0))
-    np.testing.assert_array_equal(mean, [2.5, 1.0, 4.0, 3.0, 5.5])
-    np.testing.assert_array_equal(per_sd, [-2.5, 0.0, -2.0, 0.0, -1.5])
-    # Trials share a session only where it enters linearly.
-    np.testing.assert_array_equal(sessions.linear @ sessions.linear.T, np.eye(5))
+    assert sessions.symbols == ("session_1", "session_2")
+    np.testing.assert_array_equal(sessions.setting, [0, 0, 1, 2])
+    np.testing.assert_array_equal(sessions.alone, [0, 0, 0, 1])
+    np.testing.assert_array_equal(np.argmax(sessions.rows, axis=1), [1, 0, 2, 3, 2])
+    theta = {"session_sd": 0.1, "session_1": -2.0, "session_2": 3.0}
+    np.testing.assert_allclose(sessions.log_friction(theta), [-0.2, 0.3, 0.3, -0.125, 0.0, 0.125], atol=1e-15)
+    np.testing.assert_array_equal(sessions.setting_of_run, [0, 0, 1, 2, 2, 2])
+    np.testing.assert_array_equal(sessions.responses(np.arange(6.0)), [[0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 4, 5]])
     # No more parameters than there are rows for; the sessions with the most settings have them.
     many = np.repeat(np.arange(10), 2)
     crowded = np.append(many, 9)
     found = parameters_of(np.eye(3)[np.append(np.tile([0, 1], 10), 2)], np.eye(10)[crowded])
     np.testing.assert_array_equal(found, [0, 1, 2, 3, 4, 5, 6, -1, -1, 7])
+    # Then those that share their setting with the most.
+    found = parameters_of(np.eye(4)[[0, 1, 1, 2, 2, 2, 3]], np.eye(7))
+    np.testing.assert_array_equal(found, [-1, 0, 1, 2, 3, 4, -1])
 
 
 def test_the_sampler_integrates_the_absolute_scatter_alone(folder: Path) -> None:

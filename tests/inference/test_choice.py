@@ -7,12 +7,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.stats import multivariate_normal
 
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.left_out import conditional_densities
 from capsule_id.inference.choice import leave_out
 from capsule_id.inference.choice.evidence import _bridge, log_evidence
 from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_out, weighted_draws
@@ -47,30 +45,21 @@ def test_each_word_varies_its_own_choice(rig: Rig) -> None:
         variants_of(rig, ["lagg"])
 
 
-def joint_density(e: Progression) -> float:
-    """Log-density of all readings at ``THETA``."""
-    misfit = e.misfit(THETA)
-    covariance = np.diag(misfit.sd**2) + misfit.design @ misfit.design.T
-    return float(multivariate_normal(cov=covariance).logpdf(misfit.raw))
-
-
 def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
     """p(y_b | y_rest) = p(y) / p(y_rest); the rest is also the experiment without the setting."""
     (e,) = cast(list[Progression], make_experiments(rig))
-    found, motions = conditional_densities(e, [THETA, THETA]), e.motions_of_draws([THETA])
+    found, motions = e.densities_of_settings([THETA, THETA]), e.motions_of_draws([THETA])
     for setting in range(len(e.settings)):
         smaller = e.without(setting)
         assert smaller.n == e.n - 3
         np.testing.assert_allclose(e.motions_without(motions, setting), smaller.motions_of_draws([THETA]), rtol=1e-9)
-        np.testing.assert_allclose(found[:, setting], joint_density(e) - joint_density(smaller), rtol=1e-6)
+        own = float(e.log_likelihood(THETA) - smaller.log_likelihood(THETA))
+        np.testing.assert_allclose(found[:, setting], own, rtol=1e-6)
 
 
 def test_absurd_values_have_no_density(rig: Rig) -> None:
-    """Displacements of a light year leave the covariance singular."""
     (e,) = cast(list[Progression], make_experiments(rig))
-    theta = {**THETA, "discrepancy": 1e16, "trial_scatter": 0.0}
-    assert np.all(np.isnan(conditional_densities(e, [theta])))
-    assert np.all(np.isnan(conditional_densities(e, [{**THETA, "trial_scatter": np.nan}])))
+    assert np.all(np.isnan(e.densities_of_settings([{**THETA, "trial_scatter": np.nan}])))
 
 
 class Readings:
@@ -251,13 +240,13 @@ def test_motions_that_are_known_serve_a_setting_left_out(rig: Rig) -> None:
     """The refit begins with the motions of all other settings and the proposal of all."""
     target = LogPosterior(rig, make_experiments(rig))
     (e,) = target.experiments
-    motions = np.arange(8.0).reshape(2, 4)  # setting 1 has a session of its own, and two runs
+    motions = np.arange(10.0).reshape(2, 5)  # setting 1 has a session of its own, and three runs
     nothing = cast(Any, None)
     emulated = Emulation(nothing, ExactMotions(np.zeros((2, 3)), [motions]), cast(Any, "proposal"), nothing)
     draws = replace(readings_and_draws(3)[1], target=target, drawn_from=emulated)
     first, known = leave_out._without(draws, cast(Progression, e), 1)
     assert first == "proposal"
-    np.testing.assert_array_equal(cast(ExactMotions, known).motions[0], motions[:, [0, 2]])
+    np.testing.assert_array_equal(cast(ExactMotions, known).motions[0], motions[:, [0, 4]])
 
 
 def test_no_evidence_where_few_draws_are_inside() -> None:

@@ -22,10 +22,10 @@ TRIAL_SCATTER = scatter(
     "trial_scatter", "1", "relative scatter of the displacement of a trial", r"s_\mathrm{trial}",
     Prior("halfnormal", 0.0, 0.1),
 )  # fmt: skip
-#: Sessions with several settings, in the order of the numbers in the column; no table has more of them as parameters.
+#: Sessions that are parameters, in the order of the numbers in the column; no table has more of them.
 SESSIONS = tuple(
     nuisance(
-        f"session_{j}", "1", f"friction of session {j} with several settings: its logarithm over session_sd", f"z_{j}",
+        f"session_{j}", "1", f"friction of the session that is parameter {j}: its logarithm over session_sd", f"z_{j}",
         Prior("normal", 0.0, 1.0),
     )
     for j in range(1, 9)
@@ -137,7 +137,7 @@ MESSAGES = {
     "progression.sessions": Message(
         "sessions",
         warn="{several:# session} with several settings, and only {most} of them have their friction as a parameter. The "
-        "others enter as a linear term, which is rough where sessions differ by 10 % or more: give the table of each day "
+        "others count as different sessions at every setting, so that intervals are too narrow: give the table of each day "
         "or place its own entry",
     ),
     "progression.settings": Message(

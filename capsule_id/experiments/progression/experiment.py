@@ -4,7 +4,7 @@
 
 Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see ``capsule_id.experiments.progression.sessions``.
 The discrepancy is an error of the model's mean velocity at setting b that all trials of the setting share. It enters
-linearly and is integrated out.
+linearly and is integrated out; see ``capsule_id.experiments.progression.groups``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,9 +33,8 @@ from capsule_id.experiments.progression.declaration import (
     TRIAL_SD,
 )
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.left_out import conditional_densities
 from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
-from capsule_id.experiments.progression.sessions import Sessions, parameters_of
+from capsule_id.experiments.progression.sessions import EDGES, Sessions, lines, parameters_of
 from capsule_id.experiments.progression.starts import starts_of
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -99,7 +98,7 @@ class Progression(TrialsExperiment):
         self.session = sessions_of(table, rows)
         self.parameter = parameters_of(self.setting, self.session)
         self.sessions = Sessions(self.setting, self.session, self.parameter)
-        self.groups = TrialGroups(self.distance, self.setting, self.sessions.linear)
+        self.groups = TrialGroups(self.distance, self.sessions)
         stated = {name: getattr(table.settings, name) for name in (AMPLITUDE[self.drive], "lag")}
         exact = {name: q.value if q is not None and q.sd == 0.0 else 0.0 for name, q in stated.items()}
         self.force, self.lag = exact[AMPLITUDE[self.drive]], exact["lag"]
@@ -183,8 +182,8 @@ class Progression(TrialsExperiment):
         settings = jnp.asarray(self.settings)[self.sessions.setting_of_run]
         return self.displacements(theta, self.sessions.log_friction(theta), settings)
 
-    def responses(self, theta: ValuesBySymbol) -> tuple[Any, Any]:
-        """(cases,) mean of X2, m, and its change per standard deviation of a session, m; see ``Sessions.responses``."""
+    def responses(self, theta: ValuesBySymbol) -> Any:
+        """(cases, nodes) X2, m; see ``Sessions.responses``."""
         return self.sessions.responses(self.runs(theta))
 
     def _inputs(self, theta: ValuesBySymbol) -> dict[str, Any]:
@@ -207,48 +206,58 @@ class Progression(TrialsExperiment):
         return batched(_runs_at, self, draws, np.zeros((len(draws), 0)), self.settings)
 
     def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
-        without = OF_TRIALS if np.any(self.sessions.sign) else (*OF_TRIALS, "session_sd")
+        without = OF_TRIALS if np.any(self.sessions.node) else (*OF_TRIALS, "session_sd")
         positive = {row.symbol: row.positive for row in self.parameters if row.symbol not in without}
         varied = {mass: True for mass in self.masses if len({draw[mass] for draw in draws}) > 1}
         emulator = Emulator({**positive, **varied}, [self._inputs(draw) for draw in draws], motions)
         return eqx.tree_at(lambda e: e.emulator, self, emulator, is_leaf=lambda x: x is None)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        return (self.misfit_of(theta, *self.responses(theta), xp),)
+        return (self.misfit_of(theta, self.responses(theta), xp),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[TrialMisfit]:
-        return (self.trials_of(theta, *self.responses(theta), xp),)
+        return (self.trials_of(theta, self.responses(theta), xp),)
 
-    def trials_of(self, theta: ValuesBySymbol, mean: Any, per_sd: Any, xp: ModuleType = jnp) -> TrialMisfit:
-        """Likelihood of the trials at the responses ``mean`` and ``per_sd`` of ``responses``."""
-        mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
-        variance = self.reading_variance + (theta["trial_scatter"] * mean) ** 2
-        time = xp.asarray(self.time)[xp.asarray(self.sessions.setting).astype(int)]
-        return TrialMisfit(self.groups, mean, per_sd, variance, theta["discrepancy"] * time)
+    def trials_of(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType = jnp) -> TrialMisfit:
+        """Likelihood of the trials at the ``responses``."""
+        discrepancy = theta["discrepancy"] * xp.asarray(self.time)
+        return TrialMisfit(self.groups, xp.asarray(X2), self.reading_variance, theta["trial_scatter"], discrepancy)
 
-    def misfit_of(self, theta: ValuesBySymbol, mean: Any, per_sd: Any, xp: ModuleType = jnp) -> Misfit:
-        """The misfit at the responses ``mean`` and ``per_sd`` of ``responses``."""
-        mean, per_sd = xp.asarray(mean), xp.asarray(per_sd)
-        rows, discrepancy = self.sessions.rows, theta["discrepancy"] * self.setting * self.time[None]
-        expected = rows @ mean
-        design = xp.concatenate([(rows @ per_sd)[:, None] * self.sessions.shared, discrepancy], axis=1)
-        variance = self.reading_variance + (theta["trial_scatter"] * expected) ** 2
-        return Misfit(self.distance - expected, variance, xp.ones(len(self.distance)), design)
+    def misfit_of(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType = jnp) -> Misfit:
+        """The misfit at the ``responses``, the motion of a session linear about its most probable z."""
+        rows, alone = xp.asarray(self.sessions.rows), xp.asarray(self.sessions.alone)
+        start, slope, expected = self._most_probable_lines(theta, xp.asarray(X2), xp)
+        discrepancy = theta["discrepancy"] * self.setting * self.time[None]
+        # The columns of sessions that are parameters are 0.
+        design = xp.concatenate([rows * (alone * slope)[None], discrepancy], axis=1)
+        variance = self.reading_variance + (theta["trial_scatter"] * (rows @ expected)) ** 2
+        return Misfit(self.distance - rows @ start, variance, xp.ones(len(self.distance)), design)
+
+    def _most_probable_lines(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> tuple[Any, Any, Any]:
+        """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m."""
+        start, slope = lines(X2, xp)
+        count = xp.sum(xp.asarray(self.sessions.rows), axis=0)
+        r = (xp.asarray(self.sessions.rows).T @ self.distance / count)[:, None] - start
+        time = xp.asarray(self.time)[xp.asarray(self.sessions.setting).astype(int)][:, None]
+        variance = self.reading_variance + (theta["trial_scatter"] * start[:, :1]) ** 2
+        w = variance / count[:, None] + (theta["discrepancy"] * time) ** 2
+        z = xp.clip(slope * r / (w + slope**2), xp.asarray(EDGES[None, :-1]), xp.asarray(EDGES[None, 1:]))
+        best = xp.argmin(z**2 + (r - slope * z) ** 2 / w, axis=1)[:, None]
+        start, slope, z = (xp.take_along_axis(x, best, axis=1)[:, 0] for x in (start, slope, z))
+        return start, slope, start + slope * z
 
     def profile(self, theta: ValuesBySymbol) -> Any:
         """The log-likelihood as a function of values of the scatters by symbol, the motions linear in ``session_sd``."""
-        mean, per_sd = (np.asarray(x) for x in self.responses(theta))
-        sd, slope = theta["session_sd"], 0.0
-        if self.sessions.symbols:
-            more = self.responses({**theta, "session_sd": (1.0 + SESSION_STEP) * sd})[0]
-            slope = (np.asarray(more) - mean) / (SESSION_STEP * sd)
+        sd = theta["session_sd"]
+        X2, more = (
+            np.asarray(self.responses({**theta, "session_sd": size})) for size in (sd, (1.0 + SESSION_STEP) * sd)
+        )
+        slope = (more - X2) / (SESSION_STEP * sd)
 
         def log_likelihood(scatters: ValuesBySymbol) -> float:
             own = {**theta, **scatters}
-            moved = mean + (own["session_sd"] - sd) * slope
-            return float(
-                self.trials_of(own, moved, own["session_sd"] / sd * per_sd, np).log_density(own["trial_sd"], np)
-            )
+            moved = X2 + (own["session_sd"] - sd) * slope
+            return float(self.trials_of(own, moved, np).log_density(own["trial_sd"], np))
 
         return log_likelihood
 
@@ -285,7 +294,9 @@ class Progression(TrialsExperiment):
         return speed_panels(self, settings, centre, limits, label)
 
     def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
-        return conditional_densities(self, draws)
+        X2 = np.asarray(self.sessions.responses(self.motions_of_draws(draws)))
+        pairs = zip(draws, X2, strict=True)
+        return np.stack([self.trials_of(theta, own, np).of_settings(theta["trial_sd"], np) for theta, own in pairs])
 
     def without(self, setting: int) -> "Progression":
         kept = self.setting[:, setting] == 0.0
@@ -305,7 +316,7 @@ class Progression(TrialsExperiment):
                 session,
                 parameter,
                 sessions,
-                TrialGroups(distance, membership, sessions.linear),
+                TrialGroups(distance, sessions),
                 np.delete(self.time, setting),
                 None,
             ),

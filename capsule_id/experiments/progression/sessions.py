@@ -1,10 +1,11 @@
 """Sessions of a progression: how the friction of each one enters, and the runs of the capsule that follow.
 
-Session j has friction multiplied by exp(session_sd z_j), z_j ~ N(0, 1). Where a session has several settings, its
-trials determine z_j well, and the motion is no straight line in it: z_j is a parameter. A session with one setting
-enters linearly, by runs at z = ± 1, and is integrated out. The error of this is one of its setting, as a discrepancy is.
+Session j has friction multiplied by exp(session_sd z_j), z_j ~ N(0, 1). Where it has several settings, or shares its
+setting with other sessions, the trials determine z_j apart from the discrepancy: z_j is a parameter. A session that
+has a setting for itself is integrated out, its motion piecewise linear in z_j between runs at ``NODES``.
 """
 
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -15,29 +16,32 @@ from jaxtyping import Float, Int
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.progression.declaration import SESSIONS
 
+#: z of the runs of a session that is integrated out; the outer lines go on to both sides.
+NODES = np.array([-1.25, 0.0, 1.25])
+#: Where the lines end; z beyond the last ones has no weight.
+EDGES = np.array([-100.0, *NODES[1:-1], 100.0])
+
 
 class Sessions(eqx.Module):
-    """Cases, each a setting in a session, and their runs: first one of every case, then the second ends of linear ones.
+    """Cases, each a setting in a session, and their runs, in the order of the cases.
 
     Attributes
     ----------
     rows : (n, cases) 1 where a trial belongs to a case
     setting : (cases,) index of its setting
-    linear : (n, s) 1 where a trial belongs to a session that enters linearly; the other cases have a column each
-    shared : (n, r) the columns of ``linear`` of sessions that enter linearly
-    case, sign : (runs,) index of the case; z of a session that enters linearly, else 0
+    alone : (cases,) 1 where z is integrated out
+    at : (cases, nodes) index of the run at each of ``NODES``; of the same run where z is a parameter
+    case, node : (runs,) index of the case; z of a session that is integrated out, else 0
     own : (runs, parameters) 1 where z is this parameter
-    second : (cases,) index of the run at the other end; of the same run where z is a parameter
     """
 
     rows: np.ndarray
     setting: np.ndarray
-    linear: np.ndarray
-    shared: np.ndarray
+    alone: np.ndarray
+    at: np.ndarray
     case: np.ndarray
-    sign: np.ndarray
+    node: np.ndarray
     own: np.ndarray
-    second: np.ndarray
 
     def __init__(
         self,
@@ -49,17 +53,13 @@ class Sessions(eqx.Module):
         trials = np.stack([np.argmax(setting, axis=1), np.argmax(session, axis=1)], axis=1)
         cases, case = np.unique(trials, axis=0, return_inverse=True)
         of = parameter[cases[:, 1]]
-        first, linear = np.arange(len(cases)), np.flatnonzero(of < 0)
-        self.rows, self.setting = np.eye(len(cases))[case], cases[:, 0]
-        shared = np.stack([cases[:, 1], np.where(of < 0, -1, cases[:, 0])], axis=1)
-        link = np.unique(shared, axis=0, return_inverse=True)[1]
-        self.linear = np.eye(1 + int(np.max(link)))[link[case]]
-        self.shared = self.linear[:, np.unique(link[of < 0])]
-        self.case = np.concatenate([first, linear])
-        self.sign = np.concatenate([np.where(of < 0, 1.0, 0.0), -np.ones(len(linear))])
+        alone = of < 0
+        self.rows, self.setting, self.alone = np.eye(len(cases))[case], cases[:, 0], 1.0 * alone
+        runs = np.where(alone, len(NODES), 1)
+        self.case = np.repeat(np.arange(len(cases)), runs)
+        self.node = np.concatenate([NODES if one else [0.0] for one in alone])
+        self.at = (np.cumsum(runs) - runs)[:, None] + alone[:, None] * np.arange(len(NODES))
         self.own = 1.0 * (of[self.case][:, None] == np.arange(1 + int(np.max(parameter))))
-        self.second = first.copy()
-        self.second[linear] = len(cases) + np.arange(len(linear))
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -69,7 +69,7 @@ class Sessions(eqx.Module):
     def log_friction(self, theta: ValuesBySymbol) -> Any:
         """(runs,) logarithm of what multiplies the friction."""
         known = [theta[symbol] for symbol in self.symbols]
-        z = self.sign + (self.own @ jnp.stack(known) if known else 0.0)
+        z = self.node + (self.own @ jnp.stack(known) if known else 0.0)
         return theta["session_sd"] * z
 
     @property
@@ -77,11 +77,9 @@ class Sessions(eqx.Module):
         """(runs,) index of the setting of each run."""
         return _index(self.setting)[_index(self.case)]
 
-    def responses(self, X2: Any) -> tuple[Any, Any]:
-        """(..., cases) mean of X2 over what is not a parameter, m, and its change per sd of a session, m, from (..., runs)."""
-        second = _index(self.second)
-        upper, lower = X2[..., : len(second)], jnp.asarray(X2)[..., second]
-        return 0.5 * (upper + lower), 0.5 * (upper - lower)
+    def responses(self, X2: Any) -> Any:
+        """(..., cases, nodes) X2 of every case at ``NODES``, from (..., runs)."""
+        return jnp.asarray(X2)[..., _index(self.at)]
 
 
 def _index(numbers: Any) -> Any:
@@ -89,16 +87,25 @@ def _index(numbers: Any) -> Any:
     return jnp.asarray(numbers).astype(int)
 
 
+def lines(X: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
+    """(..., lines) value at z = 0 and slope of the lines between X (..., nodes) at ``NODES``."""
+    nodes = xp.asarray(NODES.reshape(*(1,) * (X.ndim - 1), -1))
+    slope = (X[..., 1:] - X[..., :-1]) / (nodes[..., 1:] - nodes[..., :-1])
+    return X[..., :-1] - slope * nodes[..., :-1], slope
+
+
 def parameters_of(
     setting: Float[np.ndarray, "n settings"], session: Float[np.ndarray, "n sessions"]
 ) -> Int[np.ndarray, " sessions"]:
-    """Index of the parameter of each session, -1 where it enters linearly.
+    """Index of the parameter of each session, -1 where it is integrated out, in each of its settings alone.
 
-    Sessions with several settings have parameters, at most as many as there are ``SESSIONS``: those with most settings.
+    There are at most as many parameters as ``SESSIONS``: of the sessions with most settings, then of those that share
+    their setting with most others.
     """
-    settings = np.sum((session.T @ setting) > 0.0, axis=1)
-    most = np.argsort(-settings, kind="stable")[: len(SESSIONS)]
-    chosen = np.sort(most[settings[most] > 1])
+    visits = (session.T @ setting) > 0.0
+    settings, others = np.sum(visits, axis=1), visits.astype(int) @ (np.sum(visits, axis=0) - 1)
+    most = np.lexsort([-others, -settings])[: len(SESSIONS)]
+    chosen = np.sort(most[(settings[most] > 1) | (others[most] > 0)])
     found = np.full(len(settings), -1)
     found[chosen] = np.arange(len(chosen))
     return found
