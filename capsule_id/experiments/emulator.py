@@ -5,6 +5,7 @@ Advances in Neural Information Processing Systems 20, 2007, 1177). It approximat
 Matérn kernel of smoothness 5/2. The sampler uses it for proposals only; exact motions decide on every one of them.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,8 @@ from jaxtyping import Float
 
 #: Number of features, correlation length in sds of the training inputs, and ridge penalty of a weight.
 FEATURES, LENGTH, RIDGE = 2000, 8.0, 1e-3
+#: Coefficients of the series of a cosine in the square.
+COSINE = [(-1.0) ** k / math.factorial(2 * k) for k in range(10)]
 #: Rows of a block of the normal equations.
 ROWS = 2048
 #: Degrees of freedom of the random frequencies: twice the smoothness of the kernel.
@@ -77,5 +80,15 @@ class Emulator(eqx.Module):
     def _features(self, x: Any, xp: Any) -> Any:
         """(n, features + 1 + p) of inputs (n, p)."""
         z = (x - self.centre[None]) / self.scale[None]
-        waves = xp.cos(z @ self.frequencies + self.phases[None])
+        waves = _cosine(z @ self.frequencies + self.phases[None], xp)
         return xp.concatenate([waves, xp.ones((len(z), 1)), z], axis=1)
+
+
+def _cosine(x: Any, xp: Any) -> Any:
+    """Cosine of x (...) within 1e-8, by its series; XLA's own takes four times as long on a CPU."""
+    turns = x / (2.0 * np.pi)
+    square = (2.0 * np.pi * (turns - xp.round(turns))) ** 2
+    found = COSINE[-1] * xp.ones_like(square)
+    for coefficient in COSINE[-2::-1]:
+        found = found * square + coefficient
+    return found

@@ -1,16 +1,12 @@
 """Progressions: the likelihood against SciPy, sessions, the start on its own, faults of a folder with their remedies."""
 
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
-from scipy.special import logsumexp
-from scipy.stats import multivariate_normal
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
@@ -18,8 +14,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import KIND
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.sessions import NODES, Sessions, parameters_of
+from capsule_id.experiments.progression.sessions import NODES
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.fit.joint_fit import _rescaled
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -27,6 +22,7 @@ from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives.pulses import Pulses
 from capsule_id.physics.model import CapsuleParameters, simulate
 from tests.capsule_cases import jit_quickly
+from tests.experiments.summed_sessions import integrated
 from tests.rig.faults import fault_of
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
@@ -59,28 +55,6 @@ def plain_displacement(s: float, period: float, count: float) -> float:
     return float(simulate(p, drive, np.array([0.0, period * count])).X2[-1])
 
 
-def integrated(
-    trials: list[np.ndarray], X2: list[np.ndarray], variance: list[np.ndarray], shared: float, z: np.ndarray
-) -> float:
-    """Log-density of the ``trials`` of one setting by SciPy, each session integrated by a sum over z.
-
-    Parameters
-    ----------
-    X2, variance : displacement and variance of a trial in each session at z; of one number where it is known
-    shared : variance of the discrepancy
-    """
-    y, sizes = np.concatenate(trials), [len(own) for own in trials]
-    places = list(product(*(range(len(x)) for x in X2)))
-    log_weight = [[-0.5 * z**2 - logsumexp(-0.5 * z**2), np.zeros(1)][len(x) == 1] for x in X2]
-    density = []
-    for place in places:
-        at = list(enumerate(place))
-        mean = np.repeat([X2[j][i] for j, i in at], sizes)
-        covariance = shared + np.diag(np.repeat([variance[j][i] for j, i in at], sizes))
-        density.append(multivariate_normal(mean, covariance).logpdf(y) + sum(log_weight[j][i] for j, i in at))
-    return float(logsumexp(density))
-
-
 def test_the_likelihood_is_that_of_plain_runs(folder: Path) -> None:
     """One session is a parameter, the other is integrated out, with lines between its runs."""
     e = progression(folder)
@@ -105,77 +79,6 @@ def test_the_likelihood_is_that_of_plain_runs(folder: Path) -> None:
     changed = float(log_likelihood({**THETA, **other}))
     assert abs(changed - expected) > 0.05
     assert e.profile(THETA)(other) == pytest.approx(changed, abs=0.2 * abs(changed - expected))
-
-
-@pytest.mark.parametrize("lone", [(), (0,), (1, 3), (0, 1, 2)])
-def test_sums_over_groups_give_the_density_of_the_trials(lone: tuple[int, ...]) -> None:
-    """Two settings in two sessions each, of which some are integrated out, against SciPy."""
-    rng, scatters, z = np.random.default_rng(5), np.array([[0.1], [0.7]]), np.linspace(-6.0, 6.0, 201)
-    b, j = np.repeat([0, 0, 1, 1], [3, 2, 1, 4]), np.repeat([0, 1, 2, 3], [3, 2, 1, 4])
-    parameter = np.array([-1 if k in lone else k for k in range(4)])
-    sessions = Sessions(np.eye(2)[b], np.eye(4)[j], parameter)
-    distance, at_nodes = rng.normal(size=10), rng.normal(size=(4, len(NODES)))
-    at_nodes = np.where(sessions.alone[:, None] > 0.0, at_nodes, at_nodes[:, :1])
-    groups, discrepancy = TrialGroups(distance, sessions), np.array([0.3, 0.8])
-    assert len(groups.grid) == {0: 0, 1: 1, 2: 1, 3: 101}[len(lone)]
-    X2 = [make_interp_spline(NODES, x, k=1)(z) if k in lone else x[:1] for k, x in enumerate(at_nodes)]
-    expected = [
-        [
-            integrated(
-                [distance[j == k] for k in own], [X2[k] for k in own], [0.04 + t**2 + 0.0 * X2[k] for k in own], d**2, z
-            )
-            for own, d in zip(([0, 1], [2, 3]), discrepancy, strict=True)
-        ]
-        for t in scatters[:, 0]
-    ]
-    for xp in (np, jnp):
-        trials = TrialMisfit(groups, at_nodes, 0.04, 0.0, discrepancy)
-        np.testing.assert_allclose(np.asarray(trials.of_settings(scatters, xp))[:, 0], expected, rtol=1e-4)
-        found = np.asarray(trials.log_density(scatters, xp))
-        np.testing.assert_allclose(found, np.sum(expected, axis=1, keepdims=True), rtol=1e-4)
-
-
-def test_the_scatter_of_a_trial_follows_its_displacement() -> None:
-    """A session that is integrated out, with trials near one end of what it can explain."""
-    distance, z = np.array([-1.0, -1.04]), np.linspace(-6.0, 6.0, 2001)
-    sessions = Sessions(np.ones((2, 1)), np.ones((2, 1)), np.array([-1]))
-    X2 = np.array([[0.0, -0.5, -1.2]])
-    trials = TrialMisfit(TrialGroups(distance, sessions), X2, 1e-4, 0.05, np.array([0.01]))
-    own = make_interp_spline(NODES, X2[0], k=1)(z)
-    expected = integrated([distance], [own], [1e-4 + (0.05 * own) ** 2], 1e-4, z)
-    assert float(trials.log_density(0.0)) == pytest.approx(expected, abs=0.02)
-    constant = integrated([distance], [own], [1e-4 + (0.05 * 0.5) ** 2 + 0.0 * own], 1e-4, z)
-    assert abs(constant - expected) > 0.2
-
-
-def test_runs_between_the_outer_ones_matter(tmp_path: Path) -> None:
-    """Sessions that differ by 20 %, against 41 exact runs of each; a line through the outer runs is worse."""
-    design = RobotDesign(1e-3 * np.arange(60.0, 120.0, 5.0), np.full(12, 0.3), sessions=12, session_sd=0.2)
-    synthesize_robot(tmp_path / "rig", 6, design)
-    e = progression(tmp_path / "rig")
-    theta, z, fine = {**THETA, "session_sd": 0.2}, np.linspace(-5.0, 5.0, 41), np.linspace(-5.0, 5.0, 401)
-    assert e.sessions.symbols == ()
-    runs = e.displacements_of_draws([theta], 0.2 * np.tile(z, 12)[None], np.repeat(e.settings, 41, axis=0))
-    X2 = np.asarray(e.responses(theta))
-    middle = 0.5 * (X2[:, :1] + X2[:, 2:])
-    expected = [
-        integrated(
-            [e.distance[own > 0.0]],
-            [x],
-            [e.reading_variance + theta["trial_sd"] ** 2 + (theta["trial_scatter"] * x) ** 2],
-            (theta["discrepancy"] * time) ** 2,
-            fine,
-        )
-        for own, time, x in zip(
-            e.setting.T, e.time, make_interp_spline(z, runs.reshape(12, 41).T, k=1)(fine).T, strict=True
-        )
-    ]
-    with_three, with_two = (
-        np.asarray(e.trials_of(theta, own, np).of_settings(theta["trial_sd"], np)) - expected
-        for own in (X2, np.concatenate([X2[:, :1], middle, X2[:, 2:]], axis=1))
-    )
-    assert np.sqrt(np.mean(with_three**2)) < 0.6
-    assert np.sqrt(np.mean(with_two**2)) > 0.9
 
 
 def test_a_scatter_and_what_it_scales_move_together(tmp_path: Path) -> None:
@@ -230,30 +133,6 @@ def test_without_a_column_a_session_is_a_block_of_equal_settings(folder: Path, t
     assert blocks.setting.shape == (10, 3)
     # The first setting has two sessions.
     assert blocks.sessions.symbols == ("session_1", "session_2")
-
-
-def test_a_session_with_several_settings_or_a_shared_one_is_a_parameter() -> None:
-    """Two settings in session 3, one of them in session 1 too: cases, runs, and what a session changes."""
-    setting, session = np.eye(3)[[0, 0, 1, 2, 1]], np.eye(4)[[3, 1, 3, 0, 3]]
-    found = parameters_of(setting, session)
-    np.testing.assert_array_equal(found, [-1, 0, -1, 1])
-    sessions = Sessions(setting, session, found)
-    assert sessions.symbols == ("session_1", "session_2")
-    np.testing.assert_array_equal(sessions.setting, [0, 0, 1, 2])
-    np.testing.assert_array_equal(sessions.alone, [0, 0, 0, 1])
-    np.testing.assert_array_equal(np.argmax(sessions.rows, axis=1), [1, 0, 2, 3, 2])
-    theta = {"session_sd": 0.1, "session_1": -2.0, "session_2": 3.0}
-    np.testing.assert_allclose(sessions.log_friction(theta), [-0.2, 0.3, 0.3, -0.125, 0.0, 0.125], atol=1e-15)
-    np.testing.assert_array_equal(sessions.setting_of_run, [0, 0, 1, 2, 2, 2])
-    np.testing.assert_array_equal(sessions.responses(np.arange(6.0)), [[0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 4, 5]])
-    # No more parameters than there are rows for; the sessions with the most settings have them.
-    many = np.repeat(np.arange(10), 2)
-    crowded = np.append(many, 9)
-    found = parameters_of(np.eye(3)[np.append(np.tile([0, 1], 10), 2)], np.eye(10)[crowded])
-    np.testing.assert_array_equal(found, [0, 1, 2, 3, 4, 5, 6, -1, -1, 7])
-    # Then those that share their setting with the most.
-    found = parameters_of(np.eye(4)[[0, 1, 1, 2, 2, 2, 3]], np.eye(7))
-    np.testing.assert_array_equal(found, [-1, 0, 1, 2, 3, 4, -1])
 
 
 def test_the_sampler_integrates_the_absolute_scatter_alone(folder: Path) -> None:

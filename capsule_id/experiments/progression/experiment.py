@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol
-from capsule_id.experiments.emulator import Emulator
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
@@ -34,7 +33,8 @@ from capsule_id.experiments.progression.declaration import (
 )
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
-from capsule_id.experiments.progression.sessions import EDGES, Sessions, lines, parameters_of
+from capsule_id.experiments.progression.run_emulator import RunEmulator
+from capsule_id.experiments.progression.sessions import SIDES, Sessions, lines, parameters_of
 from capsule_id.experiments.progression.starts import starts_of
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -82,7 +82,7 @@ class Progression(TrialsExperiment):
 
     checks = (check_discrepancy,)
     reaction: float = eqx.field(static=True)
-    emulator: Emulator | None
+    emulator: RunEmulator | None
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction, self.smoothing, self.ground = friction, None, ground_of(table)
@@ -178,18 +178,13 @@ class Progression(TrialsExperiment):
     def runs(self, theta: ValuesBySymbol) -> Any:
         """(runs,) X2 of the runs of ``sessions``, m."""
         if self.emulator is not None:
-            return self.emulator(self._inputs(theta))
+            return self.emulator(theta)
         settings = jnp.asarray(self.settings)[self.sessions.setting_of_run]
         return self.displacements(theta, self.sessions.log_friction(theta), settings)
 
     def responses(self, theta: ValuesBySymbol) -> Any:
         """(cases, nodes) X2, m; see ``Sessions.responses``."""
         return self.sessions.responses(self.runs(theta))
-
-    def _inputs(self, theta: ValuesBySymbol) -> dict[str, Any]:
-        """Inputs of an emulator: sessions enter by the logarithm of their friction."""
-        sessions = {symbol: theta["session_sd"] * theta[symbol] for symbol in self.sessions.symbols}
-        return {**theta, **sessions}
 
     def displacements(self, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
         """X2, m, at rows of ``settings`` (rows, 4) with friction multiplied by exp(s), s (rows,)."""
@@ -206,10 +201,10 @@ class Progression(TrialsExperiment):
         return batched(_runs_at, self, draws, np.zeros((len(draws), 0)), self.settings)
 
     def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
-        without = OF_TRIALS if np.any(self.sessions.node) else (*OF_TRIALS, "session_sd")
+        without = (*OF_TRIALS, "session_sd", *self.sessions.symbols)
         positive = {row.symbol: row.positive for row in self.parameters if row.symbol not in without}
         varied = {mass: True for mass in self.masses if len({draw[mass] for draw in draws}) > 1}
-        emulator = Emulator({**positive, **varied}, [self._inputs(draw) for draw in draws], motions)
+        emulator = RunEmulator(self.sessions, {**positive, **varied}, draws, motions)
         return eqx.tree_at(lambda e: e.emulator, self, emulator, is_leaf=lambda x: x is None)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
@@ -241,7 +236,7 @@ class Progression(TrialsExperiment):
         time = xp.asarray(self.time)[xp.asarray(self.sessions.setting).astype(int)][:, None]
         variance = self.reading_variance + (theta["trial_scatter"] * start[:, :1]) ** 2
         w = variance / count[:, None] + (theta["discrepancy"] * time) ** 2
-        z = xp.clip(slope * r / (w + slope**2), xp.asarray(EDGES[None, :-1]), xp.asarray(EDGES[None, 1:]))
+        z = SIDES[None] * xp.maximum(SIDES[None] * slope * r / (w + slope**2), 0.0)
         best = xp.argmin(z**2 + (r - slope * z) ** 2 / w, axis=1)[:, None]
         start, slope, z = (xp.take_along_axis(x, best, axis=1)[:, 0] for x in (start, slope, z))
         return start, slope, start + slope * z

@@ -2,7 +2,7 @@
 
 Session j has friction multiplied by exp(session_sd z_j), z_j ~ N(0, 1). Where it has several settings, or shares its
 setting with other sessions, the trials determine z_j apart from the discrepancy: z_j is a parameter. A session that
-has a setting for itself is integrated out, its motion piecewise linear in z_j between runs at ``NODES``.
+has a setting for itself is integrated out, its motion linear in z_j on either side of 0, by runs at ``NODES``.
 """
 
 from types import ModuleType
@@ -16,10 +16,8 @@ from jaxtyping import Float, Int
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.progression.declaration import SESSIONS
 
-#: z of the runs of a session that is integrated out; the outer lines go on to both sides.
-NODES = np.array([-1.25, 0.0, 1.25])
-#: Where the lines end; z beyond the last ones has no weight.
-EDGES = np.array([-100.0, *NODES[1:-1], 100.0])
+#: z of the runs of a session that is integrated out, and the side of 0 of each line between them; it has no other end.
+NODES, SIDES = np.array([-1.25, 0.0, 1.25]), np.array([-1.0, 1.0])
 
 
 class Sessions(eqx.Module):
@@ -89,9 +87,8 @@ def _index(numbers: Any) -> Any:
 
 def lines(X: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
     """(..., lines) value at z = 0 and slope of the lines between X (..., nodes) at ``NODES``."""
-    nodes = xp.asarray(NODES.reshape(*(1,) * (X.ndim - 1), -1))
-    slope = (X[..., 1:] - X[..., :-1]) / (nodes[..., 1:] - nodes[..., :-1])
-    return X[..., :-1] - slope * nodes[..., :-1], slope
+    slope = (X[..., 1:] - X[..., :-1]) / xp.asarray(np.diff(NODES).reshape(*(1,) * (X.ndim - 1), -1))
+    return xp.stack([X[..., 1], X[..., 1]], axis=-1), slope
 
 
 def parameters_of(

@@ -67,7 +67,7 @@ DRAWS_PER_TAU, MAX_THIN = 5.0, 15
 PILOT_STEPS, LONG_PILOT_STEPS = 60, 300
 #: Name of the first move, and of that of an emulated posterior with its number of steps.
 FIRST = "block independence + differential evolution"
-DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 40
+DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
 #: Other kinds of moves are tried only where the block proposal stays above this, in steps.

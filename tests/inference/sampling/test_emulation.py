@@ -2,14 +2,17 @@
 
 from copy import copy
 from pathlib import Path
+from types import ModuleType
 from typing import cast
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.emulator import Emulator
+from capsule_id.experiments.emulator import Emulator, _cosine
 from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.experiments.progression.run_emulator import RunEmulator
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import ensembles, moves
 from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, Places
@@ -86,6 +89,12 @@ def test_an_emulator_follows_a_function_and_leaves_out_what_is_not_known() -> No
     assert np.all(errors < 0.04)
 
 
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_the_waves_are_cosines(xp: ModuleType) -> None:
+    x = np.linspace(-300.0, 300.0, 10_001)
+    np.testing.assert_allclose(_cosine(xp.asarray(x), xp), np.cos(x), rtol=0.0, atol=1e-8)
+
+
 def test_the_posterior_of_a_progression_is_emulated_near_its_draws(tmp_path: Path) -> None:
     """Motions and log-densities of new draws; parameters of the scatters have no part in the emulator."""
     rig = three_settings(tmp_path / "rig")
@@ -97,13 +106,17 @@ def test_the_posterior_of_a_progression_is_emulated_near_its_draws(tmp_path: Pat
     fit = PointFit(target.names, u, {}, np.diag(sd**2), {}, none, none, np.zeros(1), *flags)
     exact = MarginalPosterior(target, fit)
     assert exact.can_be_emulated
-    v = exact.centre + np.random.default_rng(0).standard_normal((640, exact.dimension)) * sd[: exact.dimension]
+    v = exact.centre + np.random.default_rng(0).standard_normal((760, exact.dimension)) * sd[: exact.dimension]
     (motions,) = exact.motions(v)
     emulated = exact.emulated(v[:600], [motions[:600]])
     (e,) = emulated.target.experiments
-    emulator = cast(Emulator, cast(Progression, e).emulator)
-    assert {"k1", "mu", "P_on", "lag", "session_sd"} <= set(emulator.symbols)
-    assert not {"trial_scatter", "trial_sd", "discrepancy", "g"} & set(emulator.symbols)
+    emulator = cast(RunEmulator, cast(Progression, e).emulator)
+    # Each session that is a parameter has inputs of its own; all others have their sd.
+    for part, own in zip(emulator.parts, ("session_sd", "session_1"), strict=True):
+        assert {"k1", "mu", "P_on", "lag", own} <= set(part.symbols)
+        assert (
+            len({"session_sd", "session_1", "trial_scatter", "trial_sd", "discrepancy", "g"} & set(part.symbols)) == 1
+        )
     # The exact density is untouched, and no longer that of the emulator.
     known, found = exact.parts(v[600:]), emulated.parts(v[600:])
     assert not np.array_equal(known, found)

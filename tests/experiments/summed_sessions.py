@@ -1,0 +1,29 @@
+"""Density of trials by SciPy, with sums over the sessions that are integrated out."""
+
+from itertools import product
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+
+def integrated(
+    trials: list[np.ndarray], X2: list[np.ndarray], variance: list[np.ndarray], shared: float, z: np.ndarray
+) -> float:
+    """Log-density of the ``trials`` of one setting by SciPy, each session integrated by a sum over z.
+
+    Parameters
+    ----------
+    X2, variance : displacement and variance of a trial in each session at z; of one number where it is known
+    shared : variance of the discrepancy
+    """
+    y, sizes = np.concatenate(trials), [len(own) for own in trials]
+    places = list(product(*(range(len(x)) for x in X2)))
+    log_weight = [[-0.5 * z**2 - logsumexp(-0.5 * z**2), np.zeros(1)][len(x) == 1] for x in X2]
+    density = []
+    for place in places:
+        at = list(enumerate(place))
+        mean = np.repeat([X2[j][i] for j, i in at], sizes)
+        covariance = shared + np.diag(np.repeat([variance[j][i] for j, i in at], sizes))
+        density.append(multivariate_normal(mean, covariance).logpdf(y) + sum(log_weight[j][i] for j, i in at))
+    return float(logsumexp(density))
