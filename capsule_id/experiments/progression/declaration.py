@@ -137,7 +137,7 @@ MESSAGES = {
     "progression.sessions": Message(
         "sessions",
         warn="{several:# session} with several settings, and only {most} of them have their friction as a parameter. The "
-        "others count as different sessions at every setting, so that intervals are too narrow: give the table of each day "
+        "others count as a new session at every setting, so that intervals are too narrow: give the table of each day "
         "or place its own entry",
     ),
     "progression.settings": Message(

@@ -34,7 +34,7 @@ from capsule_id.experiments.progression.declaration import (
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
 from capsule_id.experiments.progression.run_emulator import RunEmulator
-from capsule_id.experiments.progression.sessions import SIDES, Sessions, lines, parameters_of
+from capsule_id.experiments.progression.sessions import MIDDLE, NODES, Sessions, edges, lines, parameters_of
 from capsule_id.experiments.progression.starts import starts_of
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -201,7 +201,7 @@ class Progression(TrialsExperiment):
         return batched(_runs_at, self, draws, np.zeros((len(draws), 0)), self.settings)
 
     def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
-        without = (*OF_TRIALS, "session_sd", *self.sessions.symbols)
+        without = (*OF_TRIALS, "session_sd", *(row.symbol for row in SESSIONS))
         positive = {row.symbol: row.positive for row in self.parameters if row.symbol not in without}
         varied = {mass: True for mass in self.masses if len({draw[mass] for draw in draws}) > 1}
         emulator = RunEmulator(self.sessions, {**positive, **varied}, draws, motions)
@@ -220,38 +220,43 @@ class Progression(TrialsExperiment):
 
     def misfit_of(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType = jnp) -> Misfit:
         """The misfit at the ``responses``, the motion of a session linear about its most probable z."""
-        rows, alone = xp.asarray(self.sessions.rows), xp.asarray(self.sessions.alone)
+        rows, columns = xp.asarray(self.sessions.rows), xp.asarray(self.sessions.columns)
         start, slope, expected = self._most_probable_lines(theta, xp.asarray(X2), xp)
         discrepancy = theta["discrepancy"] * self.setting * self.time[None]
-        # The columns of sessions that are parameters are 0.
-        design = xp.concatenate([rows * (alone * slope)[None], discrepancy], axis=1)
+        design = xp.concatenate([(rows @ columns) * (slope @ columns)[None], discrepancy], axis=1)
         variance = self.reading_variance + (theta["trial_scatter"] * (rows @ expected)) ** 2
         return Misfit(self.distance - rows @ start, variance, xp.ones(len(self.distance)), design)
 
-    def _most_probable_lines(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> tuple[Any, Any, Any]:
-        """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m."""
-        start, slope = lines(X2, xp)
+    def _most_probable_lines(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> tuple[Any, ...]:
+        """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m.
+
+        The slope is 0 where this z is an end of the line: the readings lie beyond what the session can explain.
+        """
+        start, slope = lines(X2, NODES, xp)
         count = xp.sum(xp.asarray(self.sessions.rows), axis=0)
         r = (xp.asarray(self.sessions.rows).T @ self.distance / count)[:, None] - start
         time = xp.asarray(self.time)[xp.asarray(self.sessions.setting).astype(int)][:, None]
-        variance = self.reading_variance + (theta["trial_scatter"] * start[:, :1]) ** 2
+        variance = self.reading_variance + (theta["trial_scatter"] * X2[:, MIDDLE, None]) ** 2
         w = variance / count[:, None] + (theta["discrepancy"] * time) ** 2
-        z = SIDES[None] * xp.maximum(SIDES[None] * slope * r / (w + slope**2), 0.0)
+        low, high = (xp.asarray(edge[None]) for edge in edges(NODES))
+        z = xp.clip(slope * r / (w + slope**2), low, high)
         best = xp.argmin(z**2 + (r - slope * z) ** 2 / w, axis=1)[:, None]
-        start, slope, z = (xp.take_along_axis(x, best, axis=1)[:, 0] for x in (start, slope, z))
-        return start, slope, start + slope * z
+        expected, inside = start + slope * z, (z > low) & (z < high)
+        found = xp.where(inside, start, expected), xp.where(inside, slope, 0.0), expected
+        return tuple(xp.take_along_axis(x, best, axis=1)[:, 0] for x in found)
 
     def profile(self, theta: ValuesBySymbol) -> Any:
-        """The log-likelihood as a function of values of the scatters by symbol, the motions linear in ``session_sd``."""
+        """The log-likelihood as a function of values of the scatters, by symbol; motions are those near ``session_sd``."""
         sd = theta["session_sd"]
-        X2, more = (
-            np.asarray(self.responses({**theta, "session_sd": size})) for size in (sd, (1.0 + SESSION_STEP) * sd)
-        )
-        slope = (more - X2) / (SESSION_STEP * sd)
+        X2, more = (np.asarray(self.responses({**theta, "session_sd": f * sd})) for f in (1.0, 1.0 + SESSION_STEP))
+        change = (more - X2) / SESSION_STEP
+        # Without scatter, a session that is integrated out has the motion of z = 0.
+        bend = (change - (X2 - X2[:, [MIDDLE]])) * self.sessions.alone[:, None]
 
         def log_likelihood(scatters: ValuesBySymbol) -> float:
             own = {**theta, **scatters}
-            moved = X2 + (own["session_sd"] - sd) * slope
+            h = own["session_sd"] / sd - 1.0
+            moved = X2 + h * change + min(h, 0.0) ** 2 * bend
             return float(self.trials_of(own, moved, np).log_density(own["trial_sd"], np))
 
         return log_likelihood

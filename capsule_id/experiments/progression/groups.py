@@ -2,8 +2,8 @@
 
 Trials of a case differ only by their own scatter, so their number, mean and spread are sufficient. Given the
 parameters, settings are independent. The discrepancy of a setting is integrated out in closed form, and so is the
-session of a case that has none as a parameter: its motion is linear in z on either side of 0. Where a setting has
-several of these, they share its discrepancy, which is integrated by a sum.
+session of a case that has none as a parameter: its motion is piecewise linear in z. Where a setting has several of
+these, they share its discrepancy, which is integrated by Gauss-Hermite quadrature about a normal approximation.
 """
 
 from dataclasses import dataclass
@@ -16,15 +16,16 @@ import jax.scipy.special as jax_special
 import numpy as np
 import scipy.special as scipy_special
 from jaxtyping import Float
+from numpy.polynomial.hermite_e import hermegauss
 
 from capsule_id.experiments.linear import LOG_2PI
-from capsule_id.experiments.progression.sessions import SIDES, Sessions, lines
+from capsule_id.experiments.progression.sessions import INNER, MIDDLE, NODES, Sessions, edges, lines
 
-#: Discrepancies of a setting with several sessions that are integrated out, in its conditional sds.
-GRID = np.linspace(-5.0, 5.0, 101)
+#: Nodes of the discrepancy of a setting with several sessions that are integrated out.
+DISCREPANCIES = 13
 #: Within these z a line may explain the readings, for the variance of a trial that depends on its displacement.
 FARTHEST_Z = 3.0
-#: Least probability of a side of z = 0.
+#: Smallest probability that is computed as such; the logarithm of a smaller one is that of the tail of a normal density.
 LEAST = 1e-300
 
 
@@ -34,11 +35,9 @@ class TrialGroups(eqx.Module):
     Attributes
     ----------
     count, mean, spread : (cases,) number of trials, mean, m, and sum of squares about it, m^2
-    known, filled : (settings, g) index of the cases of a setting that are known, and 1 where there is one
-    lone : (lone,) index of the other cases
-    of_setting : (lone, settings) 1 where a case belongs to a setting
-    several : (settings,) 1 where it has more than one of these
-    grid : of the discrepancy, in its conditional sds; () where no session is integrated out
+    known, filled : (settings, g) index of the cases of a setting that are known, and 1 where there is one; else any case
+    lone : index of the cases that have a setting for themselves, apart from known ones, and of those that share it
+    of_setting : for both, (cases, settings) 1 where a case belongs to a setting
     """
 
     count: np.ndarray
@@ -46,10 +45,8 @@ class TrialGroups(eqx.Module):
     spread: np.ndarray
     known: np.ndarray
     filled: np.ndarray
-    lone: np.ndarray
-    of_setting: np.ndarray
-    several: np.ndarray
-    grid: tuple[float, ...] = eqx.field(static=True)
+    lone: tuple[np.ndarray, np.ndarray]
+    of_setting: tuple[np.ndarray, np.ndarray]
 
     def __init__(self, distance: Float[np.ndarray, " n"], sessions: Sessions) -> None:
         """Group trials by their distance, m."""
@@ -59,13 +56,12 @@ class TrialGroups(eqx.Module):
         settings = np.arange(1 + int(np.max(sessions.setting)))
         known = [np.flatnonzero((sessions.setting == b) & (sessions.alone == 0.0)) for b in settings]
         self.filled = 1.0 * (np.arange(max(1, *map(len, known))) < np.array(list(map(len, known)))[:, None])
-        self.known = np.zeros(self.filled.shape, dtype=int)
+        first = np.array([np.argmax(sessions.setting == b) for b in settings])
+        self.known = np.repeat(first[:, None], self.filled.shape[1], axis=1)
         self.known[self.filled > 0.0] = np.concatenate(known)
-        self.lone = np.flatnonzero(sessions.alone)
-        self.of_setting = 1.0 * (sessions.setting[self.lone][:, None] == settings)
-        most = np.sum(self.of_setting, axis=0)
-        self.several = 1.0 * (most > 1)
-        self.grid = tuple(GRID.tolist()) if np.any(most > 1) else (0.0,) * int(np.any(most > 0))
+        self.lone = np.flatnonzero(sessions.alone > sessions.shared), np.flatnonzero(sessions.shared)
+        first, second = (1.0 * (sessions.setting[own][:, None] == settings) for own in self.lone)
+        self.of_setting = first, second
 
 
 @dataclass(frozen=True)
@@ -74,7 +70,7 @@ class TrialMisfit:
 
     Attributes
     ----------
-    X2 : (cases, nodes) displacements at z = ``NODES``, m; equal where z is a parameter
+    X2 : (cases, nodes) displacements at z = ``NODES``, m; where z is a parameter, the middle one counts
     reading_variance, trial_scatter : variance of a reading, m^2, and relative scatter of a trial
     discrepancy : (settings,) its standard deviation, m
     """
@@ -95,16 +91,16 @@ class TrialMisfit:
         flat = scatter.reshape(-1, 1, 1)
         # Axes: scatter, setting, case.
         X2, y, count, spread = self._cases(groups.known, xp)
-        v = self.reading_variance + (self.trial_scatter * X2[None, ..., 0]) ** 2 + flat**2
-        weight, y = (groups.filled * count)[None] / v, (y - X2[..., 0])[None]
+        v = self.reading_variance + (self.trial_scatter * X2[None, ..., MIDDLE]) ** 2 + flat**2
+        weight, y = (groups.filled * count)[None] / v, (y - X2[..., MIDDLE])[None]
         inside = (groups.filled * count)[None] * (LOG_2PI + xp.log(v)) + (groups.filled * spread)[None] / v
         # What the discrepancy explains of the trials of known friction, and its normal density given these.
         prior, moment = (self.discrepancy**2)[None], xp.sum(weight * y, axis=2)
         gain = 1.0 + prior * xp.sum(weight, axis=2)
         variance = prior / gain
         density = -0.5 * (xp.sum(inside + weight * y**2, axis=2) - variance * moment**2 + xp.log(gain))
-        if groups.grid:
-            density = density + self._of_lone_sessions(flat, variance * moment, variance, xp)
+        for shared in np.flatnonzero([own.shape[0] > 0 for own in groups.lone]):
+            density = density + self._of_lone_sessions(int(shared), flat, (variance * moment, variance), xp)
         return density.reshape(*scatter.shape, -1)
 
     def _cases(self, index: Any, xp: ModuleType) -> tuple[Any, Any, Any, Any]:
@@ -113,36 +109,74 @@ class TrialMisfit:
         groups = self.groups
         return self.X2[index], *(xp.asarray(x)[index] for x in (groups.mean, groups.count, groups.spread))
 
-    def _of_lone_sessions(self, scatter: Any, mean: Any, variance: Any, xp: ModuleType) -> Any:
+    def _of_lone_sessions(self, shared: int, scatter: Any, discrepancy: tuple[Any, Any], xp: ModuleType) -> Any:
         """(scatter, settings) density of the trials whose z is integrated out.
+
+        The variance of a trial is taken where its line is nearest to the mean of the trials.
 
         Parameters
         ----------
+        shared : 0 for cases that have a setting for themselves, 1 for those that share it
         scatter : (scatter, 1, 1) m
-        mean, variance : (scatter, settings) of the discrepancy given all other trials, m and m^2
+        discrepancy : (scatter, settings) its mean, m, and variance, m^2, given the trials of known friction
         """
-        groups, special = self.groups, scipy_special if xp is np else jax_special
-        X2, y, count, spread = self._cases(groups.lone, xp)
-        start, slope = lines(X2, xp)
-        sides = SIDES[None]
-        far = start + FARTHEST_Z * sides * slope
-        nearest = xp.clip(y[:, None], xp.minimum(start, far), xp.maximum(start, far))
+        special, of_setting = scipy_special if xp is np else jax_special, self.groups.of_setting[shared]
+        nodes, chosen = (NODES, slice(None)) if shared else (NODES[INNER], INNER)
+        X2, y, count, spread = self._cases(self.groups.lone[shared], xp)
+        start, slope = lines(X2[:, chosen], nodes, xp)
+        low, high = (start + slope * np.clip(z, -FARTHEST_Z, FARTHEST_Z)[None] for z in edges(nodes))
+        nearest = xp.clip(y[:, None], xp.minimum(low, high), xp.maximum(low, high))
         # Axes: scatter, case, line, discrepancy.
         v = (self.reading_variance + (self.trial_scatter * nearest[None]) ** 2 + scatter**2)[..., None]
-        start, slope, sides = (x[None, ..., None] for x in (start, slope, sides))
+        start, slope = (x[None, ..., None] for x in (start, slope))
         y, count, spread = (x[None, :, None, None] for x in (y, count, spread))
-        # Where only one session is integrated out, the variance of the discrepancy stays in the closed form.
-        own, several, grid = groups.of_setting.T, groups.several[None], np.array(groups.grid).reshape(1, 1, 1, -1)
-        mean, inner, outer = (
-            (x @ own)[..., None, None] for x in (mean, variance * (1.0 - several), variance * several)
-        )
-        r, w = y - start - (mean + xp.sqrt(outer) * grid), v / count + inner
+        mean, variance = ((x @ of_setting.T)[..., None, None] for x in discrepancy)
+        at, weights = hermegauss(DISCREPANCIES if shared else 1)
+        t, correction = xp.zeros((1, 1, 1, 1)), xp.zeros((1, 1, 1))
+        if shared:
+            t, correction = self._discrepancies(X2, scatter, discrepancy, at, xp)
+            t = xp.einsum("kbd,cb->kcd", t, of_setting)[:, :, None]
+        r = y - start - (mean + xp.sqrt(variance) * t)
+        # One case of a setting has the variance of the discrepancy in closed form.
+        w = v / count + (0.0 if shared else variance)
         total = w + slope**2
         inside = (count - 1.0) * (LOG_2PI + xp.log(v)) + xp.log(count) + spread / v
-        # Given the readings and its line, z is normal; the part of it on the side of the line counts. Where both parts
-        # are 0 in floating point, the readings are about 38 sds from all that the session can explain.
-        part = 0.5 * special.erfc(-sides * slope * r / xp.sqrt(2.0 * w * total))
-        density = -0.5 * (inside + LOG_2PI + xp.log(total) + r**2 / total)
-        cases = special.logsumexp(density, axis=2, b=xp.maximum(part, LEAST))
-        weights = -0.5 * grid[0] ** 2 - scipy_special.logsumexp(-0.5 * grid**2)
-        return special.logsumexp(xp.einsum("kcd,cb->kbd", cases, groups.of_setting) + weights, axis=2)
+        # Given the readings and its line, z is normal; the part of it that belongs to the line counts.
+        z, precision = slope * r / total, xp.sqrt(total / w)
+        lower, upper = ((edge.reshape(1, 1, -1, 1) - z) * precision for edge in edges(nodes))
+        part = _log_probability(lower, upper, special, xp)
+        cases = special.logsumexp(part - 0.5 * (inside + LOG_2PI + xp.log(total) + r**2 / total), axis=2)
+        log_weights = correction + np.log(weights / np.sum(weights)).reshape(1, 1, -1)
+        settings = xp.einsum("kcd,cb->kbd", cases, of_setting)
+        found = special.logsumexp(settings + log_weights, axis=2)
+        return found * (xp.sum(of_setting, axis=0) > 0.0)[None]
+
+    def _discrepancies(
+        self, X2: Any, scatter: Any, discrepancy: tuple[Any, Any], at: np.ndarray, xp: ModuleType
+    ) -> tuple[Any, Any]:
+        """(scatter, settings, d) discrepancies in sds from their mean, and logarithms of the factors of their weights.
+
+        The nodes ``at`` lie about a normal approximation: each motion is taken as linear between the inner runs.
+        """
+        of_setting = self.groups.of_setting[1]
+        _, y, count, _ = self._cases(self.groups.lone[1], xp)
+        X2 = X2.reshape(1, *X2.shape)
+        slope = (X2[..., INNER][..., -1] - X2[..., INNER][..., 0]) / (NODES[INNER][-1] - NODES[INNER][0])
+        v = self.reading_variance + (self.trial_scatter * X2[..., MIDDLE]) ** 2 + scatter[..., 0] ** 2
+        q = 1.0 / (v / count[None] + slope**2)
+        mean, variance = discrepancy
+        r = y[None] - X2[..., MIDDLE] - mean @ of_setting.T
+        gain = 1.0 + variance * (q @ of_setting)
+        centre = xp.sqrt(variance) * ((q * r) @ of_setting) / gain
+        u = at.reshape(1, 1, -1)
+        t = centre[..., None] + u / xp.sqrt(gain)[..., None]
+        return t, 0.5 * (u**2 - t**2 - xp.log(gain)[..., None])
+
+
+def _log_probability(lower: Any, upper: Any, special: ModuleType, xp: ModuleType) -> Any:
+    """Logarithm of the standard normal probability between ``lower`` and ``upper``, which differ by 1 or more."""
+    right = lower > 0.0
+    near, far = xp.where(right, lower, -upper), xp.where(right, upper, -lower)
+    found = 0.5 * (special.erfc(near / np.sqrt(2.0)) - special.erfc(far / np.sqrt(2.0)))
+    tail = -0.5 * (near**2 + LOG_2PI) - xp.log(xp.maximum(near, 1.0))
+    return xp.where(found > LEAST, xp.log(xp.maximum(found, LEAST)), tail)

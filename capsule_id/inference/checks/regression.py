@@ -45,7 +45,8 @@ def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, n
     sd, at = misfit.sd, np.array([float(theta[s]) for s in symbols])
     raw = jacobian(residuals, at, DIFFERENCE * np.maximum(np.abs(at), 1e-12)) / sd[:, None]
     columns = np.concatenate([raw, misfit.design / sd[:, None]], axis=1)
-    columns = columns / np.linalg.norm(columns, axis=0)
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 0.0] / size[size > 0.0]
     return np.asarray(experiment.residuals(theta, np))[: experiment.n], columns
 
 

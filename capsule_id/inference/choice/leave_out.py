@@ -1,8 +1,8 @@
 """Expected log predictive density of settings left out, by Pareto-smoothed importance sampling (PSIS-LOO).
 
 Draws of a density near the posterior are weighted by the posterior: of the emulated posterior where there is one, else
-independent draws of the sampler's adapted proposal. For each draw the readings of a setting are normal given all other
-readings. Division by their density leaves the setting out.
+independent draws of the sampler's adapted proposal. Division by the density of the readings of a setting, given the
+parameters and all other readings, leaves the setting out.
 (A. Vehtari, A. Gelman, J. Gabry, *Practical Bayesian model evaluation using leave-one-out cross-validation and WAIC*,
 Statistics and Computing 27, 2017, 1413.)
 """
