@@ -113,23 +113,36 @@ def test_a_misfit_stays_where_no_friction_explains_the_readings(tmp_path: Path) 
     assert np.min(residuals([-1.0, -0.5, 0.0, -0.5, -1.0])) > 5.0
 
 
-def test_an_outlying_trial_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The motion depends on two parameters only: a column without effect must not hide the trial."""
-    synthesize_robot(tmp_path / "rig", 3, RobotDesign(1e-3 * np.arange(60.0, 170.0, 10.0), np.full(11, 0.3)))
+@pytest.mark.parametrize("sessions", [2, 11])
+def test_an_outlying_trial_is_found(tmp_path: Path, sessions: int) -> None:
+    """The columns of discrepancies span those of the parameters, which must not hide the trial."""
+    design = RobotDesign(1e-3 * np.arange(60.0, 170.0, 10.0), np.full(11, 0.3), sessions=sessions)
+    synthesize_robot(tmp_path / "rig", 3, design)
     (e,) = cast(list[Progression], make_experiments(read_rig(tmp_path / "rig")))
     theta = {**THETA, "session_2": 0.3}
-    case = np.arange(11.0)[:, None]
-    monkeypatch.setattr(
-        Progression,
-        "responses",
-        lambda _, t: 1e-3 * t["k1"] * np.cos(case / 3.0) + 0.05 * t["c"] * np.ones((11, len(NODES))),
-    )
-    true = e.sessions.rows @ np.asarray(e.responses(theta))[:, MIDDLE]
-    readings = true + e.misfit(theta).sd * np.random.default_rng(0).standard_normal(len(true))
-    for row, size in ((None, 0.0), (13, 0.06)):
-        distance = readings + size * (np.arange(len(readings)) == row)
-        found = outliers(eqx.tree_at(lambda one: one.distance, e, distance), theta, 0.01)
+    for row, size in ((None, 0.0), (13, 0.06), (31, 0.3)):
+        distance = e.distance + size * (np.arange(e.n) == row)
+        found = outliers(eqx.tree_at(lambda one: one.distance, e, distance), theta, 0.001)
         assert [one.row for one in found] == ([] if row is None else [row])
+
+
+def test_a_known_session_moves_the_discrepancy_of_the_others() -> None:
+    """One known session and two that are integrated out at one setting, another setting, and each of them left out."""
+    rng, z = np.random.default_rng(3), np.linspace(-6.0, 6.0, 201)
+    b, j = np.repeat([0, 0, 0, 1, 1], 2), np.repeat([0, 1, 2, 3, 0], 2)
+    sessions = Sessions(np.eye(2)[b], np.eye(4)[j], parameters_of(np.eye(2)[b], np.eye(4)[j]))
+    np.testing.assert_array_equal(sessions.shared, [0, 1, 1, 0, 0])
+    distance = 0.3 * rng.normal(size=10) + 0.5
+    at_nodes = np.asarray(sessions.responses(0.3 * rng.normal(size=len(sessions.case))))
+    known = sessions.alone == 0.0
+    trials = TrialMisfit(TrialGroups(distance, sessions), at_nodes, 0.04, 0.0, np.array([0.4, 0.6]))
+    X2 = [x[[MIDDLE]] if own else make_interp_spline(NODES, x, k=1)(z) for own, x in zip(known, at_nodes, strict=True)]
+    cases = [distance[own > 0.0] for own in sessions.rows.T]
+    expected = [
+        integrated([cases[k] for k in own], [X2[k] for k in own], [0.04 + 0.0 * X2[k] for k in own], d**2, z)
+        for own, d in (([0, 1, 2], 0.4), ([3, 4], 0.6))
+    ]
+    np.testing.assert_allclose(np.asarray(trials.of_settings(0.0)), expected, rtol=1e-4)
 
 
 def test_runs_between_the_outer_ones_matter(tmp_path: Path) -> None:

@@ -57,11 +57,6 @@ def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
         np.testing.assert_allclose(found[:, setting], own, rtol=1e-6)
 
 
-def test_absurd_values_have_no_density(rig: Rig) -> None:
-    (e,) = cast(list[Progression], make_experiments(rig))
-    assert np.all(np.isnan(e.densities_of_settings([{**THETA, "trial_scatter": np.nan}])))
-
-
 class Readings:
     """Readings y_b ~ N(theta, 1), each a setting of its own; the posterior of theta under a flat prior is normal."""
 

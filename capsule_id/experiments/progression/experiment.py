@@ -230,13 +230,13 @@ class Progression(TrialsExperiment):
     def _most_probable_lines(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> tuple[Any, ...]:
         """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m.
 
-        The slope is 0 where this z is an end of the line: the readings lie beyond what the session can explain.
+        The slope is 0 where this z is at a kink: no small change of it explains more.
         """
         start, slope = lines(X2, NODES, xp)
         count = xp.sum(xp.asarray(self.sessions.rows), axis=0)
         r = (xp.asarray(self.sessions.rows).T @ self.distance / count)[:, None] - start
         time = xp.asarray(self.time)[xp.asarray(self.sessions.setting).astype(int)][:, None]
-        variance = self.reading_variance + (theta["trial_scatter"] * X2[:, MIDDLE, None]) ** 2
+        variance = self.reading_variance + (theta["trial_scatter"] * X2[:, MIDDLE, None]) ** 2 + theta["trial_sd"] ** 2
         w = variance / count[:, None] + (theta["discrepancy"] * time) ** 2
         low, high = (xp.asarray(edge[None]) for edge in edges(NODES))
         z = xp.clip(slope * r / (w + slope**2), low, high)
@@ -246,11 +246,11 @@ class Progression(TrialsExperiment):
         return tuple(xp.take_along_axis(x, best, axis=1)[:, 0] for x in found)
 
     def profile(self, theta: ValuesBySymbol) -> Any:
-        """The log-likelihood as a function of values of the scatters, by symbol; motions are those near ``session_sd``."""
+        """The log-likelihood as a function of values of the scatters, by symbol; motions linear in ``session_sd``."""
         sd = theta["session_sd"]
         X2, more = (np.asarray(self.responses({**theta, "session_sd": f * sd})) for f in (1.0, 1.0 + SESSION_STEP))
         change = (more - X2) / SESSION_STEP
-        # Without scatter, a session that is integrated out has the motion of z = 0.
+        # Below, they are bent: at 0, a session that is integrated out has the motion of z = 0.
         bend = (change - (X2 - X2[:, [MIDDLE]])) * self.sessions.alone[:, None]
 
         def log_likelihood(scatters: ValuesBySymbol) -> float:

@@ -36,7 +36,7 @@ class TrialGroups(eqx.Module):
     ----------
     count, mean, spread : (cases,) number of trials, mean, m, and sum of squares about it, m^2
     known, filled : (settings, g) index of the cases of a setting that are known, and 1 where there is one; else any case
-    lone : index of the cases that have a setting for themselves, apart from known ones, and of those that share it
+    lone : index of the other cases: of those alone in their setting, apart from known ones, and of those that share it
     of_setting : for both, (cases, settings) 1 where a case belongs to a setting
     """
 
@@ -148,8 +148,7 @@ class TrialMisfit:
         cases = special.logsumexp(part - 0.5 * (inside + LOG_2PI + xp.log(total) + r**2 / total), axis=2)
         log_weights = correction + np.log(weights / np.sum(weights)).reshape(1, 1, -1)
         settings = xp.einsum("kcd,cb->kbd", cases, of_setting)
-        found = special.logsumexp(settings + log_weights, axis=2)
-        return found * (xp.sum(of_setting, axis=0) > 0.0)[None]
+        return special.logsumexp(settings + log_weights, axis=2)
 
     def _discrepancies(
         self, X2: Any, scatter: Any, discrepancy: tuple[Any, Any], at: np.ndarray, xp: ModuleType

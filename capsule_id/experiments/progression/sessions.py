@@ -2,8 +2,8 @@
 
 Session j has friction multiplied by exp(session_sd z_j), z_j ~ N(0, 1). Where it has several settings, z_j is a
 parameter; at most eight sessions are. All others are integrated out, in each of their settings alone, with a motion that
-is piecewise linear in z_j between runs. There are more runs where the setting has other sessions too, because these
-determine z_j apart from the discrepancy, also far from 0.
+is piecewise linear in z_j between runs. There are more runs where the setting has several of these sessions,
+because they determine z_j apart from the discrepancy, also far from 0.
 """
 
 from types import ModuleType
@@ -17,6 +17,8 @@ from jaxtyping import Float, Int
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.progression.declaration import SESSIONS
 
+#: z beyond which a session has no weight.
+FAR = 1e3
 #: z of the runs of a session that is integrated out. One that has its setting for itself has the inner ones only. The
 #: outer lines go on beyond their runs.
 NODES = np.array([-2.5, -1.25, 0.0, 1.25, 2.5])
@@ -110,8 +112,8 @@ def lines(X: Any, nodes: np.ndarray, xp: ModuleType = jnp) -> tuple[Any, Any]:
 
 
 def edges(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(lines,) z where each line ends; the outer ones have no end."""
-    return np.append(-np.inf, nodes[1:-1]), np.append(nodes[1:-1], np.inf)
+    """(lines,) z where each line begins and ends; the outer ones go on."""
+    return np.append(-FAR, nodes[1:-1]), np.append(nodes[1:-1], FAR)
 
 
 def parameters_of(

@@ -15,6 +15,8 @@ from capsule_id.inference.fit.curvature import jacobian
 
 #: Relative step of difference quotients, dimensionless.
 DIFFERENCE = 1e-5
+#: Singular values below this part of the largest one are those of columns that depend on each other.
+DEPENDENT = 1e-8
 #: Largest number of flagged rows per experiment. More outliers indicate a wrong model, not wrong rows.
 MOST_FLAGGED = 3
 
@@ -59,7 +61,8 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
     r, columns = design(experiment, theta)
     keep = np.arange(len(r))
     found: list[Outlier] = []
-    while len(found) < MOST_FLAGGED and len(keep) > columns.shape[1] + 2:
+    # Columns of nuisances may span those of parameters: their rank counts, not their number.
+    while len(found) < MOST_FLAGGED and len(keep) > np.linalg.matrix_rank(columns[keep], rtol=DEPENDENT) + 2:
         score, freedom = _studentised(r[keep], columns[keep], experiment.scale_known)
         worst = int(np.argmax(np.abs(score)))
         tail = stats.norm.sf(abs(score[worst])) if freedom is None else stats.t.sf(abs(score[worst]), freedom)
@@ -73,11 +76,12 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
 
 def _studentised(r: np.ndarray, columns: np.ndarray, known: bool) -> tuple[np.ndarray, int | None]:
     """Studentised residuals about the local fit, and their degrees of freedom (None: normal)."""
-    q, _ = np.linalg.qr(columns)
+    u, size, _ = np.linalg.svd(columns, full_matrices=False)
+    q = u[:, size > DEPENDENT * size[0]]
     rest = r - q @ (q.T @ r)
     free = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-9)
     if known:
         return rest / np.sqrt(free), None
-    freedom = len(r) - columns.shape[1] - 1
+    freedom = len(r) - q.shape[1] - 1
     variance = np.maximum((rest @ rest - rest**2 / free) / freedom, 1e-300)
     return rest / np.sqrt(variance * free), freedom
