@@ -1,19 +1,22 @@
 """Sessions of a progression: which are parameters, their runs, and the density of trials with the others integrated out."""
 
 from pathlib import Path
+from types import ModuleType
 from typing import cast
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.scipy.special as jax_special
 import numpy as np
 import pytest
+import scipy.special as scipy_special
 from scipy.interpolate import make_interp_spline
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
+from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit, _log_probability
 from capsule_id.experiments.progression.run_emulator import RunEmulator
 from capsule_id.experiments.progression.sessions import INNER, MIDDLE, NODES, Sessions, parameters_of
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
@@ -65,6 +68,17 @@ def test_the_scatter_of_a_trial_follows_its_displacement() -> None:
     assert float(trials.log_density(0.0)) == pytest.approx(expected, abs=0.02)
 
 
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_probabilities_in_both_tails_are_accurate(xp: ModuleType) -> None:
+    lower = np.array([-60.0, -39.0, -12.0, -2.0, 0.0, 3.0, 10.0, 30.0, 50.0])
+    upper = lower + np.array([2.0, 1.5, 1.0, 5.0, 1.0, 1.2, 9.0, 2.0, 4.0])
+    near, far = np.where(lower > 0.0, -lower, upper), np.where(lower > 0.0, -upper, lower)
+    expected = norm.logcdf(near) + np.log1p(-np.exp(norm.logcdf(far) - norm.logcdf(near)))
+    special = scipy_special if xp is np else jax_special
+    found = _log_probability(xp.asarray(lower), xp.asarray(upper), special, xp)
+    np.testing.assert_allclose(np.asarray(found), expected, atol=1e-3)
+
+
 def test_readings_that_no_friction_explains_have_the_density_of_the_tail() -> None:
     """A capsule that stays where friction is higher, and trials on the other side; probabilities are 0 as numbers."""
     z, at_nodes = np.linspace(-6.0, 6.0, 2001), np.array([[0.2, 0.1, 0.0, 0.0, 0.0]])
@@ -113,6 +127,27 @@ def test_a_misfit_stays_where_no_friction_explains_the_readings(tmp_path: Path) 
     assert np.min(residuals([-1.0, -0.5, 0.0, -0.5, -1.0])) > 5.0
 
 
+def test_a_misfit_is_about_the_z_that_is_most_probable(tmp_path: Path) -> None:
+    """Lines of 20 and 2 mm per sd of a session, and trials that scatter by 10 mm: the least cost by a fine sum over z."""
+    three_settings(tmp_path)
+    header, *rows = [line.rsplit(",", 1)[0] for line in (tmp_path / "progression.csv").read_text().splitlines()]
+    (tmp_path / "progression.csv").write_text("\n".join([header, *rows, *rows[:3]]) + "\n")
+    (e,) = cast(list[Progression], make_experiments(read_rig(tmp_path)))
+    own, z = e.sessions.rows[:, 0] > 0.0, np.linspace(-6.0, 6.0, 24_001)
+    assert e.sessions.shared[0] == 1.0
+    theta = {**THETA, "discrepancy": 1e-9, "trial_scatter": 0.0, "trial_sd": 0.01}
+    variance = theta["trial_sd"] ** 2 + e.reading_variance
+    X2 = np.asarray(e.responses(theta)).copy()
+    for away in (-0.015, 0.01, 0.02, 0.025, 0.026, 0.04):
+        X2[0] = np.mean(e.distance[own]) - away + np.array([-0.0275, -0.025, 0.0, 0.025, 0.0275])
+        at = make_interp_spline(NODES, X2[0], k=1)(z)
+        least = np.min(z**2 + np.sum((e.distance[own][:, None] - at) ** 2, axis=0) / variance)
+        rest, nuisances = e.misfit_of(theta, X2, np).at(theta["trial_sd"], np).at_nuisance_mean(np)
+        # On the outer line z is about 1.25 and held: its own cost is not among the nuisances.
+        held = 1.25**2 if nuisances[0] == 0.0 else nuisances[0] ** 2
+        assert np.sum(rest[own] ** 2) + held == pytest.approx(least, rel=1e-2)
+
+
 @pytest.mark.parametrize("sessions", [2, 11])
 def test_an_outlying_trial_is_found(tmp_path: Path, sessions: int) -> None:
     """The columns of discrepancies span those of the parameters, which must not hide the trial."""
@@ -124,6 +159,18 @@ def test_an_outlying_trial_is_found(tmp_path: Path, sessions: int) -> None:
         distance = e.distance + size * (np.arange(e.n) == row)
         found = outliers(eqx.tree_at(lambda one: one.distance, e, distance), theta, 0.001)
         assert [one.row for one in found] == ([] if row is None else [row])
+
+
+def test_an_outlying_trial_is_found_where_no_parameter_has_an_effect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A capsule that moves alike whatever its parameters are: their columns are 0."""
+    (e,) = cast(list[Progression], make_experiments(three_settings(tmp_path / "rig")))
+    monkeypatch.setattr(Progression, "responses", lambda *_: jnp.full((3, len(NODES)), 0.1))
+    distance = 0.1 + 1e-3 * np.random.default_rng(0).standard_normal(e.n)
+    distance[4] += 0.1
+    (found,) = outliers(eqx.tree_at(lambda one: one.distance, e, distance), THETA, 0.01)
+    assert found.row == 4
 
 
 def test_a_known_session_moves_the_discrepancy_of_the_others() -> None:
@@ -203,9 +250,12 @@ def test_a_session_with_several_settings_is_a_parameter() -> None:
 def test_a_run_is_emulated_by_the_friction_of_its_own_session() -> None:
     """Two sessions that are parameters and one that is integrated out, in the order of the runs."""
     rng = np.random.default_rng(2)
-    sessions = Sessions(np.eye(3)[[0, 0, 1, 2]], np.eye(4)[[3, 1, 3, 0]], np.array([-1, 0, -1, 1]))
+    sessions = Sessions(np.eye(3)[[0, 0, 1, 2]], np.eye(4)[[3, 1, 3, 0]], np.array([-1, 1, -1, 0]))
     names = ("k1", "session_sd", *sessions.symbols)
-    draws = [dict(zip(names, (1.0 + 0.1 * a, 0.2, b, c), strict=True)) for a, b, c in rng.normal(size=(300, 3))]
+    draws = [
+        dict(zip(names, (1.0 + 0.1 * a, 0.2 * np.exp(0.3 * b), c, d), strict=True))
+        for a, b, c, d in rng.normal(size=(1000, 4))
+    ]
 
     def motions(theta: dict[str, float]) -> np.ndarray:
         s = np.asarray(sessions.log_friction(theta))

@@ -48,13 +48,16 @@ def test_each_word_varies_its_own_choice(rig: Rig) -> None:
 def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
     """p(y_b | y_rest) = p(y) / p(y_rest); the rest is also the experiment without the setting."""
     (e,) = cast(list[Progression], make_experiments(rig))
-    found, motions = e.densities_of_settings([THETA, THETA]), e.motions_of_draws([THETA])
+    draws = [THETA, {**THETA, "mu": 1.02 * THETA["mu"]}]
+    found, motions = e.densities_of_settings(draws), e.motions_of_draws([THETA])
+    np.testing.assert_allclose(np.sum(found, axis=1), [float(e.log_likelihood(draw)) for draw in draws], rtol=1e-6)
+    assert abs(np.diff(np.sum(found, axis=1))[0]) > 0.1
     for setting in range(len(e.settings)):
         smaller = e.without(setting)
         assert smaller.n == e.n - 3
         np.testing.assert_allclose(e.motions_without(motions, setting), smaller.motions_of_draws([THETA]), rtol=1e-9)
         own = float(e.log_likelihood(THETA) - smaller.log_likelihood(THETA))
-        np.testing.assert_allclose(found[:, setting], own, rtol=1e-6)
+        np.testing.assert_allclose(found[0, setting], own, rtol=1e-6)
 
 
 class Readings:

@@ -13,6 +13,7 @@ from capsule_id.records.contacts import Contacts
 from capsule_id.records.label import UNDECIDED, measured_motion
 from capsule_id.records.mean_velocity import MeanVelocity
 from capsule_id.records.repeat import Repeat, find_period
+from capsule_id.records.tone import Harmonic
 from tests.records.runs import FRESH, LONGER, Known, fresh, longer, noisier, reference, scattered, table_of
 
 
@@ -173,8 +174,7 @@ def test_a_wrong_stated_frequency_is_found_and_does_no_harm() -> None:
     case = reference()[16]
     motion = case.motion(Omega=0.8 * case.run.truth.Omega)
     assert motion.label == case.label == "P-1-F-1"
-    assert motion.evidence.drive is not None
-    assert motion.evidence.drive.disagrees
+    assert cast(Harmonic, motion.evidence.drive).disagrees
 
 
 def test_uneven_sampling_is_a_reason() -> None:

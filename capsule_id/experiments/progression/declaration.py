@@ -25,7 +25,7 @@ TRIAL_SCATTER = scatter(
 #: Sessions that are parameters, in the order of the numbers in the column; no table has more of them.
 SESSIONS = tuple(
     nuisance(
-        f"session_{j}", "1", f"friction of the session that is parameter {j}: its logarithm over session_sd", f"z_{j}",
+        f"session_{j}", "1", f"friction of session {j} with several settings: its logarithm over session_sd", f"z_{j}",
         Prior("normal", 0.0, 1.0),
     )
     for j in range(1, 9)

@@ -61,9 +61,8 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
     r, columns = design(experiment, theta)
     keep = np.arange(len(r))
     found: list[Outlier] = []
-    # Columns of nuisances may span those of parameters: their rank counts, not their number.
-    while len(found) < MOST_FLAGGED and len(keep) > np.linalg.matrix_rank(columns[keep], rtol=DEPENDENT) + 2:
-        score, freedom = _studentised(r[keep], columns[keep], experiment.scale_known)
+    while len(found) < MOST_FLAGGED and len(keep) > (basis := _basis(columns[keep])).shape[1] + 2:
+        score, freedom = _studentised(r[keep], basis, experiment.scale_known)
         worst = int(np.argmax(np.abs(score)))
         tail = stats.norm.sf(abs(score[worst])) if freedom is None else stats.t.sf(abs(score[worst]), freedom)
         p = min(1.0, 2.0 * float(tail) * len(keep))
@@ -74,10 +73,17 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
     return found
 
 
-def _studentised(r: np.ndarray, columns: np.ndarray, known: bool) -> tuple[np.ndarray, int | None]:
-    """Studentised residuals about the local fit, and their degrees of freedom (None: normal)."""
+def _basis(columns: np.ndarray) -> np.ndarray:
+    """(n, rank) orthonormal columns with the span of ``columns`` (n, p).
+
+    Columns of nuisances may span those of parameters, as discrepancies do that all trials of a setting share.
+    """
     u, size, _ = np.linalg.svd(columns, full_matrices=False)
-    q = u[:, size > DEPENDENT * size[0]]
+    return u[:, size > DEPENDENT * np.max(size, initial=0.0)]
+
+
+def _studentised(r: np.ndarray, q: np.ndarray, known: bool) -> tuple[np.ndarray, int | None]:
+    """Studentised residuals about the local fit with the orthonormal columns q, and degrees of freedom (None: normal)."""
     rest = r - q @ (q.T @ r)
     free = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-9)
     if known:

@@ -14,7 +14,7 @@ from capsule_id.experiments.free_vibration.decay_models import decay as rubbed_d
 from capsule_id.experiments.free_vibration.twin import DECAY_NOISE, RELEASES, decay
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.static_friction.declaration import tilts as tilted
-from capsule_id.inference.checks.regression import outliers
+from capsule_id.inference.checks.regression import _basis, outliers
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
@@ -148,3 +148,10 @@ def test_tests_of_lines_keep_their_level(tmp_path: Path) -> None:
     assert np.mean(bent) == pytest.approx(0.1, abs=bound)
     # Bonferroni over the rows is an upper bound, near to exact for independent rows.
     assert 0.1 - bound - 0.02 < np.mean(struck) < 0.1 + bound
+
+
+@pytest.mark.parametrize(("columns", "rank"), [(np.zeros((5, 0)), 0), (np.eye(5)[:, [0, 1, 1]], 2)])
+def test_columns_that_depend_on_each_other_count_once(columns: np.ndarray, rank: int) -> None:
+    found = _basis(columns)
+    assert found.shape == (5, rank)
+    np.testing.assert_allclose(found @ found.T @ columns, columns, atol=1e-12)
