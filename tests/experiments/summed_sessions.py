@@ -8,7 +8,12 @@ from scipy.stats import multivariate_normal
 
 
 def integrated(
-    trials: list[np.ndarray], X2: list[np.ndarray], variance: list[np.ndarray], shared: float, z: np.ndarray
+    trials: list[np.ndarray],
+    X2: list[np.ndarray],
+    variance: list[np.ndarray],
+    shared: float,
+    z: np.ndarray,
+    relative: float | np.ndarray = 1.0,
 ) -> float:
     """Log-density of the ``trials`` of one setting by SciPy, each session integrated by a sum over z.
 
@@ -16,6 +21,7 @@ def integrated(
     ----------
     X2, variance : displacement and variance of a trial in each session at z; of one number where it is known
     shared : variance of the discrepancy
+    relative : (n,) variance of each trial relative to ``variance``
     """
     y, sizes = np.concatenate(trials), [len(own) for own in trials]
     places = list(product(*(range(len(x)) for x in X2)))
@@ -24,6 +30,6 @@ def integrated(
     for place in places:
         at = list(enumerate(place))
         mean = np.repeat([X2[j][i] for j, i in at], sizes)
-        covariance = shared + np.diag(np.repeat([variance[j][i] for j, i in at], sizes))
+        covariance = shared + np.diag(relative * np.repeat([variance[j][i] for j, i in at], sizes))
         density.append(multivariate_normal(mean, covariance).logpdf(y) + sum(log_weight[j][i] for j, i in at))
     return float(logsumexp(density))

@@ -17,6 +17,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit, _log_probability
+from capsule_id.experiments.progression.linear_misfit import linear_misfit
 from capsule_id.experiments.progression.run_emulator import RunEmulator
 from capsule_id.experiments.progression.sessions import INNER, MIDDLE, NODES, Sessions, parameters_of
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
@@ -118,7 +119,7 @@ def test_a_misfit_stays_where_no_friction_explains_the_readings(tmp_path: Path) 
 
     def residuals(at_nodes: list[float]) -> np.ndarray:
         X2[lone] = place * np.array(at_nodes)
-        misfit = e.misfit_of(theta, X2, np).at(theta["trial_sd"], np)
+        misfit = linear_misfit(e, theta, X2, np).at(theta["trial_sd"], np)
         assert misfit.design.shape[1] == 1 + len(e.settings)
         return np.abs(misfit.at_nuisance_mean(np)[0][own])
 
@@ -142,7 +143,7 @@ def test_a_misfit_is_about_the_z_that_is_most_probable(tmp_path: Path) -> None:
         X2[0] = np.mean(e.distance[own]) - away + np.array([-0.0275, -0.025, 0.0, 0.025, 0.0275])
         at = make_interp_spline(NODES, X2[0], k=1)(z)
         least = np.min(z**2 + np.sum((e.distance[own][:, None] - at) ** 2, axis=0) / variance)
-        rest, nuisances = e.misfit_of(theta, X2, np).at(theta["trial_sd"], np).at_nuisance_mean(np)
+        rest, nuisances = linear_misfit(e, theta, X2, np).at(theta["trial_sd"], np).at_nuisance_mean(np)
         # On the outer line z is about 1.25 and held: its own cost is not among the nuisances.
         held = 1.25**2 if nuisances[0] == 0.0 else nuisances[0] ** 2
         assert np.sum(rest[own] ** 2) + held == pytest.approx(least, rel=1e-2)

@@ -102,6 +102,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "P_on": (_FORCE, None),
         "P_d": (_FORCE, None),
         "lag": (_LAG, None),
+        "tails": (ChoiceRule(("normal", "heavy")), "normal"),
     },
 }
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from capsule_id.experiments.kind import Kind, made_by
+from capsule_id.experiments.progression.outliers import MOST_TRIALS
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
 from capsule_id.rig.entry import Entry
@@ -42,12 +43,16 @@ FEWEST_SETTINGS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressionSettings(GroundSettings):
-    """Settings of a progression, SI. ``P_on``, ``P_d`` and ``lag`` are priors where they have an sd."""
+    """Settings of a progression, SI. ``P_on``, ``P_d`` and ``lag`` are priors where they have an sd.
+
+    With heavy ``tails`` a trial may be outlying, see ``capsule_id.experiments.progression.outliers``.
+    """
 
     drive: Literal["pulses", "harmonic"] = "pulses"
     P_on: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
     P_d: Annotated[Quantity | None, QuantityRule("N", ANY, has_sd=True)] = None
     lag: Annotated[Quantity | None, QuantityRule("s", NOT_NEGATIVE, has_sd=True)] = None
+    tails: Literal["normal", "heavy"] = "normal"
 
 
 def _check_drive(entry: Entry[ProgressionSettings]) -> None:
@@ -82,11 +87,25 @@ def _check_periods(entry: Entry[ProgressionSettings]) -> None:
         raise entry.file.error(row, "periods", "periods must be a whole number", value, "count whole periods")
 
 
+def _check_tails(entry: Entry[ProgressionSettings]) -> None:
+    """Bound the number of trials that share a setting where any of them may be outlying."""
+    count = np.unique(_settings(entry.table, "periods"), return_counts=True)[1]
+    if entry.table.settings.tails == "heavy" and np.max(count) > MOST_TRIALS:
+        rule = f"heavy tails need at most {MOST_TRIALS} trials at each setting"
+        remedy = "remove tails; the fit names outlying rows"
+        raise entry.error("tails", rule, f"{np.max(count)} trials", remedy, of_key=True)
+
+
+def _settings(table: Table[Any], *more: str) -> np.ndarray:
+    """Index of the setting of the drive of every row, where columns ``more`` count too."""
+    drive = [name for name in ("period", "f", "duty", "P_on", "P_d", "current", *more) if name in table.columns]
+    return np.unique(np.stack([table[name] for name in drive], axis=1), axis=0, return_inverse=True)[1]
+
+
 def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where a table has few settings, or more sessions with several settings than there are parameters for."""
     del rig
-    drive = [name for name in ("period", "f", "duty", "P_on", "P_d", "current") if name in table.columns]
-    setting = np.unique(np.stack([table[name] for name in drive], axis=1), axis=0, return_inverse=True)[1]
+    setting = _settings(table)
     settings = 1 + int(np.max(setting))
     if settings < FEWEST_SETTINGS:
         facts = {"settings": settings, "wanted": FEWEST_SETTINGS}
@@ -109,6 +128,7 @@ TEMPLATE = """\
 # drive = "pulses"                                    # or "harmonic"
 # P_on = { value = 1.25, sd = 0.5, unit = "N" }
 # lag = { value = 5, sd = 2, unit = "ms" }
+# tails = "normal"                                    # or "heavy": one or two trials of a setting may be outlying
 # distance_sd = { value = 1, unit = "mm" }
 # slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
 # N0 = { value = 0, unit = "N" }
@@ -162,7 +182,7 @@ KIND = Kind(
     sets=(("period", "periods", "distance"), ("f", "periods", "distance")),
     optional=("duty", "P_on", "P_d", "current", "session"),
     settings=ProgressionSettings,
-    rules=(_check_drive, _check_periods),
+    rules=(_check_drive, _check_periods, _check_tails),
     masses=lambda table: ("m1", "m2"),
     parameters=(SESSION_SD, *SESSIONS, TRIAL_SCATTER, TRIAL_SD, DISCREPANCY),
     bench=False,

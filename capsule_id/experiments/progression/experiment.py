@@ -4,7 +4,8 @@
 
 Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see ``capsule_id.experiments.progression.sessions``.
 The discrepancy is an error of the model's mean velocity at setting b that all trials of the setting share. It enters
-linearly and is integrated out; see ``capsule_id.experiments.progression.groups``.
+linearly and is integrated out; see ``capsule_id.experiments.progression.groups``. With heavy tails some trials have a
+larger error; see ``capsule_id.experiments.progression.outliers``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,9 +33,10 @@ from capsule_id.experiments.progression.declaration import (
     TRIAL_SD,
 )
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
+from capsule_id.experiments.progression.linear_misfit import linear_misfit
 from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
 from capsule_id.experiments.progression.run_emulator import RunEmulator
-from capsule_id.experiments.progression.sessions import MIDDLE, NODES, Sessions, edges, lines, parameters_of
+from capsule_id.experiments.progression.sessions import MIDDLE, Sessions, parameters_of
 from capsule_id.experiments.progression.starts import starts_of
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -66,6 +68,7 @@ class Progression(TrialsExperiment):
     reading_variance : m^2
     force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
     has_lag : whether the lag is a parameter
+    heavy : whether trials have heavy tails, see ``capsule_id.experiments.progression.outliers``
     emulator : of ``runs``; None: they are exact
     """
 
@@ -79,6 +82,7 @@ class Progression(TrialsExperiment):
     drive: str = eqx.field(static=True)
     amplitude_from: str = eqx.field(static=True)
     has_lag: bool = eqx.field(static=True)
+    heavy: bool = eqx.field(static=True)
 
     checks = (check_discrepancy,)
     reaction: float = eqx.field(static=True)
@@ -98,7 +102,8 @@ class Progression(TrialsExperiment):
         self.session = sessions_of(table, rows)
         self.parameter = parameters_of(self.setting, self.session)
         self.sessions = Sessions(self.setting, self.session, self.parameter)
-        self.groups = TrialGroups(self.distance, self.sessions)
+        self.heavy = table.settings.tails == "heavy"
+        self.groups = TrialGroups(self.distance, self.sessions, self.heavy)
         stated = {name: getattr(table.settings, name) for name in (AMPLITUDE[self.drive], "lag")}
         exact = {name: q.value if q is not None and q.sd == 0.0 else 0.0 for name, q in stated.items()}
         self.force, self.lag = exact[AMPLITUDE[self.drive]], exact["lag"]
@@ -208,7 +213,7 @@ class Progression(TrialsExperiment):
         return eqx.tree_at(lambda e: e.emulator, self, emulator, is_leaf=lambda x: x is None)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        return (self.misfit_of(theta, self.responses(theta), xp),)
+        return (linear_misfit(self, theta, self.responses(theta), xp),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[TrialMisfit]:
         return (self.trials_of(theta, self.responses(theta), xp),)
@@ -217,33 +222,6 @@ class Progression(TrialsExperiment):
         """Likelihood of the trials at the ``responses``."""
         discrepancy = theta["discrepancy"] * xp.asarray(self.time)
         return TrialMisfit(self.groups, xp.asarray(X2), self.reading_variance, theta["trial_scatter"], discrepancy)
-
-    def misfit_of(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType = jnp) -> Misfit:
-        """The misfit at the ``responses``, the motion of a session linear about its most probable z."""
-        rows, columns = xp.asarray(self.sessions.rows), xp.asarray(self.sessions.columns)
-        start, slope, expected = self._most_probable_lines(theta, xp.asarray(X2), xp)
-        discrepancy = theta["discrepancy"] * self.setting * self.time[None]
-        design = xp.concatenate([(rows @ columns) * (slope @ columns)[None], discrepancy], axis=1)
-        variance = self.reading_variance + (theta["trial_scatter"] * (rows @ expected)) ** 2
-        return Misfit(self.distance - rows @ start, variance, xp.ones(len(self.distance)), design)
-
-    def _most_probable_lines(self, theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> tuple[Any, ...]:
-        """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m.
-
-        The slope is 0 where this z is at a kink: no small change of it explains more.
-        """
-        start, slope = lines(X2, NODES, xp)
-        count = xp.sum(xp.asarray(self.sessions.rows), axis=0)
-        r = (xp.asarray(self.sessions.rows).T @ self.distance / count)[:, None] - start
-        time = xp.asarray(self.time)[xp.asarray(self.sessions.setting).astype(int)][:, None]
-        variance = self.reading_variance + (theta["trial_scatter"] * X2[:, MIDDLE, None]) ** 2 + theta["trial_sd"] ** 2
-        w = variance / count[:, None] + (theta["discrepancy"] * time) ** 2
-        low, high = (xp.asarray(edge[None]) for edge in edges(NODES))
-        z = xp.clip(slope * r / (w + slope**2), low, high)
-        best = xp.argmin(z**2 + (r - slope * z) ** 2 / w, axis=1)[:, None]
-        expected, inside = start + slope * z, (z > low) & (z < high)
-        found = xp.where(inside, start, expected), xp.where(inside, slope, 0.0), expected
-        return tuple(xp.take_along_axis(x, best, axis=1)[:, 0] for x in found)
 
     def profile(self, theta: ValuesBySymbol) -> Any:
         """The log-likelihood as a function of values of the scatters, by symbol; motions linear in ``session_sd``."""
@@ -316,7 +294,7 @@ class Progression(TrialsExperiment):
                 session,
                 parameter,
                 sessions,
-                TrialGroups(distance, sessions),
+                TrialGroups(distance, sessions, self.heavy),
                 np.delete(self.time, setting),
                 None,
             ),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol, band
+from capsule_id.experiments.progression.outliers import SHARE, TIMES
 from capsule_id.views import Comparison, Curve, Points
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ def new_trials(
     own = {name: np.array([draw[name] for draw in draws])[:, None] for name in SCATTERS}
     X2 = e.displacements_of_draws(draws, own["session_sd"] * z[0], settings)
     variance = e.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
+    if e.heavy:
+        variance = np.where(rng.uniform(size=variance.shape) < SHARE, TIMES**2, 1.0) * variance
     return X2 + own["discrepancy"] * time * z[1] + np.sqrt(variance) * z[2]
 
 
