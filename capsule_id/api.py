@@ -1,5 +1,6 @@
 """What the commands do, as functions: read a rig folder, fit it, load the result."""
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from capsule_id.inference.pipeline import (
     sample_posterior,
     second_models,
     stage_seeds,
+    unfinished,
 )
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -57,6 +59,7 @@ def fit(
     registry: Registry | None = None,
     friction: type[FrictionLaw] | None = None,
     ess: float = DEFAULT_ESS,
+    preliminary: Callable[[Fit], None] | None = None,
 ) -> Fit:
     """Fit a rig: point estimate, posterior, checks. The command ``fit-params`` chooses every one of the parameters.
 
@@ -72,6 +75,7 @@ def fit(
     registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
     friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
     ess : sampling stops at this bulk and tail effective sample size of every parameter
+    preliminary : called before the sampling with the point fit: a result without intervals, panels and records
 
     Raises
     ------
@@ -98,7 +102,11 @@ def fit(
         made, second = second_models(make_experiments(rig, experiments, kinds, friction), readings)
         target = LogPosterior(rig, made)
         point = fit_points(target, kinds, seeds.starts, sampled=budget is not None)
-        checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, show, ess), (*readings, *second))
+        before = (*readings, *second)
+        if preliminary is not None and budget is not None:
+            first = unfinished(point, before)
+            preliminary(make_result(first, kinds, seeds.report, made_from, Fit, panels=False))
+        checked = check_fit(sample_posterior(point, seeds.walkers, budget, store, show, ess), before)
         return make_result(checked, kinds, seeds.report, made_from, Fit)
 
 

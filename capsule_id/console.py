@@ -119,6 +119,14 @@ class Progress:
         self._shown = now
         self._show(self._line(done, total, now - self._began))
 
+    def note(self, text: str) -> None:
+        """Show lines of text that stay."""
+        if self._enabled:
+            self._end_line()
+            self._stage = ""
+            self._show(text)
+            self._end_line()
+
     def _line(self, done: int, total: int, elapsed: float) -> str:
         if total <= 1:
             return f"{self._stage} ..."

@@ -148,13 +148,30 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     return replace(checked, widened=widened, findings=(*checked.findings, Finding("model.error", "warn", facts)))
 
 
+def unfinished(point: PointStage, before: Sequence[Finding] = ()) -> SampledFit:
+    """Check the point fit alone, while the sample is still to be drawn; ``before`` as in ``check_fit``."""
+    checked = check_fit(sample_posterior(point, point.seed, None), before)
+    findings = [Finding("sample.unfinished", "warn") if f.code == "chains.converged" else f for f in checked.findings]
+    return replace(checked, findings=tuple(findings))
+
+
 def make_result(
-    checked: SampledFit, registry: Registry, seed: int, made_from: Provenance, kind: type[AnyResult] = Result
+    checked: SampledFit,
+    registry: Registry,
+    seed: int,
+    made_from: Provenance,
+    kind: type[AnyResult] = Result,
+    *,
+    panels: bool = True,
 ) -> AnyResult:
     """Assemble the result: tables, panels, records, and the arrays that are saved with the sample.
 
     The versions in its provenance include those of the packages in ``registry``.
-    ``kind`` is the class of the result; the interface passes a subclass with a method that writes it.
+
+    Parameters
+    ----------
+    kind : class of the result; the interface passes a subclass with a method that writes it
+    panels : False leaves out panels and records, which take most of the time
     """
     stop_if_interrupted()
     release_memory()
@@ -162,7 +179,7 @@ def make_result(
     rng = np.random.default_rng(seed)
     predictive = {e.label: e.predictive_p([e.local(d) for d in checked.draws], rng) for e in target.experiments}
     summary, nuisances = parameter_tables(checked, registry)
-    views = (e.record_view(e.local(checked.values)) for e in target.experiments)
+    views = (e.record_view(e.local(checked.values)) for e in target.experiments if panels)
     return kind(
         rig=target.rig,
         registry=registry,
@@ -171,7 +188,7 @@ def make_result(
         point_fit=checked.fit,
         posterior=posterior,
         findings=tuple(checked.findings),
-        comparisons=_comparisons(checked, predictive, registry),
+        comparisons=_comparisons(checked, predictive, registry) if panels else (),
         notes=tuple(make_notes(checked, predictive)),
         records=tuple(view for view in views if view is not None),
         fixed={name: value for name, value in target.fixed.items() if name != "g"},

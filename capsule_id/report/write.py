@@ -13,7 +13,7 @@ import pandas as pd
 
 from capsule_id.inference.result import Result
 from capsule_id.report.columns import columns_of
-from capsule_id.report.gallery import pictures
+from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
 from capsule_id.report.netcdf import write_posterior
 from capsule_id.report.saved import save
@@ -35,12 +35,17 @@ def write_result(result: Result, directory: Path) -> None:
     for picture in drawn:
         (figures / f"{picture.name}.png").write_bytes(picture.png)
     save(result, directory)
-    (directory / "report.html").write_text(render(result, drawn), encoding="utf-8", newline="\n")
+    write_report(result, directory, drawn)
     if result.posterior is not None:
         write_posterior(result, directory / "posterior.nc")
     table_frame(result).to_csv(directory / "parameters.csv", lineterminator="\n")
     text = json.dumps(parameters_json(result), indent=1, ensure_ascii=False, allow_nan=False)
     (directory / "parameters.json").write_text(text + "\n", encoding="utf-8", newline="\n")
+
+
+def write_report(result: Result, directory: Path, drawn: Sequence[Picture] = ()) -> None:
+    """Write report.html with these pictures."""
+    (directory / "report.html").write_text(render(result, drawn), encoding="utf-8", newline="\n")
 
 
 def parameters_json(result: Result) -> dict[str, object]:

@@ -1,13 +1,13 @@
 """The fit of one rig: result directory, table, verdict."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capsule_id.commands.compilation import keep_programs, set_xla_options
-from capsule_id.console import OnProgress, say
+from capsule_id.console import OnProgress, Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.registry import Registry
@@ -74,13 +74,30 @@ def fingerprint_of(rig: Rig, options: Options, kinds: Registry) -> Mapping[str, 
     }
 
 
-def write_fit(rig: Rig, options: Options, folder: Path, kinds: Registry, progress: OnProgress) -> "Fit":
-    """Fit, and write the result and the saved chains to ``folder``."""
+def write_fit(
+    rig: Rig,
+    options: Options,
+    folder: Path,
+    kinds: Registry,
+    progress: OnProgress,
+    preliminary: Callable[["Fit"], None] | None = None,
+) -> "Fit":
+    """Fit, and write the result and the saved chains to ``folder``. ``preliminary`` as in ``capsule_id.fit``."""
     from capsule_id.api import fit
     from capsule_id.report.write import write_result
 
     store = folder / CHAINS
-    result = fit(rig, options.seed, options.experiments, options.budget, store, progress, kinds, ess=options.ess)
+    result = fit(
+        rig,
+        options.seed,
+        options.experiments,
+        options.budget,
+        store,
+        progress,
+        kinds,
+        ess=options.ess,
+        preliminary=preliminary,
+    )
     made = result.provenance.made[0], options.command
     result = replace(result, provenance=replace(result.provenance, made=made))
     progress(0, 1, "report")
@@ -101,7 +118,7 @@ def fit_one(
     options: Options,
     directory: Path,
     kinds: Registry,
-    progress: OnProgress,
+    progress: Progress,
     *,
     resume: bool = False,
     as_json: bool = False,
@@ -118,11 +135,20 @@ def fit_one(
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.report.console_table import table_text, verdict_text
     from capsule_id.report.texts.messages import messages_of
+    from capsule_id.report.write import write_report
 
     make_experiments(rig, options.experiments, kinds)
     messages_of(kinds)  # refuses conflicting messages before the fit
     with work_in_progress(directory, fingerprint_of(rig, options, kinds), resume) as partial:
-        result = write_fit(rig, options, partial, kinds, progress)
+
+        def show_point(first: "Fit") -> None:
+            write_report(first, partial)
+            table = table_text(first.summary, synthetic=rig.synthetic)
+            progress.note(f"point fit, before the sample; report: {partial / 'report.html'}\n{table}")
+
+        # A fit of bench tests ends as soon.
+        preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
+        result = write_fit(rig, options, partial, kinds, progress, preliminary)
         publish(partial, directory)
     report, failed = directory / "report.html", failed_checks(result, kinds)
     if as_json:

@@ -38,10 +38,10 @@ def _place(finding: Finding) -> str:
 
 def _missing(result: Result) -> Iterator[tuple[str, str]]:
     if result.posterior is None:
-        yield (
-            "Sample",
-            "Run fit-params without --no-sample: only a sample gives intervals and lets checks judge the numbers.",
-        )
+        # A fit that goes on shows its point fit first.
+        unfinished = any(finding.code == "sample.unfinished" for finding in result.findings)
+        how = "Wait for the end of fit-params" if unfinished else "Run fit-params without --no-sample"
+        yield "Sample", f"{how}: only a sample gives intervals and lets checks judge the numbers."
         return
     names = [str(name) for name in result.summary.index if not is_stated(name)]
     for name in names:

@@ -110,6 +110,9 @@ POSTERIOR_MESSAGES: Mapping[str, Message] = {
             + " when the steps were used up. Raise --max-steps, or look for a parameter that the data do not inform."
         ),
     ),
+    "sample.unfinished": Message(
+        "sample", warn="the sample is still to be drawn: this is the point fit alone, without intervals and figures"
+    ),
     "sample.maximum": Message(
         "maximum and sample", ok="the sample of every physical parameter has one mode, at the maximum", fail=_modes
     ),
