@@ -1,6 +1,5 @@
 """Progressions with heavy tails: the density against sums over outlying trials, outliers that move nothing, rules."""
 
-from itertools import combinations
 from pathlib import Path
 from types import ModuleType
 from typing import cast
@@ -17,7 +16,7 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
 from capsule_id.experiments.progression.linear_misfit import linear_misfit
-from capsule_id.experiments.progression.outliers import MOST, MOST_TRIALS, SHARE, TIMES, configurations
+from capsule_id.experiments.progression.outliers import MOST_TRIALS, SHARE, TIMES, alternatives
 from capsule_id.experiments.progression.panels import new_trials
 from capsule_id.experiments.progression.sessions import MIDDLE, NODES, Sessions
 from capsule_id.inference.checks.regression import outliers
@@ -33,25 +32,22 @@ SCATTERS = {"session_sd": THETA["session_sd"], "trial_scatter": 0.0}
 def test_the_density_is_the_sum_over_outlying_trials(lone: tuple[int, ...], xp: ModuleType) -> None:
     """Two settings in two sessions each, of which some are integrated out, against SciPy."""
     rng, scatters, z = np.random.default_rng(5), np.array([0.1, 0.7]), np.linspace(-5.0, 5.0, 101)
-    b, j = np.repeat([0, 0, 1, 1], [2, 1, 1, 2]), np.repeat([0, 1, 2, 3], [2, 1, 1, 2])
+    sizes = [2, 1, 4, 2]
+    b, j = np.repeat([0, 0, 1, 1], sizes), np.repeat([0, 1, 2, 3], sizes)
     sessions = Sessions(np.eye(2)[b], np.eye(4)[j], np.array([-1 if k in lone else k for k in range(4)]))
-    distance, at_nodes = 0.3 * rng.normal(size=6), 0.3 * rng.normal(size=(4, len(NODES)))
+    distance, at_nodes = 0.3 * rng.normal(size=9), 0.3 * rng.normal(size=(4, len(NODES)))
     distance[1] += 6.0
     at_nodes = np.asarray(sessions.responses(at_nodes.ravel()[: len(sessions.case)]))
     X2 = [make_interp_spline(NODES, x, k=1)(z) if k in lone else x[[MIDDLE]] for k, x in enumerate(at_nodes)]
 
     def expected(setting: int, discrepancy: float, scatter: float) -> float:
         rows, cases = np.flatnonzero(b == setting), [2 * setting, 2 * setting + 1]
-        found, size_of = list[float](), list[int]()
-        for size in range(MOST + 1):
-            for outlying in combinations(rows, size):
-                relative = np.where(np.isin(rows, outlying), TIMES**2, 1.0)
-                own, variance = [X2[k] for k in cases], [0.04 + scatter**2 + 0.0 * X2[k] for k in cases]
-                trials = [distance[j == k] for k in cases]
-                found.append(integrated(trials, own, variance, discrepancy**2, z, relative))
-                size_of.append(size)
-        share = np.array(size_of) * np.log(SHARE) + (len(rows) - np.array(size_of)) * np.log(1.0 - SHARE)
-        return float(logsumexp(np.array(found) + share) - logsumexp(share))
+        own, variance = [X2[k] for k in cases], [0.04 + scatter**2 + 0.0 * X2[k] for k in cases]
+        trials, found = [distance[j == k] for k in cases], list[float]()
+        for outlying in (-1, *rows):
+            relative, share = np.where(rows == outlying, TIMES**2, 1.0), SHARE if outlying >= 0 else 1.0 - SHARE
+            found.append(integrated(trials, own, variance, discrepancy**2, z, relative) + np.log(share))
+        return float(logsumexp(found)) - np.log(1.0 - SHARE + len(rows) * SHARE)
 
     trials = TrialMisfit(TrialGroups(distance, sessions, heavy=True), at_nodes, 0.04, 0.0, np.array([0.3, 0.8]))
     by_sums = [[expected(setting, d, scatter) for setting, d in ((0, 0.3), (1, 0.8))] for scatter in scatters]
@@ -60,16 +56,15 @@ def test_the_density_is_the_sum_over_outlying_trials(lone: tuple[int, ...], xp: 
     assert np.all(np.asarray(normal.of_settings(scatters, xp))[:, 0] < np.array(by_sums)[:, 0] - 5.0)
 
 
-def test_configurations_of_settings_with_different_numbers_of_trials() -> None:
-    setting = np.eye(2)[[0, 1, 1]]
-    variance, log_share = configurations(setting, heavy=True)
-    assert variance.tolist() == [[1, 1, 1], [100, 100, 1], [1, 1, 100], [1, 100, 100]]
-    np.testing.assert_allclose(np.exp(log_share).sum(axis=0), 1.0)
-    np.testing.assert_allclose(np.exp(log_share[:, 0]), [0.95, 0.05, 0.0, 0.0])
-    np.testing.assert_allclose(np.exp(log_share[:, 1]), [0.9025, 0.0475, 0.0475, 0.0025])
-    variance, log_share = configurations(setting, heavy=False)
-    np.testing.assert_array_equal(variance, np.ones((1, 3)))
-    np.testing.assert_array_equal(log_share, np.zeros((1, 2)))
+def test_alternatives_of_settings_with_different_numbers_of_trials() -> None:
+    variance, log_share, of = alternatives(np.eye(2)[[0, 1, 1]], heavy=True)
+    assert of.tolist() == [0, 0, 1, 1, 1]
+    assert variance.tolist() == [[1, 1, 1], [100, 1, 1], [1, 1, 1], [1, 100, 1], [1, 1, 100]]
+    np.testing.assert_allclose(np.exp(log_share), [0.95, 0.05, 0.95 / 1.05, 0.05 / 1.05, 0.05 / 1.05])
+    np.testing.assert_allclose(np.bincount(of, weights=np.exp(log_share)), 1.0)
+    variance, log_share, of = alternatives(np.eye(2)[[0, 1, 1]], heavy=False)
+    np.testing.assert_array_equal(variance, np.ones((2, 3)))
+    np.testing.assert_array_equal(log_share, np.zeros(2))
 
 
 def progression(folder: Path, tails: str) -> Progression:

@@ -128,7 +128,7 @@ TEMPLATE = """\
 # drive = "pulses"                                    # or "harmonic"
 # P_on = { value = 1.25, sd = 0.5, unit = "N" }
 # lag = { value = 5, sd = 2, unit = "ms" }
-# tails = "normal"                                    # or "heavy": one or two trials of a setting may be outlying
+# tails = "normal"                                    # or "heavy": one trial of a setting may be outlying
 # distance_sd = { value = 1, unit = "mm" }
 # slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
 # N0 = { value = 0, unit = "N" }

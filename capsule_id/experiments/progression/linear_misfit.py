@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def linear_misfit(e: "Progression", theta: ValuesBySymbol, X2: Any, xp: ModuleType = jnp) -> Misfit:
     """The misfit at the ``responses`` (cases, nodes), m, the motion of a session linear about its most probable z.
 
-    With heavy tails the outlying trials are those of the most probable configuration of each setting.
+    With heavy tails the outlying trials are those of the most probable alternative of each setting.
     """
     rows, columns = xp.asarray(e.sessions.rows), xp.asarray(e.sessions.columns)
     usual = _relative_variance(e, theta, X2, xp)
@@ -29,13 +29,13 @@ def linear_misfit(e: "Progression", theta: ValuesBySymbol, X2: Any, xp: ModuleTy
 
 def _relative_variance(e: "Progression", theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> Any:
     """(n,) variance of each trial relative to the usual one."""
-    of_configurations = xp.asarray(e.groups.variance)
-    if len(of_configurations) == 1:
-        return of_configurations[0]
-    density = e.trials_of(theta, X2, xp).of_configurations(xp.asarray(theta["trial_sd"]).reshape(1), xp)[:, 0]
-    best = xp.argmax(density + xp.asarray(e.groups.log_share), axis=0)
-    own = best[xp.argmax(xp.asarray(e.setting), axis=1)]
-    return xp.take_along_axis(of_configurations, own[None], axis=0)[0]
+    groups = e.groups
+    if not e.heavy:
+        return xp.ones(e.n)
+    density = e.trials_of(theta, X2, xp).of_alternatives(xp.asarray(theta["trial_sd"]).reshape(1), xp)[0]
+    own = xp.asarray(e.setting) @ (xp.arange(len(e.settings))[:, None] == xp.asarray(groups.setting)[None])
+    best = xp.argmax(xp.where(own > 0.0, density[None], -xp.inf), axis=1)
+    return xp.take_along_axis(xp.asarray(groups.variance), best[None], axis=0)[0]
 
 
 def _most_probable_lines(

@@ -1,43 +1,31 @@
-"""Outlying trials of a progression with ``tails = "heavy"``: which trials of a setting have the larger scatter.
+"""Outlying trials of a progression with ``tails = "heavy"``: which trial of a setting has the larger scatter.
 
 Each trial has ``TIMES`` the scatter with probability ``SHARE``, independently of the others: a contaminated normal
-distribution (Tukey 1960), here given that a setting has at most ``MOST`` such trials. A configuration is one choice of
-the outlying trials of every setting; the densities of all configurations are added.
+distribution (Tukey 1960), here given that a setting has at most one such trial. No outlying trial, or one of them: these
+are the alternatives of a setting, and their densities are added.
 """
 
-from itertools import combinations
-
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 #: Probability that a trial is outlying, and its scatter relative to that of the others.
 SHARE, TIMES = 0.05, 10.0
-#: Most outlying trials of a setting.
-MOST = 2
-#: Most trials of a setting: the number of configurations grows with their square.
+#: Most trials of a setting: among more of them, several would be outlying.
 MOST_TRIALS = 12
 
 
-def configurations(
+def alternatives(
     setting: Float[np.ndarray, "n settings"], heavy: bool
-) -> tuple[Float[np.ndarray, "configurations n"], Float[np.ndarray, "configurations settings"]]:
-    """Variance of every trial relative to the usual one, and the log-probability of each configuration of a setting.
+) -> tuple[Float[np.ndarray, "alternatives n"], Float[np.ndarray, " alternatives"], Int[np.ndarray, " alternatives"]]:
+    """Variance of every trial relative to the usual one, log-probability within the setting, and setting of each.
 
-    The first configuration has no outlying trial, and is the only one where the tails are not ``heavy``. A setting with
-    fewer trials than others has fewer configurations; the probability of the rest is 0.
+    The first alternative of a setting has no outlying trial, and is the only one where the tails are not ``heavy``.
     """
-    chosen = [_choices(np.flatnonzero(own), heavy) for own in setting.T]
-    number = max(map(len, chosen))
-    variance, log_share = np.ones((number, len(setting))), np.full((number, len(chosen)), -np.inf)
-    for b, choices in enumerate(chosen):
-        size = np.array(list(map(len, choices)))
-        share = np.log(SHARE) * size + np.log1p(-SHARE) * (np.sum(setting[:, b]) - size)
-        log_share[: len(choices), b] = share - np.logaddexp.reduce(share)
-        for k, outlying in enumerate(choices):
-            variance[k, list(outlying)] = TIMES**2
-    return variance, log_share
-
-
-def _choices(rows: np.ndarray, heavy: bool) -> list[tuple[int, ...]]:
-    """Choices of the outlying trials among ``rows`` of a setting."""
-    return [own for size in range((MOST if heavy else 0) + 1) for own in combinations(rows.tolist(), size)]
+    variance, log_share, of = list[np.ndarray](), list[float](), list[int]()
+    for b, own in enumerate(setting.T):
+        trials = np.flatnonzero(own) if heavy else np.array([], dtype=int)
+        odds = np.append(1.0, np.full(len(trials), SHARE / (1.0 - SHARE)))
+        log_share += np.log(odds / np.sum(odds)).tolist()
+        variance += [np.ones(len(setting)), *(np.where(np.arange(len(setting)) == i, TIMES**2, 1.0) for i in trials)]
+        of += [b] * (1 + len(trials))
+    return np.array(variance), np.array(log_share), np.array(of)
