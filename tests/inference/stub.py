@@ -58,6 +58,7 @@ class Gaussian:
         self.centre = mean + self.OFF * np.sqrt(np.diag(sigma))
         self.covariance = self.WIDE**2 * sigma
         self.normal_priors = np.full((2, len(mean)), np.nan)
+        self.scaled = list[tuple[int, np.ndarray]]()
 
     def parts(self, v: np.ndarray) -> np.ndarray:
         """(w, d) -> (w, blocks)."""

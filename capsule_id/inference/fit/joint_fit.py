@@ -236,17 +236,12 @@ def _rescaled(target: LogPosterior, u: np.ndarray) -> np.ndarray:
 
     The readings determine only their product, so that a change of one alone is always worse.
     """
-    scaled = dict[str, set[str]]()
-    for e in target.experiments:
-        for name, own in e.scaled_by.items():
-            scaled.setdefault(name, set()).update(own)
-    for name, own in scaled.items():
-        if own:
-            points = np.repeat(u[None], len(FACTORS), axis=0)
-            points[:, target.names.index(name)] += np.log(FACTORS)
-            points[:, np.isin(target.names, sorted(own))] /= FACTORS[:, None]
-            value = weigh(target, points)
-            u = points[np.argmax(value)] if np.max(value) > weigh(target, u[None])[0] else u
+    for scale, own in target.scaled:
+        points = np.repeat(u[None], len(FACTORS), axis=0)
+        points[:, scale] += np.log(FACTORS)
+        points[:, own] /= FACTORS[:, None]
+        value = weigh(target, points)
+        u = points[np.argmax(value)] if np.max(value) > weigh(target, u[None])[0] else u
     return u
 
 

@@ -37,6 +37,7 @@ class Emulable(Protocol):
     """A density whose motions can be emulated; see ``capsule_id.inference.target.marginal.MarginalPosterior``."""
 
     normal_priors: np.ndarray
+    scaled: list[tuple[int, np.ndarray]]
 
     def parts(self, v: np.ndarray) -> np.ndarray: ...
 
@@ -119,7 +120,7 @@ def emulation(
     for _ in range(last_rounds):
         emulated = target.emulated(*known)
         proposal, drawn = _follow(emulated, proposal, drawn, large, random)
-        moves = delayed_moves(emulated.parts, proposal, drawn, STEPS, OTHER)
+        moves = delayed_moves(emulated.parts, proposal, drawn, STEPS, target.scaled, OTHER)
         walkers = _chain(target, walkers, moves, random).run(EXACT_STEPS, store=False).state.coords
         known = known.more(target, _last_places(emulated, proposal, walkers, random))
     emulated = target.emulated(*known)

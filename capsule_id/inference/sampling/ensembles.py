@@ -95,6 +95,7 @@ class Target(Protocol):
     centre: np.ndarray
     covariance: np.ndarray
     normal_priors: np.ndarray
+    scaled: list[tuple[int, np.ndarray]]
 
     @property
     def can_be_emulated(self) -> bool: ...
@@ -198,7 +199,7 @@ def pilot(target: Target, seed: int) -> Schedule:
     if target.can_be_emulated:
         emulated = emulation(target, *laplace_proposal(target), random)
         begin, name = emulated.start, DELAYED
-        first = delayed_moves(emulated.target.parts, emulated.proposal, begin.v, DELAYED_STEPS)
+        first = delayed_moves(emulated.target.parts, emulated.proposal, begin.v, DELAYED_STEPS, target.scaled)
     else:
         proposal = adapted_proposal(target, random)
         begin, name, first = proposal, FIRST, block_move(proposal)

@@ -10,6 +10,8 @@ from capsule_id.inference.sampling.proposal import BlockProposal
 
 #: Share of the delayed moves whose inner chain is a random walk, its number of steps, and a step in sds of the posterior.
 LOCAL, WALK, SHORT = 0.3, 5, 0.15
+#: Share of the delayed moves whose inner chain rescales, and the sd of the logarithm of a factor.
+RESCALED, FACTOR = 0.2, 0.7
 #: emcee's moves with their weights.
 Moves = list[tuple[Any, float]]
 #: (w, d) -> (w, blocks), log-density of each block; or (w, blocks, k), log-density and what else is kept of each block.
@@ -87,6 +89,37 @@ class RandomWalk:
         return Walkers(coords, parts, before.proposed), moved
 
 
+class Rescaling:
+    """Metropolis steps that multiply a scale by a factor, and divide by it what the scale multiplies.
+
+    Where readings determine only the product, no other step goes far along the hyperbola on which it is constant.
+
+    Parameters
+    ----------
+    blocks : indices of the parameters of each block
+    scaled : indices of the logarithm of each scale and of what it multiplies, all in one block
+    """
+
+    def __init__(self, blocks: Sequence[np.ndarray], scaled: Sequence[tuple[int, np.ndarray]]) -> None:
+        self.blocks = blocks
+        self._scaled = [(next(i for i, block in enumerate(blocks) if at in block), at, own) for at, own in scaled]
+
+    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
+        parts = log_density(coords)
+        return Walkers(coords, parts, np.zeros_like(parts))
+
+    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
+        new, factors = before.coords.copy(), np.zeros_like(before.proposed)
+        for block, at, own in self._scaled:
+            t = FACTOR * random.standard_normal(len(new))
+            new[:, at] += t
+            new[:, own] *= np.exp(-t)[:, None]
+            factors[:, block] -= len(own) * t  # the Jacobian
+        coords, parts, moved = accept(random, before, new, log_density(new), factors, self.blocks)
+        return Walkers(coords, parts, before.proposed), moved
+
+
 class DelayedMove(emcee.moves.Move):
     """Delayed acceptance of all blocks of parameters (Christen & Fox 2005): proposals from an emulated posterior.
 
@@ -99,7 +132,7 @@ class DelayedMove(emcee.moves.Move):
     inner : steps that leave the emulated posterior unchanged
     """
 
-    def __init__(self, emulated: Parts, inner: BlockMove | RandomWalk, steps: int) -> None:
+    def __init__(self, emulated: Parts, inner: BlockMove | RandomWalk | Rescaling, steps: int) -> None:
         self.emulated, self.inner, self.steps = emulated, inner, steps
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
@@ -164,7 +197,14 @@ def block_move(proposal: BlockProposal) -> Moves:
     return [(BlockMove(proposal), 0.9), (emcee.moves.DEMove(), 0.1)]
 
 
-def delayed_moves(emulated: Parts, proposal: BlockProposal, near: np.ndarray, steps: int, other: float = 0.1) -> Moves:
+def delayed_moves(
+    emulated: Parts,
+    proposal: BlockProposal,
+    near: np.ndarray,
+    steps: int,
+    scaled: Sequence[tuple[int, np.ndarray]] = (),
+    other: float = 0.1,
+) -> Moves:
     """Delayed acceptance by chains of ``steps`` block moves, and of short random walks, with some differential evolution.
 
     A walker where the emulated density is too small rejects almost every distant proposal. The error of an emulator is
@@ -173,12 +213,16 @@ def delayed_moves(emulated: Parts, proposal: BlockProposal, near: np.ndarray, st
     Parameters
     ----------
     near : (n, d) draws; the steps of a walk have a share of their covariance
+    scaled : see ``Rescaling``; some chains rescale these
     other : share of steps by differential evolution, which needs no emulator
     """
     walk = RandomWalk(proposal.blocks, SHORT**2 * np.atleast_2d(np.cov(near.T)))
+    share = RESCALED if scaled else 0.0
+    rescaling = [(DelayedMove(emulated, Rescaling(proposal.blocks, scaled), WALK), share * (1.0 - other))]
     return [
-        (DelayedMove(emulated, BlockMove(proposal), steps), (1.0 - LOCAL) * (1.0 - other)),
+        (DelayedMove(emulated, BlockMove(proposal), steps), (1.0 - LOCAL - share) * (1.0 - other)),
         (DelayedMove(emulated, walk, WALK), LOCAL * (1.0 - other)),
+        *(rescaling if scaled else []),
         (emcee.moves.DEMove(), other),
     ]
 

@@ -133,6 +133,18 @@ class LogPosterior(eqx.Module):
         return np.flatnonzero(~self.scatter)
 
     @property
+    def scaled(self) -> list[tuple[int, np.ndarray]]:
+        """Index of each scale, and indices of the parameters of which only the product with it changes the motion."""
+        scaled = dict[str, set[str]]()
+        for e in self.experiments:
+            for name, own in e.scaled_by.items():
+                scaled.setdefault(name, set()).update(own)
+        pairs = (
+            (self.names.index(name), np.flatnonzero(np.isin(self.names, sorted(own)))) for name, own in scaled.items()
+        )
+        return [(scale, own) for scale, own in pairs if len(own)]
+
+    @property
     def prior_sd(self) -> np.ndarray:
         """(d,) sd of u under the prior."""
         return np.array([prior_sd(row) for row in self.parameters])

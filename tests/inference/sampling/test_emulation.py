@@ -72,6 +72,43 @@ def test_short_walks_keep_the_exact_posterior() -> None:
         assert 0.2 < np.mean(ensemble.acceptance) <= 1.0
 
 
+def hyperbola(v: np.ndarray) -> np.ndarray:
+    """(w, 2) a half-normal scale, v[0] its logarithm, and z of two sessions, of which the product with it is known."""
+    scale = np.exp(v[:, 0])
+    sessions = np.sum(v[:, 1:3] ** 2 + ((scale[:, None] * v[:, 1:3] - [0.12, 0.09]) / 0.01) ** 2, axis=1)
+    return np.stack([v[:, 0] - 0.5 * (scale / 0.1) ** 2 - 0.5 * sessions, -0.5 * v[:, 3] ** 2], axis=1)
+
+
+def test_rescaling_keeps_the_posterior_and_follows_a_hyperbola(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against quadrature over the scale. Negative control: no Jacobian."""
+    t = np.linspace(np.log(1e-3), np.log(2.0), 4001)
+    scale = np.exp(t)[:, None]
+    # z ~ N(0, 1) and scale z ~ N(m, 0.01^2): the density of m is normal.
+    sd = np.hypot(0.01, scale)
+    log_density = (
+        t - 0.5 * (scale[:, 0] / 0.1) ** 2 - np.sum(0.5 * (np.array([[0.12, 0.09]]) / sd) ** 2 + np.log(sd), axis=1)
+    )
+    weight = np.exp(log_density - np.max(log_density))
+    mean = np.sum(t * weight) / np.sum(weight)
+    blocks = [np.arange(3), np.array([3])]
+    walk = moves.RandomWalk(blocks, np.diag([0.01, 0.01, 0.01, 1.0]))
+    random = np.random.RandomState(1)
+    start = initial_state(np.array([np.log(0.1), 1.2, 0.9, 0.0]) + 0.01 * random.standard_normal((64, 4)), random)
+
+    def far(rescales: bool) -> float:
+        """Distance of the mean of the logarithm from quadrature, in standard errors by four parts of the walkers."""
+        rescaling = [(moves.DelayedMove(hyperbola, moves.Rescaling(blocks, [(0, np.array([1, 2]))]), 5), 0.5)]
+        both = [(moves.DelayedMove(hyperbola, walk, 5), 0.5), *(rescaling if rescales else [])]
+        ensemble = Ensemble(hyperbola, start, both).run(600)
+        means = np.mean(ensemble.chain[100:, :, 0], axis=0)
+        return float((np.mean(means) - mean) / (np.std(means) / np.sqrt(len(means))))
+
+    assert abs(far(rescales=True)) < LIMIT
+    accept = moves.accept
+    monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:4], 0.0 * args[4], args[5]))
+    assert abs(far(rescales=True)) > LIMIT
+
+
 def test_an_emulator_follows_a_function_and_leaves_out_what_is_not_known() -> None:
     rng = np.random.default_rng(0)
 
