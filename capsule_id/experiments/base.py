@@ -148,6 +148,11 @@ class Experiment(eqx.Module):
         return (None,)
 
     @property
+    def loads(self) -> np.ndarray | None:
+        """(n,) normal force of every trial, N, where it differs between them: residuals must not depend on it."""
+        return None
+
+    @property
     def has_joint_scatters(self) -> bool:
         """Whether readings have several scatters at once; then a point fit takes them from ``profile`` together."""
         return False

@@ -12,6 +12,8 @@ from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.friction_experiment import FrictionExperiment
 from capsule_id.experiments.families.friction_variants import candidates
+from capsule_id.fitted import Fit
+from capsule_id.inference.checks.order import trend
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, named_line, quantity
 
@@ -121,3 +123,41 @@ def test_no_law_is_proposed_that_is_refused(tmp_path: Path) -> None:
     weighed = Entry(entry.kind, entry.label, {name: x for name, x in entry.columns.items() if "normal" not in name})
     made = experiment(tmp_path / "weight", weighed, head=head)
     assert any("viscous" in model.free for model in candidates([made]))
+
+
+def at_loads(folder: Path, mu: tuple[float, ...], order: np.ndarray) -> Fit:
+    """Pulls at four loads with these coefficients and 3 % scatter, in an order of the rows."""
+    rng = np.random.default_rng(4)
+    force = np.repeat(mu, 6) * LOAD * (1.0 + 0.03 * rng.standard_normal(len(LOAD)))
+    entry = Entry("static_friction", "table", {"force [N]": force[order], "normal_force [N]": LOAD[order]})
+    return cid.fit(rig(folder, entry), budget=None)
+
+
+def test_a_coefficient_that_changes_with_the_load_is_named_in_any_order(tmp_path: Path) -> None:
+    """Before: trusted where the rows are shuffled, which the finding on their order had proposed."""
+    shuffled = np.random.default_rng(0).permutation(len(LOAD))
+    for name, order in (("sorted", np.arange(len(LOAD))), ("shuffled", shuffled)):
+        result = at_loads(tmp_path / name, (0.32, 0.31, 0.28, 0.38), order)
+        (found,) = [f for f in result.findings if f.level == "fail"]
+        assert found.code == "trials.loads"
+        assert "0.32 at 5.46 N" in result.text(found)
+        assert "at 104 N" in result.text(found)
+        assert result.summary.at["mu", "trust"] == "not trusted"
+        # The coefficients at the loads have an sd of 0.04; the scatter of the trials alone would give 0.003.
+        assert result.summary.at["mu", "sd"] > 0.012
+    # The remedy: the rows of one load.
+    one = {"force [N]": 0.28 * LOAD[12:18], "normal_force [N]": LOAD[12:18]}
+    one["force [N]"] = one["force [N]"] * (1.0 + 0.03 * np.random.default_rng(5).standard_normal(6))
+    assert cid.fit(rig(tmp_path / "one", Entry("static_friction", "table", one)), budget=None).clean
+
+
+def test_a_trend_with_the_load_is_named_where_every_trial_has_its_own() -> None:
+    rng = np.random.default_rng(1)
+    load = np.geomspace(5.0, 100.0, 12)
+
+    def p(power: float, seed: int) -> float:
+        own = np.random.default_rng(seed)
+        return trend(power * np.log(load) + 0.05 * own.standard_normal(12), load)
+
+    assert p(0.1, 0) < 0.002
+    assert np.mean([p(0.0, int(seed)) < 0.05 for seed in rng.integers(0, 10**6, 200)]) < 0.09

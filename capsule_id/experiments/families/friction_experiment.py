@@ -82,12 +82,19 @@ class FrictionExperiment(GroundExperiment):
     """A friction experiment; all of them share the friction law, the paper's protocol and one panel."""
 
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
+    #: () or (n,), N, where it is stated; None: that of the weight
+    normal_force: np.ndarray | None = None
     checks = (check_one_surface, check_variants)
     tables = (variant_table,)
 
     @property
     def masses(self) -> tuple[str, ...]:
         return self.friction.masses
+
+    @property
+    def loads(self) -> np.ndarray | None:
+        differ = self.normal_force is not None and np.size(self.normal_force) > 1
+        return np.asarray(self.normal_force) if differ else None
 
     @property
     def speeds_known(self) -> bool:

@@ -32,7 +32,6 @@ class SlidingFriction(FrictionExperiment):
     speed_sd: float
     values_sd: float
     #: (n,), N; None: that of the weight
-    normal_force: np.ndarray | None
     normal_force_sd: float
     quantity: str = eqx.field(static=True)
 

@@ -1,6 +1,6 @@
-"""Order of the trials: neighbouring rows, or rows of one table, whose residuals are alike are not independent."""
+"""Order of the trials: neighbouring rows, rows of one table or of one load whose residuals are alike are not independent."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from scipy import stats
@@ -24,8 +24,19 @@ SMALLEST_SCATTER = 0.02
 SMALLEST_FACTOR, FEWEST_TRIALS = 1.2, 2
 
 
-def check_order(s: SampledFit) -> list[Finding]:
-    """Check that residuals of neighbouring rows are uncorrelated (permutation test of the lag-1 correlation)."""
+def check_trials(s: SampledFit) -> list[Finding]:
+    """Check that residuals of trials depend neither on the load, nor on the order, nor on the table."""
+    loads = check_loads(s)
+    return [*check_order(s, {f.experiment for f in loads if f.level == "fail"}), *check_tables(s), *loads]
+
+
+def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
+    """Check that residuals of neighbouring rows are uncorrelated (permutation test of the lag-1 correlation).
+
+    Parameters
+    ----------
+    by_load : tables whose residuals depend on the load: the order within a load is judged
+    """
     findings, tables = [], []
     for e in s.experiments:
         if e.time_series:
@@ -34,6 +45,9 @@ def check_order(s: SampledFit) -> list[Finding]:
         # An outlier shifts the fit; without it the residuals are those of the local fit to the other rows.
         if s.flagged.get(e.label):
             residuals = residuals - columns @ np.linalg.lstsq(columns, residuals, rcond=None)[0]
+        if e.label in by_load:
+            groups = np.unique(_loads(s, e), return_inverse=True)[1]
+            residuals = residuals - (np.bincount(groups, residuals) / np.bincount(groups))[groups]
         if len(residuals) >= FEWEST_ROWS and np.std(residuals) > SMALLEST_SCATTER:
             tables.append((e, residuals))
     for e, residuals in tables:
@@ -82,6 +96,39 @@ def check_tables(s: SampledFit) -> list[Finding]:
             findings.append(Finding("trials.tables", "fail", facts, members[0].label))
     number = sum(len(members) for members, _ in groups)
     return findings or [Finding("trials.tables", "ok", {"number": number})] * bool(groups)
+
+
+def check_loads(s: SampledFit) -> list[Finding]:
+    """Check that friction is in proportion to the normal force: residuals of trials do not depend on it.
+
+    Permutation tests of the scatter between loads, and of the correlation with the logarithm of the load.
+    """
+    tables = [(e, _unflagged(s, e)[0], _loads(s, e)) for e in s.experiments if e.loads is not None]
+    tables = [(e, r, load) for e, r, load in tables if len(r) >= FEWEST_ROWS and len(np.unique(load)) > 1]
+    findings = []
+    for e, residuals, load in tables:
+        levels = np.unique(load)
+        factor, p_levels = (
+            between([residuals[load == one] for one in levels]) if len(levels) < len(load) else (1.0, 1.0)
+        )
+        p = 2.0 * min(trend(residuals, load), p_levels if factor > SMALLEST_FACTOR else 1.0)
+        if p * len(tables) < ORDER_LEVEL:
+            coefficient = np.delete(e.observed, list(s.flagged.get(e.label, []))) / load
+            means = [(float(one), float(np.mean(coefficient[load == one]))) for one in levels]
+            findings.append(Finding("trials.loads", "fail", {"means": means, "p": p}, e.label))
+    return findings or [Finding("trials.loads", "ok", {"number": len(tables)})] * bool(tables)
+
+
+def trend(residuals: np.ndarray, load: np.ndarray, seed: int = 0) -> float:
+    """Probability that a random order of residuals (n,) has as large a correlation with the logarithm of ``load`` (n,)."""
+    x, r = np.log(load) - np.mean(np.log(load)), residuals - np.mean(residuals)
+    shuffled = np.random.default_rng(seed).permuted(np.tile(r, (PERMUTATIONS, 1)), axis=1)
+    return float((1 + np.sum(np.abs(shuffled @ x) >= np.abs(r @ x) * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
+
+
+def _loads(s: SampledFit, e: Experiment) -> np.ndarray:
+    """Load of every row without the flagged ones, N."""
+    return np.delete(np.asarray(e.loads), list(s.flagged.get(e.label, [])))
 
 
 def _means_count(s: SampledFit, e: Experiment) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.experiment_checks import check_outliers, check_stated_errors, check_whiteness
 from capsule_id.inference.checks.modes import check_maximum, check_starts
-from capsule_id.inference.checks.order import check_order, check_tables
+from capsule_id.inference.checks.order import check_trials
 from capsule_id.inference.checks.predictive import check_statistics
 from capsule_id.inference.checks.priors import check_priors
 from capsule_id.inference.checks.sampled_fit import SampledFit
@@ -41,8 +41,7 @@ def run_checks(sampled: SampledFit) -> SampledFit:
         *whiteness,
         *outliers,
         *check_stated_errors(sampled),
-        *check_order(sampled),
-        *check_tables(sampled),
+        *check_trials(sampled),
         *check_statistics(sampled),
         *_declared_findings(sampled, bench=True),
         *_informed(sampled),

@@ -155,6 +155,18 @@ def _tables_disagree(facts: Facts) -> str:
     )
 
 
+def _loads_differ(facts: Facts) -> str:
+    """The coefficient at the loads, the lowest and the highest where there are many."""
+    means = facts["means"]
+    shown = means if len(means) <= 6 else [means[0], means[len(means) // 2], means[-1]]
+    values = ", ".join(f"{coefficient:.3g} at {load:.3g} N" for load, coefficient in shown)
+    return (
+        f"expected friction in proportion to the normal force; found a coefficient of {values} (p = {facts['p']:.1g}). One "
+        "coefficient does not hold for all loads. Fit the rows of each load in a folder of its own, and use the load that is "
+        "nearest to the weight of the capsule."
+    )
+
+
 #: What a statistic of the residuals that is too large means.
 _STATISTICS: Mapping[str, str] = {
     "sign runs": "too many neighbours have the same sign",
@@ -202,6 +214,11 @@ FIT_MESSAGES: Mapping[str, Message] = {
         "agreement of tables",
         ok="{number:# table} of trials agree within their scatter",
         fail=_tables_disagree,
+    ),
+    "trials.loads": Message(
+        "friction against load",
+        ok="friction is in proportion to the normal force in {number:# table}",
+        fail=_loads_differ,
     ),
     "residuals.statistics": Message(
         "residuals like noise",

@@ -53,12 +53,13 @@ def widenings(s: SampledFit) -> dict[str, Widening]:
     """Error of the model of every physical parameter that a failed check of its bench test concerns, by name."""
     failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
     kinds = {e.kind for e in s.experiments if e.label in failed or e.table.label in failed}
+    by_load = {f.experiment for f in s.findings if f.code == "trials.loads" and f.level == "fail"}
     estimates: dict[str, list[tuple[float, float]]] = {}
     for e in s.experiments:
         # The parts of a run, or of a record with an amplitude of its own, have other nuisances than the whole.
         local = any(not (row.physical or row.scatter) for row in e.parameters)
         if e.kind in kinds and e.bench and not e.event_driven and not local:
-            for name, pair in estimates_of_parts(e, s.values):
+            for name, pair in estimates_of_parts(e, s.values, by_load=e.label in by_load):
                 estimates.setdefault(name, []).append(pair)
     found = {name: widening(pairs) for name, pairs in estimates.items() if len(pairs) >= FEWEST_PARTS}
     return {name: one for name, one in found.items() if one.factor > 1.0}
@@ -74,14 +75,27 @@ def widening(pairs: Sequence[tuple[float, float]]) -> Widening:
     return Widening(max(1.0, float(np.sqrt(chi_square / freedom))), quantile, len(pairs))
 
 
-def estimates_of_parts(e: Experiment, values: Mapping[str, float]) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Name, estimate and standard error of every physical parameter from every part of ``e`` that can be fitted."""
+def estimates_of_parts(
+    e: Experiment, values: Mapping[str, float], by_load: bool = False
+) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Name, estimate and standard error of every physical parameter from every part of ``e`` that can be fitted.
+
+    Parameters
+    ----------
+    by_load : whether a part holds the rows of one load, of similar loads where there are many, not consecutive rows
+    """
     unknowns = sum(not row.scatter for row in e.parameters) + e.misfit(e.local(values)).design.shape[1]
     rows = informative_rows(e)
     number = min(MOST_PARTS, len(rows) // max(ROWS_PER_UNKNOWN * unknowns, 3))
     if number < 2:
         return
-    for chosen in np.array_split(rows, number):
+    chosen_rows = np.array_split(rows, number)
+    if e.loads is not None and by_load:
+        levels, index = np.unique(e.loads, return_inverse=True)
+        chosen_rows = np.array_split(np.argsort(e.loads, kind="stable"), number)
+        if FEWEST_PARTS <= len(levels) <= MOST_PARTS:
+            chosen_rows = [np.flatnonzero(index == level) for level in range(len(levels))]
+    for chosen in chosen_rows:
         try:
             (part,) = type(e).make(rows_of(e.table, chosen), e.rig, getattr(e, "friction", EQUATION_1))
             with np.errstate(all="ignore"):
