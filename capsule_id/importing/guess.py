@@ -184,7 +184,9 @@ def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidat
     ratio = float(parts[-1] / max(*parts, 1e-300))
     bench = ratio < 0.5 * (DECAYS + DRIVEN)
     chosen = max((each for each in records if each.kind.bench == bench), key=lambda each: each.score)
-    clear = ratio < DECAYS or ratio > DRIVEN
+    # A push near the end of a decay makes its last part as large as the first ones.
+    least = float(np.min(parts[int(np.argmax(parts)) :]) / max(*parts, 1e-300))
+    clear = ratio < DECAYS or least > DRIVEN
     words = "decays" if bench else "is driven"
     return (
         chosen,

@@ -90,8 +90,10 @@ MESSAGES = {
             "alone; a difference this large is expected from their errors with probability {p:.2g}"
         ),
         fail=(
-            "{tilts} and {slides}: expected one surface; found mu = {mu_tilts:.3f} by tilting and {mu_slides:.3f} by "
-            "sliding (p = {p:.2g}). Measure both on the same surface, and read the tilt at break-away."
+            "{tilts} and {slides}: expected one surface; found mu = {mu_tilts:.3f} at rest and {mu_slides:.3f} by "
+            "sliding (p = {p:.2g}). Measure both on the same surface, and read the tilt or pull at break-away. Static friction "
+            "above sliding friction is no fault, but constant friction cannot show it: give the slides a column speed and "
+            'state friction = "stribeck", or fit both in folders of their own.'
         ),
     ),
 }

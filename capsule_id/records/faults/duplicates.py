@@ -91,11 +91,18 @@ def chance_of_equality(readings: Readings) -> float:
         # A step of 0.1 deg is a decimal one in deg alone.
         step, width = reading_step(factor * thinned(values)) / factor, TABLE_SCATTER * float(np.ptp(values))
         if readings.record and len(values) >= SHORTEST_RECORD:
-            width = WIDTH * noise_level(values)
+            step, width = max(step, _level_spacing(values)), WIDTH * noise_level(values)
         # A step of 0 is that of float64.
         own = min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
         chance *= own if readings.record else max(own, _set_share(values, readings.values))
     return chance
+
+
+def _level_spacing(values: np.ndarray) -> float:
+    """Mean spacing of the levels of a record (n,) that are read often, else 0: an encoder's need not be even."""
+    levels = np.unique(thinned(values))
+    often = 1 < len(levels) < MOST_LEVELS * len(thinned(values))
+    return float(np.ptp(levels)) / (len(levels) - 1) if often else 0.0
 
 
 def _set_share(column: np.ndarray, rows: np.ndarray) -> float:

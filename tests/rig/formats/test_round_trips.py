@@ -85,7 +85,11 @@ def test_channels_of_a_labview_file_with_different_rates_have_times_of_their_own
         ("X_Columns\tNo\n", "X_Columns\tOne\n", "a cell must be a number"),
         ("Delta_X\t", "Delta_Y\t", "must state X0 and a positive Delta_X"),
         ("\tcurrent\t", "\tstrom\t", "must be a header"),
-        ("***End_of_Header***", "***End***", "a header must end with"),
+        (
+            "***End_of_Header***",
+            "***End***",
+            "must have a header that ends with .*, none, rename a file of plain columns",
+        ),
     ],
 )
 def test_faults_of_a_labview_file(tmp_path: Path, fault: str, repaired: str, rule: str | None) -> None:
