@@ -164,6 +164,21 @@ def test_long_records_are_thinned_and_the_finding_says_so() -> None:
     assert default_block_size(TIME[:2000], columns[1].values[:2000]) == 1
 
 
+def test_a_very_long_record_is_named_and_the_remedy_works() -> None:
+    """250 periods of 600 samples are fitted by 8000 means, with the remedy by 2000."""
+    rate, n = np.sqrt(bench.K1 / bench.M1), 150_000
+    time = np.arange(n) * (2.0 * np.pi / rate / 600.0)
+    x = RELEASE * np.exp(-0.01 * rate * time) * np.cos(rate * time) + NOISE * noise("white", n)
+    columns = [bench.column("time", time), bench.column("x_rel", x)]
+    table = bench.table("free_vibration", columns, "decay")
+    (found,) = [f for f in lint_decay(table, bench.rig(table)) if f.code == "decays.long"]
+    assert found.facts["readings"] == pytest.approx(8000, rel=0.05)
+    assert found.facts["late"] == ""
+    coarse = bench.table("free_vibration", columns, "decay", thin=found.facts["thin"])
+    assert [f for f in lint_decay(coarse, bench.rig(coarse)) if f.code == "decays.long"] == []
+    assert FreeVibration(coarse, bench.rig(coarse)).n == pytest.approx(2000, rel=0.05)
+
+
 def test_the_estimate_of_a_long_record_is_that_of_its_means(monkeypatch: pytest.MonkeyPatch) -> None:
     values = bench.released(TIME, RELEASE, c=C) + 0.1 * NOISE * noise("white", 4000)
     table = bench.table("free_vibration", [bench.column("time", TIME), bench.column("x_rel", values)], "decay")

@@ -37,6 +37,8 @@ PROPOSED_FACTOR = 10
 FEWEST_PERIODS = 2
 #: Fewest block means in a period.
 FEWEST_MEANS = 4
+#: Number of readings whose fit takes minutes, and block means in a period that are proposed for it.
+MANY_READINGS, COARSE_MEANS = 6000, 8
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
@@ -177,6 +179,12 @@ def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterabl
     if table.settings.thin is None and table.settings.forward == "closed" and thin > 1:
         facts = {"file": table.file, "samples": len(time), "thin": thin, "means": len(time) // thin}
         yield Finding("decays.thinned", "ok", facts, table.label)
+    readings = len(time) // (table.settings.thin or thin)
+    if readings > MANY_READINGS:
+        size = block_size(time, values, COARSE_MEANS)
+        late = " A stop ends the record earlier, which saves more." if len(time) // size > MANY_READINGS else ""
+        facts = {"file": table.file, "readings": readings, "thin": size, "means": COARSE_MEANS, "late": late}
+        yield Finding("decays.long", "warn", facts, table.label)
 
 
 def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
@@ -279,6 +287,13 @@ MESSAGES = {
         ok=(
             "{file}: the fit uses {means} means of {thin} consecutive samples each instead of {samples} samples. That widens "
             "intervals by less than 0.5 % and saves time. To fit every sample, add thin = 1 to the experiment in rig.toml."
+        ),
+    ),
+    "decays.long": Message(
+        "length of a decay",
+        warn=(
+            "{file}: the fit uses {readings} readings, and takes minutes. {means} means in a period widen the intervals by "
+            "some 3 %: add thin = {thin} to the experiment in rig.toml.{late}"
         ),
     ),
     "decays.second": Message(
