@@ -163,6 +163,11 @@ class Experiment(eqx.Module):
         return {}
 
     @property
+    def balanced(self) -> tuple[str, ...]:
+        """Names of positive parameters that the products of ``scaled_by`` multiply, by their exponentials."""
+        return ()
+
+    @property
     def mirrored(self) -> tuple[str, ...]:
         """Names of the parameters whose sign is unknown: the point fit tries both."""
         return ()

@@ -9,6 +9,7 @@ import numpy as np
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.misfit import Misfit
+from capsule_id.inference.target.scales import Scale
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Settings, Table
 from capsule_id.views import Comparison
@@ -58,7 +59,7 @@ class Gaussian:
         self.centre = mean + self.OFF * np.sqrt(np.diag(sigma))
         self.covariance = self.WIDE**2 * sigma
         self.normal_priors = np.full((2, len(mean)), np.nan)
-        self.scaled = list[tuple[int, np.ndarray]]()
+        self.scaled = list[Scale]()
 
     def parts(self, v: np.ndarray) -> np.ndarray:
         """(w, d) -> (w, blocks)."""

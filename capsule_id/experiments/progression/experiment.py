@@ -51,6 +51,8 @@ from capsule_id.views import Comparison
 
 #: Scales of the half-normal priors of trial_sd and discrepancy, relative to the largest reading.
 TRIAL_PRIOR, DISCREPANCY_PRIOR = 0.05, 0.1
+#: Parameters in proportion to the friction force.
+FRICTION_FORCES = ("mu", "mu_back", "viscous")
 #: Parameters that change no motion.
 OF_TRIALS = ("trial_scatter", "trial_sd", "discrepancy")
 #: Step of the derivative with respect to ``session_sd``, relative.
@@ -154,6 +156,10 @@ class Progression(TrialsExperiment):
     @property
     def scaled_by(self) -> dict[str, tuple[str, ...]]:
         return {"session_sd": tuple(f"{symbol}[{self.label}]" for symbol in self.sessions.symbols)}
+
+    @property
+    def balanced(self) -> tuple[str, ...]:
+        return tuple(row.name for row in self.parameters if row.symbol in FRICTION_FORCES)
 
     @property
     def mirrored(self) -> tuple[str, ...]:

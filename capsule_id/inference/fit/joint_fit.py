@@ -236,7 +236,7 @@ def _rescaled(target: LogPosterior, u: np.ndarray) -> np.ndarray:
 
     The readings determine only their product, so that a change of one alone is always worse.
     """
-    for scale, own in target.scaled:
+    for scale, own, _ in target.scaled:
         points = np.repeat(u[None], len(FACTORS), axis=0)
         points[:, scale] += np.log(FACTORS)
         points[:, own] /= FACTORS[:, None]

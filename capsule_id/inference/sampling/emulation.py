@@ -16,6 +16,7 @@ from capsule_id.inference.sampling.moves import Moves, block_move, delayed_moves
 from capsule_id.inference.sampling.proposal import BlockProposal
 from capsule_id.inference.sampling.refinement import NO_MASS, effective_size, refined
 from capsule_id.inference.sampling.transport import LARGEST_MAP, Transported
+from capsule_id.inference.target.scales import Scale
 
 #: Draws of the first round and of each later one, largest number of rounds.
 FIRST_DRAWS, DRAWS, ROUNDS = 2048, 1024, 6
@@ -37,7 +38,7 @@ class Emulable(Protocol):
     """A density whose motions can be emulated; see ``capsule_id.inference.target.marginal.MarginalPosterior``."""
 
     normal_priors: np.ndarray
-    scaled: list[tuple[int, np.ndarray]]
+    scaled: list[Scale]
 
     def parts(self, v: np.ndarray) -> np.ndarray: ...
 

@@ -29,6 +29,7 @@ from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initia
 from capsule_id.inference.sampling.moves import Moves, block_move, delayed_moves, other_moves
 from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
 from capsule_id.inference.sampling.refinement import NO_MASS, refined
+from capsule_id.inference.target.scales import Scale
 
 #: Number of independent ensembles, enough for a split R-hat.
 ENSEMBLES = 4
@@ -95,7 +96,7 @@ class Target(Protocol):
     centre: np.ndarray
     covariance: np.ndarray
     normal_priors: np.ndarray
-    scaled: list[tuple[int, np.ndarray]]
+    scaled: list[Scale]
 
     @property
     def can_be_emulated(self) -> bool: ...

@@ -7,6 +7,7 @@ import emcee
 import numpy as np
 
 from capsule_id.inference.sampling.proposal import BlockProposal
+from capsule_id.inference.target.scales import Scale
 
 #: Share of the delayed moves whose inner chain is a random walk, its number of steps, and a step in sds of the posterior.
 LOCAL, WALK, SHORT = 0.3, 5, 0.15
@@ -90,19 +91,21 @@ class RandomWalk:
 
 
 class Rescaling:
-    """Metropolis steps that multiply a scale by a factor, and divide by it what the scale multiplies.
+    """Metropolis steps along which the products of a scale and its factors, or what balances them, keep the motion.
 
-    Where readings determine only the product, no other step goes far along the hyperbola on which it is constant.
+    A step multiplies the scale and divides its factors by the same number; or it adds a number to all factors, and
+    divides what they balance by the exponential of its product with the scale. Where readings determine only products,
+    no other step goes far along the hyperbola on which one is constant.
 
     Parameters
     ----------
     blocks : indices of the parameters of each block
-    scaled : indices of the logarithm of each scale and of what it multiplies, all in one block
+    scaled : each in one block
     """
 
-    def __init__(self, blocks: Sequence[np.ndarray], scaled: Sequence[tuple[int, np.ndarray]]) -> None:
+    def __init__(self, blocks: Sequence[np.ndarray], scaled: Sequence[Scale]) -> None:
         self.blocks = blocks
-        self._scaled = [(next(i for i, block in enumerate(blocks) if at in block), at, own) for at, own in scaled]
+        self._scaled = [(next(i for i, block in enumerate(blocks) if one.scatter in block), one) for one in scaled]
 
     def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
         parts = log_density(coords)
@@ -111,11 +114,16 @@ class Rescaling:
     def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
         """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
         new, factors = before.coords.copy(), np.zeros_like(before.proposed)
-        for block, at, own in self._scaled:
-            t = FACTOR * random.standard_normal(len(new))
-            new[:, at] += t
-            new[:, own] *= np.exp(-t)[:, None]
-            factors[:, block] -= len(own) * t  # the Jacobian
+        rescales = random.uniform() < 0.5
+        for block, (scale, own, balanced) in self._scaled:
+            t = random.standard_normal(len(new))
+            if rescales:
+                new[:, scale] += FACTOR * t
+                new[:, own] *= np.exp(-FACTOR * t)[:, None]
+                factors[:, block] -= len(own) * FACTOR * t  # the Jacobian
+            else:
+                new[:, own] += t[:, None]
+                new[:, balanced] -= (np.exp(new[:, scale]) * t)[:, None]
         coords, parts, moved = accept(random, before, new, log_density(new), factors, self.blocks)
         return Walkers(coords, parts, before.proposed), moved
 
@@ -202,7 +210,7 @@ def delayed_moves(
     proposal: BlockProposal,
     near: np.ndarray,
     steps: int,
-    scaled: Sequence[tuple[int, np.ndarray]] = (),
+    scaled: Sequence[Scale] = (),
     other: float = 0.1,
 ) -> Moves:
     """Delayed acceptance by chains of ``steps`` block moves, and of short random walks, with some differential evolution.

@@ -20,6 +20,7 @@ from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol
 from capsule_id.inference.target.compiling import COMPILE
 from capsule_id.inference.target.groups import Group, make_groups
 from capsule_id.inference.target.priors import Priors, covering_prior, override, prior_of, prior_sd
+from capsule_id.inference.target.scales import Scale
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.rig.model import Rig
 
@@ -133,16 +134,20 @@ class LogPosterior(eqx.Module):
         return np.flatnonzero(~self.scatter)
 
     @property
-    def scaled(self) -> list[tuple[int, np.ndarray]]:
-        """Index of each scale, and indices of the parameters of which only the product with it changes the motion."""
-        scaled = dict[str, set[str]]()
+    def scaled(self) -> list[Scale]:
+        """Each scatter of which only the product with other parameters changes the motion."""
+        scaled, balanced = dict[str, set[str]](), dict[str, set[str]]()
         for e in self.experiments:
             for name, own in e.scaled_by.items():
                 scaled.setdefault(name, set()).update(own)
-        pairs = (
-            (self.names.index(name), np.flatnonzero(np.isin(self.names, sorted(own)))) for name, own in scaled.items()
-        )
-        return [(scale, own) for scale, own in pairs if len(own)]
+                balanced.setdefault(name, set()).update(e.balanced)
+
+        def indices(names: set[str]) -> np.ndarray:
+            return np.flatnonzero(np.isin(self.names, sorted(names)))
+
+        return [
+            Scale(self.names.index(name), indices(own), indices(balanced[name])) for name, own in scaled.items() if own
+        ]
 
     @property
     def prior_sd(self) -> np.ndarray:

@@ -35,6 +35,7 @@ from capsule_id.inference.target.quadrature import (
     log_stretch,
     position,
 )
+from capsule_id.inference.target.scales import Scale
 
 #: Smallest and largest distance from the point fit of the walkers that determine the nodes, in standard deviations.
 #: The largest is wide because few trials give the heavy tails of Student's t.
@@ -78,7 +79,7 @@ class MarginalPosterior:
     blocks : indices, among the located parameters, of each factor of the posterior
     centre, covariance : (dimension,), (dimension, dimension) Laplace approximation of u
     normal_priors : (2, dimension) centre and width of the prior of u where it is normal; NaN elsewhere
-    scaled : indices, among the located parameters, of each scale and of what it multiplies, see ``LogPosterior.scaled``
+    scaled : ``LogPosterior.scaled``, indices among the located parameters
     kept : (2, scatters) block of each scatter and its place among the scatters of that block, see ``factors``
     """
 
@@ -92,16 +93,18 @@ class MarginalPosterior:
         self.normal_priors = np.where(priors.lognormal, np.stack([priors.centre, priors.width]), np.nan)
         own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
         self.blocks = [block for block in own if len(block)]
-        self.scaled = [(int(own[0]), own[1:]) for own in map(self._places, target.scaled)]
+        self.scaled = [
+            Scale(
+                int(np.searchsorted(self._located, one.scatter)),
+                *(np.searchsorted(self._located, own) for own in one[1:]),
+            )
+            for one in target.scaled
+        ]
         # A scatter whose block has no located parameter depends on nothing: it is drawn with the first block.
         own_block = np.where(self._label[self._scatter] < len(self.blocks), self._label[self._scatter], 0)
         before = np.tril(own_block[:, None] == own_block, -1)
         self.kept = np.stack([own_block, np.sum(before, axis=1)])
         self.grid = choose_grid(self._terms, fit.u[self._scatter], self._label[self._scatter], self._probes())
-
-    def _places(self, scaled: tuple[int, np.ndarray]) -> np.ndarray:
-        """Places of a scale and of what it multiplies among the located parameters."""
-        return np.searchsorted(self._located, [scaled[0], *scaled[1]])
 
     @property
     def fingerprint(self) -> str:

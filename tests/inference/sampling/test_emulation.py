@@ -21,6 +21,7 @@ from capsule_id.inference.sampling.ensembles import DELAYED, sample
 from capsule_id.inference.sampling.proposal import block_proposal
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
+from capsule_id.inference.target.scales import Scale
 from tests.inference.sampling.test_sampling import LIMIT, scores
 from tests.inference.stub import Gaussian
 from tests.inference.three_settings import THETA, three_settings
@@ -72,41 +73,62 @@ def test_short_walks_keep_the_exact_posterior() -> None:
         assert 0.2 < np.mean(ensemble.acceptance) <= 1.0
 
 
-def hyperbola(v: np.ndarray) -> np.ndarray:
-    """(w, 2) a half-normal scale, v[0] its logarithm, and z of two sessions, of which the product with it is known."""
-    scale = np.exp(v[:, 0])
-    sessions = np.sum(v[:, 1:3] ** 2 + ((scale[:, None] * v[:, 1:3] - [0.12, 0.09]) / 0.01) ** 2, axis=1)
-    return np.stack([v[:, 0] - 0.5 * (scale / 0.1) ** 2 - 0.5 * sessions, -0.5 * v[:, 3] ** 2], axis=1)
+def hyperbola(v: np.ndarray, sd: float = 0.01) -> np.ndarray:
+    """(w, 2) a half-normal scale, v[0] its logarithm, z of two sessions, and the logarithm of mu, v[3], N(0, 1).
+
+    The friction of both sessions is known: mu exp(scale z) is exp(0.12) and exp(0.09) within ``sd``.
+    """
+    scale = np.exp(v[:, :1])
+    known = ((v[:, 3:4] + scale * v[:, 1:3] - [0.12, 0.09]) / sd) ** 2
+    sessions = 0.5 * np.sum(v[:, 1:3] ** 2 + known, axis=1)
+    return np.stack(
+        [v[:, 0] - 0.5 * (scale[:, 0] / 0.1) ** 2 - sessions - 0.5 * v[:, 3] ** 2, -0.5 * v[:, 4] ** 2], axis=1
+    )
+
+
+def moments() -> tuple[float, float]:
+    """Mean of the logarithm of the scale and variance of that of mu, by quadrature over the scale."""
+    t = np.linspace(np.log(1e-4), np.log(1.0), 4001)
+    scale = np.exp(t)
+    # Given scale and mu, z ~ N(0, 1) and a normal reading of mu + scale z: the reading is N(mu, scale^2 + sd^2).
+    sd2, y = scale**2 + 0.01**2, np.array([0.12, 0.09])
+    precision = 1.0 + 2.0 / sd2
+    mean = np.sum(y) / sd2 / precision
+    log_density = t - 0.5 * (scale / 0.1) ** 2 - np.log(sd2) - 0.5 * np.log(precision)
+    log_density += 0.5 * precision * mean**2 - 0.5 * np.sum(y**2) / sd2
+    weight = np.exp(log_density - np.max(log_density))
+    weight /= np.sum(weight)
+    return float(t @ weight), float(weight @ (1.0 / precision + mean**2) - (weight @ mean) ** 2)
 
 
 def test_rescaling_keeps_the_posterior_and_follows_a_hyperbola(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against quadrature over the scale. Negative control: no Jacobian."""
-    t = np.linspace(np.log(1e-3), np.log(2.0), 4001)
-    scale = np.exp(t)[:, None]
-    # z ~ N(0, 1) and scale z ~ N(m, 0.01^2): the density of m is normal.
-    sd = np.hypot(0.01, scale)
-    log_density = (
-        t - 0.5 * (scale[:, 0] / 0.1) ** 2 - np.sum(0.5 * (np.array([[0.12, 0.09]]) / sd) ** 2 + np.log(sd), axis=1)
-    )
-    weight = np.exp(log_density - np.max(log_density))
-    mean = np.sum(t * weight) / np.sum(weight)
-    blocks = [np.arange(3), np.array([3])]
-    walk = moves.RandomWalk(blocks, np.diag([0.01, 0.01, 0.01, 1.0]))
+    """With a wrong emulator, against quadrature. Negative controls: no such steps, and no Jacobian."""
+    blocks, scales = [np.arange(4), np.array([4])], [Scale(0, np.array([1, 2]), np.array([3]))]
+    walk = moves.RandomWalk(blocks, np.diag([0.01, 0.01, 0.01, 1e-4, 1.0]))
     random = np.random.RandomState(1)
-    start = initial_state(np.array([np.log(0.1), 1.2, 0.9, 0.0]) + 0.01 * random.standard_normal((64, 4)), random)
+    centre = np.array([np.log(0.05), 0.0, 0.0, 0.105, 0.0])
+    start = initial_state(centre + 0.01 * random.standard_normal((64, 5)), random)
 
-    def far(rescales: bool) -> float:
-        """Distance of the mean of the logarithm from quadrature, in standard errors by four parts of the walkers."""
-        rescaling = [(moves.DelayedMove(hyperbola, moves.Rescaling(blocks, [(0, np.array([1, 2]))]), 5), 0.5)]
-        both = [(moves.DelayedMove(hyperbola, walk, 5), 0.5), *(rescaling if rescales else [])]
-        ensemble = Ensemble(hyperbola, start, both).run(600)
-        means = np.mean(ensemble.chain[100:, :, 0], axis=0)
-        return float((np.mean(means) - mean) / (np.std(means) / np.sqrt(len(means))))
+    def wrong(v: np.ndarray) -> np.ndarray:
+        return hyperbola(v, 0.012)
 
-    assert abs(far(rescales=True)) < LIMIT
+    def sample(rescales: bool) -> tuple[float, float, float]:
+        """Error of the mean of log scale in standard errors; variance of log mu over the exact one, and that of its means."""
+        rescaling = [(moves.DelayedMove(wrong, moves.Rescaling(blocks, scales), 5), 0.5)]
+        both = [(moves.DelayedMove(wrong, walk, 5), 0.5), *(rescaling if rescales else [])]
+        chain = Ensemble(hyperbola, start, both).run(1500).chain[300:]
+        means, (mean, variance) = np.mean(chain, axis=0), moments()
+        far = (np.mean(means[:, 0]) - mean) / (np.std(means[:, 0]) / np.sqrt(len(means)))
+        return float(far), float(np.var(chain[:, :, 3]) / variance), float(np.var(means[:, 3]) / variance)
+
+    far, variance, of_means = sample(rescales=True)
+    assert abs(far) < LIMIT
+    assert variance == pytest.approx(1.0, abs=0.2)
+    # A mean over independent draws has a variance of 1/1200; without these steps each walker stays on its part.
+    assert sample(rescales=False)[2] > 3.0 * of_means
     accept = moves.accept
     monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:4], 0.0 * args[4], args[5]))
-    assert abs(far(rescales=True)) > LIMIT
+    assert abs(sample(rescales=True)[0]) > LIMIT
 
 
 def test_an_emulator_follows_a_function_and_leaves_out_what_is_not_known() -> None:
