@@ -148,8 +148,8 @@ class Experiment(eqx.Module):
         return (None,)
 
     @property
-    def loads(self) -> np.ndarray | None:
-        """(n,) normal force of every trial, N, where it differs between them: residuals must not depend on it."""
+    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Normal force of every trial, N, and its friction coefficient, (n,) each, where the force is stated row by row."""
         return None
 
     @property

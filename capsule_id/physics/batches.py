@@ -111,6 +111,7 @@ def lanes_of(tree: Tree, times: ArrayLike) -> tuple[Tree, Times, bool]:
 
 @jax.jit
 def _first_lane(tree: Tree) -> Tree:
+    """``tree`` without the axis of lanes. One program: each slice outside of programs takes a tenth of the time of a run."""
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 

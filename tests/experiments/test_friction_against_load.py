@@ -161,3 +161,22 @@ def test_a_trend_with_the_load_is_named_where_every_trial_has_its_own() -> None:
 
     assert p(0.1, 0) < 0.002
     assert np.mean([p(0.0, int(seed)) < 0.05 for seed in rng.integers(0, 10**6, 200)]) < 0.09
+
+
+def test_two_loads_with_few_rows_and_loads_on_a_slope(tmp_path: Path) -> None:
+    rng, load = np.random.default_rng(2), np.repeat([6.0, 60.0], 5)
+    force = np.repeat([0.35, 0.28], 5) * load * (1.0 + 0.02 * rng.standard_normal(10))
+    shuffled = rng.permutation(10)
+    columns = {"force [N]": force[shuffled], "normal_force [N]": load[shuffled]}
+    few = cid.fit(rig(tmp_path / "few", Entry("static_friction", "table", columns)), budget=None)
+    assert [f.code for f in few.findings if f.level == "fail"] == ["trials.loads"]
+    # The weight along a slope is no friction.
+    along = 0.6 * 9.81 * np.sin(np.deg2rad(20.0))
+    columns = {"force [N]": force + along, "normal_force [N]": load}
+    with suppress(InputError):  # the weight along the slope needs the masses
+        make_rig(tmp_path / "slope", Entry("static_friction", "table", columns, {"slope": quantity(20.0, "deg")}))
+    toml = tmp_path / "slope" / "rig.toml"
+    masses = '[rig]\nm1 = { value = 0.1, sd = 0.001, unit = "kg" }\nm2 = { value = 0.5, sd = 0.001, unit = "kg" }\n'
+    toml.write_text(toml.read_text().replace("[rig]\n", masses) + f"\n[model]\n{CONSTANT}\n")
+    found = [f for f in cid.fit(cid.read_rig(toml.parent), budget=None).findings if f.code == "trials.loads"]
+    assert found[0].facts["means"][0][1] == pytest.approx(0.35, rel=0.03)

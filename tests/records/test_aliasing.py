@@ -30,3 +30,12 @@ def test_uneven_times_tell_frequencies_apart(monkeypatch: pytest.MonkeyPatch) ->
 def test_even_times_do_not() -> None:
     found = aliases(*record(0.0), FREQUENCY * 1.002)
     np.testing.assert_allclose(found[:2], [SAMPLING - FREQUENCY, SAMPLING + FREQUENCY], atol=0.01)
+
+
+@pytest.mark.parametrize("decimals", [5, 4, 3])
+def test_rounded_times_of_even_sampling_do_not(decimals: int) -> None:
+    """30 frames a second: each step is rounded, and so is their median."""
+    rng, time = np.random.default_rng(1), np.arange(200) / 30.0
+    for f in (8.0, 11.3, 33.0):
+        values = np.exp(-0.3 * time) * np.cos(2.0 * np.pi * f * time) + 1e-3 * rng.standard_normal(200)
+        assert len(aliases(np.round(time, decimals), values, f)) > 0

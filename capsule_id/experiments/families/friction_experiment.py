@@ -82,19 +82,12 @@ class FrictionExperiment(GroundExperiment):
     """A friction experiment; all of them share the friction law, the paper's protocol and one panel."""
 
     role: ClassVar[Literal["static", "dynamic", "sliding"]]
-    #: () or (n,), N, where it is stated; None: that of the weight
-    normal_force: np.ndarray | None = None
     checks = (check_one_surface, check_variants)
     tables = (variant_table,)
 
     @property
     def masses(self) -> tuple[str, ...]:
         return self.friction.masses
-
-    @property
-    def loads(self) -> np.ndarray | None:
-        differ = self.normal_force is not None and np.size(self.normal_force) > 1
-        return np.asarray(self.normal_force) if differ else None
 
     @property
     def speeds_known(self) -> bool:
@@ -145,6 +138,12 @@ def stated_normal_forces(table: Table[Any]) -> tuple[np.ndarray | None, float]:
     """Return the column ``normal_force``, (n,) N, or None, and its reading error, N."""
     column = table.columns.get("normal_force")
     return (None, 0.0) if column is None else (column.values, column.reading_sd)
+
+
+def loads_of(normal_force: np.ndarray | None, coefficient: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """``Experiment.loads`` from the stated normal force, () or (n,) N, and the coefficients (n,)."""
+    several = normal_force is not None and np.size(normal_force) > 1
+    return (np.asarray(normal_force), coefficient) if several else None
 
 
 def friction_comparison(

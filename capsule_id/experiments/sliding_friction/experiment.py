@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.families.friction_experiment import FrictionExperiment, stated_normal_forces
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment, loads_of, stated_normal_forces
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit
@@ -32,6 +32,7 @@ class SlidingFriction(FrictionExperiment):
     speed_sd: float
     values_sd: float
     #: (n,), N; None: that of the weight
+    normal_force: np.ndarray | None
     normal_force_sd: float
     quantity: str = eqx.field(static=True)
 
@@ -60,6 +61,10 @@ class SlidingFriction(FrictionExperiment):
     def masses(self) -> tuple[str, ...]:
         weighed = self.normal_force is None or "slope" in self.ground
         return ("m1", "m2") if self.quantity == "force" and weighed else super().masses
+
+    @property
+    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
+        return loads_of(self.normal_force, self.paper_points()[1])
 
     @property
     def observed(self) -> np.ndarray:

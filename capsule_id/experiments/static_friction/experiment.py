@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.families.friction_experiment import FrictionExperiment, stated_normal_forces
+from capsule_id.experiments.families.friction_experiment import FrictionExperiment, loads_of, stated_normal_forces
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -120,6 +120,10 @@ class StaticPulls(FrictionExperiment):
     @property
     def scatters(self) -> tuple[str]:
         return ("pull_scatter",)
+
+    @property
+    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
+        return loads_of(self.normal_force, self.paper_points()[1])
 
     @property
     def observed(self) -> np.ndarray:

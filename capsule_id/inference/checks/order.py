@@ -22,6 +22,8 @@ FEWEST_ROWS = 6
 SMALLEST_SCATTER = 0.02
 #: Smallest factor of the sd by which tables of one kind disagree that counts, and fewest rows of a table.
 SMALLEST_FACTOR, FEWEST_TRIALS = 1.2, 2
+#: Rows of a load, on average, from which their own mean is taken.
+ROWS_OF_A_LOAD = 3
 
 
 def check_trials(s: SampledFit) -> list[Finding]:
@@ -46,8 +48,7 @@ def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
         if s.flagged.get(e.label):
             residuals = residuals - columns @ np.linalg.lstsq(columns, residuals, rcond=None)[0]
         if e.label in by_load:
-            groups = np.unique(_loads(s, e), return_inverse=True)[1]
-            residuals = residuals - (np.bincount(groups, residuals) / np.bincount(groups))[groups]
+            residuals = _within_loads(residuals, _loads(s, e)[0])
         if len(residuals) >= FEWEST_ROWS and np.std(residuals) > SMALLEST_SCATTER:
             tables.append((e, residuals))
     for e, residuals in tables:
@@ -103,20 +104,29 @@ def check_loads(s: SampledFit) -> list[Finding]:
 
     Permutation tests of the scatter between loads, and of the correlation with the logarithm of the load.
     """
-    tables = [(e, _unflagged(s, e)[0], _loads(s, e)) for e in s.experiments if e.loads is not None]
-    tables = [(e, r, load) for e, r, load in tables if len(r) >= FEWEST_ROWS and len(np.unique(load)) > 1]
+    tables = [(e, _unflagged(s, e)[0], *_loads(s, e)) for e in s.experiments if e.loads is not None]
+    tables = [one for one in tables if len(one[1]) >= FEWEST_ROWS and len(np.unique(one[2])) > 1]
     findings = []
-    for e, residuals, load in tables:
-        levels = np.unique(load)
-        factor, p_levels = (
-            between([residuals[load == one] for one in levels]) if len(levels) < len(load) else (1.0, 1.0)
-        )
-        p = 2.0 * min(trend(residuals, load), p_levels if factor > SMALLEST_FACTOR else 1.0)
+    for e, residuals, load, coefficient in tables:
+        groups = [residuals[load == one] for one in np.unique(load)]
+        p = 2.0 * min(trend(_standardised(residuals, load), load), _of_levels(groups))
         if p * len(tables) < ORDER_LEVEL:
-            coefficient = np.delete(e.observed, list(s.flagged.get(e.label, []))) / load
-            means = [(float(one), float(np.mean(coefficient[load == one]))) for one in levels]
+            means = [(float(one), float(np.mean(coefficient[load == one]))) for one in np.unique(load)]
             findings.append(Finding("trials.loads", "fail", {"means": means, "p": p}, e.label))
     return findings or [Finding("trials.loads", "ok", {"number": len(tables)})] * bool(tables)
+
+
+def _of_levels(groups: Sequence[np.ndarray]) -> float:
+    """Probability of as large a scatter between the loads; 1 where it is small.
+
+    Each load may have a scatter of its own (Alexander and Govern 1994). With few rows a test by permutations cannot reach
+    a small probability.
+    """
+    if sum(map(len, groups)) == len(groups) or between(groups)[0] <= SMALLEST_FACTOR:
+        return 1.0
+    if min(map(len, groups)) >= ROWS_OF_A_LOAD:
+        return float(stats.alexandergovern(*groups).pvalue)
+    return between(groups)[1]
 
 
 def trend(residuals: np.ndarray, load: np.ndarray, seed: int = 0) -> float:
@@ -126,9 +136,29 @@ def trend(residuals: np.ndarray, load: np.ndarray, seed: int = 0) -> float:
     return float((1 + np.sum(np.abs(shuffled @ x) >= np.abs(r @ x) * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
 
 
-def _loads(s: SampledFit, e: Experiment) -> np.ndarray:
-    """Load of every row without the flagged ones, N."""
-    return np.delete(np.asarray(e.loads), list(s.flagged.get(e.label, [])))
+def _within_loads(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
+    """Residuals (n,) without their mean at each load, or, where loads have few rows, without a line in its logarithm."""
+    groups = np.unique(load, return_inverse=True)[1]
+    size = np.bincount(groups)
+    if len(load) >= ROWS_OF_A_LOAD * len(size):
+        return residuals - (np.bincount(groups, residuals) / size)[groups]
+    return residuals - np.polyval(np.polyfit(np.log(load), residuals, 1), np.log(load))
+
+
+def _standardised(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
+    """Residuals (n,) over their sd at each load, where every load has enough rows."""
+    groups = np.unique(load, return_inverse=True)[1]
+    if np.min(np.bincount(groups)) < ROWS_OF_A_LOAD:
+        return residuals
+    sd = np.array([np.std(residuals[groups == k], ddof=1) for k in range(np.max(groups) + 1)])
+    return residuals / np.maximum(sd, SMALLEST_SCATTER)[groups]
+
+
+def _loads(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
+    """Load, N, and coefficient of every row without the flagged ones."""
+    assert e.loads is not None, "the table has loads"
+    load, coefficient = (np.delete(x, list(s.flagged.get(e.label, []))) for x in e.loads)
+    return load, coefficient
 
 
 def _means_count(s: SampledFit, e: Experiment) -> bool:

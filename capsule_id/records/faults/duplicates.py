@@ -25,6 +25,8 @@ COMPARED = 4096
 MOST_DECIMALS = 15
 #: Distance of a level from an even spacing, in spacings; share of the levels that must be within it.
 LEVEL_TOLERANCE, REGULAR_LEVELS = 0.2, 0.9
+#: A gap between levels is large beyond so many steps; levels are uneven where this share of the gaps is large.
+LARGE_GAP, MANY_LARGE_GAPS = 3.0, 0.3
 #: Largest number of levels per reading of a table and of a record: at a high amplitude most levels are read once.
 MOST_LEVELS, MOST_LEVELS_OF_RECORD = 0.5, 0.9
 
@@ -91,18 +93,23 @@ def chance_of_equality(readings: Readings) -> float:
         # A step of 0.1 deg is a decimal one in deg alone.
         step, width = reading_step(factor * thinned(values)) / factor, TABLE_SCATTER * float(np.ptp(values))
         if readings.record and len(values) >= SHORTEST_RECORD:
-            step, width = max(step, _level_spacing(values)), WIDTH * noise_level(values)
+            step, width = max(step, _uneven_spacing(values, step)), WIDTH * noise_level(values)
         # A step of 0 is that of float64.
         own = min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
         chance *= own if readings.record else max(own, _set_share(values, readings.values))
     return chance
 
 
-def _level_spacing(values: np.ndarray) -> float:
-    """Mean spacing of the levels of a record (n,) that are read often, else 0: an encoder's need not be even."""
-    levels = np.unique(thinned(values))
-    often = 1 < len(levels) < MOST_LEVELS * len(thinned(values))
-    return float(np.ptp(levels)) / (len(levels) - 1) if often else 0.0
+def _uneven_spacing(values: np.ndarray, step: float) -> float:
+    """Mean gap between the levels of a record (n,) where many are far larger than the reading step; else 0.
+
+    An encoder may read on several grids that are shifted against each other. A few large gaps are jumps of the motion.
+    """
+    thin = thinned(values)
+    gaps = np.diff(np.unique(thin))
+    several = 1 < len(gaps) < MOST_LEVELS * len(thin)
+    uneven = several and np.mean(gaps > LARGE_GAP * step) > MANY_LARGE_GAPS
+    return float(np.mean(gaps[gaps <= LARGE_GAP * np.quantile(gaps, 0.75)])) if uneven else 0.0
 
 
 def _set_share(column: np.ndarray, rows: np.ndarray) -> float:

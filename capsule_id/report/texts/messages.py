@@ -162,8 +162,8 @@ def _loads_differ(facts: Facts) -> str:
     values = ", ".join(f"{coefficient:.3g} at {load:.3g} N" for load, coefficient in shown)
     return (
         f"expected friction in proportion to the normal force; found a coefficient of {values} (p = {facts['p']:.1g}). One "
-        "coefficient does not hold for all loads. Fit the rows of each load in a folder of its own, and use the load that is "
-        "nearest to the weight of the capsule."
+        "coefficient does not hold for all loads. Fit the rows of similar loads in a folder of their own, and use the load "
+        "that is nearest to the weight of the capsule. Where the speed changes with the load, look first at the friction law."
     )
 
 

@@ -91,8 +91,8 @@ def estimates_of_parts(
         return
     chosen_rows = np.array_split(rows, number)
     if e.loads is not None and by_load:
-        levels, index = np.unique(e.loads, return_inverse=True)
-        chosen_rows = np.array_split(np.argsort(e.loads, kind="stable"), number)
+        levels, index = np.unique(e.loads[0], return_inverse=True)
+        chosen_rows = np.array_split(np.argsort(e.loads[0], kind="stable"), number)
         if FEWEST_PARTS <= len(levels) <= MOST_PARTS:
             chosen_rows = [np.flatnonzero(index == level) for level in range(len(levels))]
     for chosen in chosen_rows:

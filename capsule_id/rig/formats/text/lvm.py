@@ -182,8 +182,11 @@ def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | N
 
 def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:
     """Headers and segments of a file."""
-    if not any(line.startswith(_END) for line in lines):
-        rule, remedy = f"a .lvm file must have a header that ends with {_END}", "rename a file of plain columns to .txt"
+    if not any(line.strip().startswith(_END) for line in lines):
+        rule, remedy = (
+            f"a .lvm file must have a header that ends with {_END}",
+            "rename a file of plain columns to .txt, or export the record again",
+        )
         raise InputError(rule, "none", remedy, path, 1, 1)
     word = "Separator"
     stated = next((line for line in lines if line.startswith(word)), word + "\t")
