@@ -1,7 +1,6 @@
 """Progressions with heavy tails: the density against sums over outlying trials, outliers that move nothing, rules."""
 
 from pathlib import Path
-from types import ModuleType
 from typing import cast
 
 import equinox as eqx
@@ -28,10 +27,9 @@ SCATTERS = {"session_sd": THETA["session_sd"], "trial_scatter": 0.0}
 
 
 @pytest.mark.parametrize("lone", [(), (0,), (0, 1, 2)])
-@pytest.mark.parametrize("xp", [np, jnp])
-def test_the_density_is_the_sum_over_outlying_trials(lone: tuple[int, ...], xp: ModuleType) -> None:
+def test_the_density_is_the_sum_over_outlying_trials(lone: tuple[int, ...]) -> None:
     """Two settings in two sessions each, of which some are integrated out, against SciPy."""
-    rng, scatters, z = np.random.default_rng(5), np.array([0.1, 0.7]), np.linspace(-5.0, 5.0, 101)
+    rng, scatters, z = np.random.default_rng(5), np.array([0.1, 0.7]), np.linspace(-5.0, 5.0, 81)
     sizes = [2, 1, 4, 2]
     b, j = np.repeat([0, 0, 1, 1], sizes), np.repeat([0, 1, 2, 3], sizes)
     sessions = Sessions(np.eye(2)[b], np.eye(4)[j], np.array([-1 if k in lone else k for k in range(4)]))
@@ -51,9 +49,10 @@ def test_the_density_is_the_sum_over_outlying_trials(lone: tuple[int, ...], xp: 
 
     trials = TrialMisfit(TrialGroups(distance, sessions, heavy=True), at_nodes, 0.04, 0.0, np.array([0.3, 0.8]))
     by_sums = [[expected(setting, d, scatter) for setting, d in ((0, 0.3), (1, 0.8))] for scatter in scatters]
-    np.testing.assert_allclose(np.asarray(trials.of_settings(scatters, xp)), by_sums, rtol=1e-3)
     normal = TrialMisfit(TrialGroups(distance, sessions), at_nodes, 0.04, 0.0, np.array([0.3, 0.8]))
-    assert np.all(np.asarray(normal.of_settings(scatters, xp))[:, 0] < np.array(by_sums)[:, 0] - 5.0)
+    for xp in (np, jnp):
+        np.testing.assert_allclose(np.asarray(trials.of_settings(scatters, xp)), by_sums, rtol=1e-3)
+        assert np.all(np.asarray(normal.of_settings(scatters, xp))[:, 0] < np.array(by_sums)[:, 0] - 5.0)
 
 
 def test_alternatives_of_settings_with_different_numbers_of_trials() -> None:
