@@ -187,7 +187,8 @@ def _column_lines(found: FoundLayout, guessed: Guess) -> Iterable[str]:
     elif TIME not in guessed.columns and guessed.confidence == "unsure" and "sampling rate" in guessed.reason:
         yield _commented(f'{TIME} = {{ rate = {{ value = 1000, unit = "Hz" }} }}', "unsure", "the file states no rate")
     for name, column in guessed.columns.items():
-        source = f'{{ from = {_source(found, column)}, unit = "{column.unit}" }}'
+        factor = "" if column.scale is None else f", scale = {column.scale:.10g}"
+        source = f'{{ from = {_source(found, column)}, unit = "{column.unit}"{factor} }}'
         yield _commented(f"{name} = {source}", column.confidence, column.reason)
 
 

@@ -13,6 +13,7 @@ from capsule_id.experiments.kind import Kind
 from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
 from capsule_id.importing.layout import FoundLayout
 from capsule_id.records.faults.release import find_free_decay
+from capsule_id.rig.units import factor_to_si
 
 Confidence = Literal["sure", "likely", "unsure"]
 TIME = "time"
@@ -24,16 +25,19 @@ UNIT_SCORE, LEFT_OUT, LEAD = 1.0, -0.25, 1.0
 #: fraction it is driven.
 DECAYS, DRIVEN = 0.5, 0.8
 _PARTS = 5
+#: SI unit of a displacement, a velocity or an acceleration -> that of the same quantity of an angle.
+ANGULAR = {"m": "rad", "m/s": "rad/s", "m/s^2": "rad/s^2"}
 
 
 @dataclass(frozen=True)
 class ColumnGuess:
-    """A column of the kind: index in the file, unit, and what the guess rests on."""
+    """A column of the kind: index in the file, unit, what the guess rests on, and the factor to write beside it."""
 
     index: int
     unit: str
     confidence: Confidence
     reason: str
+    scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,8 @@ def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     names = sorted({candidate.kind.name for candidate in leading})
     if len(names) == 1:
         chosen = max(candidates, key=lambda candidate: candidate.score)
+        if TIME not in chosen.kind.columns and _has_times(found):
+            return _guess(found, chosen, "unsure", f"the file is a record in time, {names[0]} a table of trials")
         return _guess(found, chosen, "sure", "the columns fit no other kind as well")
     by_motion = _by_motion(found, leading)
     if by_motion is not None:
@@ -105,6 +111,8 @@ def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
         guesses = {}
         for (i, name), (j, index) in product(enumerate(wanted), enumerate(found.columns)):
             scored = _score(found, index, name, kind.columns[name].si, dimensions)
+            if scored is None and name in kind.channels:
+                scored = _score_of_angle(found, index, name, kind.columns[name].si, dimensions)
             if scored is not None:
                 scores[i, j], guesses[i, j] = scored
         rows, places = linear_sum_assignment(scores, maximize=True)
@@ -160,6 +168,37 @@ def _score(
     exact = unit == (text or "").strip()
     reason = f"the file says {found.names[index]!r}" + ("" if exact else f", read as {unit}")
     return by_name + UNIT_SCORE, ColumnGuess(index, unit, "sure" if exact else "likely", reason)
+
+
+def _score_of_angle(
+    found: FoundLayout, index: int, name: str, si: str, dimensions: list[str]
+) -> tuple[float, ColumnGuess] | None:
+    """How well an angle, its rate or its acceleration fits a channel of motion: entered as arm times angle."""
+    if si not in ANGULAR:
+        return None
+    stem, text = name_and_unit(found.names[index], [*dimensions, *ANGULAR.values()])
+    text = text if text is not None else found.units[index]
+    is_angle = name == "x_rel" and fits_name(stem, "angle") > 0
+    if not (is_angle or fits_name(stem, name)):
+        return None
+    remedy = "multiply scale by the arm in m, or enter the moment of inertia in kg m^2 as the mass in kg"
+    if not text.strip():
+        return 2.0, ColumnGuess(index, si, "unsure", f"an angle without unit, taken as rad; {remedy}", 1.0)
+    unit = unit_of(text, [ANGULAR[si]])
+    if unit is None:
+        return None
+    scale = factor_to_si(unit, ANGULAR[si])
+    return 2.0 + UNIT_SCORE, ColumnGuess(index, si, "unsure", f"an angle in {unit}; {remedy}", scale)
+
+
+def _has_times(found: FoundLayout) -> bool:
+    """Whether a column that is named as times increases from row to row of a record."""
+    return any(
+        fits_name(name_and_unit(found.names[index], ["s"])[0], TIME)
+        and len(values) >= FEWEST_SAMPLES
+        and _is_even(values)
+        for index, values in found.columns.items()
+    )
 
 
 def _is_record(found: FoundLayout, time: int | None) -> bool:

@@ -1,13 +1,14 @@
 """Reads names and units from headers, as loggers, spreadsheets and students write them."""
 
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 
 from capsule_id.rig.units import UnitError, factor_to_si
 
-#: Words for a column of a kind, by its name; a column is always known by its own name too.
+#: Words for a column of a kind, without accents, by its name; a column is always known by its own name too.
 WORDS: Mapping[str, tuple[str, ...]] = {
-    "time": ("time", "t", "zeit", "temps", "tiempo", "elapsed", "timestamp", "clock", "value"),
+    "time": ("time", "t", "zeit", "temps", "tiempo", "tempo", "elapsed", "timestamp", "clock", "value"),
     "x_rel": (
         "relative",
         "displacement",
@@ -20,6 +21,8 @@ WORDS: Mapping[str, tuple[str, ...]] = {
         "laser",
         "auslenkung",
         "desplazamiento",
+        "deplacement",
+        "spostamento",
     ),
     "x_capsule": ("capsule", "kapsel", "housing"),
     "x_base": ("base", "shaker"),
@@ -27,11 +30,11 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "velocity": ("velocity", "speed", "v", "geschwindigkeit"),
     "acceleration": ("acceleration", "acc", "accel", "accelerometer", "beschleunigung", "a"),
     "current": ("current", "strom", "i", "courant", "amps", "coil"),
-    "force": ("force", "kraft", "f", "load", "friction", "weight", "pull"),
-    "normal_force": ("normal", "normalkraft"),
+    "force": ("force", "kraft", "f", "load", "friction", "weight", "pull", "fs", "fk", "fr"),
+    "normal_force": ("normal", "normalkraft", "fn"),
     "angle": ("angle", "tilt", "winkel", "inclination", "neigung", "theta", "alpha"),
-    "height": ("height", "hoehe", "höhe", "h"),
-    "length": ("length", "laenge", "länge", "l", "board"),
+    "height": ("height", "hoehe", "hohe", "h"),
+    "length": ("length", "laenge", "lange", "l", "board"),
     "speed": ("speed", "velocity", "v", "v0", "geschwindigkeit", "vitesse"),
     "distance": ("distance", "travel", "slide", "strecke", "weg", "x", "d", "displacement"),
     "deflection": ("deflection", "displacement", "disp", "compression", "extension", "verformung", "weg", "x"),
@@ -99,7 +102,8 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
 
 def fits_name(name: str, column: str) -> int:
     """3 for the name of the column itself, 2 for one of its words, 0 for another name."""
-    bare = name.strip().lower()
+    # Letters without their accents.
+    bare = unicodedata.normalize("NFKD", name.strip().lower()).encode("ascii", "ignore").decode()
     if re.sub(r"[\W_]+", "_", bare) == column.lower():
         return 3
     words = re.split(r"[\W_]+", bare)

@@ -272,3 +272,45 @@ def test_a_decay_that_is_pushed_near_its_end_is_not_sure_to_be_driven(
     assert 'kind = "free_vibration"  # sure' in texts["decay"]
     assert 'kind = "forced_run"  # unsure' in texts["pushed"]
     assert 'kind = "forced_run"  # sure' in texts["driven"]
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("Time (s),Angle (deg)", 'x_rel = { from = "Angle (deg)", unit = "m", scale = 0.01745329252 }  # unsure: '),
+        ("Time (s),Angle", 'x_rel = { from = "Angle", unit = "m", scale = 1 }  # unsure: an angle without unit'),
+        ("Zeit t / s,Weg b_A1 / rad", 'x_rel = { from = "Weg b_A1 / rad", unit = "m", scale = 1 }  # unsure: '),
+        (
+            "t [s],speed [deg/s]",
+            'velocity = { from = "speed [deg/s]", unit = "m/s", scale = 0.01745329252 }  # unsure: ',
+        ),
+        ("Temps (s),D\u00e9placement (mm)", 'x_rel = { from = "D\u00e9placement (mm)", unit = "mm" }  # sure: '),
+    ],
+)
+def test_a_record_of_an_angle_is_no_table_of_tilts(tmp_path: Path, header: str, line: str) -> None:
+    time = np.arange(0.0, 10.0, 0.01)
+    x = 20.0 * np.exp(-0.3 * time) * np.cos(5.0 * time)
+    rows = "".join(f"{t:.2f},{value:.5f}\n" for t, value in zip(time, x, strict=True))
+    (tmp_path / "swing.csv").write_text(f"{header}\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "swing.csv")
+    assert 'kind = "free_vibration"  # sure' in entry
+    assert line in entry
+    masses = '[rig]\nname = "a"\nm1 = { value = 0.02, unit = "kg" }\n\n'
+    (tmp_path / "rig.toml").write_text(masses + entry, encoding="utf-8")
+    (table,) = capsule_id.read_rig(tmp_path).tables
+    factor = 1e-3 if "mm" in header else np.radians(1.0) if "deg" in header else 1.0
+    (name,) = set(table.columns) - {"time"}
+    assert np.allclose(table[name], factor * x, rtol=1e-4, atol=1e-5)
+
+
+def test_a_record_in_time_is_never_surely_a_table_of_trials(tmp_path: Path) -> None:
+    """A pull recorded in time is no list of pulls; the same column without times may be one."""
+    force = 3.0 + np.sin(np.arange(100.0))
+    for name, rows, sure in (("record", 100, False), ("table", 100, True)):
+        header = "Time (s),Pull (N)\n" if name == "record" else "Pull (N),Normal (N)\n"
+        first = [f"{0.1 * k:.1f},{force[k]:.3f}" if name == "record" else f"{force[k]:.3f},9.81" for k in range(rows)]
+        (tmp_path / f"{name}.csv").write_text(header + "\n".join(first) + "\n", encoding="utf-8")
+        entry = capsule_id.propose_entry(tmp_path / f"{name}.csv")
+        (kind,) = (line for line in entry.split("\n") if line.startswith("kind = "))
+        assert ("the file is a record in time" in kind) == (not sure)
+        assert ("# unsure" in kind) or sure
