@@ -25,7 +25,9 @@ COMPONENTS, LEAST_WEIGHT = 8, 0.01
 #: Steps of expectation maximisation after each round with several components.
 STEPS = 5
 #: Rounds end where the effective sample size of every block is this share of the draws of a round: after all rounds with
-#: one component, and before. Early rounds may miss a tail, and their effective sample size does not show it.
+#: one component, and before. Early rounds may miss a tail, and their effective sample size does not show it. A large
+#: block keeps its first proposal above the first share where it is too large for a map, above the second otherwise: a
+#: scatter that may be zero has a tail that the Laplace approximation does not reach.
 ENOUGH, EXCELLENT = 0.3, 0.6
 #: Weights are tempered, w^a, where their effective sample size is below this number per parameter; exponents a to try.
 LEAST_SIZE, TEMPERS = 20.0, 0.8 ** np.arange(30)
@@ -127,7 +129,8 @@ def refined(
         for j, own in enumerate(blocks):
             size = own.add(u[:, first.blocks[j]], log_parts[:, j])
             if i == 0:
-                good.append(large[j] and size >= ENOUGH * DRAWS)
+                kept = EXCELLENT if len(first.blocks[j]) <= LARGEST_MAP else ENOUGH
+                good.append(large[j] and size >= kept * DRAWS)
             else:
                 good.append(size >= (ENOUGH if i >= SINGLE else EXCELLENT) * DRAWS)
             own.next(good[j], rng)

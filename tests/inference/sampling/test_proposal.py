@@ -245,6 +245,31 @@ def test_a_large_block_that_its_first_proposal_misses_gets_a_map() -> None:
     assert waits[True] < waits[False] + np.log(0.75), waits
 
 
+def hardly_seen(u: np.ndarray) -> np.ndarray:
+    """Log-density (n, 1) of nine coordinates; the last is the logarithm of a term that may be absent."""
+    others = np.sum(stats.norm.logpdf(u[:, :8]), axis=1)
+    return (others + stats.norm.logpdf(u[:, 8], 0.0, 4.6) + stats.norm.logpdf(np.exp(u[:, 8]), 1.0, 0.35))[:, None]
+
+
+def test_a_large_block_with_a_term_that_may_be_absent_does_not_keep_its_laplace_approximation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A chain waits in the tail as many steps as the weight there."""
+    first = block_proposal([np.arange(9)], np.zeros(9), np.diag([1.0] * 8 + [0.35**2]), [True])
+    tail = np.zeros((30, 9))
+    tail[:, 8] = np.linspace(-6.0, -1.0, 30)
+    waits = dict[bool, float]()
+    for adapted in (True, False):
+        if not adapted:  # negative control: the share of effective draws that was enough before
+            monkeypatch.setattr(refinement, "EXCELLENT", refinement.ENOUGH)
+        found = refined(hardly_seen, first, np.full((2, 9), np.nan), np.random.RandomState(0), [True])
+        u = found.draw(np.random.RandomState(1), 20_000)
+        scale = np.mean(np.exp(hardly_seen(u) - found.log_density(u)))
+        waits[adapted] = float(np.max(np.exp(hardly_seen(tail) - found.log_density(tail)))) / scale
+    assert waits[True] < 5.0, waits
+    assert waits[False] > 10.0 * waits[True], waits
+
+
 def test_weights_of_a_hopeless_start_are_cut_to_the_best_draws() -> None:
     log_weights = -1e9 * np.random.default_rng(0).uniform(size=1000)
     weights = tempered(log_weights, 40.0)
