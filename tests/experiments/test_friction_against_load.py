@@ -174,9 +174,55 @@ def test_two_loads_with_few_rows_and_loads_on_a_slope(tmp_path: Path) -> None:
     along = 0.6 * 9.81 * np.sin(np.deg2rad(20.0))
     columns = {"force [N]": force + along, "normal_force [N]": load}
     with suppress(InputError):  # the weight along the slope needs the masses
-        make_rig(tmp_path / "slope", Entry("static_friction", "table", columns, {"slope": quantity(20.0, "deg")}))
+        pressed = {"slope": quantity(20.0, "deg"), "load_is": '"pressed"'}
+        make_rig(tmp_path / "slope", Entry("static_friction", "table", columns, pressed))
     toml = tmp_path / "slope" / "rig.toml"
     masses = '[rig]\nm1 = { value = 0.1, sd = 0.001, unit = "kg" }\nm2 = { value = 0.5, sd = 0.001, unit = "kg" }\n'
     toml.write_text(toml.read_text().replace("[rig]\n", masses) + f"\n[model]\n{CONSTANT}\n")
     found = [f for f in cid.fit(cid.read_rig(toml.parent), budget=None).findings if f.code == "trials.loads"]
     assert found[0].facts["means"][0][1] == pytest.approx(0.35, rel=0.03)
+
+
+@pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+def test_weights_pull_along_a_slope(tmp_path: Path, kind: str, direction: str) -> None:
+    """Before: every load pulled along the slope as capsule and rod do, and mu was wrong without a word."""
+    slope, mu, sd = np.deg2rad(7.0), 0.35, 0.2
+    rng, sign = np.random.default_rng(6), -1.0 if direction == "backward" else 1.0
+    force = LOAD * (mu * (1.0 + 0.01 * rng.standard_normal(len(LOAD))) + sign * np.tan(slope))
+    settings = {"slope": quantity(7.0, "deg"), "direction": f'"{direction}"', "load_is": '"weight"'}
+    entry = Entry(kind, "table", {"force [N]": force, "normal_force [N]": LOAD}, settings)
+    result = cid.fit(rig(tmp_path / "weight", entry), budget=None)
+    row = result.summary.loc["mu"]
+    assert row["map"] == pytest.approx(mu, abs=4.0 * row["standard_error"])
+    assert row["standard_error"] < 0.003
+    assert row["paper"] == pytest.approx(mu, rel=0.01)
+    assert result.clean
+    # The error of the normal force counts in the weight along the slope too.
+    read = np.repeat(LOAD, 40) + sd * rng.standard_normal(40 * len(LOAD))
+    columns = {"force [N]": np.repeat(LOAD, 40) * (mu + sign * np.tan(slope)), "normal_force [N]": read}
+    made = experiment(
+        tmp_path / "sd", Entry(kind, "table", columns, {**settings, "normal_force_sd": quantity(sd, "N")})
+    )
+    (misfit,) = made.misfits({"mu": mu, "slope": slope}, np)
+    assert np.std(misfit.raw / np.sqrt(misfit.fixed_variance)) == pytest.approx(1.0, rel=0.1)
+    relative, _ = made.point_errors()
+    assert np.std((made.paper_points()[1] / mu - 1.0) / relative) == pytest.approx(1.0, rel=0.1)
+    # Negative control: as a force without weight, beside capsule and rod.
+    masses = '[rig]\nm1 = { value = 0.1, unit = "kg" }\nm2 = { value = 0.5, unit = "kg" }\n'
+    toml = tmp_path / "weight" / "rig.toml"
+    toml.write_text(toml.read_text().replace("[rig]\n", masses).replace('"weight"', '"pressed"'))
+    other = cid.fit(cid.read_rig(toml.parent), budget=None)
+    assert not other.clean
+    assert abs(other.summary.at["mu", "map"] - mu) > 0.05
+
+
+@pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
+def test_a_load_on_a_slope_must_say_where_it_comes_from(tmp_path: Path, kind: str) -> None:
+    slope = {"slope": quantity(5.0, "deg")}
+    with pytest.raises(InputError, match="load_is must say") as caught:
+        rig(tmp_path / "none", table(kind, 0.3, settings=slope))
+    assert 'load_is = "weight"' in caught.value.remedy
+    rig(tmp_path / "stated", table(kind, 0.3, settings={**slope, "load_is": '"weight"'}))
+    with pytest.raises(InputError, match="load_is needs a slope"):
+        rig(tmp_path / "level", table(kind, 0.3, settings={"load_is": '"weight"'}))

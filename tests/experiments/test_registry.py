@@ -41,6 +41,7 @@ KINDS = default_registry()
 #: Every setting of every kind by the interface: its rule, and its default (...: it must be stated).
 _CHANNELS = ("x_rel", "x_capsule", "acceleration_rod", "current")
 _DIRECTION = (ChoiceRule(("forward", "backward")), "forward")
+_LOAD = (ChoiceRule(("weight", "pressed")), None)
 _FORWARD = (ChoiceRule(("closed", "capsule")), "closed")
 _FORCE = QuantityRule("N", ANY, has_sd=True)
 _LAG = QuantityRule("s", NOT_NEGATIVE, has_sd=True)
@@ -67,10 +68,11 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         **_GROUND,
         "length_is": (ChoiceRule(("board", "base")), None),
         "normal_force": (QuantityRule("N"), None),
+        "load_is": _LOAD,
         "direction": _DIRECTION,
     },
     "dynamic_friction": {**_GROUND, "forward": _FORWARD, "direction": _DIRECTION},
-    "sliding_friction": {**_GROUND, "direction": _DIRECTION},
+    "sliding_friction": {**_GROUND, "load_is": _LOAD, "direction": _DIRECTION},
     "motor_current": {"sd_ratio": (QuantityRule("N/A"), None)},
     "support_spring": {
         "spring": (NameRule(), ...),

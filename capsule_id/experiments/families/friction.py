@@ -26,6 +26,13 @@ class SurfaceSettings(GroundSettings):
     direction: Literal["forward", "backward"] = "forward"
 
 
+@dataclass(frozen=True, kw_only=True)
+class PullSettings(SurfaceSettings):
+    """``load_is``: whether stated normal forces on a slope come from weights, or press without weight; else None."""
+
+    load_is: Literal["weight", "pressed"] | None = None
+
+
 #: Column of the normal force of every trial, where it differs from trial to trial.
 NORMAL_FORCE_COLUMN = ColumnRule("N", POSITIVE)
 
@@ -50,6 +57,27 @@ def check_normal_force(entry: Entry[Any]) -> None:
             raise entry.error(
                 key, f"{key} must not stand beside the column normal_force", "both", f"remove {key}", True
             )
+
+
+def check_load(entry: Entry[Any]) -> None:
+    """Require ``load_is`` where the normal force is stated on a slope: weights pull along the slope too.
+
+    Raises
+    ------
+    InputError
+        At the entry or its setting.
+    """
+    table = entry.table
+    stated = "normal_force" in table.columns or getattr(table.settings, "normal_force", None) is not None
+    needed = stated and "force" in table.columns and "slope" in table.settings.ground
+    if needed and table.settings.load_is is None:
+        rule = "load_is must say where a stated normal force on a slope comes from"
+        remedy = (
+            'write load_is = "weight" for weights on the capsule, or load_is = "pressed" for a force without weight'
+        )
+        raise entry.error("", rule, "none", remedy)
+    if table.settings.load_is is not None and not needed:
+        raise entry.error("load_is", "load_is needs a slope and a stated normal force", "no such", "remove it", True)
 
 
 CAPTIONS = {

@@ -5,6 +5,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
+import equinox as eqx
 import numpy as np
 from scipy.optimize import OptimizeWarning, curve_fit
 
@@ -14,6 +15,7 @@ from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.families.friction_checks import check_variants, variant_table
 from capsule_id.experiments.families.friction_model import FrictionModel, GroundExperiment
 from capsule_id.experiments.families.inclined import weight_along
+from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import CoulombStribeck, normal_force, slide_distance
 from capsule_id.rig.model import Table
 from capsule_id.views import Comparison, Curve, Finding, Points
@@ -111,10 +113,10 @@ class FrictionExperiment(GroundExperiment):
         return weight_along(theta["m1"] + theta["m2"], theta["g"], self.ground_at(theta), self.backward)
 
     @property
-    def stated_along(self) -> float:
-        """``along`` at the stated masses."""
-        stated = {name: self.rig.mass(name) for name in ("m1", "m2")} if self.ground else {}
-        return float(self.along({**stated, **self.stated_ground, "g": self.rig.g.value}))
+    def stated_along(self) -> np.ndarray:
+        """``along`` at the stated masses, () or (n,) N."""
+        stated = {name: self.rig.mass(name) for name in ("m1", "m2") if name in self.masses}
+        return np.asarray(self.along({**stated, **self.stated_ground, "g": self.rig.g.value}))
 
     @abstractmethod
     def point_errors(self) -> tuple[Any, Any]:
@@ -134,16 +136,55 @@ class FrictionExperiment(GroundExperiment):
         return friction_comparison([self], theta, draws)
 
 
+class LoadedExperiment(FrictionExperiment):
+    """Forces that overcome friction, where the normal force may be stated for all trials or for each.
+
+    On a slope such a normal force N comes from weights, whose part along the slope is N tan(slope), or presses without
+    weight beside the weight of capsule and rod.
+    """
+
+    #: () or (n,), N; None: that of the weight
+    normal_force: np.ndarray | None
+    normal_force_sd: float
+    #: Whether the stated normal force comes from weights.
+    of_weights: bool = eqx.field(static=True)
+
+    @property
+    def weighed(self) -> bool:
+        """Whether the force depends on the masses."""
+        return self.normal_force is None or ("slope" in self.ground and not self.of_weights)
+
+    @property
+    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
+        several = self.normal_force is not None and np.size(self.normal_force) > 1
+        return (np.asarray(self.normal_force), self.paper_points()[1]) if several else None
+
+    def along(self, theta: ValuesBySymbol) -> Any:
+        """Weight along the slope, N, () or (n,)."""
+        if self.normal_force is None or not self.of_weights:
+            return super().along(theta)
+        slope = self.ground_at(theta)["slope"]
+        uphill = self.normal_force * array_module(slope).tan(slope)
+        return -uphill if self.backward else uphill
+
+    def of_normal_force(self, coefficient: Any, along: Any) -> Any:
+        """Change of the force with its normal force, from the ``coefficient`` of friction."""
+        return coefficient + along / self.normal_force if self.of_weights else coefficient
+
+    def relative_errors(self, force: np.ndarray, force_sd: float) -> np.ndarray:
+        """Relative sd (n,) of the coefficients (force - along)/N, from the errors of force (n,) and N."""
+        along = self.stated_along
+        of_force = force_sd / (force - along)
+        if self.normal_force is None:
+            return np.abs(of_force)
+        share = force / (force - along) if self.of_weights else 1.0
+        return np.hypot(of_force, share * self.normal_force_sd / self.normal_force)
+
+
 def stated_normal_forces(table: Table[Any]) -> tuple[np.ndarray | None, float]:
     """Return the column ``normal_force``, (n,) N, or None, and its reading error, N."""
     column = table.columns.get("normal_force")
     return (None, 0.0) if column is None else (column.values, column.reading_sd)
-
-
-def loads_of(normal_force: np.ndarray | None, coefficient: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """``Experiment.loads`` from the stated normal force, () or (n,) N, and the coefficients (n,)."""
-    several = normal_force is not None and np.size(normal_force) > 1
-    return (np.asarray(normal_force), coefficient) if several else None
 
 
 def friction_comparison(

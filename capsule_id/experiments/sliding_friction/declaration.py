@@ -9,7 +9,8 @@ from capsule_id.experiments.families.friction import (
     MASSES_OF_FREE,
     MESSAGES,
     NORMAL_FORCE_COLUMN,
-    SurfaceSettings,
+    PullSettings,
+    check_load,
     check_normal_force,
     check_scatter,
     friction_estimates,
@@ -28,19 +29,19 @@ SLIDING_SCATTER = scatter(
 )
 
 
-def _masses(table: Table[SurfaceSettings]) -> tuple[str, ...]:
+def _masses(table: Table[PullSettings]) -> tuple[str, ...]:
     # The force overcomes the weight along the slope too.
-    weighed = "normal_force" not in table.columns or "slope" in table.settings.ground
+    weighed = "normal_force" not in table.columns or table.settings.load_is == "pressed"
     return ("m1", "m2") if "force" in table.columns and weighed else ()
 
 
-def _stated_law(entry: Entry[SurfaceSettings]) -> Mapping[str, Any]:
+def _stated_law(entry: Entry[PullSettings]) -> Mapping[str, Any]:
     """The keys of ``[model]``; none where it is no table, which its own reader refuses."""
     model = entry.document.data.get("model", {})
     return model if isinstance(model, dict) else {}
 
 
-def _check_speed(entry: Entry[SurfaceSettings]) -> None:
+def _check_speed(entry: Entry[PullSettings]) -> None:
     """Refuse readings without speeds under a law that depends on the speed.
 
     Raises
@@ -56,7 +57,7 @@ def _check_speed(entry: Entry[SurfaceSettings]) -> None:
     raise entry.error("", rule, " ".join(entry.table.columns), remedy)
 
 
-def _check_viscous(entry: Entry[SurfaceSettings]) -> None:
+def _check_viscous(entry: Entry[PullSettings]) -> None:
     """Refuse a viscous part beside normal forces of every row.
 
     Raises
@@ -78,6 +79,7 @@ TEMPLATE = """\
 # direction = "forward"                               # "backward": it slid away from the support spring
 # slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
 # N0 = { value = 0, unit = "N" }
+# load_is = "weight"                                    # a stated normal force on a slope; or "pressed"
 """
 
 KIND = Kind(
@@ -90,8 +92,8 @@ KIND = Kind(
     },
     sets=(("speed", "force"), ("speed", "coefficient"), ("force",), ("coefficient",)),
     optional=("normal_force",),
-    settings=SurfaceSettings,
-    rules=(check_normal_force, _check_speed, _check_viscous),
+    settings=PullSettings,
+    rules=(check_normal_force, _check_speed, _check_viscous, check_load),
     masses=_masses,
     masses_of_free=MASSES_OF_FREE,
     parameters=(SLIDING_SCATTER,),

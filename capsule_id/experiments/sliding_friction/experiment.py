@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.families.friction_experiment import FrictionExperiment, loads_of, stated_normal_forces
+from capsule_id.experiments.families.friction_experiment import LoadedExperiment, stated_normal_forces
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit
@@ -18,7 +18,7 @@ from capsule_id.physics.friction import FrictionLaw
 from capsule_id.rig.model import Rig, Table
 
 
-class SlidingFriction(FrictionExperiment):
+class SlidingFriction(LoadedExperiment):
     """Steady sliding, y = mu_d(v) for a coefficient. A force is N mu_d(v) and the weight along the slope.
 
     N is that of the weight, or stated for every row. Without a speed the friction must not depend on it.
@@ -31,9 +31,6 @@ class SlidingFriction(FrictionExperiment):
     values: np.ndarray
     speed_sd: float
     values_sd: float
-    #: (n,), N; None: that of the weight
-    normal_force: np.ndarray | None
-    normal_force_sd: float
     quantity: str = eqx.field(static=True)
 
     role = "sliding"
@@ -47,6 +44,7 @@ class SlidingFriction(FrictionExperiment):
         self.speed = table["speed"] if self.speeds_known else np.zeros(len(self.values))
         self.speed_sd = table.columns["speed"].reading_sd if self.speeds_known else 0.0
         self.normal_force, self.normal_force_sd = stated_normal_forces(table)
+        self.of_weights = table.settings.load_is == "weight"
         self.values_sd = table.columns[self.quantity].reading_sd
 
     @property
@@ -59,12 +57,7 @@ class SlidingFriction(FrictionExperiment):
 
     @property
     def masses(self) -> tuple[str, ...]:
-        weighed = self.normal_force is None or "slope" in self.ground
-        return ("m1", "m2") if self.quantity == "force" and weighed else super().masses
-
-    @property
-    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
-        return loads_of(self.normal_force, self.paper_points()[1])
+        return ("m1", "m2") if self.quantity == "force" and self.weighed else super().masses
 
     @property
     def observed(self) -> np.ndarray:
@@ -77,8 +70,10 @@ class SlidingFriction(FrictionExperiment):
         normal = 1.0 if self.normal_force is None else self.normal_force
         value, slope = (xp.asarray(values) for values in _value_and_slope(law, self.speed))
         predicted = normal * value
-        variance = self.values_sd**2 + (normal * slope * self.speed_sd) ** 2 + (value * self.normal_force_sd) ** 2
-        raw = self.values - predicted - (self.along(theta) if self.quantity == "force" else 0.0)
+        along = self.along(theta) if self.quantity == "force" else 0.0
+        of_normal = self.of_normal_force(value, along) * self.normal_force_sd
+        variance = self.values_sd**2 + (normal * slope * self.speed_sd) ** 2 + of_normal**2
+        raw = self.values - predicted - along
         return (Misfit(raw, variance, predicted, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -90,9 +85,9 @@ class SlidingFriction(FrictionExperiment):
 
     def point_errors(self) -> tuple[np.ndarray, float]:
         """The reading error of the speed is left out: it enters through the slope of the law."""
-        along = self.stated_along if self.quantity == "force" else 0.0
-        of_normal = 0.0 if self.normal_force is None else self.normal_force_sd / self.normal_force
-        return np.hypot(self.values_sd / (self.values - along), of_normal), 1.0
+        if self.quantity == "coefficient":
+            return self.values_sd / self.values, 1.0
+        return self.relative_errors(self.values, self.values_sd), 1.0
 
     def starts(self) -> dict[str, Start]:
         return {**self.rough_starts(), "sliding_scatter": Start(0.02, 0.3)}

@@ -10,7 +10,8 @@ from capsule_id.experiments.families.friction import (
     CAPTIONS,
     MESSAGES,
     NORMAL_FORCE_COLUMN,
-    SurfaceSettings,
+    PullSettings,
+    check_load,
     check_normal_force,
     check_scatter,
     friction_estimates,
@@ -35,7 +36,7 @@ TRIALS, TRIAL_SD = 4, np.deg2rad(0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TiltSettings(SurfaceSettings):
+class TiltSettings(PullSettings):
     """Settings of tilts; ``length_is``: side of the triangle, None without one; ``normal_force`` of a pull, N."""
 
     length_is: Literal["board", "base"] | None = None
@@ -84,7 +85,7 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
 def _masses(table: Table[TiltSettings]) -> tuple[str, ...]:
     # The pull overcomes the weight along the slope too.
     stated = table.settings.normal_force is not None or "normal_force" in table.columns
-    weighed = not stated or "slope" in table.settings.ground
+    weighed = not stated or table.settings.load_is == "pressed"
     return ("m1", "m2") if "force" in table.columns and weighed else ()
 
 
@@ -112,6 +113,7 @@ TEMPLATE = """\
 # angle_resolution = { value = 0.1, unit = "deg" }
 # direction = "forward"                               # "backward": it slips away from the support spring
 # slope = { value = 0, unit = "deg" }                   # of pulls, and N0; default: those of [rig]
+# load_is = "weight"                                    # a stated normal force on a slope; or "pressed"
 # N0 = { value = 0, unit = "N" }
 """
 
@@ -128,7 +130,7 @@ KIND = Kind(
     optional=("normal_force",),
     masses=_masses,
     settings=TiltSettings,
-    rules=(check_normal_force, _check_tilt, _check_ground),
+    rules=(check_normal_force, _check_tilt, _check_ground, check_load),
     parameters=(TILT_SD, PULL_SCATTER),
     make=made_by("capsule_id.experiments.static_friction.experiment:StaticFriction"),
     template=TEMPLATE,

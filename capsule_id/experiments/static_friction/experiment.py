@@ -8,7 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.families.friction_experiment import FrictionExperiment, loads_of, stated_normal_forces
+from capsule_id.experiments.families.friction_experiment import (
+    FrictionExperiment,
+    LoadedExperiment,
+    stated_normal_forces,
+)
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -88,18 +92,15 @@ class StaticFriction(FrictionExperiment):
         }
 
 
-class StaticPulls(FrictionExperiment):
+class StaticPulls(LoadedExperiment):
     """Pulls along the track: force_i = mu_0 N (1 + N(0, pull_scatter^2)) + (m1 + m2) g sin(slope) + reading error.
 
     N is stated for all trials or for each, or follows from weight, slope and N0. The weight along the slope is negative
-    for a pull downhill. The reading error of N counts too.
+    for a pull downhill, and that of weights is N tan(slope). The reading error of N counts too.
     """
 
     force: np.ndarray
     reading_sd: float
-    #: () or (n,), N; None: that of the weight
-    normal_force: np.ndarray | None
-    normal_force_sd: float
 
     role = "static"
 
@@ -109,21 +110,17 @@ class StaticPulls(FrictionExperiment):
         self.about = About(table, rig, (*friction.parameters_at_rest, PULL_SCATTER, *ground_parameters(table, rig)))
         self.force, self.reading_sd = table["force"], table.columns["force"].reading_sd
         self.normal_force, self.normal_force_sd = stated_normal_forces(table)
+        self.of_weights = table.settings.load_is == "weight"
         if table.settings.normal_force is not None:
             self.normal_force = np.asarray(table.settings.normal_force)
 
     @property
     def masses(self) -> tuple[str, ...]:
-        weighed = self.normal_force is None or "slope" in self.ground
-        return ("m1", "m2") if weighed or self.friction.law is not CoulombStribeck else ()
+        return ("m1", "m2") if self.weighed or self.friction.law is not CoulombStribeck else ()
 
     @property
     def scatters(self) -> tuple[str]:
         return ("pull_scatter",)
-
-    @property
-    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
-        return loads_of(self.normal_force, self.paper_points()[1])
 
     @property
     def observed(self) -> np.ndarray:
@@ -135,9 +132,9 @@ class StaticPulls(FrictionExperiment):
             normal = normal_force(theta["m1"], theta["m2"], theta["g"], **self.ground_at(theta))
         coefficient: Any = self.friction.coefficient(theta).forward(0.0)
         friction = normal * coefficient
-        expected = friction + self.along(theta)
-        variance = self.reading_sd**2 + (coefficient * self.normal_force_sd) ** 2
-        return (Misfit(self.force - expected, variance, friction, no_design(self.n, xp)),)
+        along = self.along(theta)
+        variance = self.reading_sd**2 + (self.of_normal_force(coefficient, along) * self.normal_force_sd) ** 2
+        return (Misfit(self.force - friction - along, variance, friction, no_design(self.n, xp)),)
 
     def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Points by the paper's formula: mu = force/N at speed 0, without the weight along the slope."""
@@ -145,8 +142,7 @@ class StaticPulls(FrictionExperiment):
         return np.zeros(self.n), (self.force - self.stated_along) / normal
 
     def point_errors(self) -> tuple[np.ndarray, float]:
-        of_normal = 0.0 if self.normal_force is None else self.normal_force_sd / self.normal_force
-        return np.hypot(self.reading_sd / (self.force - self.stated_along), of_normal), 1.0
+        return self.relative_errors(self.force, self.reading_sd), 1.0
 
     def starts(self) -> dict[str, Start]:
         # Pulls have no speed that could start v_s.
