@@ -75,7 +75,7 @@ def fit(
     registry : the kinds that read ``rig``, by default the built-in ones and those of installed packages
     friction : class of a friction law in place of eq. (1); its parameters are fitted instead of mu and v_s
     ess : sampling stops at this bulk and tail effective sample size of every parameter
-    preliminary : called before the sampling with the point fit: a result without intervals, panels and records
+    preliminary : called before the sampling with the point fit: a result without intervals, panels, notes and records
 
     Raises
     ------

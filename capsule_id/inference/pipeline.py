@@ -171,7 +171,7 @@ def make_result(
     Parameters
     ----------
     kind : class of the result; the interface passes a subclass with a method that writes it
-    panels : False leaves out panels and records, which take most of the time
+    panels : False leaves out panels, notes and records, which take most of the time
     """
     stop_if_interrupted()
     release_memory()
@@ -189,7 +189,7 @@ def make_result(
         posterior=posterior,
         findings=tuple(checked.findings),
         comparisons=_comparisons(checked, predictive, registry) if panels else (),
-        notes=tuple(make_notes(checked, predictive)),
+        notes=tuple(make_notes(checked, predictive)) if panels else (),
         records=tuple(view for view in views if view is not None),
         fixed={name: value for name, value in target.fixed.items() if name != "g"},
         observed={e.label: e.observed for e in target.experiments},

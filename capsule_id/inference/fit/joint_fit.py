@@ -49,6 +49,8 @@ FARTHEST = 2.0
 NEGLIGIBLE_INCREASE = 0.1
 #: Stop refining a start whose cost exceeds this many times the best.
 COST_RATIO_TO_ABANDON = 3.0
+#: Searches that run side by side; their number does not depend on the cores, nor do the results.
+TOGETHER = 2
 #: Try starts until two of them fit every channel within this many times its noise, or so many end at the same maximum.
 NOISE_RATIO_OF_A_GOOD_FIT, ENOUGH_THAT_AGREE = 1.2, 4
 #: Search range of a scatter's conditional maximum about its value, natural logarithm.
@@ -86,18 +88,7 @@ def joint_fit(
     starts : (s, d) u of the starting points, instead of the best candidates
     """
     starts = _choose_starts(target, known, seed, first or {}) if starts is None else starts
-    ends: list[_End] = []
-    for start in starts:
-        release_memory()
-        before = max(ends, key=lambda end: end.value, default=None)
-        if before is not None and _suffice(target, ends, before.value):
-            break
-        if before is None or not np.isfinite(before.value):
-            ends.append(_search(target, start, np.inf))
-        else:
-            # Reuse the noise levels of the best fit.
-            start = np.where(target.scatter, before.u, start)
-            ends.append(_search(target, start, COST_RATIO_TO_ABANDON * float(before.fit.cost[0])))
+    ends = _ends(target, starts)
     u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
     best = int(np.argmax(value))
     if not np.isfinite(value[best]):
@@ -129,6 +120,25 @@ def joint_fit(
         stalled=np.array([not end.converged for end in ends]),
         shares=variance_shares(target, fit.jacobian[0], target.residual_owners(u[best])),
     )
+
+
+def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
+    """Search from the ``starts`` (s, d) until some suffice: alone until a motion is finite, then ``TOGETHER``."""
+    ends: list[_End] = []
+    with ThreadPoolExecutor(TOGETHER) as threads:
+        while len(ends) < len(starts):
+            release_memory()
+            best = max(ends, key=lambda end: end.value, default=None)
+            if best is None or not np.isfinite(best.value):
+                ends.append(_search(target, starts[len(ends)], np.inf))
+                continue
+            if _suffice(target, ends, best.value):
+                break
+            # Reuse the noise levels of the best fit.
+            own = np.where(target.scatter, best.u, starts[len(ends) : len(ends) + TOGETHER])
+            limit = COST_RATIO_TO_ABANDON * float(best.fit.cost[0])
+            ends += threads.map(partial(_search, target, limit=limit), own)
+    return ends
 
 
 def _choose_starts(
