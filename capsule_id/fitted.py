@@ -22,7 +22,7 @@ from capsule_id.parameters import is_stated
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
 from capsule_id.report.columns import table_rows
-from capsule_id.report.console_table import table_text, verdict_text
+from capsule_id.report.console_table import table_text, verdict_text, wrapped
 from capsule_id.report.figures import comparisons, corner, runs, traces
 from capsule_id.report.html import summary_html
 from capsule_id.report.netcdf import data_tree
@@ -52,6 +52,12 @@ class Fit(Result):
         messages = messages_of(self.registry)
         return sorted({title_of(finding.code, messages) for finding in self.findings if finding.level == "fail"})
 
+    @property
+    def changes_of_model(self) -> list[str]:
+        """Texts of the findings that change the model of the quoted values from the stated one."""
+        messages = messages_of(self.registry)
+        return [self.text(f) for f in self.findings if f.code in messages and messages[f.code].changes_model]
+
     def text(self, item: Finding | ResultTable) -> str:
         """What a finding says (what was expected, what was found, what to do), or the caption of a table."""
         messages = messages_of(self.registry)
@@ -66,7 +72,7 @@ class Fit(Result):
 
     def __str__(self) -> str:
         table = table_text(self.summary, synthetic=self.rig.synthetic)
-        return f"{table}\n{verdict_text(self.trust, self.failed)}"
+        return "\n".join([table, *wrapped(self.changes_of_model), verdict_text(self.trust, self.failed)])
 
     def _repr_html_(self) -> str:
         return summary_html(self)

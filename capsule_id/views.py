@@ -77,13 +77,17 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class Message:
-    """The words of one code: its title, the text of a finding of each level, the caption of a table."""
+    """The words of one code: its title, the text of a finding of each level, the caption of a table.
+
+    ``changes_model``: a finding of this code changes the model of the quoted values; the console shows its text.
+    """
 
     title: str
     ok: Text = ""
     warn: Text = ""
     fail: Text = ""
     caption: Text = ""
+    changes_model: bool = False
 
     def text(self, part: Literal["ok", "warn", "fail", "caption"], facts: Facts) -> str:
         """The text of ``part`` with ``facts`` filled in.

@@ -40,11 +40,17 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = No
     lines = [_line(cells[:shown], widths[:shown]) for cells in table]
     rule = "-" * max(map(len, lines))
     left_out = ", ".join(table[0][shown:])
-    more = textwrap.wrap(f"in a wider terminal and in report.html: {left_out}", max(width, 20)) if left_out else []
+    more = wrapped([f"in a wider terminal and in report.html: {left_out}"] if left_out else [], width)
     if skewed := skewed_names(summary):
         names = f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"
-        more = [*textwrap.wrap(names, max(width, 20)), *more]
+        more = [*wrapped([names], width), *more]
     return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:], *more])
+
+
+def wrapped(texts: Sequence[str], width: int | None = None) -> list[str]:
+    """Lines of the ``texts``, no wider than the terminal."""
+    width = shutil.get_terminal_size((WIDTH, 24)).columns if width is None else width
+    return [line for text in texts for line in textwrap.wrap(text, max(width, 20), break_on_hyphens=False)]
 
 
 def verdict_text(trust: Trust, failed: Sequence[str]) -> str:

@@ -1,11 +1,14 @@
 """The second fit of a free decay: it finds what the record demands, keeps what is stated, and its lines state it."""
 
 import tomllib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import capsule_id as cid
+from capsule_id import cli
 from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.declaration import MESSAGES
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -20,6 +23,7 @@ from capsule_id.experiments.free_vibration.second_fit.screening import (
 )
 from capsule_id.experiments.free_vibration.settings import DecayModel
 from tests.experiments import bench
+from tests.measured.folders import Entry, make_rig, quantity
 
 TIME = np.arange(250) / 500.0
 #: m; viscous damping c = 1, so that the record holds about eight periods.
@@ -151,3 +155,21 @@ def test_stated_words_are_kept() -> None:
     assert second.model.symbols == ()
     own = record(0.0, DRY, **words, drift="none", noise="white")
     assert second_models([own]) == ([own], [])
+
+
+def test_the_console_says_that_the_model_is_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before, only the report did. A record that keeps its model needs no sentence."""
+    monkeypatch.setenv("COLUMNS", "90")
+    for name, extra in (("dry", DRY), ("viscous", {})):
+        decay = record(0.0, extra)
+        columns = {"time [s]": decay.time, "x_rel [m]": decay.values}
+        make_rig(tmp_path / name, Entry("free_vibration", "decay", columns), head={"m1": quantity(decay.mass, "kg")})
+        words = [str(tmp_path / name), "--no-sample", "--quiet", "--out", str(tmp_path / f"{name}_out")]
+        cli.fit_params(words)
+        out = capsys.readouterr().out
+        assert ("contradicts the first model (viscous damping)" in out.replace("\n", " ")) == (name == "dry")
+        assert max(map(len, out.split("\n"))) <= max(90, len(str(tmp_path)) + 40)
+        fitted = str(cid.load(tmp_path / f"{name}_out"))
+        assert ("contradicts the first model" in fitted.replace("\n", " ")) == (name == "dry")

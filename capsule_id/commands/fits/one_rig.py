@@ -133,7 +133,7 @@ def fit_one(
     check_output(directory, options)
     prepare_jax(options, rig.has_runs)
     # JAX loads only now, so that a faulty folder is reported at once.
-    from capsule_id.report.console_table import table_text, verdict_text
+    from capsule_id.report.console_table import table_text, verdict_text, wrapped
     from capsule_id.report.texts.messages import messages_of
     from capsule_id.report.write import write_report
 
@@ -155,7 +155,8 @@ def fit_one(
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
     else:
         table = table_text(result.summary, synthetic=rig.synthetic)
-        say("\n".join([table, f"report: {report}", verdict_text(result.trust, failed)]))
+        changes = wrapped(result.changes_of_model)
+        say("\n".join([table, *changes, f"report: {report}", verdict_text(result.trust, failed)]))
     if result.clean:
         return 0
     print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
