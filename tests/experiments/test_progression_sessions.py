@@ -1,13 +1,14 @@
 """Sessions of a progression: which are parameters, their runs, and the density of trials with the others integrated out."""
 
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import cast
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.special as jax_special
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.special as scipy_special
 from scipy.interpolate import make_interp_spline
@@ -15,11 +16,13 @@ from scipy.stats import multivariate_normal, norm
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit, _log_probability
 from capsule_id.experiments.progression.linear_misfit import linear_misfit
 from capsule_id.experiments.progression.run_emulator import RunEmulator
 from capsule_id.experiments.progression.sessions import INNER, MIDDLE, NODES, Sessions, parameters_of
+from capsule_id.experiments.progression.tables import session_table
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
 from capsule_id.inference.checks.regression import outliers
 from tests.experiments.summed_sessions import integrated
@@ -268,3 +271,27 @@ def test_a_run_is_emulated_by_the_friction_of_its_own_session() -> None:
     np.testing.assert_allclose(found, motions(theta), rtol=0.01)
     changed = np.asarray(emulator({**theta, "session_1": 1.5})) != found
     np.testing.assert_array_equal(changed, sessions.own[:, 0] > 0.0)
+
+
+def test_the_table_of_sessions_has_the_numbers_of_the_file(tmp_path: Path) -> None:
+    """The parameters are numbered from 1; the file's own sessions are not."""
+    folder = three_settings(tmp_path / "rig").folder
+    file = next(folder.glob("*.csv"))
+    rows = pd.read_csv(file)
+    (column,) = (name for name in rows.columns if name.startswith("session"))
+    rows[column] = np.where(rows[column] == 1, 12, 7)
+    rows.to_csv(file, index=False)
+    (e,) = cast(tuple[Progression], make_experiments(read_rig(folder)))
+    several = [n for n in (7, 12) if rows[rows[column] == n].groupby(list(rows.columns[:2])).ngroups > 1]
+    own = {symbol: 1.0 + k for k, symbol in enumerate(e.sessions.symbols)}
+    values = {row.name: {**THETA, **own}[row.symbol] for row in e.parameters} | THETA
+    draws = [{**values, "session_sd": sd} for sd in (0.1, 0.3)]
+    (table,) = session_table([e], cast(Fitted, SimpleNamespace(values=values, draws=draws)))
+    assert table.frame["session"].tolist() == [f"{n}" for n in several]
+    assert table.frame["trials"].tolist() == [int(np.sum(rows[column] == n)) for n in several]
+    factors = np.exp(np.outer([0.1, 0.3], 1.0 + np.arange(len(several))))
+    np.testing.assert_allclose(table.frame["friction"], np.mean(factors, axis=0), atol=1e-4)
+    np.testing.assert_allclose(table.frame["its sd"], np.std(factors, axis=0), atol=1e-4)
+    (point,) = session_table([e], cast(Fitted, SimpleNamespace(values=values, draws=[])))
+    assert point.frame["friction"].iloc[0] == pytest.approx(np.exp(0.05), abs=1e-4)
+    assert np.isnan(point.frame["its sd"].to_numpy()).all()

@@ -159,6 +159,10 @@ MESSAGES = {
         warn="{several:# session} with several settings, and only {most} of them have their friction as a parameter. The "
         "others count as a new session at every setting, so that intervals are too narrow: give the table of each day "
         "or place its own entry",
+        caption=(
+            "Sessions with several settings: the parameter of each one, its number in the file, how many settings and trials "
+            "it has, and its friction relative to that of an average session."
+        ),
     ),
     "progression.settings": Message(
         "settings",

@@ -38,6 +38,7 @@ from capsule_id.experiments.progression.panels import new_trials, progression_pa
 from capsule_id.experiments.progression.run_emulator import RunEmulator
 from capsule_id.experiments.progression.sessions import MIDDLE, Sessions, parameters_of
 from capsule_id.experiments.progression.starts import starts_of
+from capsule_id.experiments.progression.tables import session_table
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.displacement import Displacement, displacement
@@ -87,6 +88,7 @@ class Progression(TrialsExperiment):
     heavy: bool = eqx.field(static=True)
 
     checks = (check_discrepancy,)
+    tables = (session_table,)
     reaction: float = eqx.field(static=True)
     emulator: RunEmulator | None
 
