@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import inf, isfinite
 from types import MappingProxyType
 from typing import Any
 
@@ -46,6 +46,21 @@ class Source:
 
 
 @dataclass(frozen=True)
+class Range:
+    """Numbers from ``min`` to ``max``, both included, in the unit of the file."""
+
+    min: float
+    max: float
+
+    def __str__(self) -> str:
+        return f"from {self.min:g} to {self.max:g}"
+
+
+#: What selects the rows of a column: a number in the unit of the file, a range of them, or a text.
+Wanted = float | str | Range
+
+
+@dataclass(frozen=True)
 class ColumnMap:
     """The column map of an experiment.
 
@@ -53,12 +68,12 @@ class ColumnMap:
     ----------
     sources : by column of the experiment
     layout : what is stated about the layout of the files
-    where : value of a column, a number in the file's unit or a text, by header or number: other rows are not read
+    where : what a row has in a column, by its header or number: other rows are not read
     """
 
     sources: Mapping[str, Source]
     layout: Layout
-    where: Mapping[str, float | str]
+    where: Mapping[str, Wanted]
 
 
 def read_map(
@@ -171,11 +186,26 @@ def _decimal(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) ->
     return read_choice(document, place, entry["decimal"], (".", ",")) if "decimal" in entry else None
 
 
-def _where(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> dict[str, float | str]:
-    """The numbers and texts of ``where``, by header or number."""
+def _where(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> dict[str, Wanted]:
+    """The numbers, ranges and texts of ``where``, by header or number."""
     place = (*path, "where")
     stated = read_table(document, place, entry.get("where", {}), "where = { <header> = <value> }")
-    return {
-        key: value.strip() if isinstance(value, str) else _number(document, (*place, key), value)
-        for key, value in stated.items()
-    }
+    return {key: _wanted(document, (*place, key), value) for key, value in stated.items()}
+
+
+def _wanted(document: TomlDocument, path: KeyPath, value: object) -> Wanted:
+    """One value of ``where``."""
+    if isinstance(value, str):
+        return value.strip()
+    if not isinstance(value, dict):
+        return _number(document, path, value)
+    refuse_unknown_keys(document, path, value, ("min", "max"))
+    if not value:
+        raise document.error(
+            path, "a range must have min or max", "none", "write { min = 2, max = 10 }, or one of them"
+        )
+    ends = [_number(document, (*path, key), value[key]) if key in value else None for key in ("min", "max")]
+    found = Range(*(side if end is None else end for side, end in zip((-inf, inf), ends, strict=True)))
+    if found.min > found.max:
+        raise document.error(path, "min must not exceed max", str(found), "exchange them")
+    return found

@@ -10,7 +10,7 @@ from capsule_id.rig.filters import pieces
 from capsule_id.rig.formats.columns import in_blocks, joined, release, whole_numbers
 from capsule_id.rig.formats.export import Export
 from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.maps.declared import ColumnMap, Header, Source
+from capsule_id.rig.maps.declared import ColumnMap, Header, Range, Source, Wanted
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, shown
 
@@ -235,15 +235,18 @@ def _where_header(part: _Part, key: str) -> Header:
     return int(key) if key.isascii() and key.isdigit() and int(key) > 0 and not stated else " ".join(key.split())
 
 
-def _selected_by(parts: Sequence[_Part], place: KeyPath, wanted: float | str) -> _Selected:
-    """The rows whose column, named by the last key of ``place``, has the value ``wanted``."""
+def _selected_by(parts: Sequence[_Part], place: KeyPath, wanted: Wanted) -> _Selected:
+    """The rows whose column, named by the last key of ``place``, has what is ``wanted``."""
     key = str(place[-1])
     if isinstance(wanted, str):
         texts = _joined([part.words(place, _where_header(part, key)) for part in parts])
         return _Selected(texts == wanted, texts == "", [shown(str(text)) for text in np.unique(texts)])
     column = _joined([part.find(place, _where_header(part, key)).values for part in parts])
     seen = [f"{value:g}" for value in np.unique(column[np.isfinite(column)])]
-    return _Selected(np.isclose(column, wanted, rtol=ROUNDING, atol=0.0), np.isnan(column), seen)
+    inside = isinstance(wanted, Range) and (column >= wanted.min) & (column <= wanted.max)
+    ends = (wanted.min, wanted.max) if isinstance(wanted, Range) else (wanted,)
+    equal = np.any([np.isclose(column, end, rtol=ROUNDING, atol=0.0) for end in ends if np.isfinite(end)], axis=0)
+    return _Selected(equal | inside, np.isnan(column), seen)
 
 
 def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.ndarray:
@@ -262,7 +265,7 @@ def _kept(
     path: KeyPath,
     values: Mapping[str, np.ndarray],
     where: Mapping[str, _Selected],
-    wanted: Mapping[str, float | str],
+    wanted: Mapping[str, Wanted],
 ) -> tuple[np.ndarray | None, int, int]:
     """Which rows are used (None: all), and how many are dropped: for a missing cell, and outside ``where``."""
     if not where and not any(_blank(column).any() for column in values.values()):
@@ -275,7 +278,7 @@ def _kept(
             text = " ".join(seen[:_MOST_VALUES]) + (" …" if len(seen) > _MOST_VALUES else "")
             value = wanted[key]
             rule = f"where must keep a row; column {shown(key)} holds {text or 'no number'}"
-            found = shown(value) if isinstance(value, str) else f"{value:g}"
+            found = shown(value) if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
             raise document.error((*path, "where", key), rule, found, "write one of the values of the column")
         inside &= selected.rows
     empty = np.zeros_like(inside)

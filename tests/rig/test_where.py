@@ -1,11 +1,12 @@
-"""Rows selected by a text of a column."""
+"""Rows selected by a text or a range of a column."""
 
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.io import savemat
 
-from tests.rig.test_column_maps import BY_NAME, DISP, TIME, assert_read, fault_of, rig_of
+from tests.rig.test_column_maps import BY_NAME, DISP, TIME, assert_read, fault_of, rig_of, rows
 
 
 def test_where_selects_rows_by_a_text(tmp_path: Path) -> None:
@@ -48,3 +49,38 @@ def test_a_text_column_of_files_side_by_side_must_be_the_same(tmp_path: Path) ->
     fault = fault_of(tmp_path, files, stated)
     assert "must be the same" in fault.rule
     assert fault.value == "'C' and 'B'"
+
+
+@pytest.mark.parametrize(
+    ("stated", "kept"),
+    [
+        ("min = 0.3, max = 1.0", slice(3, 11)),
+        ("min = 0.3", slice(3, None)),
+        ("max = 0.7", slice(0, 8)),
+    ],
+)
+def test_where_selects_a_range(tmp_path: Path, stated: str, kept: slice) -> None:
+    """Both ends count, and 0.1 + 0.2 is 0.3."""
+    load = np.cumsum(np.append(0.0, np.full(11, 0.1)))
+    files: dict[str, str | bytes] = {"t.csv": "load,t,x\n" + rows(",", columns=(load, TIME, DISP))}
+    (table,) = rig_of(tmp_path, files, f'file = "t.csv"\nwhere = {{ load = {{ {stated} }} }}\n{BY_NAME}').tables
+    np.testing.assert_allclose(table["x_rel"], 1e-3 * DISP[kept], rtol=1e-14)
+    assert table.other == 12 - len(DISP[kept])
+
+
+@pytest.mark.parametrize(
+    ("stated", "rule", "remedy"),
+    [
+        ("{ }", "a range must have min or max", "min = 2"),
+        ("{ min = 2, max = 1 }", "min must not exceed max", "exchange"),
+        ("{ min = 2, most = 3 }", "most", "max"),
+        ('{ min = "2" }', "min must be a finite number", "without quotes"),
+        ("{ min = 5 }", "where must keep a row; column 'tau' holds 3", "write one of the values"),
+    ],
+)
+def test_ranges_that_mean_nothing_are_refused(tmp_path: Path, stated: str, rule: str, remedy: str) -> None:
+    text = "tau,t,x\n" + rows(",", columns=(np.full(12, 3.0), TIME, DISP))
+    fault = fault_of(tmp_path, {"t.csv": text}, f'file = "t.csv"\nwhere = {{ tau = {stated} }}\n{BY_NAME}')
+    assert rule in f"{fault.rule} {fault.value}"
+    assert remedy in fault.remedy
+    assert_read(rig_of(tmp_path, {}, f'file = "t.csv"\nwhere = {{ tau = {{ min = 2, max = 4 }} }}\n{BY_NAME}'))
