@@ -10,9 +10,9 @@ import pytest
 import capsule_id as cid
 from capsule_id import cli
 from capsule_id.experiments.free_vibration.decay_models import decay
-from capsule_id.experiments.free_vibration.declaration import MESSAGES
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
+from capsule_id.experiments.free_vibration.messages import MESSAGES
 from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.second_fit.screening import (
     BIC_MARGIN,

@@ -1,0 +1,93 @@
+"""What the checks of free decays say, and captions of their tables."""
+
+from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
+from capsule_id.experiments.free_vibration.settings import DAMPING
+from capsule_id.views import Facts, Message
+
+
+def _second_fit(facts: Facts) -> str:
+    """The records that contradict the stated model, the quoted model and the lines that state it."""
+    return (
+        f"{', '.join(facts['labels'])}: the record contradicts the first model ({facts['first']}). The quoted values are those "
+        f"of a second fit: {facts['second']}.{facts['drift']} To state it, write {facts['lines']}. To keep the first model, "
+        f"state its words."
+    )
+
+
+def _halves(facts: Facts) -> str:
+    """The parameter whose halves disagree most, the effect that this indicates, and remedies."""
+    damping = facts["name"] in ("c", *DAMPING.values())
+    key = "damping" if damping else "stiffness"
+    leave = f"Remove {key} from its entry, or state" if key in facts["stated"] else "State"
+    values = f"the first half gives {facts['first']:.4g}, the second {facts['second']:.4g} {facts['unit']}"
+    return (
+        f"{facts['label']}: expected the same {facts['name']} in both halves of the record; {values} ({facts['z']:.1f} joint "
+        f"sd apart). The {key} depends on the amplitude or on the time in a way that the fitted model lacks "
+        f"({facts['model']}). {leave} start and stop for the amplitudes of interest."
+    )
+
+
+MESSAGES = {
+    **LINT_MESSAGES,
+    "decays.stiffness": Message(
+        "stiffness against amplitude",
+        ok="k1 is the same in all {records} records (p = {p:.2g})",
+        fail=(
+            "expected one k1 for all releases (linear near the working point); the {records} records give {low:.5g} to "
+            "{high:.5g} N/m (chi-square {chi_square:.1f}, p = {p:.1g}). Release from smaller deflections, or use k1 at this "
+            "amplitude only."
+        ),
+    ),
+    "decays.slip": Message(
+        "free decay",
+        fail=(
+            "expected a free capsule at rest, |f| <= F_b = {F_b:.3g} N; the record reaches {force:.3g} N, so the capsule "
+            "slips and this is no free decay. Hold the capsule, or release from a smaller deflection."
+        ),
+    ),
+    "decays.contact": Message(
+        "free decay",
+        fail=(
+            "x_rel reaches {reach:.3g} m and the support spring stands at {gap:.3g} m, so the rod hits it and this is no "
+            "free decay. Move the spring away, or start the window later."
+        ),
+    ),
+    "decays.records": Message(
+        "Free vibration, record by record",
+        caption=(
+            "Each record alone, by least squares on the whole raw record, beside the paper's protocol. The paper's k1 is low "
+            "by ζ², because it takes the damped frequency for the natural one. Its c depends on how peaks are read out of "
+            "noise."
+        ),
+    ),
+    "decays.halves": Message(
+        "halves of a decay",
+        ok="{labels}: the estimates of both halves of each record agree within 3 joint sd",
+        warn=_halves,
+        fail=_halves,
+    ),
+    "decays.damping": Message(
+        "Damping parameters",
+        caption=(
+            "Correlations of the damping parameters. Near -1 or 1 the record determines a combination of two parameters better "
+            "than each of them. A record over a wider range of amplitudes separates them."
+        ),
+    ),
+    "decays.first_fit": Message(
+        "second fit of free decays",
+        warn=(
+            "{record}: no second fit, because the record is not one free decay. The fit uses means of {thin} samples. "
+            "Add the line that the finding on the readings states."
+        ),
+    ),
+    "decays.second_fit": Message(
+        "second fit of free decays",
+        changes_model=True,
+        warn=_second_fit,
+        caption=(
+            "Free decays alone, under the stated model and under the model of the quoted values, both by maximum likelihood on "
+            "the readings of the latter; records weighted by their errors. BIC is relative to the lower one. Lines of rig.toml "
+            "that state the quoted model: {lines}."
+        ),
+    ),
+}
