@@ -75,7 +75,9 @@ def test_where_selects_a_range(tmp_path: Path, stated: str, kept: slice) -> None
         ("{ min = 2, max = 1 }", "min must not exceed max", "exchange"),
         ("{ min = 2, most = 3 }", "most", "max"),
         ('{ min = "2" }', "min must be a finite number", "without quotes"),
-        ("{ min = 5 }", "where must keep a row; column 'tau' holds 3", "write one of the values"),
+        ("{ min = 5 }", "where must keep a row; column 'tau' holds 3 to 3", "widen the range"),
+        ("{ min = 2, max = inf }", "max must be a finite number", "leave max out"),
+        (f"{{ max = {10**400} }}", "max must be a finite number", "number without"),
     ],
 )
 def test_ranges_that_mean_nothing_are_refused(tmp_path: Path, stated: str, rule: str, remedy: str) -> None:
@@ -84,3 +86,23 @@ def test_ranges_that_mean_nothing_are_refused(tmp_path: Path, stated: str, rule:
     assert rule in f"{fault.rule} {fault.value}"
     assert remedy in fault.remedy
     assert_read(rig_of(tmp_path, {}, f'file = "t.csv"\nwhere = {{ tau = {{ min = 2, max = 4 }} }}\n{BY_NAME}'))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6])
+def test_times_since_1970_keep_their_digits(tmp_path: Path, unit: float) -> None:
+    """Before: 1e-9 of such a time is 1.7 s, and rows at both ends of a range were taken too."""
+    epoch = np.round(unit * (1.7e9 + 0.1 * np.arange(12)), 1)
+    files: dict[str, str | bytes] = {"t.csv": "clock,t,x\n" + rows(",", columns=(epoch, TIME, DISP))}
+    for stated, kept in (
+        (f"{{ min = {float(epoch[1])!r}, max = {float(epoch[10])!r} }}", slice(1, 11)),
+        (f"{{ min = {float(epoch[2])!r} }}", slice(2, None)),
+    ):
+        (table,) = rig_of(tmp_path, files, f'file = "t.csv"\nwhere = {{ clock = {stated} }}\n{BY_NAME}').tables
+        np.testing.assert_allclose(table["x_rel"], 1e-3 * DISP[kept], rtol=1e-14)
+    between = f"{float(epoch[3] - 0.04 * unit)!r}"
+    fault = fault_of(tmp_path, {}, f'file = "t.csv"\nwhere = {{ clock = {between} }}\n{BY_NAME}')
+    assert f"{epoch[0]:.15g} {epoch[1]:.15g}" in fault.rule
+    beyond = f"{{ min = {float(epoch[-1] + unit)!r} }}"
+    fault = fault_of(tmp_path, {}, f'file = "t.csv"\nwhere = {{ clock = {beyond} }}\n{BY_NAME}')
+    assert f"{epoch[0]:.15g} to {epoch[-1]:.15g}" in fault.rule
+    assert fault.value == f"{epoch[-1] + unit:.15g} or more"

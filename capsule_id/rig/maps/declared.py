@@ -1,8 +1,9 @@
 """Reads the column map of an experiment in ``rig.toml``: ``columns`` and the keys that go with it."""
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import inf, isfinite
+from math import inf
 from types import MappingProxyType
 from typing import Any
 
@@ -21,6 +22,8 @@ from capsule_id.rig.toml_values import (
 
 #: Keys of an experiment that go with ``columns``.
 MAP_KEYS = ("columns", "files", "data_from_line", "missing", "decimal", "where", "plateaus")
+#: Largest finite number; whole numbers of TOML may be larger.
+LARGEST = sys.float_info.max
 _EXAMPLE = '{ from = "...", unit = "..." }'
 Header = str | int  #: a header, or a column's number counted from 1
 
@@ -53,7 +56,9 @@ class Range:
     max: float
 
     def __str__(self) -> str:
-        return f"from {self.min:g} to {self.max:g}"
+        if self.max == inf:
+            return f"{self.min:.15g} or more"
+        return f"{self.max:.15g} or less" if self.min == -inf else f"{self.min:.15g} to {self.max:.15g}"
 
 
 #: What selects the rows of a column: a number in the unit of the file, a range of them, or a text.
@@ -157,7 +162,7 @@ def _header(document: TomlDocument, path: KeyPath, value: object) -> Header:
 
 def _number(document: TomlDocument, path: KeyPath, value: object) -> float:
     """A finite number without unit."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
         raise document.error(path, f"{path[-1]} must be a finite number", shown(value), "write a number without quotes")
     return float(value)
 
@@ -204,6 +209,9 @@ def _wanted(document: TomlDocument, path: KeyPath, value: object) -> Wanted:
         raise document.error(
             path, "a range must have min or max", "none", "write { min = 2, max = 10 }, or one of them"
         )
+    for key in value:
+        if isinstance(value[key], float) and not abs(value[key]) <= LARGEST:
+            raise document.error((*path, key), f"{key} must be a finite number", shown(value[key]), f"leave {key} out")
     ends = [_number(document, (*path, key), value[key]) if key in value else None for key in ("min", "max")]
     found = Range(*(side if end is None else end for side, end in zip((-inf, inf), ends, strict=True)))
     if found.min > found.max:

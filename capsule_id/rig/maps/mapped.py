@@ -16,6 +16,8 @@ from capsule_id.rig.toml_values import closest, shown
 
 #: Relative difference below which a column that several files hold is the same.
 ROUNDING = 1e-9
+#: Numbers of a file equal one of ``where`` within this many units in the last place.
+ULPS = 4
 _MOST_VALUES = 6  # shown of a column where no row has the value wanted
 
 
@@ -49,11 +51,11 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Selected:
-    """Rows that a key of ``where`` selects, those without a value, (n,) each, and some values of its column."""
+    """Rows that a key of ``where`` selects, those without a value, (n,) each; where it selects none, what there is."""
 
     rows: np.ndarray
     unknown: np.ndarray
-    seen: Sequence[str]
+    seen: str
 
 
 @dataclass(frozen=True)
@@ -240,13 +242,30 @@ def _selected_by(parts: Sequence[_Part], place: KeyPath, wanted: Wanted) -> _Sel
     key = str(place[-1])
     if isinstance(wanted, str):
         texts = _joined([part.words(place, _where_header(part, key)) for part in parts])
-        return _Selected(texts == wanted, texts == "", [shown(str(text)) for text in np.unique(texts)])
+        rows = texts == wanted
+        return _Selected(
+            rows, texts == "", "" if rows.any() else _some([shown(str(text)) for text in np.unique(texts)])
+        )
     column = _joined([part.find(place, _where_header(part, key)).values for part in parts])
-    seen = [f"{value:g}" for value in np.unique(column[np.isfinite(column)])]
-    inside = isinstance(wanted, Range) and (column >= wanted.min) & (column <= wanted.max)
-    ends = (wanted.min, wanted.max) if isinstance(wanted, Range) else (wanted,)
-    equal = np.any([np.isclose(column, end, rtol=ROUNDING, atol=0.0) for end in ends if np.isfinite(end)], axis=0)
-    return _Selected(equal | inside, np.isnan(column), seen)
+    if isinstance(wanted, Range):
+        # 0.1 + 0.2 is 0.3; times since 1970 in microseconds keep their digits.
+        own = [np.spacing(end) if np.isfinite(end) else 0.0 for end in np.abs([wanted.min, wanted.max])]
+        rows = (column >= wanted.min - ULPS * own[0]) & (column <= wanted.max + ULPS * own[1])
+    else:
+        rows = np.abs(column - wanted) <= ULPS * np.spacing(abs(wanted))
+    return _Selected(rows, np.isnan(column), "" if rows.any() else _numbers_of(column, isinstance(wanted, Range)))
+
+
+def _some(texts: Sequence[str]) -> str:
+    return " ".join(texts[:_MOST_VALUES]) + (" …" if len(texts) > _MOST_VALUES else "")
+
+
+def _numbers_of(column: np.ndarray, is_range: bool) -> str:
+    """The range of the numbers of a column, or some of them, in words; "" where it has none."""
+    numbers = column[np.isfinite(column)]
+    if is_range and numbers.size:
+        return f"{np.min(numbers):.15g} to {np.max(numbers):.15g}"
+    return _some([f"{value:.15g}" for value in np.unique(numbers)[: _MOST_VALUES + 1]])
 
 
 def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.ndarray:
@@ -274,12 +293,13 @@ def _kept(
     inside = np.ones(next(iter(values.values())).size, bool)
     for key, selected in where.items():
         if not selected.rows.any():
-            seen = selected.seen
-            text = " ".join(seen[:_MOST_VALUES]) + (" …" if len(seen) > _MOST_VALUES else "")
             value = wanted[key]
-            rule = f"where must keep a row; column {shown(key)} holds {text or 'no number'}"
-            found = shown(value) if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
-            raise document.error((*path, "where", key), rule, found, "write one of the values of the column")
+            rule = f"where must keep a row; column {shown(key)} holds {selected.seen or 'no number'}"
+            found = (
+                shown(value) if isinstance(value, str) else f"{value:.15g}" if isinstance(value, float) else str(value)
+            )
+            remedy = "widen the range" if isinstance(value, Range) else "write one of the values of the column"
+            raise document.error((*path, "where", key), rule, found, remedy)
         inside &= selected.rows
     empty = np.zeros_like(inside)
     for column in values.values():
