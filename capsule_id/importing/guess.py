@@ -27,6 +27,8 @@ DECAYS, DRIVEN = 0.5, 0.8
 _PARTS = 5
 #: SI unit of a displacement, a velocity or an acceleration -> that of the same quantity of an angle.
 ANGULAR = {"m": "rad", "m/s": "rad/s", "m/s^2": "rad/s^2"}
+#: Largest angle of a swing, rad; a larger number is in degrees.
+LARGEST_SWING = 3.2
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,10 @@ class _Candidate:
 def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     """The most probable kind and columns of an export; None where no kind fits."""
     candidates = [candidate for kind in kinds.values() for candidate in _candidates(found, kind)]
+    if not any(TIME in candidate.kind.columns for candidate in candidates):
+        by_angle = _by_angle(found, kinds)
+        if by_angle is not None:
+            return by_angle
     if not candidates:
         return _without_names(found, kinds)
     best = max(candidate.score for candidate in candidates)
@@ -81,7 +87,8 @@ def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     names = sorted({candidate.kind.name for candidate in leading})
     if len(names) == 1:
         chosen = max(candidates, key=lambda candidate: candidate.score)
-        if TIME not in chosen.kind.columns and _has_times(found):
+        used = {column.index for column in chosen.columns.values()}
+        if TIME not in chosen.kind.columns and any(_is_record(found, i) for i in _times(found) if i not in used):
             return _guess(found, chosen, "unsure", f"the file is a record in time, {names[0]} a table of trials")
         return _guess(found, chosen, "sure", "the columns fit no other kind as well")
     by_motion = _by_motion(found, leading)
@@ -111,8 +118,6 @@ def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
         guesses = {}
         for (i, name), (j, index) in product(enumerate(wanted), enumerate(found.columns)):
             scored = _score(found, index, name, kind.columns[name].si, dimensions)
-            if scored is None and name in kind.channels:
-                scored = _score_of_angle(found, index, name, kind.columns[name].si, dimensions)
             if scored is not None:
                 scores[i, j], guesses[i, j] = scored
         rows, places = linear_sum_assignment(scores, maximize=True)
@@ -170,35 +175,53 @@ def _score(
     return by_name + UNIT_SCORE, ColumnGuess(index, unit, "sure" if exact else "likely", reason)
 
 
-def _score_of_angle(
-    found: FoundLayout, index: int, name: str, si: str, dimensions: list[str]
-) -> tuple[float, ColumnGuess] | None:
-    """How well an angle, its rate or its acceleration fits a channel of motion: entered as arm times angle."""
+def _by_angle(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
+    """A guess for a record of an angle, its rate or its acceleration, as arm times angle; None for another file."""
+    times = [index for index in _times(found) if len(found.columns[index]) >= FEWEST_SAMPLES]
+    candidates = []
+    for kind in kinds.values():
+        channel = next(filter(None, (_angle(found, kind, name) for name in kind.channels)), None)
+        if times and channel is not None and TIME in kind.columns:
+            time = _score(found, times[0], TIME, "s", ["s"])
+            columns = {} if time is None else {TIME: time[1]}
+            candidates.append(_Candidate(kind, {**columns, channel[0]: channel[1]}, 0.0))
+    if not candidates:
+        return None
+    by_motion = _by_motion(found, candidates)
+    return _guess(found, *(by_motion or (candidates[0], "unsure", "the file is a record in time")))
+
+
+def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess] | None:
+    """The channel ``name`` of a kind with the column that holds it as an angle; None without such a column."""
+    si = kind.columns[name].si
     if si not in ANGULAR:
         return None
-    stem, text = name_and_unit(found.names[index], [*dimensions, *ANGULAR.values()])
-    text = text if text is not None else found.units[index]
-    is_angle = name == "x_rel" and fits_name(stem, "angle") > 0
-    if not (is_angle or fits_name(stem, name)):
-        return None
     remedy = "multiply scale by the arm in m, or enter the moment of inertia in kg m^2 as the mass in kg"
-    if not text.strip():
-        return 2.0, ColumnGuess(index, si, "unsure", f"an angle without unit, taken as rad; {remedy}", 1.0)
-    unit = unit_of(text, [ANGULAR[si]])
-    if unit is None:
-        return None
-    scale = factor_to_si(unit, ANGULAR[si])
-    return 2.0 + UNIT_SCORE, ColumnGuess(index, si, "unsure", f"an angle in {unit}; {remedy}", scale)
+    for index, values in found.columns.items():
+        stem, text = name_and_unit(found.names[index], [*ANGULAR, *ANGULAR.values()])
+        text = (text if text is not None else found.units[index]).strip()
+        unit = unit_of(text, [ANGULAR[si]])
+        known = fits_name(stem, name) or (name == "x_rel" and fits_name(stem, "angle"))
+        if known and unit is not None:
+            scale, reason = factor_to_si(unit, ANGULAR[si]), f"{found.names[index]!r} times an arm of 1 m"
+            return name, ColumnGuess(index, si, "unsure", f"{reason}; {remedy}", scale)
+        if name == "x_rel" and not text and fits_name(stem, "angle"):
+            largest = float(np.nanmax(np.abs(values)))
+            scale, taken = (1.0, "rad") if largest <= LARGEST_SWING else (float(np.deg2rad(1.0)), "deg")
+            reason = f"an angle without unit, taken as {taken} because it reaches {largest:.3g}"
+            return name, ColumnGuess(index, si, "unsure", f"{reason}; {remedy}", scale)
+    return None
 
 
-def _has_times(found: FoundLayout) -> bool:
-    """Whether a column that is named as times increases from row to row of a record."""
-    return any(
-        fits_name(name_and_unit(found.names[index], ["s"])[0], TIME)
-        and len(values) >= FEWEST_SAMPLES
-        and _is_even(values)
-        for index, values in found.columns.items()
-    )
+def _times(found: FoundLayout) -> list[int]:
+    """Columns that are named as times and increase from row to row."""
+    names = {index: name_and_unit(found.names[index], ["s"])[0] for index in found.columns}
+    return [index for index, name in names.items() if fits_name(name, TIME) and _increases(found.columns[index])]
+
+
+def _increases(values: np.ndarray) -> bool:
+    values = values[np.isfinite(values)]
+    return bool(np.all(np.diff(values) > 0.0))
 
 
 def _is_record(found: FoundLayout, time: int | None) -> bool:
@@ -206,9 +229,7 @@ def _is_record(found: FoundLayout, time: int | None) -> bool:
     rows = len(next(iter(found.columns.values())))
     if time is None:
         return rows >= FEWEST_SAMPLES
-    values = found.columns[time]
-    values = values[np.isfinite(values)]
-    return rows >= 8 and bool(np.all(np.diff(values) > 0.0))
+    return rows >= 8 and _increases(found.columns[time])
 
 
 def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidate, Confidence, str] | None:

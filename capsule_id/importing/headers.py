@@ -103,7 +103,9 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
 def fits_name(name: str, column: str) -> int:
     """3 for the name of the column itself, 2 for one of its words, 0 for another name."""
     # Letters without their accents.
-    bare = unicodedata.normalize("NFKD", name.strip().lower()).encode("ascii", "ignore").decode()
+    bare = "".join(
+        mark for mark in unicodedata.normalize("NFKD", name.strip().lower()) if not unicodedata.combining(mark)
+    )
     if re.sub(r"[\W_]+", "_", bare) == column.lower():
         return 3
     words = re.split(r"[\W_]+", bare)

@@ -278,7 +278,10 @@ def test_a_decay_that_is_pushed_near_its_end_is_not_sure_to_be_driven(
     ("header", "line"),
     [
         ("Time (s),Angle (deg)", 'x_rel = { from = "Angle (deg)", unit = "m", scale = 0.01745329252 }  # unsure: '),
-        ("Time (s),Angle", 'x_rel = { from = "Angle", unit = "m", scale = 1 }  # unsure: an angle without unit'),
+        (
+            "Time (s),Angle",
+            'x_rel = { from = "Angle", unit = "m", scale = 0.01745329252 }  # unsure: an angle without unit',
+        ),
         ("Zeit t / s,Weg b_A1 / rad", 'x_rel = { from = "Weg b_A1 / rad", unit = "m", scale = 1 }  # unsure: '),
         (
             "t [s],speed [deg/s]",
@@ -293,12 +296,13 @@ def test_a_record_of_an_angle_is_no_table_of_tilts(tmp_path: Path, header: str, 
     rows = "".join(f"{t:.2f},{value:.5f}\n" for t, value in zip(time, x, strict=True))
     (tmp_path / "swing.csv").write_text(f"{header}\n{rows}", encoding="utf-8")
     entry = capsule_id.propose_entry(tmp_path / "swing.csv")
-    assert 'kind = "free_vibration"  # sure' in entry
+    # Of a velocity there are free decays only, whether it decays or not.
+    assert f'kind = "free_vibration"  # {"unsure" if "speed" in header else "sure"}' in entry
     assert line in entry
     masses = '[rig]\nname = "a"\nm1 = { value = 0.02, unit = "kg" }\n\n'
     (tmp_path / "rig.toml").write_text(masses + entry, encoding="utf-8")
     (table,) = capsule_id.read_rig(tmp_path).tables
-    factor = 1e-3 if "mm" in header else np.radians(1.0) if "deg" in header else 1.0
+    factor = 1e-3 if "mm" in header else 1.0 if "rad" in header else np.radians(1.0)
     (name,) = set(table.columns) - {"time"}
     assert np.allclose(table[name], factor * x, rtol=1e-4, atol=1e-5)
 
@@ -314,3 +318,41 @@ def test_a_record_in_time_is_never_surely_a_table_of_trials(tmp_path: Path) -> N
         (kind,) = (line for line in entry.split("\n") if line.startswith("kind = "))
         assert ("the file is a record in time" in kind) == (not sure)
         assert ("# unsure" in kind) or sure
+
+
+@pytest.mark.parametrize(
+    ("header", "lines"),
+    [
+        ("Time (s),Displacement (mm),Motor speed (rpm)", ("forced_run", 'x_rel = { from = "Displacement (mm)"')),
+        (
+            "Time (s),Angle (deg),Position (mm)",
+            ("forced_run", 'x_rel = { from = "Position (mm)", unit = "mm" }  # sure'),
+        ),
+        (
+            "Time (s),Position (mm),Angle (deg)",
+            ("forced_run", 'x_rel = { from = "Position (mm)", unit = "mm" }  # sure'),
+        ),
+        ("t (s),\u03c3x (mm),x (mm)", ("forced_run", 'x_rel = { from = "x (mm)", unit = "mm" }  # sure')),
+        (
+            "Time (s),Speed (rpm),Angle (deg)",
+            ("forced_run", 'x_rel = { from = "Angle (deg)", unit = "m", scale = 0.017'),
+        ),
+    ],
+)
+def test_an_angle_beside_a_displacement_is_not_taken(tmp_path: Path, header: str, lines: tuple[str, str]) -> None:
+    """Nor the uncertainty of a column for the column, as where letters outside ASCII are dropped."""
+    time = np.arange(0.0, 10.0, 0.01)
+    rows = "".join(f"{t:.2f},{3.0 * np.sin(12.0 * t):.5f},{np.cos(12.0 * t + 0.1):.5f}\n" for t in time)
+    (tmp_path / "run.csv").write_text(f"{header}\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "run.csv")
+    assert f'kind = "{lines[0]}"' in entry
+    assert lines[1] in entry
+    assert "velocity" not in entry
+
+
+@pytest.mark.parametrize("pause", [0.1, 3.0])
+def test_few_rows_or_a_pause_make_no_table_of_trials(tmp_path: Path, pause: float) -> None:
+    time = np.append(0.1 * np.arange(20), 2.0 + pause + 0.1 * np.arange(20))
+    rows = "".join(f"{t:.2f},{3.0 + np.sin(t):.4f}\n" for t in time)
+    (tmp_path / "pull.csv").write_text(f"Time (s),Pull (N)\n{rows}", encoding="utf-8")
+    assert "the file is a record in time" in capsule_id.propose_entry(tmp_path / "pull.csv")
