@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import capsule_id as cid
+from capsule_id import cli
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.friction_experiment import FrictionExperiment
@@ -226,3 +227,27 @@ def test_a_load_on_a_slope_must_say_where_it_comes_from(tmp_path: Path, kind: st
     rig(tmp_path / "stated", table(kind, 0.3, settings={**slope, "load_is": '"weight"'}))
     with pytest.raises(InputError, match="load_is needs a slope"):
         rig(tmp_path / "level", table(kind, 0.3, settings={"load_is": '"weight"'}))
+
+
+@pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
+@pytest.mark.parametrize("sd", ["", ", sd = 0.1"])
+def test_a_stated_normal_force_holds_the_N0_of_the_rig(tmp_path: Path, kind: str, sd: str) -> None:
+    """Before: internal failure, KeyError m1."""
+    make = rig(tmp_path, table(kind, 0.3)).folder / "rig.toml"
+    make.write_text(make.read_text().replace("[rig]\n", f'[rig]\nN0 = {{ value = 2, unit = "N"{sd} }}\n'))
+    result = cid.fit(cid.read_rig(tmp_path), budget=None)
+    assert result.summary.at["mu", "map"] == pytest.approx(0.3, abs=0.01)
+    assert list(result.summary.index) == ["mu"]
+
+
+@pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
+def test_forces_below_the_weight_along_the_slope_are_refused(tmp_path: Path, kind: str) -> None:
+    """Loads that press, taken for weights (before: internal failure, starts must be finite)."""
+    settings = {"slope": quantity(20.0, "deg"), "load_is": '"weight"'}
+    made = rig(tmp_path, table(kind, 0.3, settings=settings))
+    with pytest.raises(InputError, match="must exceed the weight along the slope") as caught:
+        make_experiments(made)
+    assert caught.value.line is not None
+    assert "load_is" in caught.value.remedy
+    assert cli.fit_params([str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert not (tmp_path / "out").exists()

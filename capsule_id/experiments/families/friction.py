@@ -59,6 +59,13 @@ def check_normal_force(entry: Entry[Any]) -> None:
             )
 
 
+def has_stated_load(table: Table[Any]) -> bool:
+    """Whether pulls state their normal force, which then holds N0 too."""
+    return isinstance(table.settings, PullSettings) and (
+        "normal_force" in table.columns or getattr(table.settings, "normal_force", None) is not None
+    )
+
+
 def check_load(entry: Entry[Any]) -> None:
     """Require ``load_is`` where the normal force is stated on a slope: weights pull along the slope too.
 
@@ -68,8 +75,7 @@ def check_load(entry: Entry[Any]) -> None:
         At the entry or its setting.
     """
     table = entry.table
-    stated = "normal_force" in table.columns or getattr(table.settings, "normal_force", None) is not None
-    needed = stated and "force" in table.columns and "slope" in table.settings.ground
+    needed = has_stated_load(table) and "force" in table.columns and "slope" in table.settings.ground
     if needed and table.settings.load_is is None:
         rule = "load_is must say where a stated normal force on a slope comes from"
         remedy = (

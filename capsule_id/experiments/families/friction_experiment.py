@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from scipy.optimize import OptimizeWarning, curve_fit
 
+from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, band
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.series import LEVEL
@@ -108,7 +109,7 @@ class FrictionExperiment(GroundExperiment):
 
     def along(self, theta: ValuesBySymbol) -> Any:
         """Weight of capsule and rod along the slope, N, positive where it opposes the motion."""
-        if not self.ground:
+        if "slope" not in self.ground:
             return 0.0
         return weight_along(theta["m1"] + theta["m2"], theta["g"], self.ground_at(theta), self.backward)
 
@@ -166,6 +167,22 @@ class LoadedExperiment(FrictionExperiment):
         slope = self.ground_at(theta)["slope"]
         uphill = self.normal_force * array_module(slope).tan(slope)
         return -uphill if self.backward else uphill
+
+    def refuse_weight_along(self, force: np.ndarray) -> None:
+        """Refuse forces (n,) of which none exceeds the weight along the slope.
+
+        Raises
+        ------
+        InputError
+            At the row with the largest friction.
+        """
+        if "slope" not in self.ground or np.any(force > self.stated_along):
+            return
+        row = int(np.argmax(force - self.stated_along))
+        along = float(np.broadcast_to(self.stated_along, force.shape)[row])
+        rule = f"a force must exceed the weight along the slope, {along:.4g} N"
+        remedy = "correct slope, direction or load_is"
+        raise InputError(rule, f"{force[row]:.4g} N", remedy, self.table.file, int(self.table.rows[row]))
 
     def of_normal_force(self, coefficient: Any, along: Any) -> Any:
         """Change of the force with its normal force, from the ``coefficient`` of friction."""

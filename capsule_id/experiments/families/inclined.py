@@ -7,10 +7,11 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 
 from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.families.friction import has_stated_load
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import FrictionLaw, normal_force, slide_distance
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Quantity, Rig, Table
 
 #: A slide downhill is braked by this share of its friction at least. It then lasts far beyond any reading.
 LEAST_BRAKING = 1e-3
@@ -45,9 +46,15 @@ class _Sensitivity(Braking):
         return super().forward(speed) ** 2 / self.law.forward(speed)
 
 
+def _acting_ground(table: Table[Any]) -> dict[str, Quantity]:
+    """Stated slope and N0 that act on the readings."""
+    held = has_stated_load(table)
+    return {name: stated for name, stated in table.settings.ground.items() if name != "N0" or not held}
+
+
 def ground_of(table: Table[Any]) -> dict[str, float | None]:
     """Slope, rad, and N0, N, where they differ from level ground and the weight alone; None: sampled, with its sd."""
-    return {name: None if stated.sd else stated.value for name, stated in table.settings.ground.items()}
+    return {name: None if stated.sd else stated.value for name, stated in _acting_ground(table).items()}
 
 
 def ground_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
@@ -56,7 +63,7 @@ def ground_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
     Equal statements of several experiments are one quantity; that of [rig] has no bracket.
     """
     rows = []
-    for name, stated in table.settings.ground.items():
+    for name, stated in _acting_ground(table).items():
         if stated.sd:
             same = (other.label for other in rig.tables if getattr(other.settings, name, None) == stated)
             of = "" if stated == getattr(rig, name) else next(same, table.label)

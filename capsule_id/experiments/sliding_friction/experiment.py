@@ -46,6 +46,8 @@ class SlidingFriction(LoadedExperiment):
         self.normal_force, self.normal_force_sd = stated_normal_forces(table)
         self.of_weights = table.settings.load_is == "weight"
         self.values_sd = table.columns[self.quantity].reading_sd
+        if self.quantity == "force":
+            self.refuse_weight_along(self.values)
 
     @property
     def speeds_known(self) -> bool:

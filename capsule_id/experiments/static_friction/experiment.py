@@ -113,6 +113,7 @@ class StaticPulls(LoadedExperiment):
         self.of_weights = table.settings.load_is == "weight"
         if table.settings.normal_force is not None:
             self.normal_force = np.asarray(table.settings.normal_force)
+        self.refuse_weight_along(self.force)
 
     @property
     def masses(self) -> tuple[str, ...]:
