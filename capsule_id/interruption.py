@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from types import FrameType
 
@@ -20,13 +21,32 @@ INTERRUPTED = 130
 GRACE = 4.0
 _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 _flag = threading.Event()
+#: ``left``: the event of the ``threads`` block that this thread works for.
+_worker = threading.local()
 _arrivals: list[float] = []
 
 
 def stop_if_interrupted() -> None:
-    """Raise ``KeyboardInterrupt`` if a signal has arrived in an ``interruptible`` block; call this between steps."""
-    if _flag.is_set():
+    """Raise ``KeyboardInterrupt`` if a signal has arrived in an ``interruptible`` block; call this between steps.
+
+    Also in a worker of ``threads`` whose block was left by an error.
+    """
+    left: threading.Event | None = getattr(_worker, "left", None)
+    if _flag.is_set() or (left is not None and left.is_set()):
         raise KeyboardInterrupt
+
+
+@contextmanager
+def threads(number: int) -> Iterator[ThreadPoolExecutor]:
+    """Worker threads. Where the block is left by an error, as by Ctrl-C in Python, their work ends at its next step."""
+    left = threading.Event()
+    with ThreadPoolExecutor(number, initializer=setattr, initargs=(_worker, "left", left)) as workers:
+        try:
+            yield workers
+        except BaseException:
+            left.set()
+            workers.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from capsule_id.inference.fit.variance_shares import variance_shares
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
-from capsule_id.interruption import stop_if_interrupted
+from capsule_id.interruption import stop_if_interrupted, threads
 from capsule_id.views import counted
 
 #: Tolerance, dimensionless, and largest number of solver steps of one descent.
@@ -125,7 +125,7 @@ def joint_fit(
 def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
     """Search from the ``starts`` (s, d) until some suffice: alone until a motion is finite, then ``TOGETHER``."""
     ends: list[_End] = []
-    with ThreadPoolExecutor(TOGETHER) as threads:
+    with threads(TOGETHER) as workers:
         while len(ends) < len(starts):
             release_memory()
             best = max(ends, key=lambda end: end.value, default=None)
@@ -137,7 +137,7 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
             # Reuse the noise levels of the best fit.
             own = np.where(target.scatter, best.u, starts[len(ends) : len(ends) + TOGETHER])
             limit = COST_RATIO_TO_ABANDON * float(best.fit.cost[0])
-            ends += threads.map(partial(_search, target, limit=limit), own)
+            ends += workers.map(partial(_search, target, limit=limit), own)
     return ends
 
 

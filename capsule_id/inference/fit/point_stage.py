@@ -4,7 +4,6 @@ experiments -> fit of the bench tests in closed form -> divide runs that amplify
 """
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
@@ -17,6 +16,7 @@ from capsule_id.inference.sampling.ensembles import sample
 from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
+from capsule_id.interruption import threads
 from capsule_id.views import Finding
 
 #: emcee steps of the bench sample, which measures the precision gained from runs and their agreement.
@@ -66,7 +66,7 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
     target, findings = cut_unpredictable(target, known)
     release_memory()
     # The joint fit takes one core most of the time: the bench is sampled on another one.
-    with ThreadPoolExecutor(1) as beside:
+    with threads(1) as beside:
         own = beside.submit(_bench_sample, alone, bench, seed) if alone and bench and sampled else None
         target, joint, wavering = _fit_with_right_starts(target, known, seed)
         bench_fit = BenchFit(bench, None if own is None else own.result())

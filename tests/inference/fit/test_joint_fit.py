@@ -1,5 +1,8 @@
 """Bench and runs fitted together, small: against the truth, against SciPy, and what smoothing would have done."""
 
+import signal
+import threading
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -33,6 +36,7 @@ from capsule_id.inference.fit.least_squares import Solver, least_squares, linear
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.tables.run_notes import smoothing_shift
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
+from capsule_id.interruption import stop_if_interrupted
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity
 from tests.experiments import bench
@@ -219,3 +223,42 @@ def test_smoothing_left_wide_is_wrong_by_many_sd_and_the_certified_widths_are_no
     wide, _ = smoothing_shift(target, fit, Smoothing(velocity=1e-2))
     assert np.max(np.abs(wide) / sd) > 10.0
     assert np.max(np.abs(wide) / sd) > 5.0 * np.max(np.abs(certified) / sd)
+
+
+def test_ctrl_c_in_python_stops_the_searches_that_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the command's flag. Before: both searches went on to their ends."""
+    target, fit = fitted()
+    first, steps = _descend(target, fit.u), list[float]()
+
+    def search(_: LogPosterior, start: np.ndarray, limit: float) -> Any:
+        if not np.isfinite(limit):
+            return first
+        for _step in range(600):
+            stop_if_interrupted()
+            steps.append(time.monotonic())
+            if len(steps) == 20:
+                signal.pthread_kill(cast(int, threading.main_thread().ident), signal.SIGINT)
+            time.sleep(0.02)
+        return first
+
+    monkeypatch.setattr(module, "_search", search)
+    with pytest.raises(KeyboardInterrupt):
+        joint_fit(target, {}, 0, starts=np.stack([fit.u] * 3))
+    assert len(steps) < 200
+    stop_if_interrupted()  # the flag of that fit is not left behind
+
+
+@pytest.mark.parametrize("wait", [(0.0, 0.1), (0.1, 0.0)])
+def test_searches_side_by_side_keep_their_order(monkeypatch: pytest.MonkeyPatch, wait: tuple[float, float]) -> None:
+    target, fit = fitted()
+    first = _descend(target, fit.u)
+    starts = fit.u + np.arange(3)[:, None]
+
+    def search(_: LogPosterior, start: np.ndarray, limit: float) -> Any:
+        number = int(np.argmin(np.max(np.abs(starts - start)[:, target.located], axis=1)))
+        time.sleep(0.0 if number == 0 else wait[number - 1])
+        return replace(first, value=first.value - number)
+
+    monkeypatch.setattr(module, "_search", search)
+    again = joint_fit(target, {}, 0, starts=starts)
+    assert (again.log_posterior[0] - again.log_posterior).tolist() == pytest.approx([0.0, 1.0, 2.0])
