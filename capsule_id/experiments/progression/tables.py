@@ -25,11 +25,11 @@ def session_table(experiments: "Sequence[Progression]", fit: Fitted) -> list[Res
             symbol = e.sessions.symbols[e.parameter[session]]
             factors = np.array([np.exp(one["session_sd"] * one[symbol]) for one in draws or [theta]])
             trials = np.flatnonzero(e.session[:, session])
-            named = "session" in e.table.columns
             rows.append(
                 {
                     "parameter": f"{symbol}[{e.label}]",
-                    "session": f"{e.table['session'][trials[0]]:g}" if named else f"from row {trials[0] + 1}",
+                    # Without this column each block of rows is a session with one setting, which has no parameter.
+                    "session": f"{e.table['session'][trials[0]]:.15g}",
                     "settings": int(np.count_nonzero(e.session[:, session] @ e.setting)),
                     "trials": len(trials),
                     "friction": float(np.mean(factors)),
