@@ -5,6 +5,7 @@ import math
 import numbers
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -20,6 +21,9 @@ from capsule_id.report.texts.messages import caption_of, finding_text, messages_
 from capsule_id.report.texts.terms import OF_A_SAMPLE, TERMS
 from capsule_id.report.typography import MISSING, fixed, symbol_parts
 from capsule_id.views import Finding, Level, Message, ResultTable, counted
+
+if TYPE_CHECKING:
+    from capsule_id.fitted import Fit
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
@@ -111,11 +115,9 @@ def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, 
     return entries
 
 
-def summary_html(result: Result) -> str:
-    """Verdict and parameter table, for a notebook."""
-    messages = messages_of(result.registry)
-    failed = sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
-    verdict = verdict_text(result.trust, failed)
+def summary_html(result: "Fit") -> str:
+    """Verdict, changes of the model and parameter table, for a notebook."""
+    verdict = verdict_text(result.trust, result.failed)
     table = _parameters(result.summary, "console")
     return (
         _environment()

@@ -171,5 +171,6 @@ def test_the_console_says_that_the_model_is_another(
         out = capsys.readouterr().out
         assert ("contradicts the first model (viscous damping)" in out.replace("\n", " ")) == (name == "dry")
         assert max(map(len, out.split("\n"))) <= max(90, len(str(tmp_path)) + 40)
-        fitted = str(cid.load(tmp_path / f"{name}_out"))
-        assert ("contradicts the first model" in fitted.replace("\n", " ")) == (name == "dry")
+        fitted = cid.load(tmp_path / f"{name}_out")
+        for text in (str(fitted), fitted._repr_html_()):
+            assert ("contradicts the first model" in text.replace("\n", " ")) == (name == "dry")

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from capsule_id.api import read_rig
+from capsule_id.experiments.lint import lint
+from capsule_id.experiments.registry import default_registry
+from capsule_id.report.texts.messages import finding_text, messages_of
 from tests.rig.test_column_maps import BY_NAME, DISP, TIME, assert_read, fault_of, rig_of, rows
 
 
@@ -106,3 +110,23 @@ def test_times_since_1970_keep_their_digits(tmp_path: Path, unit: float) -> None
     fault = fault_of(tmp_path, {}, f'file = "t.csv"\nwhere = {{ clock = {beyond} }}\n{BY_NAME}')
     assert f"{epoch[0]:.15g} to {epoch[-1]:.15g}" in fault.rule
     assert fault.value == f"{epoch[-1] + unit:.15g} or more"
+
+
+def test_ranges_that_overlap_are_named_with_a_remedy_that_works(tmp_path: Path) -> None:
+    """Before: "lines 6 to 10 repeat lines 6 to 10 ... Delete the repeated rows", which deletes the only copy."""
+    force = np.round(1.0 + np.random.default_rng(0).uniform(size=12), 4)
+    text = "load,force\n" + rows(",", columns=(np.arange(12.0), force))
+    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+    head = '[rig]\nname = "t"\nm1 = { value = 1, sd = 0.01, unit = "kg" }\nm2 = { value = 1, sd = 0.01, unit = "kg" }\n'
+    entry = '[[experiment]]\nkind = "static_friction"\nlabel = "%s"\nfile = "t.csv"\nwhere = { load = { %s } }\n'
+    columns = 'columns = { force = { from = "force", unit = "N" } }\n'
+    for second, named in (("min = 4", True), ("min = 7.5", False)):
+        entries = (entry % ("low", "max = 7") + columns, entry % ("high", second) + columns)
+        (tmp_path / "rig.toml").write_text(head + "".join(entries), encoding="utf-8")
+        rig = read_rig(tmp_path)
+        found = [f for f in lint(rig, default_registry(), rig.tables) if f.code == "readings.repeated"]
+        assert bool(found) == named
+        if named:
+            said = finding_text(found[0], messages_of(default_registry()))
+            assert "two experiments use lines 6 to 9" in said
+            assert "Delete" not in said

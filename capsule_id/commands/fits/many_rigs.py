@@ -13,7 +13,6 @@ from capsule_id.commands.cluster import client_of
 from capsule_id.commands.fits.one_rig import (
     Options,
     check_output,
-    failed_checks,
     fingerprint_of,
     prepare_jax,
     write_fit,
@@ -125,7 +124,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
             for path in folder.rglob("*")
             if path.is_file() and path.name not in WORK_FILES
         }
-    return FittedRig(files, verdict_text(result.trust, failed_checks(result, kinds)), result.clean)
+    return FittedRig(files, verdict_text(result.trust, result.failed), result.clean)
 
 
 def _in_process(rigs: Sequence[Rig], options: Options, kinds: Registry) -> Iterator[tuple[Rig, FittedRig | Exception]]:

@@ -105,14 +105,6 @@ def write_fit(
     return result
 
 
-def failed_checks(result: "Fit", kinds: Registry) -> list[str]:
-    """Titles of the failed checks."""
-    from capsule_id.report.texts.messages import messages_of, title_of
-
-    messages = messages_of(kinds)
-    return sorted({title_of(finding.code, messages) for finding in result.findings if finding.level == "fail"})
-
-
 def fit_one(
     rig: Rig,
     options: Options,
@@ -143,14 +135,14 @@ def fit_one(
 
         def show_point(first: "Fit") -> None:
             write_report(first, partial)
-            table = table_text(first.summary, synthetic=rig.synthetic)
-            progress.note(f"point fit, before the sample; report: {partial / 'report.html'}\n{table}")
+            table = [table_text(first.summary, synthetic=rig.synthetic), *wrapped(first.changes_of_model)]
+            progress.note("\n".join([f"point fit, before the sample; report: {partial / 'report.html'}", *table]))
 
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
         result = write_fit(rig, options, partial, kinds, progress, preliminary)
         publish(partial, directory)
-    report, failed = directory / "report.html", failed_checks(result, kinds)
+    report, failed = directory / "report.html", result.failed
     if as_json:
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
     else:

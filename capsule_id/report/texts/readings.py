@@ -20,6 +20,11 @@ def _repeated(facts: Facts) -> str:
     later, earlier = f"lines {line} to {last} repeat lines", f"{first} to {end}"
     if line == last:
         later, earlier = f"line {line} repeats line", f"{first}"
+    if (facts["file"], line, last) == (facts["first"], first, end):
+        return (
+            f"{facts['file']}:{line}: each reading must stand once; two experiments use {later.partition(' repeat')[0]}. Let "
+            "their where select different rows (both ends of a range count), or remove one experiment."
+        )
     return (
         f"{facts['file']}:{line}: each reading must stand once; {later} {earlier} of {facts['first']}. "
         f"Delete the repeated {'row' if line == last else 'rows'}."
