@@ -6,6 +6,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from capsule_id.experiments.motor_current.experiment import MotorCurrent
+from capsule_id.experiments.support_spring.experiment import SupportSpring
+from capsule_id.inference.checks.regression import outliers
 
 K, CURRENT_SD, FORCE_SD = 2.0, 0.15, 0.1
 CURRENTS = np.linspace(0.0, 2.0, 40)
@@ -63,3 +65,14 @@ def test_deming_regression_by_hand() -> None:
     found = minimize_scalar(objective, bounds=(1.0, 3.0), method="bounded", options={"xatol": 1e-9})
     # The intercept's prior is wide, not flat: it moves the slope by about (noise / prior width)^2.
     assert found.x == pytest.approx(deming, rel=1e-5)
+
+
+@pytest.mark.parametrize(("reading", "struck"), [(0.15, False), (0.30, True)])
+def test_readings_within_their_digit_step_are_no_outliers(reading: float, struck: bool) -> None:
+    """Nine readings on one line and one a step beside it (before: 2.5e150 sds off). Negative control: 15 steps."""
+    x = 0.05 * np.arange(1.0, 11.0)
+    force = np.append(reading, np.round(3.0 * x[1:] - 0.01, 2))
+    columns = [bench.column("deflection", x), bench.column("force", force)]
+    line = SupportSpring(table := bench.table("support_spring", columns, spring="soft"), bench.rig(table))
+    theta = {"k2": line.ordinary_line()[0], "scatter": 1e-6}
+    assert bool(outliers(line, theta, 0.01)) == struck

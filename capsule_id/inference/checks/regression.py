@@ -59,10 +59,11 @@ def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> lis
     noise is known. Otherwise it follows Student's t with n - p - 1 degrees of freedom, the reading left out.
     """
     r, columns = design(experiment, theta)
+    known = None if experiment.scale_known else _known_share(experiment, theta)
     keep = np.arange(len(r))
     found: list[Outlier] = []
     while len(found) < MOST_FLAGGED and len(keep) > (basis := _basis(columns[keep])).shape[1] + 2:
-        score, freedom = _studentised(r[keep], basis, experiment.scale_known)
+        score, freedom = _studentised(r[keep], basis, None if known is None else known[keep])
         worst = int(np.argmax(np.abs(score)))
         tail = stats.norm.sf(abs(score[worst])) if freedom is None else stats.t.sf(abs(score[worst]), freedom)
         p = min(1.0, 2.0 * float(tail) * len(keep))
@@ -82,12 +83,21 @@ def _basis(columns: np.ndarray) -> np.ndarray:
     return u[:, size > DEPENDENT * np.max(size, initial=0.0)]
 
 
-def _studentised(r: np.ndarray, q: np.ndarray, known: bool) -> tuple[np.ndarray, int | None]:
-    """Studentised residuals about the local fit with the orthonormal columns q, and degrees of freedom (None: normal)."""
+def _known_share(experiment: Experiment, theta: ValuesBySymbol) -> np.ndarray:
+    """(n,) variance of the stated errors, or of the step of the digits, in units of the noise of each reading."""
+    parts = [np.broadcast_to(one.fixed_variance, one.raw.shape) for one in experiment.misfits(theta, np)]
+    return np.concatenate(parts) / experiment.misfit(theta).sd ** 2
+
+
+def _studentised(r: np.ndarray, q: np.ndarray, known: np.ndarray | None) -> tuple[np.ndarray, int | None]:
+    """Studentised residuals about the local fit with the orthonormal columns q, and degrees of freedom (None: normal).
+
+    The scale of the noise is estimated where ``known`` (n,) is stated, and no less than it; else it is 1.
+    """
     rest = r - q @ (q.T @ r)
     free = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-9)
-    if known:
+    if known is None:
         return rest / np.sqrt(free), None
     freedom = len(r) - q.shape[1] - 1
-    variance = np.maximum((rest @ rest - rest**2 / free) / freedom, 1e-300)
+    variance = np.maximum((rest @ rest - rest**2 / free) / freedom, np.maximum(known, 1e-300))
     return rest / np.sqrt(variance * free), freedom

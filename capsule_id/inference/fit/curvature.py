@@ -5,11 +5,12 @@ compilation. Central differences with Richardson extrapolation agree with that H
 Their steps are fractions of a posterior standard deviation.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from capsule_id.errors import InputError
 from capsule_id.physics.batches import pool
 
 #: d coordinates, and a matrix of them.
@@ -21,6 +22,8 @@ STEP, RATIO = 0.05, 2.0
 #: Step of the gradient's central differences, in standard deviations. Its error is 1e-7 where the curvature changes
 #: by half over one standard deviation.
 GRADIENT_STEP = 1e-3
+#: Smallest sd of a parameter that can be sampled, in units in the last place of its value.
+FEWEST_UNITS = 1e3
 #: Rows of every batch. A fixed number needs one compilation only.
 BATCH = 32
 
@@ -90,3 +93,23 @@ def jacobian(function: Callable[[np.ndarray], np.ndarray], u: Vector, step: Vect
         offset[j] = h
         columns.append((function(u + offset) - function(u - offset)) / (2.0 * h))
     return np.stack(columns, axis=1)
+
+
+def require_width(names: Sequence[str], u: Vector, covariance: Matrix) -> None:
+    """Refuse a posterior that is narrower than the digits of its parameters: it cannot be sampled.
+
+    Raises
+    ------
+    InputError
+        With the parameter that is known best.
+    """
+    units = np.sqrt(np.diag(covariance)) / np.spacing(np.abs(u))
+    if not len(units) or np.min(units) > FEWEST_UNITS:
+        return
+    best = int(np.argmin(units))
+    raise InputError(
+        "readings must leave parameters uncertain by more than the rounding of numbers",
+        f"{names[best]} with an sd of {units[best]:.1g} units in its last place",
+        "the model follows the noise too: state simpler drift and noise in rig.toml, or leave out channels that were "
+        "computed from each other; --no-sample shows the point fit",
+    )

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.families.friction_model import EQUATION_1
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
-from capsule_id.inference.fit.curvature import BATCH, in_batches
+from capsule_id.inference.fit.curvature import BATCH, in_batches, require_width
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.compiling import COMPILE
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -89,16 +89,14 @@ class MarginalPosterior:
         self._label = np.array(self._layout.block)
         self.dimension = len(self._located)
         self.centre, self.covariance = fit.u[self._located], fit.covariance[np.ix_(self._located, self._located)]
+        require_width([self.names[i] for i in self._located], self.centre, self.covariance)
         priors = target.priors.at(self._located, np)
         self.normal_priors = np.where(priors.lognormal, np.stack([priors.centre, priors.width]), np.nan)
         own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
         self.blocks = [block for block in own if len(block)]
         self.scaled = [
-            Scale(
-                int(np.searchsorted(self._located, one.scatter)),
-                *(np.searchsorted(self._located, own) for own in one[1:]),
-            )
-            for one in target.scaled
+            Scale(int(scatter), *others)
+            for scatter, *others in ([np.searchsorted(self._located, i) for i in one] for one in target.scaled)
         ]
         # A scatter whose block has no located parameter depends on nothing: it is drawn with the first block.
         own_block = np.where(self._label[self._scatter] < len(self.blocks), self._label[self._scatter], 0)

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.inference.fit.curvature import BATCH, hessian, in_batches, jacobian, root_of_inverse
+from capsule_id.errors import InputError
+from capsule_id.inference.fit.curvature import BATCH, hessian, in_batches, jacobian, require_width, root_of_inverse
 from capsule_id.precision import require_float64
 
 require_float64()
@@ -87,3 +88,15 @@ def test_batches_have_one_shape() -> None:
     points = np.arange(3.0 * 70).reshape(70, 3)
     np.testing.assert_array_equal(in_batches(function, points), np.sum(points, axis=1))
     assert shapes == [BATCH] * 3
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_a_posterior_narrower_than_digits_is_refused(size: float) -> None:
+    """Three channels computed from one another left an internal failure: Matrix is not positive definite."""
+    u = np.array([size, -2.0])
+    require_width(["a", "b"], u, np.diag([(1e-10 * size) ** 2, 1.0]))
+    with pytest.raises(InputError, match="more than the rounding of numbers") as caught:
+        require_width(["a", "b"], u, np.diag([(1e-14 * size) ** 2, 1.0]))
+    assert caught.value.value.startswith("a with")
+    assert "--no-sample" in caught.value.remedy
+    require_width([], np.empty(0), np.empty((0, 0)))
