@@ -4,8 +4,11 @@ Headers are found in the lines above the numbers that have as many cells as the 
 comments; above the numbers they may hold the headers.
 """
 
+import csv
 import math
 import re
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,14 +124,24 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
 def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:
     """The headers in a line above the numbers; () if it holds none."""
     bare = line.lstrip(BLANKS).lstrip("".join(COMMENTS))
-    cells = _split(bare, delimiter)
-    if delimiter is None and len(cells) != width:  # headers of several words, two spaces or more between them
-        cells = re.split(r"\s{2,}", bare.strip())
-    if len(cells) == width + 1 and not cells[-1]:
-        cells.pop()
-    if len(cells) != width or not any(cells) or any(_is_number(cell) for cell in cells):
-        return ()
-    return tuple(" ".join(cell.split()) for cell in cells)
+    for cells in _header_cells(bare, delimiter):
+        if len(cells) == width + 1 and not cells[-1]:
+            cells.pop()
+        if len(cells) == width and any(cells) and not any(_is_number(cell) for cell in cells):
+            return tuple(" ".join(cell.split()) for cell in cells)
+    return ()
+
+
+def _header_cells(line: str, delimiter: str | None) -> Iterator[list[str]]:
+    """Ways to split a line of headers: as the readings, else with quotation marks, or with another separator."""
+    yield _split(line, delimiter)
+    if delimiter is None:  # headers of several words, two spaces or more between them
+        yield re.split(r"\s{2,}", line.strip())
+    for mark in (delimiter, "\t", ";", ","):
+        if mark is not None and mark in line and (mark == delimiter or delimiter is None or delimiter not in line):
+            with suppress(csv.Error):
+                (cells,) = csv.reader([line], delimiter=mark, skipinitialspace=True)
+                yield [bare(cell) for cell in cells]
 
 
 def _split(line: str, delimiter: str | None) -> list[str]:

@@ -1,0 +1,118 @@
+"""The import assistant on headers of angles, headers in quotation marks, and records in time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capsule_id
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("Time (s),Angle (deg)", 'x_rel = { from = "Angle (deg)", unit = "m", scale = 0.01745329252 }  # unsure: '),
+        (
+            "Time (s),Angle",
+            'x_rel = { from = "Angle", unit = "m", scale = 0.01745329252 }  # unsure: an angle without unit',
+        ),
+        ("Zeit t / s,Weg b_A1 / rad", 'x_rel = { from = "Weg b_A1 / rad", unit = "m", scale = 1 }  # unsure: '),
+        (
+            "t [s],speed [deg/s]",
+            'velocity = { from = "speed [deg/s]", unit = "m/s", scale = 0.01745329252 }  # unsure: ',
+        ),
+        ("Temps (s),D\u00e9placement (mm)", 'x_rel = { from = "D\u00e9placement (mm)", unit = "mm" }  # sure: '),
+    ],
+)
+def test_a_record_of_an_angle_is_no_table_of_tilts(tmp_path: Path, header: str, line: str) -> None:
+    time = np.arange(0.0, 10.0, 0.01)
+    x = 20.0 * np.exp(-0.3 * time) * np.cos(5.0 * time)
+    rows = "".join(f"{t:.2f},{value:.5f}\n" for t, value in zip(time, x, strict=True))
+    (tmp_path / "swing.csv").write_text(f"{header}\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "swing.csv")
+    # Of a velocity there are free decays only, whether it decays or not.
+    assert f'kind = "free_vibration"  # {"unsure" if "speed" in header else "sure"}' in entry
+    assert line in entry
+    masses = '[rig]\nname = "a"\nm1 = { value = 0.02, unit = "kg" }\n\n'
+    (tmp_path / "rig.toml").write_text(masses + entry, encoding="utf-8")
+    (table,) = capsule_id.read_rig(tmp_path).tables
+    factor = 1e-3 if "mm" in header else 1.0 if "rad" in header else np.radians(1.0)
+    (name,) = set(table.columns) - {"time"}
+    assert np.allclose(table[name], factor * x, rtol=1e-4, atol=1e-5)
+
+
+def test_a_record_in_time_is_never_surely_a_table_of_trials(tmp_path: Path) -> None:
+    """A pull recorded in time is no list of pulls; the same column without times may be one."""
+    force = 3.0 + np.sin(np.arange(100.0))
+    for name, rows, sure in (("record", 100, False), ("table", 100, True)):
+        header = "Time (s),Pull (N)\n" if name == "record" else "Pull (N),Normal (N)\n"
+        first = [f"{0.1 * k:.1f},{force[k]:.3f}" if name == "record" else f"{force[k]:.3f},9.81" for k in range(rows)]
+        (tmp_path / f"{name}.csv").write_text(header + "\n".join(first) + "\n", encoding="utf-8")
+        entry = capsule_id.propose_entry(tmp_path / f"{name}.csv")
+        (kind,) = (line for line in entry.split("\n") if line.startswith("kind = "))
+        assert ("the file is a record in time" in kind) == (not sure)
+        assert ("# unsure" in kind) or sure
+
+
+@pytest.mark.parametrize(
+    ("header", "lines"),
+    [
+        ("Time (s),Displacement (mm),Motor speed (rpm)", ("forced_run", 'x_rel = { from = "Displacement (mm)"')),
+        (
+            "Time (s),Angle (deg),Position (mm)",
+            ("forced_run", 'x_rel = { from = "Position (mm)", unit = "mm" }  # sure'),
+        ),
+        (
+            "Time (s),Position (mm),Angle (deg)",
+            ("forced_run", 'x_rel = { from = "Position (mm)", unit = "mm" }  # sure'),
+        ),
+        ("t (s),\u03c3x (mm),x (mm)", ("forced_run", 'x_rel = { from = "x (mm)", unit = "mm" }  # sure')),
+        (
+            "Time (s),Speed (rpm),Angle (deg)",
+            ("forced_run", 'x_rel = { from = "Angle (deg)", unit = "m", scale = 0.017'),
+        ),
+    ],
+)
+def test_an_angle_beside_a_displacement_is_not_taken(tmp_path: Path, header: str, lines: tuple[str, str]) -> None:
+    """Nor the uncertainty of a column for the column, as where letters outside ASCII are dropped."""
+    time = np.arange(0.0, 10.0, 0.01)
+    rows = "".join(f"{t:.2f},{3.0 * np.sin(12.0 * t):.5f},{np.cos(12.0 * t + 0.1):.5f}\n" for t in time)
+    (tmp_path / "run.csv").write_text(f"{header}\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "run.csv")
+    assert f'kind = "{lines[0]}"' in entry
+    assert lines[1] in entry
+    assert "velocity" not in entry
+
+
+@pytest.mark.parametrize("pause", [0.1, 3.0])
+def test_few_rows_or_a_pause_make_no_table_of_trials(tmp_path: Path, pause: float) -> None:
+    time = np.append(0.1 * np.arange(20), 2.0 + pause + 0.1 * np.arange(20))
+    rows = "".join(f"{t:.2f},{3.0 + np.sin(t):.4f}\n" for t in time)
+    (tmp_path / "pull.csv").write_text(f"Time (s),Pull (N)\n{rows}", encoding="utf-8")
+    assert "the file is a record in time" in capsule_id.propose_entry(tmp_path / "pull.csv")
+
+
+@pytest.mark.parametrize(
+    ("header", "between"),
+    [
+        ('"Time (s)","Displacement, laser (mm)"', ","),  # as spreadsheets write a header that holds the separator
+        ('"Time (s)";"Displacement; laser (mm)"', ";"),
+        ("Time (s),Displacement laser (mm)", "\t"),  # headers with another separator than the rows
+        ("Time (s);Displacement laser (mm)", "\t"),
+        ("# Time (s), Displacement laser (mm)", " "),
+    ],
+)
+def test_quoted_headers_and_headers_with_another_separator_are_kept(tmp_path: Path, header: str, between: str) -> None:
+    """Before, "column 1 without name [unit unknown]"."""
+    time = np.arange(0.0, 10.0, 0.01)
+    x = 2.0 * np.exp(-0.4 * time) * np.cos(6.0 * time)
+    rows = "".join(f"{t:.2f}{between}{value:.5f}\n" for t, value in zip(time, x, strict=True))
+    (tmp_path / "swing.csv").write_text(f"{header}\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "swing.csv")
+    (tmp_path / "rig.toml").write_text(
+        '[rig]\nname = "a"\nm1 = { value = 110, unit = "g" }\n\n' + entry, encoding="utf-8"
+    )
+    (table,) = capsule_id.read_rig(tmp_path).tables
+    np.testing.assert_allclose(table["time"], time, atol=1e-9)
+    np.testing.assert_allclose(table["x_rel"], 1e-3 * x, atol=1e-8)
+    assert 'unit = "mm" }  # sure' in entry
