@@ -8,8 +8,8 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
 from capsule_id.importing.entry import dimensions_of, entry_of
-from capsule_id.importing.guess import TIME, guess
-from capsule_id.importing.headers import name_and_unit, unit_of
+from capsule_id.importing.guess import ANGULAR, TIME, guess
+from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
 from capsule_id.importing.layout import FoundLayout, find_layout
 from capsule_id.records.clocks import estimate_clock
 from capsule_id.records.faults.clipping import clipped_samples
@@ -106,7 +106,9 @@ def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record
     values = found.columns[index]
     missing, values = int(np.sum(np.isnan(values))), values[np.isfinite(values)]
     name, text = name_and_unit(found.names[index], dimensions)
-    unit = unit_of(text or found.units[index], dimensions) or "unit unknown"
+    # A lone g is a mass, unless the header says acceleration.
+    masses = () if fits_name(name, "acceleration") else ("kg",)
+    unit = unit_of(text or found.units[index], (*masses, *dimensions, *ANGULAR.values())) or "unit unknown"
     step = reading_step(values)
     line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"
     line += f", reading step {step:.3g}" if step else ""

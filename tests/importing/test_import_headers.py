@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import capsule_id
+from capsule_id import cli
 
 
 @pytest.mark.parametrize(
@@ -116,3 +117,15 @@ def test_quoted_headers_and_headers_with_another_separator_are_kept(tmp_path: Pa
     np.testing.assert_allclose(table["time"], time, atol=1e-9)
     np.testing.assert_allclose(table["x_rel"], 1e-3 * x, atol=1e-8)
     assert 'unit = "mm" }  # sure' in entry
+
+
+def test_units_of_columns_that_no_kind_has_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before: a mass in g was standard gravity, and rad/s unknown."""
+    rows = "".join(f"{k},{2 * k + 1},{k * k},{0.1 * k:.1f}\n" for k in range(1, 12))
+    (tmp_path / "t.csv").write_text(
+        f"Mass (g),Gyroscope x (rad/s),Acceleration (g),Tilt (deg)\n{rows}", encoding="utf-8"
+    )
+    assert cli.capsule_id(["import", str(tmp_path / "t.csv")]) == 0
+    out = capsys.readouterr().out
+    for part in ("Mass [g]: 1 to 11", "Gyroscope x [rad/s]", "Acceleration [g_n]", "Tilt [deg]"):
+        assert part in out, part

@@ -274,7 +274,8 @@ MESSAGES = {
         ok="{label}: the fitted drift of the zero is slower than the motion ({share:.1%} of it at its frequency)",
         fail=(
             "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at "
-            "its frequency. It hides an error of the model. State a later start, for smaller amplitudes."
+            "its frequency. It hides an error of the model. State a later start, for smaller amplitudes. Where dry friction "
+            "ends the motion, state an earlier stop instead."
         ),
     ),
     "decays.hidden": Message(
