@@ -60,6 +60,7 @@ class Gaussian:
         self.covariance = self.WIDE**2 * sigma
         self.normal_priors = np.full((2, len(mean)), np.nan)
         self.scaled = list[Scale]()
+        self.event_driven = [True] * len(self.blocks)
 
     def parts(self, v: np.ndarray) -> np.ndarray:
         """(w, d) -> (w, blocks)."""

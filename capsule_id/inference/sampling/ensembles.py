@@ -45,8 +45,8 @@ DEFAULT_ESS = 4000.0
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks.
 FIRST_CHECK, CHECK_EVERY = 60, 20
-#: Parameters of the smallest large block: a forced run correlates all its parameters and determines them well, so that
-#: the Laplace approximation is tried as it is.
+#: Parameters of the smallest large block among those with a motion of the capsule: a forced run correlates all its
+#: parameters and determines them well, so that the Laplace approximation is tried as it is.
 LARGE = 9
 #: Rounds of adaptation that begin with a proposal adapted to a similar density.
 NEAR = 2
@@ -97,6 +97,7 @@ class Target(Protocol):
     covariance: np.ndarray
     normal_priors: np.ndarray
     scaled: list[Scale]
+    event_driven: list[bool]
 
     @property
     def can_be_emulated(self) -> bool: ...
@@ -236,8 +237,12 @@ def adapted_proposal(
 
 
 def laplace_proposal(target: Target) -> tuple[BlockProposal, list[bool]]:
-    """The Laplace approximation as a proposal, and for each block whether it is large."""
-    large = [len(block) >= LARGE for block in target.blocks]
+    """The Laplace approximation as a proposal, and for each block whether it is large.
+
+    A bench test is not: terms of a decay that may be absent need components that draw them from their priors.
+    """
+    pairs = zip(target.blocks, target.event_driven, strict=True)
+    large = [len(block) >= LARGE and event_driven for block, event_driven in pairs]
     narrow = np.isin(np.arange(target.dimension), np.concatenate([[], *compress(target.blocks, large)]))
     laplace = np.where(np.outer(narrow, narrow), target.covariance, OVERDISPERSION**2 * target.covariance)
     return block_proposal(target.blocks, target.centre, laplace, large), large

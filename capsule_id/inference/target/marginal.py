@@ -78,6 +78,7 @@ class MarginalPosterior:
     dimension : number of located parameters
     blocks : indices, among the located parameters, of each factor of the posterior
     centre, covariance : (dimension,), (dimension, dimension) Laplace approximation of u
+    event_driven : for each block whether a motion of the capsule belongs to it
     normal_priors : (2, dimension) centre and width of the prior of u where it is normal; NaN elsewhere
     scaled : ``LogPosterior.scaled``, indices among the located parameters
     kept : (2, scatters) block of each scatter and its place among the scatters of that block, see ``factors``
@@ -89,15 +90,15 @@ class MarginalPosterior:
         self._label = np.array(self._layout.block)
         self.dimension = len(self._located)
         self.centre, self.covariance = fit.u[self._located], fit.covariance[np.ix_(self._located, self._located)]
-        require_width([self.names[i] for i in self._located], self.centre, self.covariance)
+        require_width(located := [self.names[i] for i in self._located], self.centre, self.covariance)
         priors = target.priors.at(self._located, np)
         self.normal_priors = np.where(priors.lognormal, np.stack([priors.centre, priors.width]), np.nan)
-        own = [np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks)]
+        own = (np.flatnonzero(self._label[self._located] == i) for i in range(self._layout.blocks))
         self.blocks = [block for block in own if len(block)]
-        self.scaled = [
-            Scale(int(scatter), *others)
-            for scatter, *others in ([np.searchsorted(self._located, i) for i in one] for one in target.scaled)
-        ]
+        moved = [row.name for e in target.experiments if e.event_driven for row in e.parameters]
+        self.event_driven = [bool({located[i] for i in block} & set(moved)) for block in self.blocks]
+        at = partial(np.searchsorted, self._located)
+        self.scaled = [Scale(int(at(scatter)), at(own), at(other)) for scatter, own, other in target.scaled]
         # A scatter whose block has no located parameter depends on nothing: it is drawn with the first block.
         own_block = np.where(self._label[self._scatter] < len(self.blocks), self._label[self._scatter], 0)
         before = np.tril(own_block[:, None] == own_block, -1)

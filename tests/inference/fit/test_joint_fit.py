@@ -34,8 +34,10 @@ from capsule_id.inference.fit.joint_fit import (
 from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
 from capsule_id.inference.fit.least_squares import Solver, least_squares, linearised
 from capsule_id.inference.result import PointFit
+from capsule_id.inference.sampling.ensembles import laplace_proposal
 from capsule_id.inference.tables.run_notes import smoothing_shift
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
+from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity
@@ -262,3 +264,14 @@ def test_searches_side_by_side_keep_their_order(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(module, "_search", search)
     again = joint_fit(target, {}, 0, starts=starts)
     assert (again.log_posterior[0] - again.log_posterior).tolist() == pytest.approx([0.0, 1.0, 2.0])
+
+
+def test_only_blocks_with_a_motion_are_large() -> None:
+    """The bench alone keeps components that draw terms that may be absent from their priors, however many it has."""
+    target, fit = fitted()
+    alone = LogPosterior(target.rig, [e for e in target.experiments if not e.event_driven])
+    own = [target.names.index(name) for name in alone.names]
+    at = replace(fit, names=alone.names, u=fit.u[own], covariance=fit.covariance[np.ix_(own, own)])
+    for density, large in ((MarginalPosterior(target, fit), True), (MarginalPosterior(alone, at), False)):
+        assert any(density.event_driven) == large
+        assert any(laplace_proposal(density)[1]) == large
