@@ -75,7 +75,7 @@ class Fit(Result):
         return "\n".join([table, *wrapped(self.changes_of_model), verdict_text(self.trust, self.failed)])
 
     def _repr_html_(self) -> str:
-        return summary_html(self)
+        return summary_html(self, self.failed, self.changes_of_model)
 
     def to_dataframe(self) -> pd.DataFrame:
         """The content of parameters.csv: a row per parameter, noise levels included (``role``), SI."""

@@ -79,7 +79,9 @@ def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     if not any(TIME in candidate.kind.columns for candidate in candidates):
         by_angle = _by_angle(found, kinds)
         if by_angle is not None:
-            return by_angle
+            used = {column.index for column in by_angle.columns.values()}
+            beside = [one for one in candidates if not used >= {column.index for column in one.columns.values()}]
+            return replace(by_angle, confidence="unsure") if beside else by_angle
     if not candidates:
         return _without_names(found, kinds)
     best = max(candidate.score for candidate in candidates)

@@ -5,7 +5,6 @@ import math
 import numbers
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -21,9 +20,6 @@ from capsule_id.report.texts.messages import caption_of, finding_text, messages_
 from capsule_id.report.texts.terms import OF_A_SAMPLE, TERMS
 from capsule_id.report.typography import MISSING, fixed, symbol_parts
 from capsule_id.views import Finding, Level, Message, ResultTable, counted
-
-if TYPE_CHECKING:
-    from capsule_id.fitted import Fit
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")
@@ -115,14 +111,19 @@ def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, 
     return entries
 
 
-def summary_html(result: "Fit") -> str:
-    """Verdict, changes of the model and parameter table, for a notebook."""
-    verdict = verdict_text(result.trust, result.failed)
+def summary_html(result: Result, failed: Sequence[str], changes: Sequence[str]) -> str:
+    """Verdict, changes of the model and parameter table, for a notebook.
+
+    Parameters
+    ----------
+    failed, changes : titles of the failed checks; texts of the findings that change the model
+    """
+    verdict = verdict_text(result.trust, failed)
     table = _parameters(result.summary, "console")
     return (
         _environment()
         .get_template("summary.html.j2")
-        .render(result=result, verdict=verdict, table=table, missing=MISSING)
+        .render(result=result, changes=changes, verdict=verdict, table=table, missing=MISSING)
     )
 
 

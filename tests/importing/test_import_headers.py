@@ -129,3 +129,10 @@ def test_units_of_columns_that_no_kind_has_are_shown(tmp_path: Path, capsys: pyt
     out = capsys.readouterr().out
     for part in ("Mass [g]: 1 to 11", "Gyroscope x [rad/s]", "Acceleration [g_n]", "Tilt [deg]"):
         assert part in out, part
+
+
+def test_a_record_of_a_force_and_an_angle_is_not_surely_a_decay(tmp_path: Path) -> None:
+    time = np.arange(0.0, 10.0, 0.01)
+    rows = "".join(f"{t:.2f},{3.0 + np.sin(t):.4f},{8.0 * np.exp(-t) * np.cos(9.0 * t):.4f}\n" for t in time)
+    (tmp_path / "pull.csv").write_text(f"Time (s),Pull (N),Angle (deg)\n{rows}", encoding="utf-8")
+    assert 'kind = "free_vibration"  # unsure' in capsule_id.propose_entry(tmp_path / "pull.csv")

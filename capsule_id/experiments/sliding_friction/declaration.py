@@ -79,7 +79,7 @@ TEMPLATE = """\
 # direction = "forward"                               # "backward": it slid away from the support spring
 # slope = { value = 0, unit = "deg" }                   # this one alone; default: [rig]
 # N0 = { value = 0, unit = "N" }
-# load_is = "weight"                                    # a stated normal force on a slope; or "pressed"
+#: On a slope a stated normal force needs load_is = "weight", or "pressed" for a force without weight.
 """
 
 KIND = Kind(

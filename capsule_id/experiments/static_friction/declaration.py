@@ -113,7 +113,7 @@ TEMPLATE = """\
 # angle_resolution = { value = 0.1, unit = "deg" }
 # direction = "forward"                               # "backward": it slips away from the support spring
 # slope = { value = 0, unit = "deg" }                   # of pulls, and N0; default: those of [rig]
-# load_is = "weight"                                    # a stated normal force on a slope; or "pressed"
+#: On a slope a stated normal force needs load_is = "weight", or "pressed" for a force without weight.
 # N0 = { value = 0, unit = "N" }
 """
 
