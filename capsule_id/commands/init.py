@@ -23,7 +23,7 @@ HEAD = """\
 #:   columns = { time = { from = "Time (s)", unit = "s" }, x_rel = { from = 3, unit = "mm", scale = -1, offset = 0.2 } }
 #:   from is a header, or a number counted from 1; the result is (from - minus) * scale + offset, in unit.
 #:   Without a time column: time = { rate = { value = 1000, unit = "Hz" } }. Further keys, where needed:
-#:   files = ["a.csv", "b.csv"] instead of file; data_from_line = 3
+#:   files = ["a.csv", "b.csv"] instead of file; data_from_line = 3; data_to_line = 90
 #:   decimal = ","; missing = ["--", "NaN"]; where = { tau = 30 }.
 #: Every experiment has three optional keys: label = "..." is its unique name (default: the file without suffix);
 #: <column>_sd states a reading error; <column>_resolution states a reading step.

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,7 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
             "# [[experiment]]",
             '# kind = "..."',
             f"# file = {json.dumps(file)}",
+            *(f"# {line}" for line in _layout_lines(found, replace(found.layout, missing=()))),
             '# columns = { ... = { from = 1, unit = "..." } }',
         ]
         return "\n".join(lines) + "\n", None
@@ -138,8 +140,17 @@ def _layout_lines(found: FoundLayout, used: Any) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
     if used.data_from_line is not None:
         yield _commented(f"data_from_line = {used.data_from_line}", "sure", "the first row of readings")
+    if used.data_to_line is not None:
+        reason = "the last row of readings"
+        if len(found.blocks) > 1:
+            blocks = ", ".join(f"{first} to {last}" for first, last in found.blocks)
+            reason = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
+        yield _commented(f"data_to_line = {used.data_to_line}", "likely", reason)
     if used.decimal is not None:
-        yield _commented(f'decimal = "{used.decimal}"', "likely", "one column with a comma in every number")
+        reason = "one column with a comma in every number"
+        if used.decimal == ".":
+            reason = "the header has a name for every number between commas"
+        yield _commented(f'decimal = "{used.decimal}"', "likely", reason)
     if used.missing:
         texts = json.dumps(list(used.missing), ensure_ascii=False)
         yield _commented(f"missing = {texts}", "likely", "texts of cells without a reading; their rows are not used")

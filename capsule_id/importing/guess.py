@@ -21,6 +21,8 @@ TIME = "time"
 FEWEST_SAMPLES = 50
 #: Score of a unit that fits a column, of a column that is left out, and the smallest lead of a kind that is sure.
 UNIT_SCORE, LEFT_OUT, LEAD = 1.0, -0.25, 1.0
+#: Weight of the range of a column, relative to the largest one, which decides between equal scores only.
+TIE = 1e-3
 #: A record whose last fifth has less than this fraction of the amplitude of its largest part decays; above the second
 #: fraction it is driven.
 DECAYS, DRIVEN = 0.5, 0.8
@@ -117,12 +119,18 @@ def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
         wanted = [*columns, *kind.channels, *kind.optional]
         needed = set(columns) - {TIME}
         scores = np.full((len(wanted), len(found.columns)), -1e3)
+        ranges = np.zeros_like(scores)
         guesses = {}
         for (i, name), (j, index) in product(enumerate(wanted), enumerate(found.columns)):
             scored = _score(found, index, name, kind.columns[name].si, dimensions)
-            if scored is not None:
+            values = found.columns[index]
+            span = float(np.nanmax(values) - np.nanmin(values))
+            if scored is not None and (name not in kind.channels or span > 0.0):
                 scores[i, j], guesses[i, j] = scored
-        rows, places = linear_sum_assignment(scores, maximize=True)
+                ranges[i, j] = span * factor_to_si(scored[1].unit, kind.columns[name].si)
+        # Of columns that fit as well, such as the axes of an accelerometer, the one with the largest motion.
+        largest = np.maximum(np.max(ranges, axis=1, keepdims=True), np.finfo(float).tiny)
+        rows, places = linear_sum_assignment(scores + TIE * ranges / largest, maximize=True)
         pairs = [(i, j) for i, j in zip(rows, places, strict=True) if (i, j) in guesses]
         used = {j for _, j in pairs}
         chosen = {

@@ -1,8 +1,9 @@
 """Finds the layout of an export: the first row of readings, missing markers, headers, units, a stated sampling rate."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,10 @@ from capsule_id.errors import InputError
 from capsule_id.importing.headers import is_units_row
 from capsule_id.rig.formats import EXPORTS, suffix_of
 from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.text.any_layout import delimiter_of, is_number
 from capsule_id.rig.formats.text.blocks import COMPRESSED, TextFile
+from capsule_id.rig.formats.text.cells import bare, cells_of
+from capsule_id.rig.formats.text.rows import is_row
 
 #: Texts that loggers and spreadsheets write where a reading is missing.
 MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
@@ -19,6 +23,8 @@ MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null"
 MOST_MISSING = 0.5
 _BEGINNING = 100_000  # characters in which the first row of readings is searched
 _MOST_TITLES = 100  # lines
+#: Separator and number of cells of a line whose first cell is a number; None for any other line.
+Cells = tuple[str | None, int] | None
 _RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
 _RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate")
 
@@ -35,6 +41,8 @@ class FoundLayout:
     columns : index of a column of readings -> (rows,) numbers, NaN where missing
     unread : index of any other column -> the error at its first cell that is no number
     rate : sampling rate that the file states, Hz
+    blocks : first and last line of each block of readings, counted from 1, of a text with other lines between or below
+        them, of which ``export`` holds the longest; else ()
     """
 
     path: Path
@@ -45,6 +53,7 @@ class FoundLayout:
     columns: dict[int, np.ndarray]
     unread: dict[int, InputError]
     rate: float | None
+    blocks: tuple[tuple[int, int], ...] = ()
 
 
 def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundLayout:
@@ -66,16 +75,60 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
         known = " ".join(EXPORTS)
         raise InputError(f"a file must have a known format ({known})", path.name, "export it as CSV", path)
     text = suffix.removesuffix(COMPRESSED) in (".csv", ".txt", ".tsv", ".dat")
-    beginning = b""
-    if text:
-        beginning = _beginning(TextFile(content, path))
-        layout = _text_layout(beginning, path.with_suffix("") if suffix.endswith(COMPRESSED) else path)
-    else:
-        layout = Layout(missing=MARKERS)
-    export = EXPORTS[suffix](content, path, layout)
+    beginning = _beginning(TextFile(content, path)) if text else b""
+    blocks: tuple[tuple[int, int], ...] = ()
+    layout = Layout(missing=MARKERS)
+    try:
+        if text:
+            layout = _text_layout(beginning, path.with_suffix("") if suffix.endswith(COMPRESSED) else path)
+        export = EXPORTS[suffix](content, path, layout)
+    except InputError:
+        blocks = _blocks(TextFile(content, path), layout) if text else ()
+        if not blocks:
+            raise
+        first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
+        layout = replace(layout, data_from_line=first, data_to_line=last)
+        export = EXPORTS[suffix](content, path, layout)
     columns, singles, unread = _readings(export)
     names, units = _headers(export, dimensions)
-    return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles))
+    return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
+
+
+def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
+    """First and last lines of the blocks of readings of a text.
+
+    () where a single line with numbers interrupts or ends them, which is a damaged row.
+    """
+    runs, longest = _runs(file.lines(), layout)
+    after_block = [run for before, run in pairwise(runs) if before[0] == longest]
+    if any(cells is not None and len(numbers) == 1 for cells, numbers in after_block):
+        return ()
+    return tuple((numbers[0], numbers[-1]) for cells, numbers in runs if longest is not None and cells == longest)
+
+
+def _skips_rows(beginning: bytes, layout: Layout, first: int) -> bool:
+    """Whether rows like those of the longest block lie above the line ``first``."""
+    runs, longest = _runs(beginning.decode().splitlines(), layout)
+    return any(numbers[0] < first for cells, numbers in runs if longest is not None and cells == longest)
+
+
+def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[int]]], Cells]:
+    """Runs of lines with equal cells, their numbers counted from 1, and the cells of the longest run of two rows or more.
+
+    Blank lines and comments are left out.
+    """
+    kept = ((number, line) for number, line in enumerate(lines, 1) if is_row(line))
+    rows = [(number, _cells_of_row(line, layout)) for number, line in kept]
+    runs = [(cells, [number for number, _ in run]) for cells, run in groupby(rows, lambda row: row[1])]
+    tables = [run for run in runs if run[0] is not None and len(run[1]) > 1]
+    return runs, max(tables, key=lambda run: len(run[1]))[0] if tables else None
+
+
+def _cells_of_row(line: str, layout: Layout) -> Cells:
+    """Separator and number of cells of a line whose first cell is a number; None for any other line."""
+    delimiter = delimiter_of(line, layout)
+    cells = cells_of(line, delimiter)
+    return (delimiter, len(cells)) if is_number(bare(cells[0][0])) else None
 
 
 def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
@@ -121,12 +174,14 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
     first: InputError | None = None
     lines = [None, *range(1, min(_MOST_TITLES, beginning.count(b"\n") + 1) + 1)]
     for line in lines:
-        for decimal in (None, ","):
-            layout = Layout(line, MARKERS, decimal)
+        for decimal in (None, ".", ","):
+            layout = Layout(line, missing=MARKERS, decimal=decimal)
             try:
                 export = read(beginning, path, layout)
             except InputError as error:
                 first = first or error
+                continue
+            if decimal == "." and not _names_columns(export):
                 continue
             columns, _, unread = _readings(export)
             if not columns and unread:
@@ -135,9 +190,19 @@ def _text_layout(beginning: bytes, path: Path) -> Layout:
                 rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
                 first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
             if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
+                if line is not None and _skips_rows(beginning, layout, line):
+                    break
                 return layout
     assert first is not None, "every layout was refused"
     raise first
+
+
+def _names_columns(export: Export) -> bool:
+    """Whether the header has a name for each of several columns: whole numbers between commas are then no decimals."""
+    names = export.headers[0] if export.headers else ()
+    return (
+        export.width > 1 and len(names) == export.width and all(name.strip() and not is_number(name) for name in names)
+    )
 
 
 def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]:

@@ -250,13 +250,6 @@ def test_a_column_with_a_cell_that_is_no_number_is_named(
         assert (part in capsys.readouterr().out) == named
 
 
-def test_a_second_table_in_a_file_is_named_by_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = "time [s],x_rel [mm]\n" + decay_rows()
-    (tmp_path / "two.csv").write_text(f"{text}\n{text}", encoding="utf-8")
-    assert cli.capsule_id(["import", str(tmp_path / "two.csv")]) == 2
-    assert "two.csv:403:1: a cell must be a number, 'time [s]'" in capsys.readouterr().err
-
-
 def test_a_decay_that_is_pushed_near_its_end_is_not_sure_to_be_driven(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

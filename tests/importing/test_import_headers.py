@@ -1,4 +1,4 @@
-"""The import assistant on headers of angles, headers in quotation marks, and records in time."""
+"""The import assistant on headers of angles, headers in quotation marks, records in time, and columns alike."""
 
 from pathlib import Path
 
@@ -136,3 +136,38 @@ def test_a_record_of_a_force_and_an_angle_is_not_surely_a_decay(tmp_path: Path) 
     rows = "".join(f"{t:.2f},{3.0 + np.sin(t):.4f},{8.0 * np.exp(-t) * np.cos(9.0 * t):.4f}\n" for t in time)
     (tmp_path / "pull.csv").write_text(f"Time (s),Pull (N),Angle (deg)\n{rows}", encoding="utf-8")
     assert 'kind = "free_vibration"  # unsure' in capsule_id.propose_entry(tmp_path / "pull.csv")
+
+
+def test_a_column_that_never_changes_is_no_motion(tmp_path: Path) -> None:
+    rows = "".join(f"{t:.2f},3.9,{0.4 + 0.01 * np.sin(t):.4f}\n" for t in np.arange(100) / 50.0)
+    (tmp_path / "slide.csv").write_text("T (s),X (mm),COF\n" + rows, encoding="utf-8")
+    assert "No kind fits its headers" in capsule_id.propose_entry(tmp_path / "slide.csv")
+
+
+@pytest.mark.parametrize("order", [("ax", "ay", "az"), ("az", "ay", "ax")])
+def test_of_several_axes_the_largest_motion_is_chosen(tmp_path: Path, order: tuple[str, ...]) -> None:
+    time = np.arange(300) / 100.0
+    size = {"ax": 0.2, "ay": 3.0, "az": 0.5}
+    rows = zip(time, *(size[axis] * np.exp(-time) * np.cos(30.0 * time) for axis in order), strict=True)
+    header = ",".join(f"acceleration {axis} (m/s^2)" for axis in order)
+    text = f"Time (s),{header}\n" + "".join(",".join(f"{x:.6f}" for x in row) + "\n" for row in rows)
+    (tmp_path / "phone.csv").write_text(text, encoding="utf-8")
+    proposed = capsule_id.propose_entry(tmp_path / "phone.csv")
+    assert 'acceleration = { from = "acceleration ay (m/s^2)"' in proposed
+    assert "fits as well" in proposed
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [("force [N],current [A]\n1,2\n2,4\n3,6\n4,8\n", 2), ("force [N]\n1,2\n2,4\n3,6\n4,8\n", 1)],
+    ids=["two names", "one name"],
+)
+def test_whole_numbers_below_two_names_are_two_columns(
+    tmp_path: Path, text: str, columns: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before: "1,2" was read as 1.2, below any header."""
+    (tmp_path / "motor.csv").write_text(text, encoding="utf-8")
+    assert cli.capsule_id(["import", str(tmp_path / "motor.csv")]) == 0
+    said = capsys.readouterr().out
+    assert f"4 rows of {columns} column" in said
+    assert ('decimal = "."' if columns == 2 else "1.2") in said

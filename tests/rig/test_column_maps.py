@@ -116,6 +116,7 @@ LAYOUTS = {
     "spaces and decimal commas": (rows("  ", ",", THREE), BY_NUMBER),
     "no header": (rows(",", ".", THREE), BY_NUMBER),
     "a comma and a space": ("t, T, x\n" + rows(", ", ".", THREE), BY_NAME),
+    "rows of separators alone": ("t;T;x\n;;\n" + rows(";", ".", THREE).replace("\n", "\n;;\n", 3) + ";;\n", BY_NAME),
     "a separator at the end": ("t;T;x;\n" + rows(";", ".", THREE).replace("\n", ";\n"), BY_NAME),
     "a header in a comment, comments between": (
         "# t T x\n" + rows(" ", ".", THREE).replace("\n", "\n# a\n\n", 3),
@@ -266,6 +267,14 @@ FAULTS = [
     (MAP, "‸missing = []", "needs a column map", MAP, f"missing = []\n{MAP}"),
     (MAP, "columns = ‸{}", "must have columns", f"write {MAP}", MAP),
     (MAP, f"{MAP}\ndata_from_line = ‸0", "counted from 1", "such as 2", f"{MAP}\ndata_from_line = 2"),
+    (MAP, f"{MAP}\ndata_to_line = ‸true", "counted from 1", "such as 2", f"{MAP}\ndata_to_line = 13"),
+    (
+        MAP,
+        f"{MAP}\ndata_from_line = 9\ndata_to_line = ‸2",
+        "must not be above",
+        "exchange",
+        f"{MAP}\ndata_to_line = 13",
+    ),
     (MAP, f"{MAP}\nmissing = ‸3", "list of texts", 'write missing = ["--", "NaN"]', f'{MAP}\nmissing = ["--", "NaN"]'),
     ('file = "t.csv"', 'file = "t.csv"\n‸files = ["t.csv"]', "file or files", "remove file", 'files = ["t.csv"]'),
     ('file = "t.csv"', 'files = ["t.csv", ‸"t.csv"]', "named once", "remove the second", 'files = ["t.csv"]'),

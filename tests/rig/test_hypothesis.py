@@ -16,8 +16,8 @@ from capsule_id.rig.formats.export import Layout
 #: The same examples in every run.
 QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=80)
 KEYS = (
-    "columns", "data_from_line", "missing", "decimal", "where", "files", "reject", "clock", "plateaus", "label", "file",
-    "kind", "x_rel_sd", "start", "stop", "spring", "gap", "damping", "smoothing_window", "capsule",
+    "columns", "data_from_line", "data_to_line", "missing", "decimal", "where", "files", "reject", "clock", "plateaus", "label",
+    "file", "kind", "x_rel_sd", "start", "stop", "spring", "gap", "damping", "smoothing_window", "capsule",
 )  # fmt: skip
 WORDS = (
     "time", "x_rel", "from", "minus", "unit", "scale", "offset", "rate", "value", "sd", "s", "mm", "Hz", "hampel", "rule",
@@ -85,6 +85,7 @@ CELLS = st.sampled_from(
 LAYOUTS = st.builds(
     Layout,
     data_from_line=st.none() | st.integers(1, 6),
+    data_to_line=st.none() | st.integers(1, 9),
     missing=st.lists(st.sampled_from(["", "--", "NaN", "x"]), max_size=3, unique=True).map(tuple),
     decimal=st.sampled_from([None, ".", ","]),
 )

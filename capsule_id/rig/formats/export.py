@@ -13,7 +13,8 @@ class Layout:
 
     Attributes
     ----------
-    data_from_line : 1-based line of the first row of numbers (None: the first line that holds a number)
+    data_from_line, data_to_line : 1-based lines of the first and the last row of numbers (None: the first line that holds
+        a number, and the last line of the file)
     missing : texts of cells without a reading, such as ``--`` or ``NaN``
     decimal : decimal mark of a text table, "." or "," (None: found in the file)
     columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
@@ -21,6 +22,7 @@ class Layout:
     """
 
     data_from_line: int | None = None
+    data_to_line: int | None = None
     missing: tuple[str, ...] = ()
     decimal: str | None = None
     columns: tuple[str | int, ...] | None = None

@@ -21,7 +21,7 @@ from capsule_id.rig.toml_values import (
 )
 
 #: Keys of an experiment that go with ``columns``.
-MAP_KEYS = ("columns", "files", "data_from_line", "missing", "decimal", "where", "plateaus")
+MAP_KEYS = ("columns", "files", "data_from_line", "data_to_line", "missing", "decimal", "where", "plateaus")
 #: Largest finite number; whole numbers of TOML may be larger.
 LARGEST = sys.float_info.max
 _EXAMPLE = '{ from = "...", unit = "..." }'
@@ -93,7 +93,7 @@ def read_map(
     InputError
         At the key or value of ``rig.toml`` that is wrong.
     """
-    layout = Layout(_line(document, path, entry), _markers(document, path, entry), _decimal(document, path, entry))
+    layout = Layout(*_lines(document, path, entry), _markers(document, path, entry), _decimal(document, path, entry))
     if "columns" not in entry:
         for key in MAP_KEYS[1:]:
             if key in entry:
@@ -167,13 +167,20 @@ def _number(document: TomlDocument, path: KeyPath, value: object) -> float:
     return float(value)
 
 
-def _line(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> int | None:
-    """``data_from_line``, None where it is not stated."""
-    place, value = (*path, "data_from_line"), entry.get("data_from_line")
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-        rule = "data_from_line must be a line, counted from 1"
-        raise document.error(place, rule, shown(value), "write the line of the first reading, such as 2")
-    return value
+def _lines(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> tuple[int | None, int | None]:
+    """``data_from_line`` and ``data_to_line``, None where they are not stated."""
+    found = []
+    for key, which in (("data_from_line", "first"), ("data_to_line", "last")):
+        value = entry.get(key)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            rule = f"{key} must be a line, counted from 1"
+            raise document.error((*path, key), rule, shown(value), f"write the line of the {which} reading, such as 2")
+        found.append(value)
+    first, last = found
+    if first is not None and last is not None and last < first:
+        rule = f"data_to_line must not be above data_from_line = {first}"
+        raise document.error((*path, "data_to_line"), rule, str(last), "exchange them")
+    return first, last
 
 
 def _markers(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> tuple[str, ...]:

@@ -111,7 +111,11 @@ def test_a_package_that_is_not_installed_is_named(tmp_path: Path, name: str, mon
 
 
 def test_keys_of_text_files_are_refused_elsewhere(tmp_path: Path) -> None:
-    for line, key in (("data_from_line = 2", "data_from_line"), ('decimal = ","', "decimal")):
+    for line, key in (
+        ("data_from_line = 2", "data_from_line"),
+        ("data_to_line = 9", "data_to_line"),
+        ('decimal = ","', "decimal"),
+    ):
         (tmp_path / "run.mat").write_bytes(mat_5(COLUMNS))
         text = entry("run.mat", "time")
         (tmp_path / "rig.toml").write_text(f"{text}{line}\n", encoding="utf-8")

@@ -67,7 +67,10 @@ def outcome(text: str, suffix: str, layout: Layout | None) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("layout", [None, Layout(missing=("--", "")), Layout(data_from_line=2), Layout(decimal=",")])
+LAYOUTS = [None, Layout(missing=("--", "")), Layout(data_from_line=2), Layout(data_to_line=3), Layout(decimal=",")]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_blocks_of_any_size_read_the_same(monkeypatch: pytest.MonkeyPatch, layout: Layout | None) -> None:
     wanted = [outcome(text, ".csv", layout) for text in TEXTS]
     assert sum(len(found) > 1 or found[0].startswith("(") for found in wanted) >= 3

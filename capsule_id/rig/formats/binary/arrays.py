@@ -18,10 +18,10 @@ def refuse_line(layout: Layout, path: Path) -> None:
     Raises
     ------
     InputError
-        If ``layout`` states ``data_from_line`` or ``decimal``.
+        If ``layout`` states ``data_from_line``, ``data_to_line`` or ``decimal``.
     """
-    for key, value in (("data_from_line", layout.data_from_line), ("decimal", layout.decimal)):
-        if value is not None:
+    for key in ("data_from_line", "data_to_line", "decimal"):
+        if (value := getattr(layout, key)) is not None:
             raise InputError(f"a {path.suffix} file has no {key}", f"{key} = {value}", f"remove {key}", path)
 
 

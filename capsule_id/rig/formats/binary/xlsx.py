@@ -26,7 +26,7 @@ def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
     ----------
     content : the bytes of the file
     path : its name, for error lines
-    layout : as for text; ``data_from_line`` is a row of the sheet
+    layout : as for text; ``data_from_line`` and ``data_to_line`` are rows of the sheet
 
     Raises
     ------

@@ -16,9 +16,9 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.export import Export, Layout
-from capsule_id.rig.formats.text.blocks import Content, TextFile, lines_of
+from capsule_id.rig.formats.text.blocks import Content, TextFile, lines_of, occurrences
 from capsule_id.rig.formats.text.cells import BLANKS, bare, cells_of, number_in, place_of_cell, shown_cell
-from capsule_id.rig.formats.text.rows import COMMENTS, Shape, any_rows, is_comment, plain_rows
+from capsule_id.rig.formats.text.rows import COMMENTS, Shape, any_rows, is_comment, is_row, plain_rows
 
 _MANY_ROWS = 50  # whose whole parts do not increase by chance
 _COMMA_BETWEEN_DIGITS = re.compile(r"\s*([+-]?[0-9]+),[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
@@ -38,7 +38,7 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     InputError
         If the rows of numbers are not found, or a row has another number of cells than the first one.
     """
-    file = TextFile(content, path)
+    file = _file(content, path, layout)
     head = _head(file, layout)
     first, row = len(head) - 1, head.pop()
     delimiter = delimiter_of(row, layout)
@@ -70,6 +70,21 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     return Export(path, headers, width, lines, values, place, file.encoding, rows.words)
 
 
+def _file(content: Content, path: Path, layout: Layout) -> TextFile:
+    """The text down to ``data_to_line``, where that is stated."""
+    whole, last = TextFile(content, path), layout.data_to_line
+    if last is None:
+        return whole
+    number = sum(occurrences("\n", text) for _, text in whole.blocks())
+    if last > number:
+        rule, remedy = (
+            f"data_to_line must be a line of the file, which has {number}",
+            "state the line of the last reading",
+        )
+        raise InputError(rule, str(last), remedy, path, max(number, 1), 1)
+    return TextFile(content, path, last)
+
+
 def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:
     """Whether a column is named by its number or by a header."""
     return column + 1 in wanted or any(names[column] in wanted for names in headers)
@@ -77,8 +92,7 @@ def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[s
 
 def _ends_blank(text: bytes, delimiter: str | None) -> bool:
     """Whether the last cell of every row in ``text`` is blank."""
-    rows = (line for line in lines_of(text) if line.strip() and not is_comment(line))
-    return all(not cells_of(line, delimiter)[-1][0] for line in rows)
+    return all(not cells_of(line, delimiter)[-1][0] for line in lines_of(text) if is_row(line))
 
 
 def _head(file: TextFile, layout: Layout) -> list[str]:
@@ -100,7 +114,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
                 return lines
             continue
         cells = _split(line, delimiter_of(line, layout))
-        if begun is None and any(_is_number(cell) for cell in cells):
+        if begun is None and any(is_number(cell) for cell in cells):
             begun = i
         if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
             if i == begun:
@@ -127,7 +141,7 @@ def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tu
     for cells in _header_cells(bare, delimiter):
         if len(cells) == width + 1 and not cells[-1]:
             cells.pop()
-        if len(cells) == width and any(cells) and not any(_is_number(cell) for cell in cells):
+        if len(cells) == width and any(cells) and not any(is_number(cell) for cell in cells):
             return tuple(" ".join(cell.split()) for cell in cells)
     return ()
 
@@ -182,7 +196,7 @@ def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, l
         return
     rows, before, increasing = 0, -math.inf, True
     for line in file.lines(first):
-        if not line.strip() or is_comment(line):
+        if not is_row(line):
             continue
         found = _COMMA_BETWEEN_DIGITS.fullmatch(line)
         if found is None:
@@ -196,11 +210,11 @@ def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, l
     raise InputError(rule, shown_cell(file.line(first).strip()), remedy, file.path, first + 1, 1)
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
     """Whether a cell is a number with either decimal mark."""
     return number_in(cell, ".") is not None or number_in(cell, ",") is not None
 
 
 def _is_reading(cell: str, layout: Layout) -> bool:
     """Whether a cell is a number or a stated missing marker."""
-    return _is_number(cell) or cell in layout.missing
+    return is_number(cell) or cell in layout.missing

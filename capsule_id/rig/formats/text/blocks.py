@@ -31,6 +31,7 @@ class TextFile:
     ----------
     path : its name, for error lines
     encoding : its encoding
+    last : number of the last line that is read, counted from 1 (None: all are read)
 
     Raises
     ------
@@ -38,8 +39,8 @@ class TextFile:
         If the content is no text, at its line and character, or a compressed file is damaged or too large.
     """
 
-    def __init__(self, content: Content, path: Path) -> None:
-        self._content, self.path = content, path
+    def __init__(self, content: Content, path: Path, last: int | None = None) -> None:
+        self._content, self.path, self.last = content, path, last
         self._compressed = path.suffix.lower() == COMPRESSED
         self._has_feeds = False
         self.encoding = self._find_encoding()
@@ -53,6 +54,11 @@ class TextFile:
         for block in self._utf8() if self.encoding == "UTF-8" and self._has_feeds else self._decoded():
             text = block if block.endswith(b"\n") else block + b"\n"
             lines = occurrences("\n", text)
+            if self.last is not None and number + lines > self.last:
+                lines = self.last - number
+                text = b"\n".join([*text.split(b"\n", lines)[:-1], b""]) if lines else b""
+            if not lines:
+                return
             if number + lines > first:
                 yield max(number, first), text.split(b"\n", first - number)[-1] if first > number else text
             number += lines

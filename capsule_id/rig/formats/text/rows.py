@@ -16,6 +16,7 @@ from capsule_id.rig.formats.text.cells import bare, cells_of, decimal_mark, plac
 from capsule_id.views import counted
 
 COMMENTS = ("#", "%")
+_NO_CELLS = " \t\r\f\v\n,;"  # spreadsheets write blank rows as separators alone
 _PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
 _SHORT = 1_000_000  # characters of a text that NumPy reads before pandas is imported
 
@@ -97,6 +98,11 @@ class Rows:
 def is_comment(line: str) -> bool:
     """Whether a line is a comment."""
     return line.lstrip().startswith(COMMENTS)
+
+
+def is_row(line: str) -> bool:
+    """Whether a line has a cell, and is no comment."""
+    return bool(line.strip(_NO_CELLS)) and not is_comment(line)
 
 
 def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray | None:
@@ -205,8 +211,7 @@ def any_rows(
 
 def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:
     """The rows of a block with their 0-based lines; ``number`` is that of the first line."""
-    lines = enumerate(lines_of(text), number)
-    return ((line, row) for line, row in lines if row.strip() and not is_comment(row))
+    return ((line, row) for line, row in enumerate(lines_of(text), number) if is_row(row))
 
 
 def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
@@ -215,6 +220,9 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
         rule = f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has"
-        remedy = f"correct the row, or state data_from_line = {line + 1} if the readings begin here"
+        remedy = (
+            f"correct the row, or state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if "
+            f"they begin here"
+        )
         raise InputError(rule, counted(len(cells), "cell"), remedy, path, line + 1, 1)
     return cells
