@@ -279,6 +279,11 @@ class Experiment(eqx.Module):
 
     # -- optional methods of a kind ---------------------------------------------------------------------------------
 
+    @property
+    def cycles(self) -> np.ndarray | None:
+        """Time of every reading of a channel in periods of the motion, (n,); None without a period."""
+        return None
+
     def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[Experiment, ...], list[Finding]]":
         """Divide the experiment where one initial state cannot predict all of it at ``theta``; also return findings."""
         del theta

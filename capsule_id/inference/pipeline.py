@@ -31,8 +31,8 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
-from capsule_id.inference.checks.model_error.run_widening import run_widenings
-from capsule_id.inference.checks.model_error.widening import widenings
+from capsule_id.inference.checks.model_error.record_widening import record_widenings
+from capsule_id.inference.checks.model_error.widening import beside_stated, widenings
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
@@ -141,7 +141,7 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     checked = run_checks(sampled)
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
     checked = replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
-    widened = {**widenings(checked), **run_widenings(checked)}
+    widened = beside_stated(checked, {**widenings(checked), **record_widenings(checked)})
     if not widened:
         return checked
     facts = {"factors": [(name, one.factor, one.parts) for name, one in widened.items()]}

@@ -1,4 +1,4 @@
-"""Estimates the noise level of a record from its differences."""
+"""Estimates the noise level of a record from its differences, and finds where a decay is all noise."""
 
 import math
 
@@ -9,6 +9,8 @@ from capsule_id.rig.filters import PIECE
 
 #: Median of |z| for a standard normal z.
 NORMAL_QUARTILE = 0.6745
+#: Part of the energy of a decay before it is all noise.
+ENERGY = 0.99
 
 
 def noise_level(values: Num[np.ndarray, " n"], order: int = 3) -> float:
@@ -27,3 +29,9 @@ def noise_level(values: Num[np.ndarray, " n"], order: int = 3) -> float:
         values = values[(len(values) - PIECE) // 2 :][:PIECE]
     differences = np.abs(np.diff(values, order))
     return float(np.median(differences) / (NORMAL_QUARTILE * math.sqrt(math.comb(2 * order, order))))
+
+
+def length_of_motion(values: Num[np.ndarray, " n"]) -> int:
+    """Number of the first samples of a decay that hold most of its energy, before it is all noise."""
+    energy = np.cumsum((values - np.mean(values)) ** 2)
+    return min(int(np.searchsorted(energy, ENERGY * energy[-1])) + 1, len(values))

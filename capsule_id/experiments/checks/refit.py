@@ -1,6 +1,7 @@
 """Estimates from one experiment alone, with or without some of its readings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -12,8 +13,34 @@ from capsule_id.parameters import is_stated
 UNFIT = 1e9
 
 
+@dataclass(frozen=True)
+class Refit:
+    """Estimates of the physical parameters of one experiment.
+
+    Attributes
+    ----------
+    pairs : estimate and its standard error where the variance of the readings is that of the point fit, by symbol, SI
+    scale : variance of the readings over that of the point fit, from the misfit; 1 where it is known
+    freedom : degrees of freedom of ``scale``
+    """
+
+    pairs: Mapping[str, tuple[float, float]]
+    scale: float
+    freedom: int
+
+    def scaled(self, scale: float) -> dict[str, tuple[float, float]]:
+        """Estimates, and their standard errors with ``scale``."""
+        return {symbol: (value, float(np.sqrt(scale)) * sd) for symbol, (value, sd) in self.pairs.items()}
+
+
 def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """Estimate and standard error of the experiment's physical parameters without some readings, SI.
+    """Estimate and standard error of the experiment's physical parameters without some readings, SI; see ``estimate``."""
+    found = estimate(experiment, theta, left_out)
+    return found.scaled(found.scale)
+
+
+def estimate(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]) -> Refit:
+    """Estimate the experiment's physical parameters without some readings.
 
     Parameters that rig.toml states stay at the point fit: one experiment alone may not determine them. Scatters stay
     there too when nothing is left out, and are rescaled by the remaining misfit otherwise.
@@ -48,13 +75,14 @@ def refit(experiment: Experiment, theta: ValuesBySymbol, left_out: Sequence[int]
     start = np.ones(len(at)) if signed else np.zeros(len(at))
     solution = least_squares(residuals, start, method="lm", x_scale="jac")
     nuisances = experiment.misfit(theta).design.shape[1]
-    freedom = len(keep) - len(symbols) - nuisances
-    scale = 1.0 if experiment.scale_known else float(2.0 * solution.cost / max(freedom, 1))
+    freedom = max(len(keep) - len(symbols) - nuisances, 1)
     # A model that is not finite (an overdamped decay) determines nothing.
     finite = bool(np.isfinite(solution.jac).all())
-    covariance = (
-        np.linalg.pinv(solution.jac.T @ solution.jac) * scale if finite else np.full((len(at), len(at)), np.inf)
-    )
+    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) if finite else np.full((len(at), len(at)), np.inf)
     values = values_of(solution.x)
     errors = (at if signed else values) * np.sqrt(np.diag(covariance))
-    return {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)}
+    return Refit(
+        {s: (float(v), float(e)) for s, v, e in zip(symbols, values, errors, strict=True)},
+        1.0 if experiment.scale_known else float(2.0 * solution.cost / freedom),
+        freedom,
+    )

@@ -3,6 +3,7 @@
 from typing import Any, Self
 
 import equinox as eqx
+import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import ValuesBySymbol
@@ -30,6 +31,11 @@ class CapsuleForward(GroundExperiment):
     def excitation_period(self) -> float | None:
         """s; None where nothing excites the capsule periodically."""
         return None
+
+    @property
+    def cycles(self) -> np.ndarray | None:
+        period = self.excitation_period
+        return None if period is None else self.table["time"] / period
 
     @property
     def masses(self) -> tuple[str, ...]:

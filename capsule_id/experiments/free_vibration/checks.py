@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import ndimage, stats
 
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.refit import refit
@@ -17,11 +17,14 @@ from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import sensitivities, whitened
 from capsule_id.experiments.free_vibration.settings import decay_window
 from capsule_id.parameters import parameter
-from capsule_id.views import Finding
+from capsule_id.records.faults.duplicates import reading_step
+from capsule_id.records.noise import length_of_motion
+from capsule_id.rig.filters import median_step
+from capsule_id.views import Facts, Finding
 
 #: Joint sds apart from which halves of a record disagree, and from which that fails.
 HALVES_DISAGREE, HALVES_FAIL = 3.0, 4.0
-#: Fewest readings and half cycles of a half.
+#: Fewest readings and half cycles of a half; fewest half cycles that a later start leaves.
 FEWEST_READINGS, FEWEST_HALF_CYCLES = 40, 4
 #: Intervals of position in each direction of the motion, and fewest readings per interval.
 INTERVALS, READINGS_PER_INTERVAL = 12, 5
@@ -29,6 +32,10 @@ INTERVALS, READINGS_PER_INTERVAL = 12, 5
 FAST_DRIFT = 0.01
 #: Largest part of a drift that is as fast as the motion, relative to the residuals left: about half of what white noise gives.
 FAST_NOISE = 0.25
+#: Smallest ratio of the residuals of the larger half of the amplitudes to those of the smaller half that counts.
+LARGER = 1.3
+#: Steps of the readings in which a motion is lost, and fewest readings before that.
+STEPS, FEWEST_SIZES = 3.0, 30
 #: Directions of the offsets that are shorter than this, relative to the longest one, are combinations of the others.
 UNSEEN = 1e-8
 
@@ -107,7 +114,7 @@ def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
     for p, low, high, e in compared:
         if p * len(compared) < LEVEL:
             unit, scale = e.column.unit, e.column.to_display
-            facts = {"label": e.label, "p": p, "low": low * scale, "high": high * scale, "unit": unit}
+            facts = {"label": e.label, "p": p, "low": low * scale, "high": high * scale, "unit": unit, **later_start(e)}
             findings.append(Finding("decays.position", "fail", facts, e.label))
     if compared and not findings:
         facts = {"labels": ", ".join(e.label for *_, e in compared), "p": min(p for p, *_ in compared)}
@@ -122,9 +129,50 @@ def check_drift(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding
         if e.model.drift == "gp" and (parts := fast_parts(e, e.local(fit.values))) is not None:
             drift, motion, noise = parts
             level = "fail" if drift > max(FAST_DRIFT * motion, FAST_NOISE * noise) else "ok"
-            facts = {"label": e.label, "share": drift / max(motion, FAST_NOISE * noise)}
+            facts = {"label": e.label, "share": drift / max(motion, FAST_NOISE * noise), **later_start(e)}
             findings.append(Finding("decays.drift", level, facts, e.label))
     return findings
+
+
+def check_size_of_residuals(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """Check that the residuals are not larger where the motion is larger: fitted noise then holds an error of the model.
+
+    Spearman's rank correlation of their sizes with the amplitude, before the motion is lost in the steps of the readings.
+    """
+    compared, findings = [], []
+    for e in records:
+        size = np.abs(e.values - equilibrium(e.values))
+        n = int(np.flatnonzero(size >= STEPS * reading_step(e.whole[1]))[-1]) + 1
+        if n < FEWEST_SIZES:
+            continue
+        residuals = np.abs(np.asarray(e.residuals(e.local(fit.values), np))[:n])
+        period = 2.0 * np.pi / e.rough_decrement().Omega_o / median_step(e.time)
+        amplitude = ndimage.maximum_filter1d(size[:n], max(3, round(period)))
+        if np.ptp(amplitude) > 0.0 and np.ptp(residuals) > 0.0:
+            large = amplitude > np.median(amplitude)
+            ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
+            trend = stats.spearmanr(amplitude, residuals, alternative="greater")
+            p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)
+            compared.append((p, ratio, e))
+    for p, ratio, e in compared:
+        if p * len(compared) < LEVEL and ratio > LARGER:
+            facts = {"label": e.label, "ratio": ratio, "p": p, "stated": e.stated_words, **later_start(e)}
+            findings.append(Finding("decays.residuals", "fail", facts, e.label))
+    if compared and not findings:
+        facts = {"labels": ", ".join(e.label for *_, e in compared), "p": min(p for p, *_ in compared)}
+        findings.append(Finding("decays.residuals", "ok", facts))
+    return findings
+
+
+def later_start(e: "FreeVibration") -> Facts:
+    """Time from which the amplitudes are below half the largest one: ``start``, s, None where too few swings are left."""
+    size = np.abs(e.values - equilibrium(e.values))
+    begin = int(np.flatnonzero(size > 0.5 * np.max(size))[-1]) + 1
+    left = e.time[begin:][: length_of_motion(e.values[begin:])] if begin < len(e.time) else e.time[:0]
+    if len(left) == 0 or np.ptp(left) * e.rough_decrement().Omega_o / np.pi < FEWEST_HALF_CYCLES:
+        return {"start": None}
+    digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))
+    return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
 
 
 def fast_parts(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float] | None:
@@ -214,7 +262,11 @@ def _estimates(half: "FreeVibration", theta: Mapping[str, float]) -> tuple[dict[
     if half.closed and not half.model.whitened:
         pairs = refit(half, theta, [])
         return {name: v for name, (v, _) in pairs.items()}, {name: sd for name, (_, sd) in pairs.items()}
-    screening = Screening(half)
+    screening = Screening(half, k1=theta["k1"])
     found, _ = screening.fit(half.model, screening.scaled(theta))
     names = ("k1", "c", *half.model.symbols)
     return {name: found.values[name] for name in names}, {name: found.errors[name] for name in names}
+
+
+#: All checks of records of free decays but that on hidden forces, which needs the second fit.
+CHECKS = (check_stiffness, check_free_decay, check_halves, check_positions, check_size_of_residuals, check_drift)

@@ -12,13 +12,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol
 from capsule_id.experiments.clock import clock_parameters, stated_rate, stretch
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
-from capsule_id.experiments.free_vibration.checks import (
-    check_drift,
-    check_free_decay,
-    check_halves,
-    check_positions,
-    check_stiffness,
-)
+from capsule_id.experiments.free_vibration.checks import CHECKS
 from capsule_id.experiments.free_vibration.decay_models import (
     decay,
     decay_moments,
@@ -107,7 +101,7 @@ class FreeVibration(SurfaceExperiment):
     order: int = eqx.field(static=True)
 
     time_series = True
-    checks = (check_stiffness, check_free_decay, check_halves, check_positions, check_drift, check_hidden_terms)
+    checks = (*CHECKS, check_hidden_terms)
     tables = (decay_table, damping_table, second_fit_table)
 
     def __init__(
@@ -320,6 +314,10 @@ class FreeVibration(SurfaceExperiment):
     def largest_deflection(self) -> float:
         """Largest distance of a sample from the rest position, m."""
         return self.deflection * float(np.max(np.abs(self.values - equilibrium(self.values))))
+
+    @property
+    def cycles(self) -> np.ndarray:
+        return self.time * self.rough_decrement().Omega_o / (2.0 * np.pi)
 
     def damping_trend(self) -> Facts:
         """Drift of damping and frequency of the peaks with amplitude, see ``trend``; empty without drift."""

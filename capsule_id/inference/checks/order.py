@@ -6,10 +6,11 @@ import numpy as np
 from scipy import stats
 
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks.refit import refit
+from capsule_id.experiments.checks.refit import estimate, refit
 from capsule_id.experiments.checks.series import autocorrelation
 from capsule_id.inference.checks.regression import design
 from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.parameters import is_stated
 from capsule_id.views import Finding
 
 #: Family-wise false-alarm rate over the tables, and smallest correlation that counts: it widens the sd by a fifth.
@@ -72,7 +73,52 @@ def lag_1(residuals: np.ndarray, seed: int = 0) -> tuple[float, float]:
 
 
 def check_tables(s: SampledFit) -> list[Finding]:
-    """Check that tables of trials with the same parameters and one scatter have the same mean residual.
+    """Check that tables with the same parameters agree: by their mean residuals, or, with offsets, by their slopes."""
+    findings, number = [], 0
+    for found, members in (tables_by_mean(s), tables_by_slope(s)):
+        findings, number = [*findings, *found], number + members
+    return findings or [Finding("trials.tables", "ok", {"number": number})] * bool(number)
+
+
+def tables_by_slope(s: SampledFit) -> tuple[list[Finding], int]:
+    """Findings on tables that each have an offset, such as calibrations of one spring, and the number of tables.
+
+    The test is that of Alexander and Govern (1994): each table has its own scatter and degrees of freedom.
+    """
+    alike: dict[tuple[str, ...], list[Experiment]] = {}
+    for e in s.experiments:
+        own = [row.name for row in e.parameters if row.physical and not is_stated(row.name)]
+        if e.bench and not e.time_series and own and e.misfit(e.local(s.values)).design.shape[1]:
+            alike.setdefault((e.kind, *own), []).append(e)
+    groups, findings = [members for members in alike.values() if len(members) > 1], []
+    for members in groups:
+        row = next(row for row in members[0].parameters if row.physical)
+        fits = [estimate(e, e.local(s.values), list(s.flagged.get(e.label, []))) for e in members]
+        pairs = [one.scaled(one.scale)[row.symbol] for one in fits]
+        freedom = [np.inf if e.scale_known else one.freedom for e, one in zip(members, fits, strict=True)]
+        factor, p = heterogeneity(pairs, freedom)
+        if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
+            estimates = [(e.label, value) for e, (value, _) in zip(members, pairs, strict=True)]
+            facts = {"name": row.name, "estimates": estimates, "unit": row.unit, "p": p, "factor": factor}
+            findings.append(Finding("trials.tables", "fail", facts, members[0].label))
+    return findings, sum(map(len, groups))
+
+
+def heterogeneity(pairs: Sequence[tuple[float, float]], freedom: Sequence[float]) -> tuple[float, float]:
+    """Factor by which estimates scatter more than their standard errors say (Birge), and its probability.
+
+    The t statistic of each estimate is converted to a normal one with its own degrees of freedom.
+    """
+    value, sd = np.array(pairs).T
+    sd = np.maximum(sd, 1e-12 * np.abs(value))
+    t = (value - np.average(value, weights=sd**-2.0)) / sd
+    z = stats.norm.isf(np.maximum(stats.t.sf(np.abs(t), freedom), 1e-300))
+    chi_square, more = float(np.sum(z**2)), len(value) - 1
+    return float(np.sqrt(chi_square / more)), float(stats.chi2.sf(chi_square, more))
+
+
+def tables_by_mean(s: SampledFit) -> tuple[list[Finding], int]:
+    """Findings on tables of trials without offset and with one scatter, and the number of tables.
 
     A permutation test of the scatter between tables. Their common scatter otherwise absorbs what differs between them.
     """
@@ -95,8 +141,7 @@ def check_tables(s: SampledFit) -> list[Finding]:
                 "factor": factor,
             }
             findings.append(Finding("trials.tables", "fail", facts, members[0].label))
-    number = sum(len(members) for members, _ in groups)
-    return findings or [Finding("trials.tables", "ok", {"number": number})] * bool(groups)
+    return findings, sum(len(members) for members, _ in groups)
 
 
 def check_loads(s: SampledFit) -> list[Finding]:

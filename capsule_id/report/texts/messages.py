@@ -149,7 +149,7 @@ def _tables_disagree(facts: Facts) -> str:
     unit = _after_number(facts["unit"])
     estimates = ", ".join(f"{value:.4g}{unit} by {label}" for label, value in facts["estimates"])
     return (
-        f"expected tables of trials that agree; found {facts['name']} = {estimates} (p = {facts['p']:.1g}). It depends on "
+        f"expected tables that agree; found {facts['name']} = {estimates} (p = {facts['p']:.1g}). It depends on "
         f"what differs between them, such as load, day or speed; the sd is too small by a factor of about "
         f"{facts['factor']:.1f}. Find the cause, or fit each table in a folder of its own."
     )
@@ -212,7 +212,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
     ),
     "trials.tables": Message(
         "agreement of tables",
-        ok="{number:# table} of trials agree within their scatter",
+        ok="{number:# table} of equal tests agree within their scatter",
         fail=_tables_disagree,
     ),
     "trials.loads": Message(
@@ -232,7 +232,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
         "model error",
         warn=lambda facts: (
             "estimates from parts of the data scatter more than their sds say, so the quoted sd is multiplied by "
-            + ", ".join(f"{factor:.1f} for {name} ({parts} parts)" for name, factor, parts in facts["factors"])
+            + ", ".join(f"{factor:.3g} for {name} ({parts} parts)" for name, factor, parts in facts["factors"])
             + ". It is an estimate of the model's error; find its cause before you use the number."
         ),
     ),

@@ -1,6 +1,6 @@
 """Trials in order and repeated readings off the line are named; false alarms keep to their level."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments.families.line_replicates import lack_of_fit
-from capsule_id.inference.checks.order import between, lag_1
+from capsule_id.inference.checks.order import between, heterogeneity, lag_1
 from tests.measured.folders import Entry, make_rig, quantity
 
 
@@ -97,6 +97,54 @@ def test_tables_of_one_surface_that_disagree_are_named(tmp_path: Path) -> None:
     agreeing = pulls(tmp_path / "agree", (0.2, 0.2, 0.2))
     assert [f.level for f in agreeing.findings if f.code == "trials.tables"] == ["ok"]
     assert agreeing.clean
+
+
+def test_false_alarms_and_the_factor_of_slopes_that_differ() -> None:
+    """Three lines of 10 readings each: the scatter between their slopes, each with its own estimated sd."""
+    rng = np.random.default_rng(4)
+
+    def found(spread: float) -> tuple[float, float]:
+        value = rng.standard_normal(3) * np.hypot([0.5, 1.0, 2.0], spread)
+        return heterogeneity(list(zip(value, [0.5, 1.0, 2.0] * np.sqrt(rng.chisquare(8, 3) / 8), strict=True)), [8] * 3)
+
+    p = [found(0.0)[1] for _ in range(2000)]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.02)
+    assert np.mean(np.array(p) < 0.005) < 0.01
+    apart = [found(10.0) for _ in range(300)]
+    assert np.mean([one[1] < 0.005 for one in apart]) > 0.8
+    assert heterogeneity([(1.0, 0.1), (2.0, 0.1)], [np.inf, np.inf])[0] == pytest.approx(1.0 / 0.1 / np.sqrt(2.0))
+
+
+def lines_of(folder: Path, slopes: tuple[float, ...], words: Mapping[str, str]) -> Fit:
+    """Tables of force against current, each of ten readings with a scatter of 0.02 N."""
+    rng = np.random.default_rng(6)
+    current = np.linspace(0.3, 3.0, 10)
+    force = [K * current + 0.02 * rng.standard_normal(10) + 0.05 for K in slopes]
+    entries = [
+        Entry("motor_current", f"m{i}", {"force [N]": y, "current [A]": current}, words) for i, y in enumerate(force)
+    ]
+    return cid.fit(make_rig(folder, *entries), budget=None)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [{}, {"force_sd": quantity(0.02, "N"), "current_sd": quantity(0.001, "A")}],
+    ids=["estimated errors", "stated errors"],
+)
+def test_calibrations_that_disagree_are_named_and_widened(tmp_path: Path, words: Mapping[str, str]) -> None:
+    """Before: three motors were trusted with the sd of the readings; with stated errors "the line is not straight"."""
+    result = lines_of(tmp_path / "apart", (2.0, 2.1, 2.05), words)
+    (found,) = [f for f in result.findings if f.code == "trials.tables"]
+    assert found.level == "fail"
+    assert "by m0" in result.text(found)
+    assert "by m2" in result.text(found)
+    row = result.summary.loc["K"]
+    assert row["sd"] > 0.5 * np.std([0.5, 1.0 / 2.1, 1.0 / 2.05]) / np.sqrt(3.0)
+    # The remedy: each in a folder of its own; and motors that are alike agree.
+    alike = lines_of(tmp_path / "alike", (2.05, 2.05, 2.05), words)
+    assert [f.level for f in alike.findings if f.code == "trials.tables"] == ["ok"]
+    alone = lines_of(tmp_path / "alone", (2.1,), words)
+    assert alone.clean
 
 
 def levels(rng: np.random.Generator, deviation: float) -> tuple[np.ndarray, np.ndarray]:

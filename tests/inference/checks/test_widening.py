@@ -1,6 +1,8 @@
 """Where a check fails, sds widen by the scatter between parts of the data; a clean fit keeps its sds."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.inference.checks.model_error.widening import widening
+from capsule_id.inference.checks.model_error.widening import Widening, beside_stated, widening
 from tests.experiments.bench import K1, M1, released
 from tests.inference.checks.test_order import drifting
 from tests.measured.folders import Entry, make_rig, quantity
@@ -30,6 +32,18 @@ def test_the_factor_is_near_1_without_model_error() -> None:
     ]
     assert np.median(factor) == pytest.approx(max(1.0, np.sqrt(stats.chi2.median(4) / 4.0)), abs=0.05)
     assert np.max(factor) < 2.5
+
+
+def test_the_share_of_a_stated_mass_is_not_widened() -> None:
+    """k1 is 3 times the error of the readings from that of m1: by 1 and 9 parts in 10 of its variance."""
+    covariance = np.array([[10.0, 3.0], [3.0, 1.0]])
+    s: Any = SimpleNamespace(target=SimpleNamespace(names=("k1", "m1")), fit=SimpleNamespace(covariance=covariance))
+    found = beside_stated(s, {"k1": Widening(5.0, 1.2, 6)})["k1"]
+    assert found.factor**2 == pytest.approx(0.9 + 0.1 * 25.0)
+    assert found.stretch**2 == pytest.approx(0.9 + 0.1 * 36.0)
+    alone: Any = SimpleNamespace(target=SimpleNamespace(names=("k1", "c")), fit=s.fit)
+    assert beside_stated(alone, {"k1": Widening(5.0, 1.2, 6)})["k1"].factor == pytest.approx(5.0)
+    assert beside_stated(s, {"k1": Widening(1.01, 1.2, 6)}) == {}
 
 
 def tilts(folder: Path, angle: np.ndarray, budget: int | None = None) -> Fit:

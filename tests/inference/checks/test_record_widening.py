@@ -1,4 +1,4 @@
-"""Error of the model in runs: intervals that cover under a misfit that repeats with every excitation period."""
+"""Error of the model in runs and decays: intervals that cover under misfits between periods and within them."""
 
 from dataclasses import replace
 from functools import cache
@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments.forced_run.base_run import BaseRun
-from capsule_id.inference.checks.model_error.run_widening import (
+from capsule_id.experiments.free_vibration.decay_models import decay
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.inference.checks.model_error.record_widening import (
     PRIORS,
     by_phase,
     by_time,
     parts_of_residuals,
-    run_widenings,
+    record_widenings,
     steps_of_parts,
 )
 from capsule_id.inference.checks.model_error.widening import FEWEST_PARTS, widening
@@ -23,6 +25,7 @@ from capsule_id.inference.fit.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.views import Finding
+from tests.experiments import bench
 from tests.experiments import test_base_run as shaken
 
 NO_ARRAY = np.zeros(0)
@@ -86,13 +89,13 @@ def test_noise_alone_widens_little(known: SampledFit) -> None:
 
 
 def test_a_failed_check_widens_the_parameters_of_its_run(known: SampledFit) -> None:
-    assert run_widenings(replace(known, findings=())) == {}
-    quiet = run_widenings(known)
+    assert record_widenings(replace(known, findings=())) == {}
+    quiet = record_widenings(known)
     assert all(one.factor < 2.0 for one in quiet.values())
     # The rod's spring is 10 % stiffer than the record shows.
     u = known.fit.u + np.where(np.array(known.target.names) == "k1", 0.1, 0.0)
     values = {**known.values, "k1": 1.1 * known.values["k1"]}
-    wide = run_widenings(replace(known, fit=replace(known.fit, u=u), values=values))
+    wide = record_widenings(replace(known, fit=replace(known.fit, u=u), values=values))
     assert wide["k1"].factor > 5.0
     assert wide["k1"].parts >= FEWEST_PARTS
     assert set(wide) <= set(shaken.TRUTH)
@@ -126,3 +129,62 @@ def test_a_parameter_that_only_its_prior_determines_does_not_widen_another() -> 
     assert widening(steps_of_parts(jacobian, residuals, 0, part)).factor < 2.0
     shared = np.where(part == PRIORS, -1, part)
     assert widening(steps_of_parts(jacobian, residuals, 0, shared)).factor > 4.0
+
+
+@cache
+def dry_decay(k_cubic: float = 0.0) -> SampledFit:
+    """A decay of twelve periods with dry friction at its true values, but for the cubic force of its record."""
+    time, truth = np.arange(480) / 800.0, {"k1": 1420.0, "c": 0.3, "F_dry": 0.05, "amplitude[d]": 2e-3}
+    motion = np.asarray(decay(time, {**truth, "m1": bench.M1, "k_cubic": k_cubic}, 2e-3, 0.0, 40).x_rel)
+    columns = [bench.column("time", time), bench.column("x_rel", motion)]
+    table = bench.table("free_vibration", columns, "d", damping=("viscous", "dry"), thin=1, drift="none", noise="white")
+    rig = bench.rig(table)
+    target = LogPosterior(rig, [FreeVibration(table, rig)])
+    values = {**truth, "turning_time[d]": 0.0, "noise_sd[d]": 2e-5, "m1": bench.M1}
+    u = target.unconstrain(np.array([values[name] for name in target.names]))
+    fit = PointFit(target.names, u, values, NO_ARRAY, {}, NO_ARRAY, NO_ARRAY, NO_ARRAY, NO_ARRAY, NO_ARRAY)
+    return SampledFit(
+        target, fit, None, {**target.fixed, **values}, findings=(Finding("residuals.white", "fail", {}, "d"),)
+    )
+
+
+def errors_of_decays(misfit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of F_dry over its sd, and over the half-length of its widened interval, of 300 linearised fits.
+
+    misfit : of one half period, units of the noise; relative to the amplitude, and independent of the other ones
+    """
+    s, rng = dry_decay(), np.random.default_rng(0)
+    run, located = cast(FreeVibration, s.experiments[0]), s.target.located
+    k = [s.target.names[i] for i in located].index("F_dry")
+    jacobian = residual_jacobian(s.target, s.fit.u)[:, located]
+    part, inverse = parts_of_residuals(s, [run], by_time), np.linalg.pinv(jacobian)
+    half, envelope = (2.0 * run.cycles).astype(int), np.exp(-run.cycles / 6.0)
+    sd, plain, widened = float(np.linalg.norm(inverse[k])), [], []
+    for _ in range(300):
+        residuals = np.zeros(len(jacobian))
+        waves = misfit * rng.standard_normal(half[-1] + 1)[half] * envelope * np.sin(2.0 * np.pi * run.cycles)
+        residuals[: run.n] = rng.standard_normal(run.n) + waves
+        step = inverse @ residuals
+        one = widening(steps_of_parts(jacobian, residuals - jacobian @ step, k, part))
+        plain.append(step[k] / sd)
+        widened.append(step[k] / (sd * one.stretch) / 1.96)
+    return np.abs(plain), np.abs(widened)
+
+
+def test_intervals_of_a_decay_with_an_amplitude_of_its_own_cover_under_misfit() -> None:
+    plain, widened = errors_of_decays(10.0)
+    assert np.mean(plain < 1.96) < 0.6
+    assert np.mean(widened < 1.0) >= 0.9
+    plain, widened = errors_of_decays(0.0)
+    assert np.mean(plain < 1.96) == pytest.approx(0.95, abs=0.04)
+    assert np.median(plain / widened) / 1.96 < 1.8
+
+
+def test_a_failed_check_widens_the_parameters_of_a_decay_with_dry_friction() -> None:
+    assert record_widenings(replace(dry_decay(), findings=())) == {}
+    assert all(one.factor < 1.01 for one in record_widenings(dry_decay()).values())
+    # The stiffness falls by 5 % with the amplitude.
+    wide = record_widenings(dry_decay(0.05 * 1420.0 / 2e-3**2))
+    assert wide["k1"].factor > 3.0
+    assert wide["k1"].parts >= FEWEST_PARTS
+    assert set(wide) <= {"k1", "c", "F_dry"}

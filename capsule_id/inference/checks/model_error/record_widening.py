@@ -1,11 +1,12 @@
-"""Error of the model in runs, from the scores of parts of their records.
+"""Error of the model in runs and decays, from the scores of parts of their records.
 
 residuals and Jacobian at the fit -> derivative with respect to one parameter, the others refitted
     -> step of that parameter from every part -> chi-square between the parts (``widening``)
 
-A run determines some parameters only as a whole, so its parts are not fitted. Each part gives a Gauss-Newton step of
-one parameter and its sd. A record is divided into successive whole excitation periods, and by phase of the excitation.
-A misfit that repeats with every period shows between phases only. The widest interval counts.
+A run, or a decay with an amplitude, a drift or noise of its own, determines some parameters only as a whole, so its
+parts are not fitted. Each part gives a Gauss-Newton step of one parameter and its sd. A record is divided into
+successive whole periods, that of a run also by phase of the excitation. A misfit that repeats with every period shows
+between phases only. The widest interval counts.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,37 +14,41 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from capsule_id.experiments.families.capsule_experiment import CapsuleForward
+from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.model_error.widening import (
     FEWEST_PARTS,
     LARGEST_RELATIVE_SD,
     MOST_PARTS,
     Widening,
+    has_own_nuisances,
     widening,
 )
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import residual_jacobian
+from capsule_id.parameters import is_stated
+from capsule_id.records.noise import length_of_motion
 
 #: Parts of an excitation period. They are long beside most waves of a misfit, so that their steps are independent.
 PHASES = 6
 #: Number of the priors, which every part meets. Without them the step of a parameter that the data leave open has no end.
 PRIORS = -2
 #: Numbers of the parts of the n samples of a record; None where it cannot be divided in this way.
-Division = Callable[[CapsuleForward], Int[np.ndarray, " n"] | None]
+Division = Callable[[Experiment], Int[np.ndarray, " n"] | None]
 
 
-def run_widenings(s: SampledFit) -> dict[str, Widening]:
-    """Error of the model of every physical parameter of a run with a failed check, by name."""
+def record_widenings(s: SampledFit) -> dict[str, Widening]:
+    """Error of the model of every physical parameter of a run or a decay with a failed check, by name."""
     failed = {f.experiment for f in s.findings if f.level == "fail" and f.experiment}
-    runs = [e for e in s.experiments if isinstance(e, CapsuleForward) and {e.label, e.table.label} & failed]
-    if not runs:
+    records = [e for e in s.experiments if {e.label, e.table.label} & failed and has_own_nuisances(e)]
+    if not any(e.cycles is not None for e in records):
         return {}
-    located = s.target.located
+    # Stated values are no estimates from the parts: ``beside_stated`` adds their share of the sd.
+    located = np.array([i for i in s.target.located if not is_stated(s.target.names[i])])
     jacobian, residuals = residual_jacobian(s.target, s.fit.u)[:, located], s.target.plain_residuals(s.fit.u)
-    informed = {row.name for e in runs for row in e.parameters if row.physical}
+    informed = {row.name for e in records for row in e.parameters if row.physical}
     found = {}
     for division in (by_time, by_phase):
-        part = parts_of_residuals(s, runs, division)
+        part = parts_of_residuals(s, records, division)
         for k, i in enumerate(located.tolist()):
             name, largest_sd = s.target.names[i], LARGEST_RELATIVE_SD
             if name not in informed:
@@ -56,34 +61,32 @@ def run_widenings(s: SampledFit) -> dict[str, Widening]:
     return found
 
 
-def by_time(run: CapsuleForward) -> Int[np.ndarray, " n"] | None:
-    """Successive parts of whole excitation periods, about equally long."""
-    period = run.excitation_period
-    if period is None:
+def by_time(record: Experiment) -> Int[np.ndarray, " n"] | None:
+    """Successive parts of whole periods, about equally long; -1: the end of a decay, which is all noise."""
+    if record.cycles is None:
         return None
-    time = run.table["time"]
-    cycle = ((time - time[0]) / period).astype(int)
-    number = int(cycle[-1]) + 1
-    return cycle * min(number, MOST_PARTS) // number
+    cycle = (record.cycles - record.cycles[0]).astype(int)
+    end = len(cycle) if record.event_driven else length_of_motion(record.observed)
+    number = int(cycle[end - 1]) + 1
+    return np.where(np.arange(len(cycle)) < end, cycle * min(number, MOST_PARTS) // number, -1)
 
 
-def by_phase(run: CapsuleForward) -> Int[np.ndarray, " n"] | None:
-    """The same parts of every excitation period."""
-    period = run.excitation_period
-    if period is None:
+def by_phase(record: Experiment) -> Int[np.ndarray, " n"] | None:
+    """The same parts of every excitation period; None of a decay, whose period is not exactly known."""
+    if record.cycles is None or not record.event_driven:
         return None
-    return (run.table["time"] / period % 1.0 * PHASES).astype(int) % PHASES
+    return (record.cycles % 1.0 * PHASES).astype(int) % PHASES
 
 
-def parts_of_residuals(s: SampledFit, runs: Sequence[CapsuleForward], division: Division) -> Int[np.ndarray, " m"]:
+def parts_of_residuals(s: SampledFit, records: Sequence[Experiment], division: Division) -> Int[np.ndarray, " m"]:
     """Part of each of ``LogPosterior.plain_residuals``; -1, one more part, for other experiments; ``PRIORS`` for priors."""
     parts, used = [], 0
     for e in s.experiments:
         own = np.full(len(e.residuals(e.local(s.values), np)), -1)
-        numbers = next((division(run) for run in runs if run is e), None)
+        numbers = next((division(one) for one in records if one is e), None)
         if numbers is not None:
             channels = e.n // len(numbers)
-            own[: channels * len(numbers)] = used + np.tile(numbers, channels)
+            own[: channels * len(numbers)] = np.tile(np.where(numbers < 0, -1, used + numbers), channels)
             used += int(np.max(numbers)) + 1
         parts.append(own)
     return np.concatenate([*parts, np.full(s.target.dimension, PRIORS)])
