@@ -18,6 +18,22 @@ def test_a_drifting_decay_is_clean_and_right() -> None:
     assert np.max(np.abs(found.z)) < 4.0
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_rod_that_dry_friction_stops_is_clean_and_right(seed: int) -> None:
+    """Few swings: before, halves were fitted about a rough stiffness (seed 0), and one stroke was refused (seed 1)."""
+    found = outcome("dry", seed)
+    assert (found.clean, found.model) == (True, "viscous + dry damping")
+    assert np.max(np.abs(found.z)) < 2.0
+
+
+@pytest.mark.parametrize("seed", [26, 31, 95])
+def test_one_passage_of_the_rest_position_gives_the_frequency(seed: int) -> None:
+    """Before: half the record counted as half a period, and k1 was 80 times too small."""
+    columns = [bench.column("time", TIME), bench.column("x_rel", twin("dry", seed))]
+    record = FreeVibration(bench.table("free_vibration", columns), bench.rig())
+    assert record.rough_decrement().Omega_o == pytest.approx(np.sqrt(bench.K1 / bench.M1), rel=0.1)
+
+
 def test_the_default_model_is_not_clean_and_wrong_by_many_sds() -> None:
     """Negative control: where all words are stated there is no second fit."""
     found = outcome("dry", 0, damping=("viscous",), stiffness="linear", drift="none", noise="white")

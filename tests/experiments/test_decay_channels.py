@@ -21,6 +21,8 @@ from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Scre
 from capsule_id.experiments.free_vibration.second_fit.screening import second_models
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import whitened
 from capsule_id.experiments.free_vibration.settings import DecayModel
+from capsule_id.experiments.registry import default_registry
+from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.experiments.decay_calibration import twin
@@ -178,6 +180,10 @@ def test_halves_of_a_decay_with_dry_friction_name_the_damping() -> None:
     assert finding.facts["second"] > finding.facts["first"]
 
 
+def text(finding: Finding) -> str:
+    return finding_text(finding, messages_of(default_registry()))
+
+
 def sensor_error(x: np.ndarray, size: float) -> np.ndarray:
     """A sensor that reads ``size`` too low below a quarter of the deflection."""
     return x - size * (x < -0.25 * RELEASE)
@@ -200,10 +206,38 @@ def test_a_sensor_error_is_named_and_smaller_amplitudes_are_free_of_it() -> None
     (found,) = positions(faulty)
     assert (found.code, found.level, found.experiment) == ("decays.position", "fail", "decay")
     assert found.facts["low"] < -0.25 * RELEASE
-    # The remedy: a start from which the rod no longer gets there.
-    later = int(np.flatnonzero(x < -0.25 * RELEASE)[-1]) + 1
-    (mended,) = positions(faulty, later)
-    assert mended.level == "ok"
+    # The remedy, followed until the rod no longer gets there.
+    starts = []
+    while found.level == "fail":
+        starts.append(found.facts["start"])
+        assert f'add start = {{ value = {starts[-1]:.10g}, unit = "s" }}' in text(found)
+        (found,) = positions(faulty, int(np.searchsorted(TIME, starts[-1])))
+    assert 1 <= len(starts) <= 2
+    # Too few swings are left.
+    (short,) = positions(sensor_error(x, 2e-4) + noise, 0, 60)
+    assert (short.level, short.facts["start"]) == ("fail", None)
+    assert "record again from smaller deflections" in text(short)
+
+
+def sizes(values: np.ndarray) -> Finding:
+    """The finding on the sizes of residuals of a record whose noise a second fit may choose."""
+    table = bench.table("free_vibration", [bench.column("time", TIME), bench.column("x_rel", values)], "decay")
+    result = cid.fit(bench.rig(table), budget=None)
+    (found,) = [f for f in result.findings if f.code == "decays.residuals"]
+    return found
+
+
+def test_noise_that_follows_the_amplitude_is_no_noise() -> None:
+    """Before: an error of the model, fitted as coloured noise, was trusted. Here the rod rubs at random in each stroke."""
+    x = np.asarray(decay(TIME, VISCOUS, RELEASE, 0.0, 30).x_rel)
+    rng = np.random.default_rng(2)
+    coloured = np.convolve(rng.standard_normal(len(x) + 9), np.ones(10) / 3.0, "valid")
+    assert sizes(x + 1e-5 * coloured).level == "ok"
+    envelope = RELEASE * np.exp(-0.5 * C / bench.M1 * TIME)
+    found = sizes(x + 0.01 * envelope * coloured + 2e-6 * rng.standard_normal(len(x)))
+    assert (found.level, found.experiment) == ("fail", "decay")
+    assert found.facts["ratio"] > 1.3
+    assert f"add start = {{ value = {found.facts['start']:.10g}" in text(found)
 
 
 def pendulum(release: float) -> np.ndarray:
@@ -238,7 +272,9 @@ def test_a_drift_that_swings_with_the_rod_fails() -> None:
     for seed in (101, 106):
         assert [found.level for found in drift_findings(twin("drift", seed), (), False)] == ["ok"]
     # The remedy: a start from which the amplitudes are smaller.
-    (mended,) = drift_findings(pendulum(2.4)[60:], ("dry",), True)
+    begin = int(np.searchsorted(TIME, large.facts["start"]))
+    assert f"start = {{ value = {large.facts['start']:.10g}" in text(large)
+    (mended,) = drift_findings(pendulum(2.4)[begin:], ("dry",), True)
     assert mended.level == "ok"
 
 

@@ -1,6 +1,9 @@
 """Turning points of a decay, and records too short or too slowly sampled for a fit."""
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +12,14 @@ import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.free_vibration.points_checks import check_forces_of_points
+from capsule_id.experiments.free_vibration.turning_points import TurningPoints
+from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.rig.model import Quantity
+from capsule_id.views import Finding
 from tests.scipy_decay import scipy_decay
 
 FORCES = {"k1": 9.6, "c": 0.12, "m1": 1.0}
@@ -98,3 +107,55 @@ def test_an_uneven_record_has_no_estimate_by_the_paper(tmp_path: Path) -> None:
     row = result.summary.loc["k1"]
     assert np.isnan(row["paper"])
     assert abs(row["map"] - FORCES["k1"]) < 4.0 * row["standard_error"]
+
+
+def checked(both: bool, extra: dict[str, float], seed: int, path: Path, words: str = "") -> tuple[list[Finding], Any]:
+    """Findings on forces and halves at the fit, and the experiment."""
+    rig = read_rig(
+        folder(path / f"{both}{seed}", *turning_points(both, extra, seed), f'samples = "turning_points"\n{words}')
+    )
+    (own,) = make_experiments(rig)
+    values: Any = SimpleNamespace(values={**point_fit(LogPosterior(rig, [own]), 0).values, "m1": 1.0})
+    return [f for check in own.checks for f in check([own], values)], own
+
+
+def test_turning_points_without_misfit_pass(tmp_path: Path) -> None:
+    """Sixteen tables, two findings each: at most one above 3 joint sds, none above 4."""
+    found = [checked(both, {}, seed, tmp_path)[0] for both in (True, False) for seed in range(8)]
+    assert all([one.code for one in each] == ["decays.forces", "decays.halves"] for each in found)
+    assert sum(one.level != "ok" for each in found for one in each) <= 1
+    assert all(one.level != "fail" for each in found for one in each)
+
+
+@pytest.mark.parametrize(
+    ("extra", "line"),
+    [({"k_cubic": -0.3}, 'stiffness = "cubic"'), ({"F_dry": 0.3}, 'damping = ["viscous", "dry"]')],
+    ids=str,
+)
+def test_a_force_that_is_missing_fails_and_the_line_mends_it(
+    tmp_path: Path, extra: dict[str, float], line: str
+) -> None:
+    """Before: a softening spring was trusted, with a stiffness between those of the halves, twelve sds from either."""
+    found, own = checked(True, extra, 2, tmp_path)
+    assert (found[0].code, found[0].level, found[0].facts["line"]) == ("decays.forces", "fail", line)
+    assert line in finding_text(found[0], messages_of(default_registry()))
+    mended, _ = checked(True, extra, 2, tmp_path / "mended", line)
+    assert [one.level for one in mended] == ["ok", "ok"]
+    # A mass known to 20 % makes such a change small beside the quoted sds.
+    uncertain = TurningPoints(own.table, replace(own.rig, m1=Quantity(1.0, 0.2)))
+    values: Any = SimpleNamespace(values={**point_fit(LogPosterior(own.rig, [own]), 0).values, "m1": 1.0})
+    assert check_forces_of_points([own], values)[0].level == "fail"
+    assert check_forces_of_points([uncertain], values)[0].level == ("warn" if "k_cubic" in extra else "fail")
+
+
+def test_turning_points_at_unequal_times_are_refused(tmp_path: Path) -> None:
+    """Before: amplitudes of releases at 5 to 82 s gave a stiffness 138 times too small."""
+    time, x = turning_points(True, {}, 1)
+    time[6:] += 0.4 * np.median(np.diff(time))
+    with pytest.raises(InputError, match="must follow each other by one time") as refused:
+        cid.fit(cid.read_rig(folder(tmp_path, time, x, 'samples = "turning_points"')), budget=None)
+    assert (refused.value.file, refused.value.line) == ("decay.csv", 8)
+    # A turning point that was not read is no fault.
+    time, x = turning_points(True, {}, 1)
+    rig = cid.read_rig(folder(tmp_path / "missed", np.delete(time, 4), np.delete(x, 4), 'samples = "turning_points"'))
+    assert len(make_experiments(rig)) == 1

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments.families.friction_model import FrictionModel
 from capsule_id.experiments.forced_run.base_run import BaseRun
-from capsule_id.inference.checks.model_error.run_widening import run_widenings
+from capsule_id.inference.checks.model_error.record_widening import record_widenings
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.fit.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit
@@ -91,7 +91,7 @@ def test_the_stiffness_of_the_frame_is_within_its_widened_interval(tmp_path: Pat
     index = [found.target.names[i] for i in found.target.located].index("k1")
     jacobian = residual_jacobian(found.target, found.fit.u)[:, found.target.located]
     sd = found.values["k1"] * float(np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[index, index]))
-    wide = run_widenings(found)["k1"]
+    wide = record_widenings(found)["k1"]
     assert wide.factor > 3.0
     assert abs(found.values["k1"] - 1191.0) < 0.03 * 1191.0
     assert abs(found.values["k1"] - 1191.0) < 2.0 * sd * wide.factor

@@ -52,6 +52,14 @@ def test_clipped_tops_and_no_smooth_ones_are_found(make: Callable[[], np.ndarray
     assert clipped_samples(clear, SAMPLES) == []
 
 
+def test_readings_with_as_many_digits_near_zero_are_not_clipped() -> None:
+    """Before: steps of 0.00039 and 0.0006 among the smallest readings gave a step of 1e-7 at the limit."""
+    swing = np.round(-0.107 * np.exp(-TIME / 40.0) * np.cos(2.0 * np.pi / PERIOD * TIME), 3)
+    swing[np.abs(swing) < 5e-4] = 6.104e-4
+    assert clipped_samples(swing, SAMPLES) == []
+    assert len(clipped_samples(np.clip(swing, -0.09, 1.0), SAMPLES)) == 1
+
+
 def test_a_held_deflection_is_no_clipping() -> None:
     held = np.concatenate([np.full(400, 2.0), decay(noise=0.0)])
     assert clipped_samples(held, SAMPLES) == []

@@ -10,7 +10,7 @@ from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_
 from capsule_id.records.faults.channels import (
     FEWEST_PERIODS,
     SIGN_ERRORS,
-    acceleration_ratio,
+    derivative_ratio,
     drive_power,
     phasor,
 )
@@ -79,7 +79,7 @@ def _columns(table: Table[Any]) -> Iterable[Finding]:
             moves, accelerates = phasor(time, position, frequency), phasor(time, whole["acceleration_rod"], frequency)
             expected = frequency**2 * abs(moves.value)
             strong = max(expected, abs(accelerates.value)) > STRONG * float(np.std(whole["acceleration_rod"]))
-            ratio = acceleration_ratio(moves, accelerates, frequency)
+            ratio = derivative_ratio(moves, accelerates, frequency, 2)
             if strong and abs(moves.value) > SIGN_ERRORS * moves.sd and not low <= ratio.real <= high:
                 other = "x_rel + x_capsule" if "x_capsule" in whole else "x_rel"
                 facts = {"file": table.file, "position": other, "ratio": ratio.real, "low": low, "high": high}

@@ -101,6 +101,10 @@ def _check_channels(entry: Entry[DecaySettings]) -> None:
             raise entry.error(key, f'{key} = "{needs}" needs x_rel and no other channel', found, "map x_rel only")
 
 
+#: Largest distance of an interval between turning points from a multiple of the median one, relative to that.
+UNEQUAL = 0.25
+
+
 def _check_turning_points(entry: Entry[DecaySettings]) -> None:
     """Refuse drift, coloured noise and thinning of turning points."""
     settings = entry.table.settings
@@ -122,19 +126,45 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         At the first such table.
     """
     for table in tables:
+        if table.settings.samples == "turning_points":
+            _check_turns(table)
+            continue
         values = shortened(*decay_window(table))[1]
         size = (values - equilibrium(values)) / np.ptp(values)
         swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > SMALLEST_SWING]))))
         stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SMALLEST_SWING
-        if table.settings.samples == "record" and swings < FEWEST_SWINGS:
-            rule = f"{channel_of(table)} must pass its rest position at least {FEWEST_SWINGS} times"
+        # Where friction stops the rod, its two strokes show their duration and what each of them loses.
+        fewest = 1 if stuck else FEWEST_SWINGS
+        if swings < fewest:
+            rule = f"{channel_of(table)} must pass its rest position at least {counted(fewest, 'time')}"
             remedy = (
-                "friction holds the rod after one swing: release it from a larger deflection, or reduce the friction"
+                "friction holds the rod within one stroke: release it from a larger deflection, or reduce the friction"
                 if stuck
                 else "record a period or more, with at least 10 samples per period; where each row is a turning point, state "
                 'samples = "turning_points"'
             )
             raise InputError(rule, f"{swings} in {len(values)} samples", remedy, Path(table.file), int(table.rows[0]))
+
+
+def _check_turns(table: Table[DecaySettings]) -> None:
+    """Refuse turning points whose intervals are no multiples of one time.
+
+    Raises
+    ------
+    InputError
+        At the first such interval.
+    """
+    step = np.diff(decay_window(table)[0])
+    multiple = step / np.median(step)
+    wrong = np.flatnonzero(np.abs(multiple - np.rint(multiple)) > UNEQUAL)
+    if len(wrong):
+        raise InputError(
+            "turning points must follow each other by one time, half a period or a period, or a multiple of it",
+            f"intervals of {np.median(step):.4g} s, and {step[wrong[0]]:.4g} s before this row",
+            "correct the time of this row; where the rows are of several decays, give each of them an entry of its own",
+            Path(table.file),
+            int(table.rows[wrong[0] + 1]),
+        )
 
 
 def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":

@@ -130,12 +130,23 @@ def logarithmic_decrement(
 
 
 def crossing_decrement(time: np.ndarray, values: np.ndarray, m1: float) -> Decrement:
-    """Rough estimate from the first zero crossings, where there are too few peaks; a typical damping stands in."""
+    """Rough estimate from the first zero crossings, where there are too few peaks; a typical damping stands in.
+
+    Beside a single crossing, half a period lies between the extremes on both sides of it; where the record begins between
+    two turning points, twice the time from the crossing to the next extreme is longer.
+    """
     x = values - equilibrium(values)
     # The noise of a rod at rest crosses zero too, so only swings beyond it count.
     swings = np.flatnonzero(np.abs(x) > max(PEAK_NOISE_RATIO * noise_level(values), 0.1 * np.ptp(x)))
     crossings = swings[1:][np.diff(np.signbit(x[swings]))]
-    spacing = np.median(np.diff(time[crossings])) if len(crossings) > 1 else 0.5 * time[-1]
+    if len(crossings) > 1:
+        spacing = float(np.median(np.diff(time[crossings])))
+    elif len(crossings) == 1:
+        crossing = int(crossings[0])
+        before, after = int(np.argmax(np.abs(x[:crossing]))), crossing + int(np.argmax(np.abs(x[crossing:])))
+        spacing = float(max(time[after] - time[before], 2.0 * (time[after] - time[crossing])))
+    else:
+        spacing = 0.5 * float(time[-1])
     omega = float(np.pi / spacing)
     k1 = m1 * omega**2
     return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * m1)))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.kinematics import lint_kinematics
 from capsule_id.experiments.free_vibration.readings.blocks import block_size, default_block_size
 from capsule_id.experiments.free_vibration.settings import (
     DAMPING,
@@ -65,6 +66,7 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         faults = faults or [
             found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")
         ]
+        faults = faults or [*lint_kinematics(table, used, period)]
     yield from faults
     window = time[used], table[channels[0]][used]
     yield from _thinned(table, *window)
@@ -203,7 +205,7 @@ def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterab
         yield Finding("decays.length", "warn", facts, table.label)
 
 
-def _line(key: str) -> str:
+def line_of(key: str) -> str:
     """A line of rig.toml that states ``key`` of the facts."""
     return f'{key} = {{{{ value = {{{key}:.10g}}, unit = "s" }}}}'
 
@@ -253,29 +255,11 @@ MESSAGES = {
         "release of a decay",
         warn=(
             "a free decay must begin with its release; found {rest:.4g} s of {before} before it. The fit leaves "
-            "that out. To confirm that, add this line to the experiment in rig.toml: " + _line("start") + "{longer}"
+            "that out. To confirm that, add this line to the experiment in rig.toml: " + line_of("start") + "{longer}"
         ),
         fail=(
             "a free decay must begin with its release; found {rest:.4g} s of {before} after the stated start. "
-            "Write this line in the experiment in rig.toml: " + _line("start")
-        ),
-    ),
-    "decays.position": Message(
-        "position of a decay",
-        ok="{labels}: the residuals do not depend on position and direction (p = {p:.2g})",
-        fail=(
-            "{label}: the residuals must not depend on the position of the rod, but they do (p = {p:.1g}), most from "
-            "{low:.4g} to {high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the "
-            "sensor, or state a later start, for smaller amplitudes."
-        ),
-    ),
-    "decays.drift": Message(
-        "drift of a decay",
-        ok="{label}: the fitted drift of the zero is slower than the motion ({share:.1%} of it at its frequency)",
-        fail=(
-            "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at "
-            "its frequency. It hides an error of the model. State a later start, for smaller amplitudes. Where dry friction "
-            "ends the motion, state an earlier stop instead."
+            "Write this line in the experiment in rig.toml: " + line_of("start")
         ),
     ),
     "decays.hidden": Message(
@@ -301,7 +285,7 @@ MESSAGES = {
         "end of a decay",
         fail=(
             "the energy of a free decay must not grow; it grows after {found:.5g} s. Add this line to the experiment in "
-            "rig.toml: " + _line("stop")
+            "rig.toml: " + line_of("stop")
         ),
     ),
     "decays.magnitude": Message(

@@ -1,6 +1,8 @@
 """What the checks of free decays say, and captions of their tables."""
 
+from capsule_id.experiments.free_vibration.kinematics import MESSAGES as KINEMATICS_MESSAGES
 from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
+from capsule_id.experiments.free_vibration.lint import line_of
 from capsule_id.experiments.free_vibration.settings import DAMPING
 from capsule_id.views import Facts, Message
 
@@ -27,8 +29,47 @@ def _halves(facts: Facts) -> str:
     )
 
 
+def _forces(facts: Facts) -> str:
+    """The force that explains the turning points better, and the line that states it."""
+    unit = "" if facts["unit"] == "1" else f" {facts['unit']}"
+    return (
+        f"{facts['label']}: expected turning points that the fitted model explains ({facts['model']}); {facts['name']} = "
+        f"{facts['value']:.3g}{unit} explains them better ({facts['z']:.1f} sd from 0). Write {facts['line']} in its entry."
+    )
+
+
+def _smaller(facts: Facts) -> str:
+    """How to leave out the large amplitudes of a record."""
+    if facts["start"] is None:
+        return "record again from smaller deflections"
+    return f"leave out the larger half of the amplitudes: add {line_of('start').format(**facts)} to the experiment in rig.toml"
+
+
+def _position(facts: Facts) -> str:
+    return (
+        "{label}: the residuals must not depend on the position of the rod, but they do (p = {p:.1g}), most from {low:.4g} to "
+        "{high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the sensor, or "
+    ).format(**facts) + f"{_smaller(facts)}."
+
+
+def _residuals(facts: Facts) -> str:
+    return (
+        "{label}: the residuals must not be larger where the motion is larger, but they are, {ratio:.1f} times (p = {p:.1g}). "
+        "What was fitted as noise is an error of the model there, such as a stiffness or a damping that depends on the "
+        "amplitude, or an error of the sensor in proportion to the motion. To find the cause, "
+    ).format(**facts) + f"{_smaller(facts)}, and compare the results."
+
+
+def _drift(facts: Facts) -> str:
+    return (
+        "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at its "
+        "frequency. It hides an error of the model. Where dry friction ends the motion, state an earlier stop; else "
+    ).format(**facts) + f"{_smaller(facts)}."
+
+
 MESSAGES = {
     **LINT_MESSAGES,
+    **KINEMATICS_MESSAGES,
     "decays.stiffness": Message(
         "stiffness against amplitude",
         ok="k1 is the same in all {records} records (p = {p:.2g})",
@@ -59,6 +100,27 @@ MESSAGES = {
             "by ζ², because it takes the damped frequency for the natural one. Its c depends on how peaks are read out of "
             "noise."
         ),
+    ),
+    "decays.forces": Message(
+        "forces of a decay",
+        ok="{labels}: no further force explains the turning points better",
+        warn=_forces,
+        fail=_forces,
+    ),
+    "decays.position": Message(
+        "position of a decay",
+        ok="{labels}: the residuals do not depend on position and direction (p = {p:.2g})",
+        fail=_position,
+    ),
+    "decays.residuals": Message(
+        "residuals and amplitude of a decay",
+        ok="{labels}: the residuals do not grow with the amplitude (p = {p:.2g})",
+        fail=_residuals,
+    ),
+    "decays.drift": Message(
+        "drift of a decay",
+        ok="{label}: the fitted drift of the zero is slower than the motion ({share:.1%} of it at its frequency)",
+        fail=_drift,
     ),
     "decays.halves": Message(
         "halves of a decay",

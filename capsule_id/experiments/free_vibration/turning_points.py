@@ -12,6 +12,7 @@ from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionM
 from capsule_id.experiments.free_vibration.decay_models import half_cycles
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
+from capsule_id.experiments.free_vibration.points_checks import check_forces_of_points, check_halves_of_points
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.starts import further_parameters
 from capsule_id.experiments.linear import NUISANCE_WIDTH
@@ -43,6 +44,8 @@ class TurningPoints(SurfaceExperiment):
     last: int = eqx.field(static=True)
     both_sides: bool = eqx.field(static=True)
     model: DecayModel = eqx.field(static=True)
+
+    checks = (check_forces_of_points, check_halves_of_points)
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.friction, self.model = friction, DecayModel.stated(table.settings)

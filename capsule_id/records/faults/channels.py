@@ -37,9 +37,9 @@ def phasor(time: np.ndarray, values: np.ndarray, Omega: float) -> Phasor:
     return Phasor(complex(cosine, -sine), noise * float(np.sqrt(2.0 / len(x))))
 
 
-def acceleration_ratio(position: Phasor, acceleration: Phasor, Omega: float) -> complex:
-    """Ratio of a recorded acceleration to that of the recorded position; 1 where both show one motion."""
-    return acceleration.value / (-(Omega**2) * position.value)
+def derivative_ratio(position: Phasor, derivative: Phasor, Omega: float, order: int) -> complex:
+    """Ratio of a recorded derivative to that of the recorded position; 1 where both show one motion."""
+    return derivative.value / ((1j * Omega) ** order * position.value)
 
 
 def drive_power(force: Phasor, position: Phasor, Omega: float) -> tuple[float, float]:

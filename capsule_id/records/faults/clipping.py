@@ -7,12 +7,14 @@ from typing import Literal
 import numpy as np
 
 from capsule_id.records.faults.duplicates import reading_step
-from capsule_id.rig.filters import pieces
+from capsule_id.rig.filters import pieces, thinned
 
 #: Fewest samples at the limit; how many times as many as at the neighbouring values.
 FEWEST_CLIPPED, EXCESS = 3, 5.0
 #: Number of neighbouring values. The peak of a sine that is read in steps has 3.4 times their mean number.
 NEIGHBOURS = 5
+#: Readings of at least this part of a limit have its step, where there are so many.
+LARGE, FEWEST_LARGE = 0.3, 20
 #: A record held at its limit for longer than this fraction of a period before its release is not clipped.
 LONGEST_HOLD = 0.2
 
@@ -36,15 +38,19 @@ def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
     """
     if np.ptp(values) == 0.0:
         return []
-    step = reading_step(values)
+    few = thinned(values)
     sides: tuple[tuple[Literal["upper", "lower"], float], ...] = (("upper", 1.0), ("lower", -1.0))
     limits = float(np.max(values)), float(np.min(values))
-    tolerance = max(0.25 * step, 4e-16 * max(abs(limit) for limit in limits))
-    return [
-        Clipped(side, limit, rows)
-        for (side, sign), limit in zip(sides, limits, strict=True)
-        if len(rows := _at_limit(values, (limit, sign), (tolerance, step), period))
-    ]
+    found = []
+    for (side, sign), limit in zip(sides, limits, strict=True):
+        # Readings with so many significant digits have finer steps near zero than at a limit.
+        large = few[few / limit >= LARGE] if limit else few
+        step = reading_step(large if len(large) >= FEWEST_LARGE else few)
+        tolerance = max(0.25 * step, 4e-16 * max(abs(limit) for limit in limits))
+        rows = _at_limit(values, (limit, sign), (tolerance, step), period)
+        if len(rows):
+            found.append(Clipped(side, limit, rows))
+    return found
 
 
 def _at_limit(

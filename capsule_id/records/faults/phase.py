@@ -120,9 +120,8 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
     noisy = None
     while large.any():
         worst = int(np.argmax(np.where(large, deviation, 0.0)))
-        # The record may be noisier here than elsewhere. One jump does not change the median of the differences.
-        local = noise_level(values[worst : worst + 2 * side])
-        if deviation[worst] * noise <= JUMP_SDS * local:
+        # The record may be noisier here than elsewhere.
+        if deviation[worst] * noise <= JUMP_SDS * _local_noise(values[worst : worst + 2 * side]):
             noisy = noisy or Jump(worst + side, float(phase[worst]), noisy=True)
             large[max(0, worst - side) : worst + side] = False
             continue
@@ -130,6 +129,19 @@ def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: 
             return Jump(worst + side, float(phase[worst]))
         large[max(0, worst - side) : worst + side] = False
     return noisy
+
+
+def _local_noise(values: np.ndarray) -> float:
+    """Noise level of a few samples with a jump in their middle: the smaller one of two estimates.
+
+    One wrong sample does not change the median of the differences. The residuals of the polynomials on both sides vary
+    less by chance, and the jump does not enter them.
+    """
+    sides = values.reshape(2, -1).T
+    place = np.arange(len(sides)) - 0.5 * (len(sides) - 1)
+    squares = polynomial.polyfit(place, sides, ORDER, full=True)[1][0]
+    residual = float(np.sqrt(np.sum(squares) / (2 * (len(sides) - ORDER - 1))))
+    return min(noise_level(values), residual)
 
 
 def _recurs(jumps: np.ndarray, precision: np.ndarray, place: int, period: float) -> bool:

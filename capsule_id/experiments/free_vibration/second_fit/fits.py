@@ -112,13 +112,16 @@ def _whitened(times: ReadingTimes, raw: Any, thetas: Mapping[str, Any], sloped: 
 
 
 class Screening:
-    """Maximum-likelihood fits of one record, by means of ``thin`` samples (default: as the record)."""
+    """Maximum-likelihood fits of one record, by means of ``thin`` samples (default: as the record).
 
-    def __init__(self, record: "FreeVibration", thin: int | None = None) -> None:
+    ``k1`` is what the bounds of k1 lie about (default: a rough estimate, which few swings with dry friction mislead).
+    """
+
+    def __init__(self, record: "FreeVibration", thin: int | None = None, k1: float | None = None) -> None:
         rough = record.rough_decrement()
         self.turning_time, peak = first_turning_point(record)
         self.side, self.size = float(np.sign(peak)), abs(peak)
-        self.m1, self.k1, self.c, self.omega = record.mass, rough.k1, rough.c, rough.Omega_o
+        self.m1, self.k1, self.c, self.omega = record.mass, k1 or rough.k1, rough.c, rough.Omega_o
         period, length = 2.0 * np.pi / self.omega, float(record.time[-1])
         self.order = record.order
         blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
