@@ -145,15 +145,20 @@ def test_interrupted_in_a_compilation_and_in_the_sample(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("experiments", "trials", "compiling"), [("bench", 150, 30), ("all", 20, 6)])
 def test_many_interruptions(tmp_path: Path, experiments: str, trials: int, compiling: int) -> None:
-    """Signals at random times of a fit of ``data/``; ``compiling`` of them at the beginning of a compilation."""
+    """Signals at random times of a fit of ``data/``; ``compiling`` of them at the beginning of a compilation.
+
+    Those at a compilation find no compiled programs on disk, the others find them as a user does.
+    """
     words = (str(DATA), "--experiments", experiments, "--quiet", "--max-steps", "300")
-    began = time.monotonic()
     code = start(tmp_path, *words, "--out", "whole").wait()
-    length, compiled = time.monotonic() - began, compilations(tmp_path)
+    compiled = compilations(tmp_path)
+    began = time.monotonic()
+    assert start(tmp_path, *words, "--out", "again", cache=True).wait() == code
+    length = time.monotonic() - began
     random = np.random.default_rng(11)
     ends = []
     for trial in range(trials):
-        fit = start(tmp_path, *words, "--out", "out")
+        fit = start(tmp_path, *words, "--out", "out", cache=trial >= compiling)
         if trial < compiling:
             number = int(random.integers(1, compiled + 1))
             wait_until(lambda number=number: compilations(tmp_path) >= number, fit)
@@ -166,7 +171,7 @@ def test_many_interruptions(tmp_path: Path, experiments: str, trials: int, compi
         if fit.returncode == 130:
             assert not (tmp_path / "out").exists()
             resume = ["--resume"] if (tmp_path / "out.partial").exists() else []
-            assert start(tmp_path, *words, "--out", "out", *resume).wait() == code
+            assert start(tmp_path, *words, "--out", "out", *resume, cache=True).wait() == code
         else:
             assert fit.returncode == code
         same_result(tmp_path / "out", tmp_path / "whole")

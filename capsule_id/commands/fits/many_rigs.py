@@ -37,9 +37,10 @@ POLL = 0.1
 
 @dataclass(frozen=True)
 class FittedRig:
-    """A result as it comes from a worker: the content of its files by path, and the verdict."""
+    """A result as it comes from a worker: the content of its files by path, changes of the model, and the verdict."""
 
     files: Mapping[str, bytes]
+    changes: str
     verdict: str
     clean: bool
 
@@ -90,7 +91,7 @@ def fit_many(
             except Exception as error:  # the other rigs are fitted all the same
                 failures.append(f"{rig.name} ({one_line(error)}; {save_traceback(error)})")
             else:
-                say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}")
+                say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}{found.changes}")
                 unclean += [rig.name] * (not found.clean)
             progress(done, len(rigs), "rigs")
     if not failures and not unclean:
@@ -110,7 +111,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
         If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
     """
     prepare_jax(options, rig.has_runs)
-    from capsule_id.report.console_table import verdict_text
+    from capsule_id.report.console_table import verdict_text, wrapped
 
     kinds = kinds or default_registry()
     with tempfile.TemporaryDirectory() as name:
@@ -124,7 +125,8 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
             for path in folder.rglob("*")
             if path.is_file() and path.name not in WORK_FILES
         }
-    return FittedRig(files, verdict_text(result.trust, result.failed), result.clean)
+    changes = "".join(f"\n{line}" for line in wrapped(result.changes_of_model))
+    return FittedRig(files, changes, verdict_text(result.trust, result.failed), result.clean)
 
 
 def _in_process(rigs: Sequence[Rig], options: Options, kinds: Registry) -> Iterator[tuple[Rig, FittedRig | Exception]]:
