@@ -15,8 +15,8 @@ def describe_run(table: Table) -> list[str]:
     evidence = "; ".join(_evidence(motion))
     lines = [f"motion {label_text(motion)} ({evidence})" if evidence else f"motion {motion.label}"]
     if motion.evidence.reasons:
-        word = "undecided because of" if motion.label == UNDECIDED else "the rest of the label is undecided because of"
-        lines.append(f"{word} {'; '.join(motion.evidence.reasons)}")
+        part = "undecided" if motion.label == UNDECIDED else "the rest of the label is undecided"
+        lines.append(f"{part}: {'; '.join(motion.evidence.reasons)}")
     if motion.evidence.drive:
         lines.append(_drive(motion.evidence.drive))
     try:

@@ -6,7 +6,7 @@ from typing import Any, get_args, get_type_hints
 
 from capsule_id.parameters import TABLE
 from capsule_id.rig.model import ModelChoices, Quantity, Table
-from capsule_id.rig.schema import GroundSettings, KindRule
+from capsule_id.rig.schema import TABLE_KEYS, GroundSettings, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_choice, read_table, refuse_unknown_keys, shown
 
@@ -23,7 +23,7 @@ def read_model(document: TomlDocument) -> ModelChoices:
         If a key or word is unknown or repeated, or a free parameter has no effect in the chosen law.
     """
     head = read_table(document, ("model",), document.data.get("model", {}), "[model]")
-    refuse_unknown_keys(document, ("model",), head, ("friction", "free", "reaction"))
+    refuse_unknown_keys(document, ("model",), head, TABLE_KEYS["[model]"], TABLE_KEYS)
     choices: dict[str, str] = {}
     for key in ("friction", "reaction"):
         words = get_args(get_type_hints(ModelChoices)[key])

@@ -18,7 +18,7 @@ from capsule_id.rig.entry import Entry
 from capsule_id.rig.formats.text.decode import decode
 from capsule_id.rig.maps.declared import MAP_KEYS
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
-from capsule_id.rig.schema import RIG_QUANTITIES, KindRule, parameter_rows
+from capsule_id.rig.schema import RIG_QUANTITIES, TABLE_KEYS, KindRule, parameter_rows
 from capsule_id.rig.tables import TableFile, read_experiment_files
 from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
 from capsule_id.rig.toml_values import (
@@ -66,7 +66,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     if "rig" not in data:
         raise InputError("rig.toml must have a table [rig]", "none", "add [rig] with a name", document.path, 1, 1)
     head = read_table(document, ("rig",), data["rig"], "[rig]")
-    refuse_unknown_keys(document, ("rig",), head, ("name", "synthetic", *RIG_QUANTITIES))
+    refuse_unknown_keys(document, ("rig",), head, TABLE_KEYS["[rig]"], TABLE_KEYS)
     if "name" not in head:
         raise document.error(("rig",), "[rig] must have a name", "none", 'add name = "..."')
     name = read_name(document, ("rig", "name"), head["name"])
@@ -216,9 +216,8 @@ def _read_experiment(
         raise document.error((*path, "kind"), "unknown kind", shown(word), f"write one of {' '.join(kinds)}")
     kind = kinds[word]
     errors = [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
-    refuse_unknown_keys(
-        document, path, entry, ("kind", "file", "label", "reject", "clock", *MAP_KEYS, *kind.setting_rules, *errors)
-    )
+    known = ("kind", "file", "label", "reject", "clock", *MAP_KEYS, *kind.setting_rules, *errors)
+    refuse_unknown_keys(document, path, entry, known, TABLE_KEYS)
     settings = _read_settings(document, path, entry, kind, ground)
     file = read_experiment_files(document, path, entry, kind)
     name = next(iter(file.sha256))

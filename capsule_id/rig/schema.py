@@ -240,3 +240,8 @@ RIG_QUANTITIES: Mapping[str, QuantityRule] = {
     "slope": SLOPE,
     "N0": PRESSING_FORCE,
 }
+#: Keys of the tables of rig.toml that stand once.
+TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
+    "[rig]": ("name", "synthetic", *RIG_QUANTITIES),
+    "[model]": ("friction", "free", "reaction"),
+}

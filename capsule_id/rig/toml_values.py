@@ -1,9 +1,10 @@
 """Reads single values of ``rig.toml``: type, unit, domain, SI. An error names the line and column of the value."""
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
 from math import isfinite
+from types import MappingProxyType
 from typing import Any
 
 from capsule_id.rig.domains import ABOVE_ONE, ANY, LARGEST, NOT_NEGATIVE, POSITIVE, SMALLEST, Domain, is_plausible
@@ -13,6 +14,8 @@ from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 NAME_PATTERN = r"[A-Za-z0-9._-]+"
 _DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
+#: No table of rig.toml, see ``refuse_unknown_keys``.
+NOWHERE: Mapping[str, Collection[str]] = MappingProxyType({})
 _LONGEST_SHOWN = 60  # characters of a faulty value in an error line
 
 
@@ -30,12 +33,18 @@ def closest(word: str, known: Collection[str]) -> str | None:
     return next(iter(get_close_matches(word[:_LONGEST_SHOWN], known, n=1)), None)
 
 
-def refuse_unknown_keys(document: TomlDocument, path: KeyPath, entry: dict[str, Any], known: Collection[str]) -> None:
-    """Raise at the first key of ``entry`` that is not ``known``."""
+def refuse_unknown_keys(
+    document: TomlDocument,
+    path: KeyPath,
+    entry: dict[str, Any],
+    known: Collection[str],
+    elsewhere: Mapping[str, Collection[str]] = NOWHERE,
+) -> None:
+    """Raise at the first key of ``entry`` that is not ``known``; ``elsewhere``: keys of other tables, by table."""
     for key in entry:
         if key not in known:
-            close = closest(key, known)
-            remedy = f"write {close}" if close else "remove it"
+            close, table = closest(key, known), next((name for name, keys in elsewhere.items() if key in keys), None)
+            remedy = f"move it to {table}" if table else f"write {close}" if close else "remove it"
             remedy += f"; known: {' '.join(known)}"
             raise document.error((*path, key), "unknown key", shown(key), remedy, of_key=True)
 

@@ -117,7 +117,7 @@ def test_check_says_it_in_a_few_lines(case: Known) -> None:
 
 def test_check_says_why_it_cannot_tell(case: Known) -> None:
     lines = describe_run(table_of(noisier(case.run, 1.0, 0), only=("current",)))
-    assert lines[:2] == ["motion undecided", "undecided because of x_rel was not recorded"]
+    assert lines[:2] == ["motion undecided", "undecided: x_rel was not recorded"]
     assert [line[:5] for line in lines[2:]] == ["drive"]
 
 

@@ -22,6 +22,12 @@ TOML_FAULTS = [
     ("# A rig with every kind of experiment.\n[rig]", "‸[rog]", "unknown key, 'rog', write rig"),
     ("synthetic = true", 'synthetic = ‸"yes"', "synthetic must be true or false"),
     ("synthetic = true", "‸colour = 1", "unknown key, 'colour', remove it"),
+    (
+        "synthetic = true",
+        '‸friction = "constant"',
+        "unknown key, 'friction', move it to [model]; known: name synthetic",
+    ),
+    ('kind = "static_friction"', 'kind = "static_friction"\n‸free = []', "unknown key, 'free', move it to [model]"),
     ('m1 = { value = 110, sd = 0.5, unit = "g" }', "m1 = ‸0.11", "m1 must be a table"),
     ("g = { value = 9.81,", "g = { value = 9.81, ‸sd = 0.01,", "unknown key, 'sd', remove it"),
     ("m1 = { value = 110", "m1 = { value = ‸-110", "m1 must be greater than 0"),

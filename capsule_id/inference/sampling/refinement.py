@@ -20,8 +20,6 @@ from capsule_id.inference.sampling.transport import LARGEST_MAP, Transported
 NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
 #: Draws of a round, and rounds with one component and with several.
 DRAWS, SINGLE, SEVERAL = 2048, 4, 12
-#: Rounds before several components describe a block with a parameter that may be absent.
-BEFORE_SEVERAL = 2
 #: Number of components of a posterior that one component does not describe; components of less weight are dropped.
 COMPONENTS, LEAST_WEIGHT = 8, 0.01
 #: Steps of expectation maximisation after each round with several components.
@@ -47,8 +45,6 @@ class _Rounds:
     def __init__(self, first: Density, prior: Float[np.ndarray, "2 d"], large: bool) -> None:
         self.proposals, self._prior, self._large = [first], prior, large
         self._several: Mixture | None = None
-        #: Whether a parameter may be absent: the posterior then bends, and one component misses its end.
-        self.bent = False
         self._u = np.empty((0, prior.shape[1]))
         self._log_posterior = self._log_drawn = np.empty(0)
 
@@ -91,16 +87,10 @@ class _Rounds:
             return self.proposals[-1]
         if self._large and u.shape[1] <= LARGEST_MAP:
             return Transported(u, weights)
-        several = len(self.proposals) > SINGLE or self.bent
+        several = len(self.proposals) > SINGLE
         mixture = _adapted(self._several, u, weights, self._prior, several, rng)
         self._several = mixture if several else None
-        self.bent = self.bent or (len(self.proposals) >= BEFORE_SEVERAL and bool(mixture.coordinates.weak))
         return mixture
-
-    @property
-    def finished(self) -> bool:
-        """Whether a good proposal needs no further round: several components describe a bent posterior."""
-        return not self.bent or self._several is not None
 
 
 def refined(
@@ -143,7 +133,6 @@ def refined(
                 good.append(large[j] and size >= kept * DRAWS)
             else:
                 good.append(size >= (ENOUGH if i >= SINGLE else EXCELLENT) * DRAWS)
-            good[j] = good[j] and own.finished
             own.next(good[j], rng)
         if all(good):
             break
