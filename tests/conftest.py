@@ -50,6 +50,7 @@ NOT_OPTIMISED = {
     "test_slope.py",
     "test_smooth.py",
     "test_smooth_derivatives.py",
+    "test_turning_points.py",
 }
 
 #: Modules whose annotations are checked at run time; the hook must stand before their first import.

@@ -174,7 +174,7 @@ def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "
         capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
     )
     if table.settings.samples == "turning_points":
-        make = made_by("capsule_id.experiments.free_vibration.turning_points:TurningPoints")
+        make = made_by("capsule_id.experiments.free_vibration.turning_points.experiment:TurningPoints")
     return tuple(e for one in _channel_tables(cut_at_release(table)) for e in make(one, rig, friction))
 
 

@@ -33,7 +33,7 @@ from capsule_id.experiments.free_vibration.decrement import (
 from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, default_block_size, is_even
 from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Channel, channel_of
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
-from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms
+from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms, reduced_record
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.starts import decay_starts, first_turning_point, further_parameters
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_comparison, decay_table, second_fit_table
@@ -314,6 +314,10 @@ class FreeVibration(SurfaceExperiment):
     def largest_deflection(self) -> float:
         """Largest distance of a sample from the rest position, m."""
         return self.deflection * float(np.max(np.abs(self.values - equilibrium(self.values))))
+
+    def reduced(self, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See ``capsule_id.experiments.free_vibration.second_fit.hidden_terms.Decay``."""
+        return reduced_record(self, theta)
 
     @property
     def cycles(self) -> np.ndarray:

@@ -15,6 +15,8 @@ from capsule_id.rig.schema import CountRule, GroundSettings, NameRule, QuantityR
 #: Parameter of every damping term besides the viscous one, and of the cubic spring.
 DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 
+#: Parameters of all forces besides those of the linear model.
+FURTHER = (*DAMPING.values(), "k_cubic")
 #: What every parameter of a further force stands for, in words.
 EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
 _DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
@@ -94,15 +96,34 @@ class DecayModel:
     @property
     def lines(self) -> str:
         """Lines of ``rig.toml`` that state the model."""
-        damping = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
-        stiffness = "cubic" if self.cubic else "linear"
-        words = f'damping = [{damping}], stiffness = "{stiffness}", drift = "{self.drift}", noise = "{self.noise}"'
-        return f"{words}, thin = {self.thin}"
+        return f'{self.force_lines}, drift = "{self.drift}", noise = "{self.noise}", thin = {self.thin}'
+
+    @property
+    def force_lines(self) -> str:
+        """Lines of ``rig.toml`` that state the forces."""
+        return f"{self.damping_line}, {self.stiffness_line}"
+
+    @property
+    def damping_line(self) -> str:
+        """Line of ``rig.toml`` that states the damping."""
+        words = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
+        return f"damping = [{words}]"
+
+    @property
+    def stiffness_line(self) -> str:
+        """Line of ``rig.toml`` that states the spring."""
+        word = "cubic" if self.cubic else "linear"
+        return f'stiffness = "{word}"'
 
     @property
     def symbols(self) -> tuple[str, ...]:
         """Symbols of the parameters besides k1 and c."""
         return (*(DAMPING[word] for word in self.damping), *(("k_cubic",) if self.cubic else ()))
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Symbols of the forces that the model lacks."""
+        return tuple(symbol for symbol in FURTHER if symbol not in self.symbols)
 
     @property
     def whitened(self) -> bool:

@@ -7,20 +7,20 @@ and the values beside it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from scipy import stats
 
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import (
-    absent,
     further_sensitivities,
     sensitivities,
     whitened,
 )
-from capsule_id.experiments.free_vibration.settings import DAMPING
+from capsule_id.experiments.free_vibration.settings import DecayModel, DecaySettings
 from capsule_id.parameters import parameter
+from capsule_id.rig.model import Table
 from capsule_id.views import Facts, Finding
 
 if TYPE_CHECKING:
@@ -62,20 +62,39 @@ class Hidden:
         return 0.0, self.sd * (ratio + float(stats.norm.isf(beyond)))
 
 
-def check_hidden_terms(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+class Decay(Protocol):
+    """A record or the turning points of a decay."""
+
+    model: DecayModel
+
+    @property
+    def label(self) -> str: ...
+
+    @property
+    def table(self) -> Table[DecaySettings]: ...
+
+    def local(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Select values by symbol from values by name."""
+        ...
+
+    def reduced(self, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives (n, p) and (n, q), and residuals (n,), in units of the noise, without own nuisances.
+
+        Derivatives with respect to k1, c and ``model.symbols``, and to the forces that the model lacks.
+        """
+        ...
+
+
+def check_hidden_terms(records: Sequence[Decay], fit: Fitted) -> list[Finding]:
     """Check that viscous records exclude further forces that would change c or k1 by much, where the settings allow them."""
-    groups: dict[Any, list[FreeVibration]] = {}
+    groups: dict[Any, list[Decay]] = {}
     for e in records:
-        settings = e.table.settings
-        if not e.model.damping and None in (settings.damping, settings.stiffness):
-            key = e.model.cubic, settings.damping, settings.stiffness, settings.offers_cubic
-            groups.setdefault(key, []).append(e)
+        # A record that demands a further damping seldom excludes another one as well.
+        if not e.model.damping and (symbols := open_forces(e)):
+            groups.setdefault((symbols, e.model.cubic, e.table.settings.offers_cubic), []).append(e)
     findings, compared = [], []
-    for (cubic, damping, stiffness, offers_cubic), members in groups.items():
+    for (offered, _, offers_cubic), members in groups.items():
         terms = hidden_terms(members, fit.values)
-        offered = (() if damping is not None else tuple(DAMPING.values())) + (
-            ("k_cubic",) * (stiffness is None and not cubic)
-        )
         facts = {"labels": [e.label for e in members], "offers_cubic": offers_cubic}
         compared += facts["labels"]
         findings += [
@@ -86,6 +105,14 @@ def check_hidden_terms(records: "Sequence[FreeVibration]", fit: Fitted) -> list[
     if compared and not findings:
         findings.append(Finding("decays.hidden", "ok", {"labels": ", ".join(compared)}))
     return findings
+
+
+def open_forces(e: Decay) -> tuple[str, ...]:
+    """Symbols of the forces that the model of ``e`` lacks and whose words the settings leave open."""
+    settings = e.table.settings
+    return tuple(
+        symbol for symbol in e.model.absent if (settings.stiffness if symbol == "k_cubic" else settings.damping) is None
+    )
 
 
 def _change(name: str, value: float, terms: Mapping[str, Hidden]) -> Facts:
@@ -104,9 +131,9 @@ def _change(name: str, value: float, terms: Mapping[str, Hidden]) -> Facts:
     return {**facts, "symbols": symbols, "largest": largest}
 
 
-def hidden_terms(records: "Sequence[FreeVibration]", values: Mapping[str, float]) -> dict[str, Hidden]:
+def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[str, Hidden]:
     """Every force that the common model of ``records`` lacks, by symbol; ``values`` of the fit, SI."""
-    blocks = [_own_nuisances_removed(e, e.local(values)) for e in records]
+    blocks = [e.reduced(e.local(values)) for e in records]
     known, further, left = (np.concatenate(part) for part in zip(*blocks, strict=True))
     model = records[0].model
     names = ("k1", "c", *model.symbols)
@@ -114,7 +141,7 @@ def hidden_terms(records: "Sequence[FreeVibration]", values: Mapping[str, float]
     inverse = np.linalg.pinv(known / size) / size[:, None]
     errors = dict(zip(names, np.linalg.norm(inverse, axis=1), strict=True))
     found = {}
-    for symbol, column in zip(absent(records[0]), further.T, strict=True):
+    for symbol, column in zip(model.absent, further.T, strict=True):
         change = inverse @ column
         own = column - known @ change
         power = float(own @ own)
@@ -123,18 +150,16 @@ def hidden_terms(records: "Sequence[FreeVibration]", values: Mapping[str, float]
     return found
 
 
-def _own_nuisances_removed(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns of the shared parameters and of further forces, and residuals, in units of the noise.
-
-    Nuisances of the record are projected out.
-    """
+def reduced_record(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``Decay.reduced`` of a record."""
     left, design, moved = sensitivities(e, theta)
     further = further_sensitivities(e, theta)
     shared = np.column_stack([moved.pop(name) for name in ("k1", "c", *e.model.symbols)])
     own = whitened(e, theta, np.column_stack([design, *moved.values()]))
     own = np.linalg.qr(own / np.linalg.norm(own, axis=0))[0]
     parts = [
-        whitened(e, theta, part) for part in (shared, np.column_stack([further[s] for s in absent(e)]), left[:, None])
+        whitened(e, theta, part)
+        for part in (shared, np.column_stack([further[s] for s in e.model.absent]), left[:, None])
     ]
     known, others, residuals = (part - own @ (own.T @ part) for part in parts)
     misfit = residuals - known @ np.linalg.lstsq(known, residuals, rcond=None)[0]

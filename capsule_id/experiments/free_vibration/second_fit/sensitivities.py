@@ -10,7 +10,7 @@ from scipy.signal import lsim
 from capsule_id.experiments.clock import stretch
 from capsule_id.experiments.free_vibration.decay_models import rates
 from capsule_id.experiments.free_vibration.readings.noise import whiten
-from capsule_id.experiments.free_vibration.settings import DAMPING
+from capsule_id.experiments.free_vibration.settings import DAMPING, FURTHER
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 STEP = 1e-5
 #: Points per period, and fewest points, of the responses to further forces.
 RESPONSE_POINTS, FEWEST_POINTS = 60, 200
-#: Parameters of all forces besides those of the linear model.
-FURTHER = (*DAMPING.values(), "k_cubic")
 
 
 def whitened(e: "FreeVibration", theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
@@ -46,17 +44,12 @@ def sensitivities(
     return left, design, moved
 
 
-def absent(e: "FreeVibration") -> list[str]:
-    """Symbols of the forces that the model of ``e`` lacks."""
-    return [symbol for symbol in FURTHER if symbol not in e.model.symbols]
-
-
 def further_sensitivities(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Derivatives (n,) of the residuals with respect to the forces that the model of ``e`` lacks, at zero force."""
     if e.closed:
         return {name: -response for name, response in force_responses(e, theta).items()}
     full = e.with_model(replace(e.model, damping=tuple(DAMPING), cubic=True))
-    names = absent(e)
+    names = e.model.absent
     known = {**theta, **dict.fromkeys(names, 0.0)}
     raw, units = full.unwhitened(known, np)[0], _units(e, theta)
     return {

@@ -1,6 +1,8 @@
 """Turning points of a free decay, read one by one: times and positions (``samples = "turning_points"``)."""
 
+from collections.abc import Sequence
 from types import ModuleType
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,14 +14,17 @@ from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionM
 from capsule_id.experiments.free_vibration.decay_models import half_cycles
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
 from capsule_id.experiments.free_vibration.decrement import Decrement
-from capsule_id.experiments.free_vibration.points_checks import check_forces_of_points, check_halves_of_points
+from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.starts import further_parameters
+from capsule_id.experiments.free_vibration.turning_points.checks import check_forces, check_halves
+from capsule_id.experiments.free_vibration.turning_points.linear import reduced_points
+from capsule_id.experiments.free_vibration.turning_points.second_fit import second_fit_table, second_models
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Prior, parameter
 from capsule_id.rig.model import Rig, Table
-from capsule_id.views import Comparison, Curve, Points
+from capsule_id.views import Comparison, Curve, Finding, Points
 
 #: Default priors of the noise of positions and times: log-normal, this fraction of the range and of the median step.
 NOISE_FRACTION, NOISE_FACTOR = 0.01, 100.0
@@ -45,10 +50,13 @@ class TurningPoints(SurfaceExperiment):
     both_sides: bool = eqx.field(static=True)
     model: DecayModel = eqx.field(static=True)
 
-    checks = (check_forces_of_points, check_halves_of_points)
+    checks = (check_forces, check_halves, check_hidden_terms)
+    tables = (second_fit_table,)
 
-    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction, self.model = friction, DecayModel.stated(table.settings)
+    def __init__(
+        self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1, model: DecayModel | None = None
+    ) -> None:
+        self.friction, self.model = friction, model or DecayModel.stated(table.settings)
         time, self.values = decay_window(table)
         self.time = time - time[0]
         step = np.diff(self.time)
@@ -76,6 +84,21 @@ class TurningPoints(SurfaceExperiment):
             *clock_parameters(table, rig),
         ]
         self.about = About(table, rig, tuple(rows))
+
+    def with_model(self, model: DecayModel) -> "TurningPoints":
+        """Return the same turning points with other forces."""
+        return TurningPoints(self.table, self.rig, self.friction, model)
+
+    @classmethod
+    def second_models(
+        cls, records: "Sequence[Any]", readings: Sequence[Finding] = ()
+    ) -> tuple[list[Any], list[Finding]]:
+        del readings
+        return second_models(records)
+
+    def reduced(self, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See ``capsule_id.experiments.free_vibration.second_fit.hidden_terms.Decay``."""
+        return reduced_points(self, theta)
 
     @property
     def scatters(self) -> tuple[str, str]:

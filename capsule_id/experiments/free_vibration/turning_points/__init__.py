@@ -1,0 +1,1 @@
+"""Turning points of a free decay, read one by one (``samples = "turning_points"``): likelihood, second fit, checks."""

@@ -1,0 +1,95 @@
+"""Choice of the forces of turning points where the readings contradict the stated ones.
+
+A force is added where the readings demand it by ``FAIL`` sds and exclude every other one in its place.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.checks.context import Fitted
+from capsule_id.experiments.free_vibration.second_fit.hidden_terms import open_forces
+from capsule_id.experiments.free_vibration.settings import DecayModel
+from capsule_id.experiments.free_vibration.turning_points.linear import (
+    DISAGREE,
+    FAIL,
+    FurtherForce,
+    bic,
+    fitted,
+    further_force,
+    standard_errors,
+)
+from capsule_id.views import Finding, ResultTable
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.free_vibration.turning_points.experiment import TurningPoints
+
+
+def second_models(tables: "Sequence[TurningPoints]") -> "tuple[list[TurningPoints], list[Finding]]":
+    """Return ``tables`` under the models that they demand, and findings that name them.
+
+    Tables with the same stated words share their parameters, and so their model.
+    """
+    chosen, findings = list(tables), list[Finding]()
+    groups: dict[tuple[object, ...], list[int]] = {}
+    for i, e in enumerate(tables):
+        groups.setdefault((e.table.settings.damping, e.table.settings.stiffness, e.model.cubic), []).append(i)
+    for members in groups.values():
+        own, contradicting = [tables[i] for i in members], list[str]()
+        while demanded := _demanded_force(own):
+            label, force = demanded
+            contradicting.append(label)
+            own = [e.with_model(force.model) for e in own]
+        if contradicting:
+            first, second = tables[members[0]].model, own[0].model
+            labels = list(dict.fromkeys(contradicting))
+            facts = {"labels": labels, "first": first.name, "second": second.name, "lines": second.force_lines}
+            findings.append(Finding("decays.second_fit", "warn", {**facts, "drift": ""}, labels[0]))
+            for i, e in zip(members, own, strict=True):
+                chosen[i] = e
+    return chosen, findings
+
+
+def second_fit_table(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[ResultTable]:
+    """Compare the turning points under the stated model and under the quoted one; [] where both are the same."""
+    del fit
+    replaced = [e for e in tables if e.model != DecayModel.stated(e.table.settings)]
+    rows = []
+    for e in replaced:
+        for role, one in (("stated", e.with_model(DecayModel.stated(e.table.settings))), ("quoted", e)):
+            theta = fitted(one)
+            estimates = standard_errors(one, theta)
+            text = ", ".join(f"{name} = {theta[name]:.5g} ± {sd:.2g}" for name, sd in estimates.items())
+            rows.append(
+                {"table": e.label, "fit": role, "model": one.model.name, "parameters": text, "BIC": bic(one, theta)}
+            )
+    if not rows:
+        return []
+    frame = pd.DataFrame(rows)
+    frame["BIC"] -= frame.groupby("table")["BIC"].transform("min")
+    lines = replaced[0].model.force_lines
+    return [ResultTable("decays.second_fit", frame.set_index(["table", "fit"]), {"lines": lines})]
+
+
+def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, FurtherForce] | None:
+    """The most significant force that a table demands, with the label of that table."""
+    found = []
+    for e in tables:
+        symbols = [s for s in open_forces(e) if s != "k_cubic" or e.table.settings.offers_cubic]
+        theta = fitted(e) if symbols else {}
+        forces = [one for symbol in symbols if (one := further_force(e, theta, symbol)) and one.z > FAIL]
+        if forces:
+            best = max(forces, key=lambda one: one.z)
+            if all(_excluded(e, other, best.symbol) for other in forces if other is not best):
+                found.append((e.label, best))
+    return max(found, key=lambda pair: pair[1].z) if found else None
+
+
+def _excluded(e: "TurningPoints", other: FurtherForce, symbol: str) -> bool:
+    """Whether the readings demand the force with the parameter ``symbol`` even beside the force ``other``."""
+    with_other = e.with_model(other.model)
+    theta: ValuesBySymbol = fitted(with_other)
+    force = further_force(with_other, theta, symbol)
+    return force is not None and force.z > DISAGREE
