@@ -247,7 +247,6 @@ def test_forces_below_the_weight_along_the_slope_are_refused(tmp_path: Path, kin
     made = rig(tmp_path, table(kind, 0.3, settings=settings))
     with pytest.raises(InputError, match="must exceed the weight along the slope") as caught:
         make_experiments(made)
-    assert caught.value.line is not None
     assert "load_is" in caught.value.remedy
     assert cli.fit_params([str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert not (tmp_path / "out").exists()

@@ -12,12 +12,12 @@ from scipy.special import logsumexp
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
+from capsule_id.experiments.progression.density.groups import TrialGroups, TrialMisfit
+from capsule_id.experiments.progression.density.linear_misfit import linear_misfit
+from capsule_id.experiments.progression.density.outliers import MOST_TRIALS, SHARE, TIMES, alternatives
+from capsule_id.experiments.progression.density.sessions import MIDDLE, NODES, Sessions
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.linear_misfit import linear_misfit
-from capsule_id.experiments.progression.outliers import MOST_TRIALS, SHARE, TIMES, alternatives
 from capsule_id.experiments.progression.panels import new_trials
-from capsule_id.experiments.progression.sessions import MIDDLE, NODES, Sessions
 from capsule_id.inference.checks.regression import outliers
 from tests.experiments.summed_sessions import integrated
 from tests.inference.three_settings import THETA, three_settings

@@ -13,8 +13,8 @@ from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import KIND
+from capsule_id.experiments.progression.density.sessions import INNER, NODES
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.sessions import INNER, NODES
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
 from capsule_id.inference.fit.joint_fit import _rescaled
 from capsule_id.inference.target.log_posterior import LogPosterior

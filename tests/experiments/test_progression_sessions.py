@@ -17,11 +17,11 @@ from scipy.stats import multivariate_normal, norm
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.context import Fitted
+from capsule_id.experiments.progression.density.groups import TrialGroups, TrialMisfit, _log_probability
+from capsule_id.experiments.progression.density.linear_misfit import linear_misfit
+from capsule_id.experiments.progression.density.run_emulator import RunEmulator
+from capsule_id.experiments.progression.density.sessions import INNER, MIDDLE, NODES, Sessions, parameters_of
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit, _log_probability
-from capsule_id.experiments.progression.linear_misfit import linear_misfit
-from capsule_id.experiments.progression.run_emulator import RunEmulator
-from capsule_id.experiments.progression.sessions import INNER, MIDDLE, NODES, Sessions, parameters_of
 from capsule_id.experiments.progression.tables import session_table
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
 from capsule_id.inference.checks.regression import outliers

@@ -49,9 +49,8 @@ def test_the_remedy_for_a_block_that_ends_reads_it(tmp_path: Path) -> None:
     text = block(1, 70) + "\n" + block(2, 80)
     with pytest.raises(capsule_id.InputError, match="a row must have 3 cells, as line 9 has") as caught:
         rig(tmp_path, text, entry("data_from_line = 9"))
-    stated = re.search(r"data_to_line = \d+", caught.value.remedy)
-    assert stated is not None
-    (table,) = rig(tmp_path, text, entry("data_from_line = 9", stated[0])).tables
+    (stated,) = re.findall(r"data_to_line = \d+", caught.value.remedy)
+    (table,) = rig(tmp_path, text, entry("data_from_line = 9", stated)).tables
     assert len(table.rows) == 70
     with pytest.raises(capsule_id.InputError, match="must be a line of the file, which has 167, 168"):
         rig(tmp_path, text, entry("data_from_line = 9\ndata_to_line = 168"))

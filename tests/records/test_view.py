@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import default_registry
 from capsule_id.records.run_description import describe_run
-from capsule_id.records.view import SMALLEST_RATE_GAIN, RecordView, view_record
+from capsule_id.records.view import SMALLEST_RATE_GAIN, Gains, RecordView, view_record
 from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
 from capsule_id.report.figures.style import figure_of, new_figure, png
 from capsule_id.report.texts.messages import finding_text, messages_of
@@ -32,8 +33,8 @@ def view(case: Known) -> RecordView:
 
 
 def test_the_window_is_the_longest_that_leaves_contacts_alone(view: RecordView) -> None:
-    assert view.at_contact is not None
-    assert view.at_contact.rate >= SMALLEST_RATE_GAIN > filter_gain(view.at_contact.f * STEP, view.samples + 2, 3, 1)
+    at_contact = cast(Gains, view.at_contact)
+    assert at_contact.rate >= SMALLEST_RATE_GAIN > filter_gain(at_contact.f * STEP, view.samples + 2, 3, 1)
     assert view.at_drive.rate > 0.999
     # Half a period of the frequency of the contacts is a contact: 4.5 ms by the model's k2 and masses
     m = 0.11 * 0.53 / 0.64
@@ -67,11 +68,11 @@ def test_poincare_points_stand_at_the_drives_phase(view: RecordView, case: Known
 
 
 def test_force_is_K_times_the_current_without_its_zero_error(view: RecordView, case: Known) -> None:
-    assert view.force is not None
+    force = cast(np.ndarray, view.force)
     truth = case.run.truth
     exact = truth.P_d * np.cos(truth.Omega * view.time + truth.phase)
-    assert np.std(view.force - exact) == pytest.approx(2.0 * 5e-3, rel=0.1)
-    assert abs(np.mean(view.force - exact)) < 1e-3
+    assert np.std(force - exact) == pytest.approx(2.0 * 5e-3, rel=0.1)
+    assert abs(np.mean(force - exact)) < 1e-3
 
 
 def test_a_view_needs_x_rel(case: Known) -> None:

@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -35,8 +36,15 @@ document.title = rows + "|" + document.querySelectorAll("details:not([open])").l
 
 def browse(file: Path, *flags: str) -> tuple[str, list[str]]:
     """The document after its scripts, and the messages of its console."""
-    assert BROWSER is not None
-    words = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom", *flags]
+    words = [
+        cast(str, BROWSER),
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--enable-logging=stderr",
+        "--dump-dom",
+        *flags,
+    ]
     words += [f"--user-data-dir={file.parent / 'profile'}", "--allow-file-access-from-files", file.as_uri()]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]

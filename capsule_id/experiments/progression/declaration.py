@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.experiments.progression.outliers import MOST_TRIALS
+from capsule_id.experiments.progression.density.outliers import MOST_TRIALS
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
 from capsule_id.rig.entry import Entry
@@ -45,7 +45,7 @@ FEWEST_SETTINGS = 6
 class ProgressionSettings(GroundSettings):
     """Settings of a progression, SI. ``P_on``, ``P_d`` and ``lag`` are priors where they have an sd.
 
-    With heavy ``tails`` a trial may be outlying, see ``capsule_id.experiments.progression.outliers``.
+    With heavy ``tails`` a trial may be outlying, see ``capsule_id.experiments.progression.density.outliers``.
     """
 
     drive: Literal["pulses", "harmonic"] = "pulses"

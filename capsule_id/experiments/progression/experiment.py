@@ -2,10 +2,11 @@
 
     distance_i = X2(setting, friction exp(s_j)) (1 + trial scatter) + discrepancy_b v t_b + trial sd + reading error
 
-Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see ``capsule_id.experiments.progression.sessions``.
+Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see
+``capsule_id.experiments.progression.density.sessions``.
 The discrepancy is an error of the model's mean velocity at setting b that all trials of the setting share. It enters
-linearly and is integrated out; see ``capsule_id.experiments.progression.groups``. With heavy tails some trials have a
-larger error; see ``capsule_id.experiments.progression.outliers``.
+linearly and is integrated out; see ``capsule_id.experiments.progression.density.groups``. With heavy tails some trials have a
+larger error; see ``capsule_id.experiments.progression.density.outliers``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,11 +33,11 @@ from capsule_id.experiments.progression.declaration import (
     TRIAL_SCATTER,
     TRIAL_SD,
 )
-from capsule_id.experiments.progression.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.linear_misfit import linear_misfit
+from capsule_id.experiments.progression.density.groups import TrialGroups, TrialMisfit
+from capsule_id.experiments.progression.density.linear_misfit import linear_misfit
+from capsule_id.experiments.progression.density.run_emulator import RunEmulator
+from capsule_id.experiments.progression.density.sessions import MIDDLE, Sessions, parameters_of
 from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
-from capsule_id.experiments.progression.run_emulator import RunEmulator
-from capsule_id.experiments.progression.sessions import MIDDLE, Sessions, parameters_of
 from capsule_id.experiments.progression.starts import starts_of
 from capsule_id.experiments.progression.tables import session_table
 from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
@@ -71,7 +72,7 @@ class Progression(TrialsExperiment):
     reading_variance : m^2
     force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
     has_lag : whether the lag is a parameter
-    heavy : whether trials have heavy tails, see ``capsule_id.experiments.progression.outliers``
+    heavy : whether trials have heavy tails, see ``capsule_id.experiments.progression.density.outliers``
     emulator : of ``runs``; None: they are exact
     """
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.experiments.base import ValuesBySymbol, band
-from capsule_id.experiments.progression.outliers import SHARE, TIMES
+from capsule_id.experiments.progression.density.outliers import SHARE, TIMES
 from capsule_id.views import Comparison, Curve, Points
 
 if TYPE_CHECKING:

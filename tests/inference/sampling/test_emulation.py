@@ -11,8 +11,8 @@ import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.emulator import Emulator, _cosine
+from capsule_id.experiments.progression.density.run_emulator import RunEmulator
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.run_emulator import RunEmulator
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling import ensembles, moves
 from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, Places

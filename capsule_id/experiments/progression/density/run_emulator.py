@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.emulator import Emulator
-from capsule_id.experiments.progression.sessions import Sessions
+from capsule_id.experiments.progression.density.sessions import Sessions
 from capsule_id.physics.batches import pool
 
 

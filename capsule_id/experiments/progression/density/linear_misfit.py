@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.experiments.progression.sessions import MIDDLE, NODES, edges, lines
+from capsule_id.experiments.progression.density.sessions import MIDDLE, NODES, edges, lines
 
 if TYPE_CHECKING:
     from capsule_id.experiments.progression.experiment import Progression

@@ -6,7 +6,7 @@ session of a case that has none as a parameter: its motion is piecewise linear i
 these, they share its discrepancy, which is integrated by Gauss-Hermite quadrature about a normal approximation.
 
 With heavy tails a setting has an alternative for every choice of its outlying trials, see
-``capsule_id.experiments.progression.outliers``, and its density is their sum. Without, it has one.
+``capsule_id.experiments.progression.density.outliers``, and its density is their sum. Without, it has one.
 """
 
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ from jaxtyping import Float
 from numpy.polynomial.hermite_e import hermegauss
 
 from capsule_id.experiments.linear import LOG_2PI
-from capsule_id.experiments.progression.outliers import alternatives
-from capsule_id.experiments.progression.sessions import INNER, MIDDLE, NODES, Sessions, edges, lines
+from capsule_id.experiments.progression.density.outliers import alternatives
+from capsule_id.experiments.progression.density.sessions import INNER, MIDDLE, NODES, Sessions, edges, lines
 
 #: Nodes of the discrepancy of a setting with several sessions that are integrated out. Errors are below 0.01 where it is
 #: up to 3 sds of the mean of a case, and reach 2 at 10 sds where a motion is flat on one side of a kink and steep beyond.
