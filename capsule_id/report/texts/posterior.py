@@ -4,6 +4,9 @@ from collections.abc import Mapping
 
 from capsule_id.views import Facts, Message
 
+#: A larger difference in log-posterior is not printed: it may be that of a place which the model excludes.
+FAR_BELOW = 1000
+
 
 def stated_p(p: float) -> str:
     """``p = 0.01``; a bound where the number underflows."""
@@ -21,10 +24,11 @@ def _disagreeing_starts(facts: Facts) -> str:
 
 
 def _maxima_without_mass(facts: Facts) -> str:
-    return (
-        f"{_disagreeing_starts(facts)}. Those ends are lower by {facts['below']:.0f} in log-posterior or lie within the "
-        "sample, so they change no number."
-    )
+    below, places = facts["below"], "lie within the sample"
+    if below >= 1.0:
+        lower = f"{below:.0f}" if below < FAR_BELOW else f"more than {FAR_BELOW}"
+        places = f"are lower by {lower} in log-posterior or {places}"
+    return f"{_disagreeing_starts(facts)}. Those ends {places}, so they change no number."
 
 
 def _maxima_with_mass(facts: Facts) -> str:

@@ -20,6 +20,7 @@ from capsule_id.inference.result import Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import Rig
+from capsule_id.views import Finding
 from tests.measured.folders import Entry, make_rig
 from tests.measured.sources import rack_friction
 
@@ -104,6 +105,20 @@ def test_a_maximum_away_from_the_sample_fails_and_names_both(tmp_path: Path) -> 
     )
     assert [f.level for f in check_starts(both, point.target, sample)] == ["warn"]
     assert [f.level for f in check_starts(both)] == ["fail"]
+
+
+@pytest.mark.parametrize(
+    ("below", "text"),
+    [
+        (0.2, "Those ends lie within the sample, so they change no number."),
+        (37.0, "Those ends are lower by 37 in log-posterior or lie within the sample"),
+        (1e12, "Those ends are lower by more than 1000 in log-posterior or lie within the sample"),
+    ],
+)
+def test_the_distance_of_other_ends_is_a_number_with_a_meaning(below: float, text: str) -> None:
+    """Before: a start outside the model's domain was lower by 1000000000246, one inside the sample by 0."""
+    facts = {"starts": 5, "stalled": 3, "elsewhere": 3, "distance": 12.0, "name": "c", "below": below}
+    assert text in finding_text(Finding("starts.agree", "warn", facts), FIT_MESSAGES)
 
 
 def test_two_modes_fail_with_their_weights(tmp_path: Path) -> None:
