@@ -58,19 +58,19 @@ def second_fit_table(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Res
     replaced = [e for e in tables if e.model != DecayModel.stated(e.table.settings)]
     rows = []
     for e in replaced:
+        own = []
         for role, one in (("stated", e.with_model(DecayModel.stated(e.table.settings))), ("quoted", e)):
             theta = fitted(one)
             estimates = standard_errors(one, theta)
             text = ", ".join(f"{name} = {theta[name]:.5g} ± {sd:.2g}" for name, sd in estimates.items())
-            rows.append(
-                {"table": e.label, "fit": role, "model": one.model.name, "parameters": text, "BIC": bic(one, theta)}
-            )
+            fit_name = role if len(replaced) == 1 else f"{role}, {e.label}"
+            own.append({"fit": fit_name, "model": one.model.name, "parameters": text, "BIC": bic(one, theta)})
+        lowest = min(row["BIC"] for row in own)
+        rows += [{**row, "BIC": row["BIC"] - lowest} for row in own]
     if not rows:
         return []
-    frame = pd.DataFrame(rows)
-    frame["BIC"] -= frame.groupby("table")["BIC"].transform("min")
     lines = replaced[0].model.force_lines
-    return [ResultTable("decays.second_fit", frame.set_index(["table", "fit"]), {"lines": lines})]
+    return [ResultTable("decays.second_fit", pd.DataFrame(rows).set_index("fit"), {"lines": lines})]
 
 
 def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, FurtherForce] | None:
