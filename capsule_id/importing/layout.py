@@ -125,10 +125,12 @@ def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[
 
 
 def _cells_of_row(line: str, layout: Layout) -> Cells:
-    """Separator and number of cells of a line whose first cell is a number; None for any other line."""
+    """Separator and number of cells of a line that begins with a number, or a missing one before others; else None."""
     delimiter = delimiter_of(line, layout)
     cells = cells_of(line, delimiter)
-    return (delimiter, len(cells)) if is_number(bare(cells[0][0])) else None
+    texts = [bare(cell[0]) for cell in cells]
+    begins = is_number(texts[0]) or (texts[0] in layout.missing and any(map(is_number, texts)))
+    return (delimiter, len(cells)) if begins else None
 
 
 def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:

@@ -3,8 +3,10 @@
 import bench
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.optimize import minimize_scalar
 
+import capsule_id as cid
 from capsule_id.experiments.motor_current.experiment import MotorCurrent
 from capsule_id.experiments.support_spring.experiment import SupportSpring
 from capsule_id.inference.checks.regression import outliers
@@ -76,3 +78,47 @@ def test_readings_within_their_digit_step_are_no_outliers(reading: float, struck
     line = SupportSpring(table := bench.table("support_spring", columns, spring="soft"), bench.rig(table))
     theta = {"k2": line.ordinary_line()[0], "scatter": 1e-6}
     assert bool(outliers(line, theta, 0.01)) == struck
+
+
+#: Weights, N, and readings of a ruler, m, with 5 mm stated: they scatter about the line by much more.
+WEIGHTS, RULER = np.array([0.0, 0.981, 1.962, 2.943, 4.905]), np.array([0.0, 0.048, 0.077, 0.104, 0.222])
+
+
+def scatter_and_error(**settings: object) -> tuple[float, float]:
+    """Scatter at the maximum, N, and standard error of k2, N/m; ruler with 5 mm, or with these settings."""
+    columns = [bench.column("force", WEIGHTS), bench.column("deflection", RULER, None if settings else 5e-3)]
+    rig = bench.rig(bench.table("support_spring", columns, "ruler", spring="F5", **settings))
+    rows = cid.fit(rig, budget=None)
+    return float(rows.nuisances.loc["scatter[ruler]", "map"]), float(rows.summary.loc["k2[F5]", "sd"])
+
+
+def test_a_scatter_beside_one_stated_error_does_not_vanish() -> None:
+    """Before: the density grew without limit as the scatter went to 0; k2 was trusted with an sd 3.5 times too small."""
+    scatter, sd = scatter_and_error()
+    assert 0.1 < scatter < 0.6
+    # Ordinary least squares: 22.5 N/m with a standard error of 2.5 N/m from three degrees of freedom.
+    assert 1.2 < sd < 4.0
+    line = SupportSpring(
+        table := bench.table(
+            "support_spring",
+            [bench.column("force", WEIGHTS), bench.column("deflection", RULER, 5e-3)],
+            "ruler",
+            spring="F5",
+        ),
+        bench.rig(table),
+    )
+    # Independent route: a normal density of y about the line, intercept with its wide prior.
+    for own in (1e-9, 0.3):
+        theta = {"k2": 22.5, "scatter": own}
+        covariance = ((22.5 * 5e-3) ** 2 + own**2) * np.eye(5) + line.width**2
+        expected = stats.multivariate_normal(np.zeros(5), covariance).logpdf(WEIGHTS - 22.5 * RULER)
+        assert float(line.log_likelihood(theta, np)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_ratio_beside_one_stated_error_has_a_density_with_a_limit() -> None:
+    columns = [bench.column("force", WEIGHTS), bench.column("deflection", RULER, 5e-3)]
+    line = SupportSpring(
+        table := bench.table("support_spring", columns, "ruler", spring="F5", sd_ratio=20.0), bench.rig(table)
+    )
+    small, fitted = (float(line.log_likelihood({"k2": 22.5, "scatter": own}, np)) for own in (1e-9, 0.3))
+    assert small < fitted

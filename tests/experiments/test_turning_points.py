@@ -188,6 +188,40 @@ def test_a_force_that_another_one_replaces_is_not_chosen(tmp_path: Path) -> None
     assert all(checked(e)[0].level == "fail" for e in kept)
 
 
+@pytest.mark.parametrize(("offset", "name"), [(0.12, "c_q"), (-0.12, "F_dry")])
+def test_amplitudes_from_another_place_than_the_rest_position_are_no_force(
+    tmp_path: Path, offset: float, name: str
+) -> None:
+    """Before: quadratic damping was adopted, c was 24 sds off, and all checks passed."""
+    time, x = turning_points(False, {}, 1)
+    (own,) = make_experiments(read_rig(folder(tmp_path, time, x + offset, 'samples = "turning_points"')))
+    e = cast(TurningPoints, own)
+    assert TurningPoints.second_models([e]) == ([e], [])
+    forces = checked(e)[0]
+    assert (forces.level, forces.facts["name"]) == ("fail", name)
+    assert "Amplitudes must be counted from the rest position" in finding_text(forces, messages_of(default_registry()))
+
+
+def test_a_cubic_spring_that_the_slope_refuses_is_not_replaced_by_damping(tmp_path: Path) -> None:
+    """Before: quadratic damping was adopted, and k1 was 18 sds off with all checks passed."""
+    rng = np.random.default_rng(1)
+    time, x = turning_points(True, {"k_cubic": -0.3}, 1)
+    settings = 'samples = "turning_points"\nslope = { value = 10, unit = "deg" }'
+    (own,) = make_experiments(read_rig(folder(tmp_path, time + 2e-2 * rng.standard_normal(10), x, settings)))
+    e = cast(TurningPoints, own)
+    assert TurningPoints.second_models([e]) == ([e], [])
+    assert checked(e)[0].level == "fail"
+
+
+def test_small_and_stiff_motions_are_fitted(tmp_path: Path) -> None:
+    """Before: internal failure, a difference step of k_cubic that changed nothing."""
+    time, x = turning_points(True, {}, 1)
+    settings = 'samples = "turning_points"\nstiffness = "cubic"'
+    (own,) = make_experiments(read_rig(folder(tmp_path, 7e-3 * (time - time[0]), 1.2e-4 * x, settings)))
+    theta = fitted(cast(TurningPoints, own))
+    assert theta["k1"] == pytest.approx(FORCES["k1"] / 7e-3**2, rel=5e-3)
+
+
 def test_a_table_that_cannot_exclude_dry_friction_does_not_give_c(tmp_path: Path) -> None:
     """Six turning points of a weak decay; before, c was trusted."""
     rng = np.random.default_rng(0)
@@ -216,6 +250,11 @@ def test_turning_points_at_unequal_times_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must follow each other by one time") as refused:
         cid.fit(cid.read_rig(folder(tmp_path, time, x, 'samples = "turning_points"')), budget=None)
     assert (refused.value.file, refused.value.line) == ("decay.csv", 8)
+    # Nor may one be entered twice: before, k1 was a third too large.
+    time, x = turning_points(True, {}, 1)
+    twice = np.insert(time, 5, time[4] + 1e-4), np.insert(x, 5, x[4])
+    with pytest.raises(InputError, match="must follow each other by one time"):
+        cid.fit(cid.read_rig(folder(tmp_path / "twice", *twice, 'samples = "turning_points"')), budget=None)
     # A turning point that was not read is no fault.
     time, x = turning_points(True, {}, 1)
     rig = cid.read_rig(folder(tmp_path / "missed", np.delete(time, 4), np.delete(x, 4), 'samples = "turning_points"'))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import capsule_id
+from capsule_id.importing.layout import find_layout
 from capsule_id.rig.model import Rig
 
 TITLES = "Instrument 7, 2026\nStep No. {step}\nSpeed = 240\nForce = {step}\n\nT,X,F\nsec,mm,N\n\n"
@@ -89,3 +90,12 @@ def test_a_damaged_row_ends_no_block(tmp_path: Path, line: int) -> None:
     (tmp_path / "steps.csv").write_text("\n".join(lines), encoding="utf-8")
     with pytest.raises(capsule_id.InputError):
         capsule_id.propose_entry(tmp_path / "steps.csv")
+
+
+def test_a_missing_first_cell_ends_no_block(tmp_path: Path) -> None:
+    """Before: the rows below it were another block, and half of the readings was left out."""
+    rows = [f"{t:.2f},{x:.6f}" for t, x in zip(TIME, np.exp(-TIME) * np.cos(30.0 * TIME), strict=True)]
+    rows[30] = "NaN," + rows[30].split(",")[1]
+    text = "T (s),X (mm)\n" + "\n".join([*rows, "Run 2", *rows[:20]]) + "\n"
+    found = find_layout(text.encode(), tmp_path / "a.csv", ())
+    assert found.blocks == ((2, 81), (83, 102))

@@ -2,7 +2,8 @@
 
 Both columns have errors where both reading errors, or their ratio, are stated. Otherwise the model has one total
 scatter about the line, in addition to any stated reading error. The true point of a reading is integrated out along
-the line. Its prior is flat in length, in units of the reading errors, so that neither column is preferred.
+the line. Its prior is flat in length, in units of the reading errors, so that neither column is preferred. Where one
+reading error alone is stated, it is flat in x, because the other error is not known.
 The slope is then that of orthogonal (Deming) regression (Hogg, Bovy & Lang 2010, section 7; Fuller 1987, section 1.3).
 A prior flat in x would bias the slope towards ordinary least squares, by -(sd_x / sd of the x's)^2 relative. The
 intercept is integrated out under a wide normal prior.
@@ -210,7 +211,13 @@ class Line(Experiment):
         across = 0.0 if self.sd_ratio is None else (slope / self.sd_ratio) ** 2
         estimated = 0.0 if self.errors_known else 1.0
         fixed, scale = self.y_sd**2 + slope**2 * self.x_sd**2, estimated * xp.sqrt(1.0 + across)
-        return (Misfit(self.y - slope * self.x, fixed, scale, design, (self.y_sd**2, estimated)),)
+        # The ratio of both errors must not depend on the scatter: its density would then have no upper limit at 0.
+        ordinate = None
+        if self.errors_known:
+            ordinate = self.y_sd**2, 0.0
+        elif self.sd_ratio is not None:
+            ordinate = fixed / (1.0 + across), 1.0
+        return (Misfit(self.y - slope * self.x, fixed, scale, design, ordinate),)
 
     def intercept(self, theta: ValuesBySymbol) -> float:
         """Conditional mean of y0, SI."""

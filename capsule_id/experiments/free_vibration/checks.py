@@ -142,7 +142,8 @@ def check_size_of_residuals(records: "Sequence[FreeVibration]", fit: Fitted) -> 
     compared, findings = [], []
     for e in records:
         size = np.abs(e.values - equilibrium(e.values))
-        n = int(np.flatnonzero(size >= STEPS * reading_step(e.whole[1]))[-1]) + 1
+        moving = np.flatnonzero(size >= STEPS * reading_step(e.whole[1]))
+        n = int(moving[-1]) + 1 if len(moving) else 0
         if n < FEWEST_SIZES:
             continue
         residuals = np.abs(np.asarray(e.residuals(e.local(fit.values), np))[:n])
@@ -150,6 +151,7 @@ def check_size_of_residuals(records: "Sequence[FreeVibration]", fit: Fitted) -> 
         amplitude = ndimage.maximum_filter1d(size[:n], max(3, round(period)))
         if np.ptp(amplitude) > 0.0 and np.ptp(residuals) > 0.0:
             large = amplitude > np.median(amplitude)
+            large = large if large.any() else amplitude == np.max(amplitude)
             ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
             trend = stats.spearmanr(amplitude, residuals, alternative="greater")
             p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)

@@ -156,7 +156,7 @@ def _check_turns(table: Table[DecaySettings]) -> None:
     """
     step = np.diff(decay_window(table)[0])
     multiple = step / np.median(step)
-    wrong = np.flatnonzero(np.abs(multiple - np.rint(multiple)) > UNEQUAL)
+    wrong = np.flatnonzero(np.abs(multiple - np.maximum(np.rint(multiple), 1.0)) > UNEQUAL)
     if len(wrong):
         raise InputError(
             "turning points must follow each other by one time, half a period or a period, or a multiple of it",

@@ -27,7 +27,7 @@ def lint_kinematics(table: Table[Any], used: slice, period: float) -> Iterable[F
         higher = phasor(time, table[name][used], Omega)
         order = CHANNELS[name].order - CHANNELS[first].order
         ratio = derivative_ratio(lower, higher, Omega, order).real
-        seen = min(abs(lower.value) / lower.sd, abs(higher.value) / higher.sd) > SIGN_ERRORS
+        seen = all(abs(one.value) > SIGN_ERRORS * one.sd for one in (lower, higher))
         if seen and not LOWEST <= ratio <= HIGHEST:
             facts = {"file": table.file, "name": name, "first": first, "order": order, "ratio": ratio}
             yield Finding("decays.kinematics", "fail", facts, table.label)

@@ -32,9 +32,15 @@ def _halves(facts: Facts) -> str:
 def _forces(facts: Facts) -> str:
     """The force that explains the turning points better, and the line that states it."""
     unit = "" if facts["unit"] == "1" else f" {facts['unit']}"
+    side = (
+        " Amplitudes must be counted from the rest position: subtract it, or give both sides."
+        if facts["one_side"]
+        else ""
+    )
     return (
         f"{facts['label']}: expected turning points that the fitted model explains ({facts['model']}); {facts['name']} = "
         f"{facts['value']:.3g}{unit} explains them better ({facts['z']:.1f} sd from 0). Write {facts['line']} in its entry."
+        f"{side}"
     )
 
 

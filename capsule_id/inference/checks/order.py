@@ -88,7 +88,10 @@ def tables_by_slope(s: SampledFit) -> tuple[list[Finding], int]:
     alike: dict[tuple[str, ...], list[Experiment]] = {}
     for e in s.experiments:
         own = [row.name for row in e.parameters if row.physical and not is_stated(row.name)]
-        if e.bench and not e.time_series and own and e.misfit(e.local(s.values)).design.shape[1]:
+        nuisances = e.misfit(e.local(s.values)).design.shape[1]
+        # Two rows of a line show nothing of their scatter.
+        enough = e.scale_known or e.n - len(s.flagged.get(e.label, [])) > len(own) + nuisances
+        if e.bench and not e.time_series and own and nuisances and enough:
             alike.setdefault((e.kind, *own), []).append(e)
     groups, findings = [members for members in alike.values() if len(members) > 1], []
     for members in groups:

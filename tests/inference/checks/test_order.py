@@ -147,6 +147,22 @@ def test_calibrations_that_disagree_are_named_and_widened(tmp_path: Path, words:
     assert alone.clean
 
 
+def test_lines_of_two_rows_show_nothing_of_their_scatter(tmp_path: Path) -> None:
+    """Before: "they disagree by a factor of 7.7", from a misfit of rounding size."""
+    rng = np.random.default_rng(6)
+    current = np.array([0.5, 2.5])
+    entries = [
+        Entry(
+            "motor_current",
+            f"m{i}",
+            {"force [N]": 2.0 * current + 0.02 * rng.standard_normal(2), "current [A]": current},
+        )
+        for i in range(3)
+    ]
+    result = cid.fit(make_rig(tmp_path, *entries), budget=None)
+    assert [f for f in result.findings if f.code == "trials.tables"] == []
+
+
 def levels(rng: np.random.Generator, deviation: float) -> tuple[np.ndarray, np.ndarray]:
     """Eight levels of four readings each, with a deviation of every level from the line, in sd of a reading."""
     x = np.repeat(np.arange(1.0, 9.0), 4)

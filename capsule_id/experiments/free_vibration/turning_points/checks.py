@@ -32,7 +32,7 @@ def check_forces(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding
         best = max(forces, key=lambda one: one.z)
         if best.z > DISAGREE:
             facts = {"label": e.label, "name": best.symbol, "value": best.value, "unit": parameter(best.symbol).unit}
-            facts |= {"z": best.z, "line": best.line, "model": e.model.name}
+            facts |= {"z": best.z, "line": best.line, "model": e.model.name, "one_side": not e.both_sides}
             level = "fail" if best.z > FAIL and best.moved else "warn"
             findings.append(Finding("decays.forces", level, facts, e.label))
     if checked and not findings:

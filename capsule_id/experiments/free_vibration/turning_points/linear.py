@@ -63,12 +63,18 @@ def wider_models(model: DecayModel) -> dict[str, DecayModel]:
     return found if model.cubic else {**found, "k_cubic": replace(model, cubic=True)}
 
 
-def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str) -> FurtherForce | None:
+def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str, offset: bool = False) -> FurtherForce | None:
     """Estimate the force with this parameter beside those of the fit ``theta``, about which the model is linearised.
 
     None for a table that is too short.
+
+    Parameters
+    ----------
+    offset : whether amplitudes of one side may be counted from another place than the rest position
     """
     columns, rows = derivatives(e, theta)
+    if offset and not e.both_sides:
+        columns = np.column_stack([columns, np.repeat([1.0, 0.0], len(e.values))])
     if len(e.values) < FEWEST_TURNS or len(e.values) <= columns.shape[1] + 1:
         return None
     raw, model = misfit(e, theta), wider_models(e.model)[symbol]
@@ -86,11 +92,16 @@ def further_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str) -> Fur
 
 def derivative_of_force(e: "TurningPoints", theta: ValuesBySymbol, symbol: str) -> Float[np.ndarray, " m"]:
     """Derivative of measured minus predicted with respect to a force that the model lacks, at zero force."""
-    size = float(np.max(np.abs(e.values)))
-    step = {"F_dry": 1e-5 * theta["k1"] * size, "k_cubic": 1e-5 * theta["k1"] / size**2}
-    step["c_q"] = 1e-4 * theta["c"] / (float(np.sqrt(theta["k1"] / theta["m1"])) * size)
+    step = STEP * natural_units(e, theta)[symbol]
     wider = e.with_model(wider_models(e.model)[symbol])
-    return (misfit(wider, {**theta, symbol: step[symbol]}) - misfit(e, theta)) / step[symbol]
+    return (misfit(wider, {**theta, symbol: step}) - misfit(e, theta)) / step
+
+
+def natural_units(e: "TurningPoints", theta: ValuesBySymbol) -> dict[str, float]:
+    """Natural units of the parameters of the forces, SI: those that change the motion by as much as itself."""
+    size, k1, m1 = float(np.max(np.abs(e.values))), theta["k1"], theta["m1"]
+    units = {"F_dry": k1 * size, "c_q": m1 / size, "k_cubic": k1 / size**2}
+    return units | {"k1": k1, "c": float(np.sqrt(k1 * m1)), "amplitude": size}
 
 
 def reduced_points(
@@ -169,9 +180,9 @@ def changes_of_second_half(
 def derivatives(e: "TurningPoints", theta: ValuesBySymbol) -> tuple[Float[np.ndarray, "m p"], list[Parameter]]:
     """Derivatives of measured minus predicted, those of the parameters first; the parameters."""
     rows = [row for row in e.parameters if not row.scatter and not is_stated(row.name)]
-    slopes = []
+    slopes, units = [], natural_units(e, theta)
     for row in rows:
-        step = STEP * (abs(theta[row.symbol]) or 1.0)
+        step = STEP * max(abs(theta[row.symbol]), 0.01 * units[row.symbol])
         sides = [misfit(e, {**theta, row.symbol: theta[row.symbol] + sign * step}) for sign in (1.0, -1.0)]
         slopes.append((sides[0] - sides[1]) / (2.0 * step))
     nuisances = np.asarray(block_diag(*(np.asarray(one.design) for one in e.misfits(theta, np))))
@@ -198,14 +209,14 @@ def least_squares(
     columns: Float[np.ndarray, "m p"], y: Float[np.ndarray, " m"], n: int
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"], float]:
     """Coefficients, their sds, and degrees of freedom; the first n rows and the others each have one noise level."""
-    size = np.linalg.norm(columns, axis=0)
+    size = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
     found, scaled, freedom, _ = _weighted(columns / size, y, n)
     return found / size, np.linalg.norm(np.linalg.pinv(scaled), axis=1) / size, float(np.min(freedom))
 
 
 def noise_levels(columns: Float[np.ndarray, "m p"], y: Float[np.ndarray, " m"], n: int) -> Float[np.ndarray, "2"]:
     """Noise levels of the first n rows and of the others beside a least-squares fit."""
-    return _weighted(columns / np.linalg.norm(columns, axis=0), y, n)[3]
+    return _weighted(columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny), y, n)[3]
 
 
 def _weighted(

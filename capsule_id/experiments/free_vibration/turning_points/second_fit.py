@@ -1,6 +1,7 @@
 """Choice of the forces of turning points where the readings contradict the stated ones.
 
-A force is added where the readings demand it by ``FAIL`` sds and exclude every other one in its place.
+A force is added where the readings demand it by ``FAIL`` sds and exclude every other one in its place. Amplitudes of one
+side must also exclude that they are counted from another place than the rest position.
 """
 
 from collections.abc import Sequence
@@ -26,6 +27,9 @@ from capsule_id.views import Finding, ResultTable
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.turning_points.experiment import TurningPoints
 
+#: Sds from zero of a force that another one must exclude.
+RIVAL = 2.0
+
 
 def second_models(tables: "Sequence[TurningPoints]") -> "tuple[list[TurningPoints], list[Finding]]":
     """Return ``tables`` under the models that they demand, and findings that name them.
@@ -35,7 +39,8 @@ def second_models(tables: "Sequence[TurningPoints]") -> "tuple[list[TurningPoint
     chosen, findings = list(tables), list[Finding]()
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, e in enumerate(tables):
-        groups.setdefault((e.table.settings.damping, e.table.settings.stiffness, e.model.cubic), []).append(i)
+        settings = e.table.settings
+        groups.setdefault((settings.damping, settings.stiffness, settings.offers_cubic, e.model.cubic), []).append(i)
     for members in groups.values():
         own, contradicting = [tables[i] for i in members], list[str]()
         while demanded := _demanded_force(own):
@@ -44,9 +49,13 @@ def second_models(tables: "Sequence[TurningPoints]") -> "tuple[list[TurningPoint
             own = [e.with_model(force.model) for e in own]
         if contradicting:
             first, second = tables[members[0]].model, own[0].model
-            labels = list(dict.fromkeys(contradicting))
-            facts = {"labels": labels, "first": first.name, "second": second.name, "lines": second.force_lines}
-            findings.append(Finding("decays.second_fit", "warn", {**facts, "drift": ""}, labels[0]))
+            facts = {
+                "labels": [e.label for e in own],
+                "first": first.name,
+                "second": second.name,
+                "lines": second.force_lines,
+            }
+            findings.append(Finding("decays.second_fit", "warn", {**facts, "drift": ""}, contradicting[0]))
             for i, e in zip(members, own, strict=True):
                 chosen[i] = e
     return chosen, findings
@@ -77,13 +86,17 @@ def _demanded_force(tables: "Sequence[TurningPoints]") -> tuple[str, FurtherForc
     """The most significant force that a table demands, with the label of that table."""
     found = []
     for e in tables:
-        symbols = [s for s in open_forces(e) if s != "k_cubic" or e.table.settings.offers_cubic]
+        symbols, cubic = open_forces(e), e.table.settings.offers_cubic
         theta = fitted(e) if symbols else {}
-        forces = [one for symbol in symbols if (one := further_force(e, theta, symbol)) and one.z > FAIL]
-        if forces:
-            best = max(forces, key=lambda one: one.z)
-            if all(_excluded(e, other, best.symbol) for other in forces if other is not best):
-                found.append((e.label, best))
+        forces = [one for symbol in symbols if (one := further_force(e, theta, symbol))]
+        offered = [one for one in forces if one.z > FAIL and (cubic or one.symbol != "k_cubic")]
+        if not offered:
+            continue
+        best = max(offered, key=lambda one: one.z)
+        rivals = [one for one in forces if one is not best and one.z > RIVAL]
+        beside_offset = further_force(e, theta, best.symbol, offset=True)
+        if beside_offset and beside_offset.z > DISAGREE and all(_excluded(e, one, best.symbol) for one in rivals):
+            found.append((e.label, best))
     return max(found, key=lambda pair: pair[1].z) if found else None
 
 
