@@ -26,6 +26,8 @@ TIE = 1e-3
 #: A record whose last fifth has less than this fraction of the amplitude of its largest part decays; above the second
 #: fraction it is driven.
 DECAYS, DRIVEN = 0.5, 0.8
+#: A record whose last part has at least this fraction of its largest one is no decay.
+STEADY = 0.97
 _PARTS = 5
 #: SI unit of a displacement, a velocity or an acceleration -> that of the same quantity of an angle.
 ANGULAR = {"m": "rad", "m/s": "rad/s", "m/s^2": "rad/s^2"}
@@ -256,7 +258,9 @@ def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidat
     chosen = max((each for each in records if each.kind.bench == bench), key=lambda each: each.score)
     # A push near the end of a decay makes its last part as large as the first ones.
     least = float(np.min(parts[int(np.argmax(parts)) :]) / max(*parts, 1e-300))
-    clear = ratio < DECAYS or least > DRIVEN
+    # A lightly damped decay has lost little at its end, but each part is smaller than the one before.
+    falls = bool(np.all(np.diff(parts) < 0.0)) and ratio < STEADY
+    clear = ratio < DECAYS or (least > DRIVEN and not falls)
     words = "decays" if bench else "is driven"
     return (
         chosen,

@@ -257,11 +257,14 @@ def test_a_decay_that_is_pushed_near_its_end_is_not_sure_to_be_driven(
     time = np.arange(2000) / 100.0
     x = np.exp(-0.15 * time) * np.cos(6.0 * time)
     push, texts = (time > 18.5) * 0.8 * np.sin(9.0 * time), dict[str, str]()
-    for name, motion in (("decay", x), ("pushed", x + push), ("driven", np.cos(6.0 * time))):
+    light = np.exp(-0.005 * time) * np.cos(6.0 * time)
+    for name, motion in (("decay", x), ("pushed", x + push), ("light", light), ("driven", np.cos(6.0 * time))):
         rows = "\n".join(f"{t:.3f},{one:.6f}" for t, one in zip(time, motion, strict=True))
         (tmp_path / f"{name}.csv").write_text(f"time [s],x_rel [mm]\n{rows}\n", encoding="utf-8")
         assert cli.capsule_id(["import", str(tmp_path / f"{name}.csv")]) == 0
         texts[name] = capsys.readouterr().out
     assert 'kind = "free_vibration"  # sure' in texts["decay"]
     assert 'kind = "forced_run"  # unsure' in texts["pushed"]
+    # A decay that loses a tenth in the record: before, sure to be driven.
+    assert 'kind = "forced_run"  # unsure' in texts["light"]
     assert 'kind = "forced_run"  # sure' in texts["driven"]
