@@ -5,13 +5,13 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from capsule_id.inference.result import Result
+from capsule_id.inference.result import Posterior, Result
 from capsule_id.report.figures import comparisons as figures
 from capsule_id.report.figures.corner import _ticks, corner
 from capsule_id.report.figures.style import figure_of, png
@@ -67,10 +67,10 @@ def _inside(polygons: list[np.ndarray], points: np.ndarray) -> np.ndarray:
 
 def test_contours_hold_the_shares_they_claim(maker: Callable[..., Result]) -> None:
     result = maker(draws=250, walkers=32)
-    assert result.posterior is not None
+    posterior = cast(Posterior, result.posterior)
     (ax,) = corner(result).figure.axes
     n = len(result.summary)
-    draws = result.posterior.draws.reshape(-1, len(result.posterior.names))[:, :2]
+    draws = posterior.draws.reshape(-1, len(posterior.names))[:, :2]
     low, high = np.percentile(draws, (0.1, 99.9), axis=0)
     width = high - low
     place = (draws - (low - 0.02 * width)) / (1.04 * width) * 0.94 + (0, n - 2)  # panel of row 1, column 0
@@ -93,8 +93,7 @@ def test_corner_ticks_are_distinct_inside_and_say_where_they_are(low: float, hig
 
 
 def test_a_frozen_chain_is_drawn(result: Result) -> None:
-    posterior = result.posterior
-    assert posterior is not None
+    posterior = cast(Posterior, result.posterior)
     frozen = dataclasses.replace(posterior, draws=np.broadcast_to(posterior.draws[:1, :1, :1], posterior.draws.shape))
     assert png(figure_of(corner(dataclasses.replace(result, posterior=frozen))))
     assert png(figure_of(traces(dataclasses.replace(result, posterior=frozen))))
@@ -119,7 +118,11 @@ def test_panels_draw_into_given_axes(result: Result) -> None:
     for draw in (figures.comparison, figures.residuals, figures.autocorrelation):
         ax = Figure().subplots()
         assert draw(item, ax) is ax
-        assert isinstance(draw(item), Axes)
+        # Without axes it makes its own, with the same content.
+        own = draw(item)
+        assert own is not ax
+        assert (own.get_xlabel(), own.get_ylabel()) == (ax.get_xlabel(), ax.get_ylabel())
+        assert (len(own.lines), len(own.collections)) == (len(ax.lines), len(ax.collections))
     ax = Figure().subplots()
     assert figures.point_fit_starts(result.point_fit, ax) is ax
 

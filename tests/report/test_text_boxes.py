@@ -2,11 +2,13 @@
 
 import itertools
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 from capsule_id.inference.result import Result
@@ -64,9 +66,7 @@ def rotated_faults(texts: list[Text]) -> list[str]:
 
 
 def figure_dpi(text: Text) -> float:
-    figure = text.get_figure(root=True)
-    assert figure is not None
-    return figure.dpi
+    return cast(Figure, text.get_figure(root=True)).dpi
 
 
 FIGURES: dict[str, Callable[[Result], Figure]] = {
@@ -111,8 +111,7 @@ def test_a_legend_over_a_record_hides_no_sample(entries: int, height: float) -> 
     set_legend(ax, place="upper right")
     figure = figure_of(ax)
     FigureCanvasAgg(figure).draw()
-    legend = ax.get_legend()
-    assert legend is not None
+    legend = cast(Legend, ax.get_legend())
     top = ax.transData.transform((0.0, 1.0))[1]
     texts = [text.get_window_extent() for text in legend.get_texts()]
     assert min(box.y0 for box in texts) > top
