@@ -289,6 +289,19 @@ class Experiment(eqx.Module):
         del theta
         return (self,), []
 
+    @property
+    def shares_noise(self) -> str:
+        """Label of the record whose noise the experiment shares: its own, or that of the record that it is a part of."""
+        return self.label
+
+    def with_coloured_noise(self, theta: ValuesBySymbol) -> tuple[Self, dict[str, float]] | None:
+        """Replace white noise, where no noise is stated, by coloured noise.
+
+        Return the new experiment and the values, SI, by name, from which a fit starts. None: the noise stays as it is.
+        """
+        del theta
+        return None
+
     def corrected_start(self, theta: ValuesBySymbol) -> tuple[Self, dict[str, float]] | None:
         """Replace the kind of initial state where the readings contradict that of ``theta``.
 

@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from capsule_id.api import fit
 from capsule_id.errors import InputError
 from capsule_id.experiments.forced_run.base_run import BaseRun
+from capsule_id.experiments.forced_run.checks.feasibility import feasibility
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.feasibility import feasibility
 from capsule_id.experiments.forced_run.start_state.slides import slides
 from capsule_id.inference.fit.joint_starts import choose_starts
 from capsule_id.inference.target.log_posterior import LogPosterior

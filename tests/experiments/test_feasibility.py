@@ -6,8 +6,8 @@ import bench
 import numpy as np
 import pytest
 
+from capsule_id.experiments.forced_run.checks.feasibility import RunConditions, contact_time, feasibility, held_rod
 from capsule_id.experiments.forced_run.declaration import MESSAGES
-from capsule_id.experiments.forced_run.feasibility import RunConditions, contact_time, feasibility, held_rod
 from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.rough_values import rough_values
 from capsule_id.physics.grazing import grazing_load

@@ -283,6 +283,6 @@ def test_the_remedy_of_a_run_names_other_laws_and_no_noise_that_is_stated(consta
     model = FrictionModel(constant=constant)
     facts = {"record": "run", "Q": 99.0, "lags": 20, "p": 1e-9, "model": "capsule", "noise": noise, "law": model.name}
     advice = text(Finding("residuals.white", "fail", {**facts, "other_laws": other_laws(model)}, "run"))
-    assert ('state noise = "ar1"' in advice) == (noise == "white")
+    assert ('remove noise = "white"' in advice) == (noise == "white")
     assert ('compare it with friction = "constant" or free = ["ratio"] in [model]' in advice) == (not constant)
     assert 'free = ["ratio"]' not in "".join(other_laws(FrictionModel(free=("ratio",))))

@@ -93,7 +93,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "lag": (_LAG, None),
         "normal_force": (QuantityRule("N"), None),
         "start": (ChoiceRule(("auto", "stuck", "moving", "settled")), "auto"),
-        "noise": (ChoiceRule(("white", "ar1")), "white"),
+        "noise": (ChoiceRule(("white", "ar1")), None),
         "segment": (QuantityRule("s"), None),
         **{f"{name}_gain_sd": (QuantityRule("1"), None) for name in _CHANNELS},
         **{f"{name}_delay_sd": (QuantityRule("s"), None) for name in _CHANNELS},

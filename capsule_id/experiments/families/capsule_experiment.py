@@ -74,5 +74,4 @@ class CapsuleForward(GroundExperiment):
         return self.friction.force({**theta, **self.ground_at(theta)})
 
     def noise_facts(self) -> Facts:
-        noise = getattr(self.table.settings, "noise", None)
-        return {"model": "capsule", "noise": noise, "law": self.friction.name, "other_laws": other_laws(self.friction)}
+        return {"model": "capsule", "law": self.friction.name, "other_laws": other_laws(self.friction)}

@@ -16,7 +16,7 @@ from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings, NameRule, QuantityRule
-from capsule_id.views import Finding, Message
+from capsule_id.views import Facts, Finding, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
@@ -70,7 +70,7 @@ class RunSettings(GroundSettings):
     lag: Annotated[Quantity | None, QuantityRule("s", NOT_NEGATIVE, has_sd=True)] = None
     normal_force: Annotated[float | None, QuantityRule("N")] = None
     start: Literal["auto", "stuck", "moving", "settled"] = "auto"
-    noise: Literal["white", "ar1"] = "white"
+    noise: Literal["white", "ar1"] | None = None
     segment: Annotated[float | None, QuantityRule("s")] = None
     x_rel_gain_sd: Gain = None
     x_capsule_gain_sd: Gain = None
@@ -93,7 +93,7 @@ class RunSettings(GroundSettings):
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
     from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE
-    from capsule_id.experiments.forced_run.feasibility import feasibility
+    from capsule_id.experiments.forced_run.checks.feasibility import feasibility
 
     settings = table.settings
     if settings.drive != "harmonic" or settings.ground:
@@ -132,6 +132,26 @@ def _masses(table: Table[RunSettings]) -> tuple[str, ...]:
     return ("m2",) if table.settings.drive == "base" else ("m1", "m2")
 
 
+def _second_fit(facts: Facts) -> str:
+    """The records whose noise is coloured, and how to state either noise."""
+    return (
+        f"{', '.join(facts['records'])}: the residuals of the first fit are correlated, so white noise is not right. The "
+        'quoted values are those of a second fit with coloured noise, AR(1). To state it, write noise = "ar1" in the entry '
+        'of the run. To keep the first fit, write noise = "white".'
+    )
+
+
+def _repeated(facts: Facts) -> str:
+    """The record whose residuals repeat, and the friction laws to compare."""
+    laws = facts["other_laws"]
+    compare = f"The fit has {facts['law']}; compare it with {' or '.join(laws)} in [model]. " if laws else ""
+    return (
+        f"{facts['record']}: expected residuals that do not repeat with every excitation period, but they do (F = "
+        f"{facts['F']:.3g}, p = {facts['p']:.1g}). An error that repeats is no noise: the model lacks a force, or a sensor has "
+        f"an error. {compare}Check spring, gap and the frequency of the drive."
+    )
+
+
 TEMPLATE = """\
 #: Forced run. Columns: time [s], and any of x_rel [mm], x_capsule [mm], acceleration_rod [m/s^2], current [A].
 #: State Omega in rad/s or f in Hz. P_d is needed where current is not recorded.
@@ -153,7 +173,7 @@ TEMPLATE = """\
 # N0 = { value = 0, unit = "N" }
 #: state of the capsule at the first sample: "auto" (default, from the record), "stuck", "moving" or "settled"
 # start = "auto"
-#: "white" (default) or "ar1": coloured noise, its correlation is estimated
+#: "white", or "ar1": coloured noise, its correlation is estimated. Default: white, and ar1 where the residuals demand it
 # noise = "white"
 #: sd of a channel's gain; also x_capsule_gain_sd acceleration_rod_gain_sd current_gain_sd
 # x_rel_gain_sd = { value = 0.01, unit = "1" }
@@ -227,6 +247,20 @@ MESSAGES = {
             "{labels}: expected one kind of start to fit; the kind of start did not settle after {rounds} fits. State "
             'start = "stuck" or "moving", or cut the record where the capsule is clearly at rest.'
         ),
+    ),
+    "runs.second_fit": Message(
+        "coloured noise",
+        warn=_second_fit,
+        caption=(
+            "Both fits of the readings: the first, with white noise, and the quoted one, with AR(1) noise. ± is the standard "
+            "error without the error of the model. Natural logarithm of the posterior density."
+        ),
+        changes_model=True,
+    ),
+    "runs.repeated": Message(
+        "repeated misfit",
+        ok="the residuals of no run repeat with the excitation (smallest p = {p:.2g})",
+        fail=_repeated,
     ),
     "runs.groups": Message(
         "Nondimensional groups",

@@ -16,19 +16,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
 from capsule_id.experiments.clock import stated_rate, stretch
 from capsule_id.experiments.families.capsule_experiment import CapsuleForward
 from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
 from capsule_id.experiments.families.inclined import ground_of
+from capsule_id.experiments.forced_run.checks.feasibility import check_feasible
+from capsule_id.experiments.forced_run.checks.predictability import check_predictable, predictable_parts
+from capsule_id.experiments.forced_run.checks.repeated import check_repeated
+from capsule_id.experiments.forced_run.coloured_noise import coloured_starts, second_fit_table
 from capsule_id.experiments.forced_run.declaration import NOISE
-from capsule_id.experiments.forced_run.feasibility import check_feasible
-from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts
-from capsule_id.experiments.forced_run.panels import run_comparisons
+from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts, stated_sds
+from capsule_id.experiments.forced_run.panels import filtered_record, run_comparisons
 from capsule_id.experiments.forced_run.parts import parts_of
-from capsule_id.experiments.forced_run.predictability import check_predictable, predictable_parts
 from capsule_id.experiments.forced_run.start_state.restart import corrected_start
 from capsule_id.experiments.forced_run.start_state.rough import AboutRun, RunStart, rough_start
 from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
@@ -39,9 +40,8 @@ from capsule_id.physics.forces import equilibrium, rod_acceleration
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
 from capsule_id.records.stated_settings import stated_gap, stated_Omega
-from capsule_id.records.view import view_record
 from capsule_id.rig.model import Rig, Table
-from capsule_id.views import Comparison, Finding
+from capsule_id.views import Comparison, Facts, Finding
 
 #: Excitation periods from rest after which the motion counts as periodic (start = "settled").
 SETTLING_PERIODS = 40
@@ -106,8 +106,8 @@ class ForcedRun(CapsuleForward):
     has_phase: ClassVar[bool] = True
     inputs: ClassVar[tuple[str, ...]] = ()
     time_series = True
-    checks = (check_feasible, check_predictable)
-    tables = (predicted_motion, scaled_groups)
+    checks = (check_feasible, check_predictable, check_repeated)
+    tables = (second_fit_table, predicted_motion, scaled_groups)
 
     def __init__(
         self,
@@ -117,6 +117,7 @@ class ForcedRun(CapsuleForward):
         part_of: str | None = None,
         leads: bool = True,
         capsule_rate: float | None = None,
+        coloured: bool = False,
     ) -> None:
         """Make one record, or a part of one.
 
@@ -126,6 +127,7 @@ class ForcedRun(CapsuleForward):
         leads : False for later parts of a record. The kind of their initial state is estimated again. A P_d that is a
             second reading of the current's amplitude counts in the first part only.
         capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or estimated
+        coloured : whether the noise is AR(1), also where the settings leave it open
         """
         self.read_drive(table)
         settings, gap = table.settings, stated_gap(table)
@@ -150,10 +152,10 @@ class ForcedRun(CapsuleForward):
         # A constant channel has zero range, so its scale is the reading error, or 1e-9 in SI units.
         ranges = np.maximum(np.ptp(self.values, axis=1), np.maximum(reading_sd, 1e-9))
         self.widths = NUISANCE_WIDTH * ranges
-        self.gain_sd, self.has_gain = self._stated(settings, "gain")
-        self.delay_sd, self.has_delay = self._stated(settings, "delay")
+        self.gain_sd, self.has_gain = stated_sds(settings, self.channels, "gain")
+        self.delay_sd, self.has_delay = stated_sds(settings, self.channels, "delay")
         self.second_reading = self.driven_by_current and self.drive_sd > 0.0
-        self.coloured = settings.noise == "ar1"
+        self.coloured = coloured or settings.noise == "ar1"
         rough = self.first_state(table)
         if capsule_rate is not None:
             rough = replace(rough, capsule_rate=capsule_rate, kind="stuck" if capsule_rate == 0.0 else "moving")
@@ -188,14 +190,22 @@ class ForcedRun(CapsuleForward):
         """Return the same record with this capsule speed at the first sample, m/s; 0: stuck."""
         return self._remade(self.table, self.about.leads, capsule_rate)
 
-    def _remade(self, table: Table, leads: bool, capsule_rate: float | None = None) -> "ForcedRun":
-        run = type(self)(table, self.rig, self.friction, self.about.record, leads, capsule_rate)
-        return run.with_smoothing(self.smoothing)
+    def _remade(self, table: Table, leads: bool, rate: float | None = None, coloured: bool = False) -> "ForcedRun":
+        record, coloured = self.about.record, coloured or self.coloured
+        return type(self)(table, self.rig, self.friction, record, leads, rate, coloured).with_smoothing(self.smoothing)
 
-    def _stated(self, settings: Any, nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
-        """Stated sd of a gain or delay by channel, and whether it is stated."""
-        sds = [getattr(settings, f"{name}_{nuisance}_sd") for name in self.channels]
-        return np.array([sd or 0.0 for sd in sds]), tuple(sd is not None for sd in sds)
+    def noise_facts(self) -> Facts:
+        return {**super().noise_facts(), "noise": "ar1" if self.coloured else self.table.settings.noise}
+
+    @property
+    def shares_noise(self) -> str:
+        return self.about.record
+
+    def with_coloured_noise(self, theta: ValuesBySymbol) -> "tuple[ForcedRun, dict[str, float]] | None":
+        if self.coloured or self.table.settings.noise is not None:
+            return None
+        coloured = self._remade(self.table, self.about.leads, self.rough.capsule_rate, coloured=True)
+        return coloured, coloured_starts(self, theta)
 
     @property
     def excitation_period(self) -> float | None:
@@ -216,8 +226,7 @@ class ForcedRun(CapsuleForward):
     @property
     def observed(self) -> np.ndarray:
         """Readings channel by channel, then the stated P_d where the current is recorded too, SI."""
-        readings = list(self.values)
-        return np.concatenate([*readings, [self.drive]] if self.second_reading else readings)
+        return np.concatenate([*self.values, [self.drive]] if self.second_reading else self.values)
 
     @property
     def scatters(self) -> tuple[str | None, ...]:
@@ -327,13 +336,7 @@ class ForcedRun(CapsuleForward):
         return max(float(theta[f"noise_{name}"]) / sd for name, sd in zip(self.channels, shown, strict=True))
 
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        """Filtered record, where x_rel is recorded and sampled evenly."""
-        _, e = self.capsule(theta)
-        try:
-            view = view_record(self.table, K=theta["K"] if self.driven_by_current else None)
-        except InputError:
-            return None
-        return RunRecord(self.label, view, np.asarray(e.force_at(self.time)))
+        return filtered_record(self, theta)
 
     def records(self, theta: ValuesBySymbol) -> list[tuple[str, np.ndarray]]:
         scaled = self.scaled(theta, np)[: len(self.channels)]

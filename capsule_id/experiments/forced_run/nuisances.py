@@ -1,6 +1,7 @@
 """Parameters of a forced run with their priors and starting values."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -88,3 +89,9 @@ def _starts_of_record(run: "ForcedRun") -> dict[str, Start]:
     if run.coloured:
         starts |= {f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in run.channels}
     return starts
+
+
+def stated_sds(settings: Any, channels: Sequence[str], nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
+    """Stated sd of a gain or delay by channel, and whether it is stated."""
+    sds = [getattr(settings, f"{name}_{nuisance}_sd") for name in channels]
+    return np.array([sd or 0.0 for sd in sds]), tuple(sd is not None for sd in sds)

@@ -6,7 +6,9 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import ValuesBySymbol, axis_label, band
+from capsule_id.experiments.checks.context import RunRecord
 from capsule_id.experiments.checks.series import autocorrelation
+from capsule_id.records.view import view_record
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay, window_samples
 from capsule_id.views import Comparison, Curve, Points
 
@@ -101,3 +103,13 @@ def _filtered(time: np.ndarray, values: np.ndarray, window: float) -> tuple[np.n
     inside = slice(half, len(time) - half)
     value, rate = (savitzky_golay(time, values, window, PORTRAIT_ORDER, derivative=n) for n in (0, 1))
     return value[inside], rate[inside]
+
+
+def filtered_record(run: "ForcedRun", theta: ValuesBySymbol) -> RunRecord | None:
+    """The record through the paper's filter, and its drive; None where x_rel is not recorded, or not evenly."""
+    _, e = run.capsule(theta)
+    try:
+        view = view_record(run.table, K=theta["K"] if run.driven_by_current else None)
+    except InputError:
+        return None
+    return RunRecord(run.label, view, np.asarray(e.force_at(run.time)))

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from capsule_id.experiments.checks.refit import refit
-from capsule_id.experiments.checks.series import LAGS, LEVEL, ljung_box
+from capsule_id.experiments.checks.series import LAGS, LEVEL, correlated_records
 from capsule_id.inference.checks.regression import MOST_FLAGGED, outliers
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.views import Finding
@@ -15,21 +15,12 @@ from capsule_id.views import Finding
 
 def check_whiteness(s: SampledFit) -> list[Finding]:
     """Check that the residuals of every record are white (Ljung–Box)."""
-    records = [
-        (e, label, residuals)
-        for e in s.experiments
-        if e.time_series
-        for label, residuals in e.records(e.local(s.values))
+    correlated, records = correlated_records(s.experiments, s.values)
+    findings = [
+        Finding("residuals.white", "fail", {**one._asdict(), **one.experiment.noise_facts()}, one.experiment.label)
+        for one in correlated
     ]
-    findings = []
-    for e, label, residuals in records:
-        q, p, lags = ljung_box(residuals)
-        if p * len(records) < LEVEL:
-            facts = {"record": label, "Q": q, "lags": lags, "p": p, **e.noise_facts()}
-            findings.append(Finding("residuals.white", "fail", facts, e.label))
-    if not records:
-        return []
-    return findings or [Finding("residuals.white", "ok", {"records": len(records), "lags": LAGS})]
+    return findings or [Finding("residuals.white", "ok", {"records": records, "lags": LAGS})] * bool(records)
 
 
 def check_outliers(s: SampledFit) -> tuple[list[Finding], dict[str, list[int]]]:

@@ -86,7 +86,9 @@ def _capsule_remedy(facts: Facts) -> str:
     if laws := facts.get("other_laws", ()):
         advice += f" The fit has {facts['law']}; compare it with {' or '.join(laws)} in [model]."
     if facts.get("noise") == "white":
-        advice += ' Where the sensor filters, state noise = "ar1" (coloured noise).'
+        advice += (
+            ' Where the sensor filters, remove noise = "white" from the entry: a second fit then has coloured noise.'
+        )
     return advice
 
 

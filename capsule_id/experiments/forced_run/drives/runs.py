@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
+from capsule_id.experiments.forced_run.checks.predictability import check_predictable
+from capsule_id.experiments.forced_run.checks.repeated import check_repeated
+from capsule_id.experiments.forced_run.coloured_noise import second_fit_table
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.predictability import check_predictable
 from capsule_id.experiments.forced_run.tables import predicted_motion
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives.pulses import Pulses
@@ -27,8 +29,8 @@ EARLIER_PERIODS = 50.0
 class OtherRun(ForcedRun):
     """A run without a harmonic force: what the paper's protocol and figures take from one is left out."""
 
-    checks = (check_predictable,)
-    tables = (predicted_motion,)
+    checks = (check_predictable, check_repeated)
+    tables = (second_fit_table, predicted_motion)
 
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
         del theta

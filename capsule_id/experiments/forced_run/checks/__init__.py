@@ -1,0 +1,1 @@
+"""Checks of forced runs at a fit."""

@@ -1,0 +1,162 @@
+"""Second fit of runs with coloured noise, and residuals that repeat with the excitation."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from capsule_id.api import fit
+from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.forced_run.base_run import BaseRun
+from capsule_id.experiments.forced_run.checks.repeated import FEWEST_PERIODS, repetition
+from capsule_id.experiments.registry import default_registry
+from capsule_id.inference.fit import point_stage
+from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.rig.model import Rig
+from capsule_id.views import Finding
+from tests.experiments.test_base_run import BASE, M2, TRUTH, N, base
+from tests.measured.folders import Entry, make_rig, quantity
+from tests.scipy_general import simulate_general
+
+RATE, NOISE = 100.0, 4e-6
+
+
+def ar1(n: int, rho: float, seed: int) -> np.ndarray:
+    """(n,) stationary AR(1) noise of unit sd."""
+    innovations = np.random.default_rng(seed).standard_normal(n + 500)
+    return np.sqrt(1.0 - rho**2) * lfilter([1.0], [1.0, -rho], innovations)[500:]
+
+
+def shaken(folder: Path, rho: float, n: int = 600, ratio: float = 0.5, seed: int = 1, **settings: str) -> Rig:
+    """A rig with one run of ``n`` samples, DOP853, with AR(1) noise; ``ratio``: kinetic over static friction."""
+    time = np.arange(n) / RATE
+    absent = dict.fromkeys(("m1", "k2", "c2", "k_cubic", "k2_back", "slope", "reaction", "viscous"), 0.0)
+    far = {"G": 1e3, "G_back": 1e3, "ratio": ratio, "mu_back": TRUTH["mu"], "m2": M2, "g": 9.81, "N0": N - M2 * 9.81}
+    states, _ = simulate_general({**TRUTH, **absent, **far}, (lambda t, on: 0.0, ()), time, rod=base)
+    x = states[:, 2] - 3e-3 + NOISE * ar1(n, rho, seed)
+    columns = {"time [s]": time, "x_base [m]": base(time) + 0.01, "x_capsule [m]": x}
+    return make_rig(
+        folder, Entry("forced_run", "shaken", columns, {**BASE, **settings}), head={"m2": quantity(M2, "kg")}
+    )
+
+
+def values_of(run: BaseRun) -> dict[str, float]:
+    return {**TRUTH, "m2": M2, "g": 9.81, "x_start": float(base(0.0)), "noise_x_capsule": NOISE} | (
+        {"ar1_x_capsule": 0.0} if run.coloured else {}
+    )
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
+def test_coloured_noise_starts_at_the_correlation_of_the_residuals(tmp_path: Path, rho: float) -> None:
+    rig = shaken(tmp_path, rho)
+    found = BaseRun(rig.tables[0], rig).with_coloured_noise(values_of(BaseRun(rig.tables[0], rig)))
+    assert found is not None
+    run, starts = found
+    assert run.coloured
+    assert "ar1_x_capsule" in {row.symbol for row in run.parameters}
+    assert np.tanh(starts["ar1_x_capsule[shaken]"]) == pytest.approx(rho, abs=0.1)
+    assert starts["noise_x_capsule[shaken]"] == pytest.approx(NOISE * np.sqrt(1.0 - rho**2), rel=0.15)
+    assert run.with_coloured_noise(values_of(run)) is None
+
+
+@pytest.mark.parametrize("noise", ["white", "ar1"])
+def test_stated_noise_stays(tmp_path: Path, noise: str) -> None:
+    rig = shaken(tmp_path, 0.9, noise=f'"{noise}"')
+    run = BaseRun(rig.tables[0], rig)
+    assert run.coloured == (noise == "ar1")
+    assert run.with_coloured_noise(values_of(run)) is None
+
+
+def test_parts_of_a_record_share_their_noise(tmp_path: Path) -> None:
+    rig = shaken(tmp_path, 0.9)
+    parts = BaseRun(rig.tables[0], rig).parts(3.0)
+    assert len(parts) == 2
+    coloured = [part.with_coloured_noise(values_of(part)) for part in parts]  # type: ignore[arg-type]
+    names = [{row.name for row in new[0].parameters if row.symbol.startswith("ar1")} for new in coloured if new]
+    assert names == [{"ar1_x_capsule[shaken]"}] * 2
+    assert {part.shares_noise for part in parts} == {"shaken"}
+
+
+def test_noise_repeats_at_the_stated_rate_only(tmp_path: Path) -> None:
+    """The innovations of AR(1) noise are white; its harmonics are found where it repeats."""
+    rig = shaken(tmp_path, 0.0)
+    run = BaseRun(rig.tables[0], rig)
+    rng = np.random.default_rng(0)
+    p = np.array([found[1] for _ in range(150) if (found := repetition(run, rng.standard_normal(600)))])
+    assert np.mean(p < 0.05) == pytest.approx(0.05, abs=0.055)
+    cycles = np.arange(600) / RATE * 2.0
+    repeated = 0.5 * np.sin(2.0 * np.pi * 3.0 * cycles)
+    assert run.cycles is not None
+    found = repetition(run, repeated + rng.standard_normal(600))
+    assert found is not None
+    assert found[1] < LEVEL
+    # negative control: the same size at a frequency that is no harmonic
+    other = repetition(run, 0.5 * np.sin(2.0 * np.pi * 3.37 * cycles) + rng.standard_normal(600))
+    assert other is not None
+    assert other[1] > LEVEL
+
+
+def test_few_periods_show_no_repetition(tmp_path: Path) -> None:
+    n = int(RATE / 2.0 * (FEWEST_PERIODS - 0.5))
+    rig = shaken(tmp_path, 0.0, n)
+    assert repetition(BaseRun(rig.tables[0], rig), np.ones(n)) is None
+
+
+Stage = Callable[[Path, float], PointStage]
+
+
+def second_of(findings: tuple[Finding, ...]) -> list[Finding]:
+    return [finding for finding in findings if finding.code == "runs.second_fit"]
+
+
+def test_a_second_fit_is_quoted_where_it_explains_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fits are replaced by the truth, with starts for the noise; the choice between both is the real one."""
+
+    def at_truth(target: LogPosterior, known: dict[str, float], seed: int) -> PointFit:
+        del seed
+        values = {**known, **TRUTH, "x_start[shaken]": float(base(0.0))}
+        values.setdefault("noise_x_capsule[shaken]", NOISE)
+        u = target.unconstrain(np.array([values[name] for name in target.names]))
+        own = target.mapping(target.theta(u))
+        height = sum(float(e.log_likelihood(e.local(own), np)) for e in target.experiments)
+        errors = dict.fromkeys(target.names, 0.0)
+        rest = (np.eye(len(u)), errors, u[None], u[None], np.array([height]), np.zeros(1, bool), np.zeros(1, bool))
+        return PointFit(target.names, u, dict(zip(target.names, target.theta(u).tolist(), strict=True)), *rest)
+
+    monkeypatch.setattr(point_stage, "joint_fit", at_truth)
+    for rho, quoted in ((0.9, True), (0.0, False)):
+        rig = shaken(tmp_path / str(rho), rho)
+        target = LogPosterior(rig, [BaseRun(rig.tables[0], rig)])
+        first = at_truth(target, {}, 0)
+        new, second, findings = point_stage.fit_coloured(target, first, 0)
+        assert new.experiments[0].coloured is quoted  # type: ignore[attr-defined]
+        assert len(second_of(tuple(findings))) == quoted
+        assert (second is first) == (not quoted)
+        if quoted:
+            white, coloured = findings[0].facts["fits"]
+            assert (white["residuals white"], coloured["residuals white"]) == ("no", "yes")
+            assert coloured["log-posterior"] > white["log-posterior"] + 100.0
+            assert "k1 = 400 ±" in coloured["parameters"]
+
+
+@pytest.mark.slow
+def test_correlated_noise_is_fitted_without_a_word(tmp_path: Path) -> None:
+    rig = shaken(tmp_path, 0.9)
+    point = fit_points(LogPosterior(rig, [BaseRun(rig.tables[0], rig)]), default_registry(), 0, sampled=False)
+    assert len(second_of(point.findings)) == 1
+    for name, truth in TRUTH.items():
+        assert abs(point.fit.values[name] - truth) < 3.5 * point.fit.standard_errors[name], name
+
+
+@pytest.mark.slow
+def test_a_wrong_friction_law_is_no_coloured_noise(tmp_path: Path) -> None:
+    """Kinetic friction of 0.8 of static friction instead of 0.5, fitted with eq. (1)."""
+    result = fit(shaken(tmp_path, 0.9, ratio=0.8), budget=None)
+    failed = {finding.code for finding in result.findings if finding.level == "fail"}
+    assert "runs.repeated" in failed
+    assert result.trust == "not trusted"
+    assert 'free = ["ratio"]' in next(result.text(f) for f in result.findings if f.code == "runs.repeated")
