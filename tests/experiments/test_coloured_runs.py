@@ -1,6 +1,7 @@
 """Second fit of runs with coloured noise, and residuals that repeat with the excitation."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,15 @@ import pytest
 from scipy.signal import lfilter
 
 from capsule_id.api import fit
+from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.families.friction_model import FrictionModel
 from capsule_id.experiments.forced_run.base_run import BaseRun
 from capsule_id.experiments.forced_run.checks.repeated import FEWEST_PERIODS, repetition
 from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.fit import point_stage
-from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.inference.fit import second_fits
+from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.inference.fit.second_fits import law_of_runs
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
@@ -106,33 +110,30 @@ def test_few_periods_show_no_repetition(tmp_path: Path) -> None:
     assert repetition(BaseRun(rig.tables[0], rig), np.ones(n)) is None
 
 
-Stage = Callable[[Path, float], PointStage]
-
-
 def second_of(findings: tuple[Finding, ...]) -> list[Finding]:
     return [finding for finding in findings if finding.code == "runs.second_fit"]
 
 
+def at_truth(target: LogPosterior, known: Mapping[str, float], seed: int) -> PointFit:
+    """In place of a fit: the true values, the noise as known, and the largest likelihood there."""
+    del seed
+    values = {"noise_x_capsule[shaken]": NOISE, "ratio": 0.8, **known, **TRUTH, "x_start[shaken]": float(base(0.0))}
+    u = target.unconstrain(np.array([values[name] for name in target.names]))
+    own = target.mapping(target.theta(u))
+    height = sum(float(e.log_likelihood(e.local(own), np)) for e in target.experiments)
+    errors = dict.fromkeys(target.names, 0.0)
+    rest = (np.eye(len(u)), errors, u[None], u[None], np.array([height]), np.zeros(1, bool), np.zeros(1, bool))
+    return PointFit(target.names, u, dict(zip(target.names, target.theta(u).tolist(), strict=True)), *rest)
+
+
 def test_a_second_fit_is_quoted_where_it_explains_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fits are replaced by the truth, with starts for the noise; the choice between both is the real one."""
-
-    def at_truth(target: LogPosterior, known: dict[str, float], seed: int) -> PointFit:
-        del seed
-        values = {**known, **TRUTH, "x_start[shaken]": float(base(0.0))}
-        values.setdefault("noise_x_capsule[shaken]", NOISE)
-        u = target.unconstrain(np.array([values[name] for name in target.names]))
-        own = target.mapping(target.theta(u))
-        height = sum(float(e.log_likelihood(e.local(own), np)) for e in target.experiments)
-        errors = dict.fromkeys(target.names, 0.0)
-        rest = (np.eye(len(u)), errors, u[None], u[None], np.array([height]), np.zeros(1, bool), np.zeros(1, bool))
-        return PointFit(target.names, u, dict(zip(target.names, target.theta(u).tolist(), strict=True)), *rest)
-
-    monkeypatch.setattr(point_stage, "joint_fit", at_truth)
+    monkeypatch.setattr(second_fits, "joint_fit", at_truth)
     for rho, quoted in ((0.9, True), (0.0, False)):
         rig = shaken(tmp_path / str(rho), rho)
         target = LogPosterior(rig, [BaseRun(rig.tables[0], rig)])
         first = at_truth(target, {}, 0)
-        new, second, findings = point_stage.fit_coloured(target, first, 0)
+        new, second, findings = second_fits.fit_coloured(target, first, 0)
         assert new.experiments[0].coloured is quoted  # type: ignore[attr-defined]
         assert len(second_of(tuple(findings))) == quoted
         assert (second is first) == (not quoted)
@@ -141,6 +142,31 @@ def test_a_second_fit_is_quoted_where_it_explains_more(tmp_path: Path, monkeypat
             assert (white["residuals white"], coloured["residuals white"]) == ("no", "yes")
             assert coloured["log-posterior"] > white["log-posterior"] + 100.0
             assert "k1 = 400 ±" in coloured["parameters"]
+
+
+def test_the_law_that_explains_the_runs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kinetic friction of 0.8 of static friction; other fits are replaced by the truth."""
+    monkeypatch.setattr(second_fits, "joint_fit", at_truth)
+    found = {}
+    for ratio in (0.8, 0.5):
+        rig = shaken(tmp_path / str(ratio), 0.0, ratio=ratio)
+        target = LogPosterior(rig, [BaseRun(rig.tables[0], rig)])
+        found[ratio] = second_fits.compare_laws(target, at_truth(target, {}, 0), 0)
+    (law,) = found[0.8]
+    assert (law.level, law.facts["law"], law.facts["line"]) == ("warn", "eq. (1), free ratio", 'free = ["ratio"]')
+    assert next(row["fit"] for row in law.facts["laws"]) == "eq. (1), free ratio"
+    # negative control: eq. (1) is right
+    assert found[0.5] == []
+
+
+def test_friction_tests_beside_runs_compare_the_laws_themselves(tmp_path: Path) -> None:
+    tilts = Entry("static_friction", "tilts", {"angle [deg]": np.array([16.0, 16.5, 17.0, 16.6])}, {})
+    rig = make_rig(tmp_path, tilts, head={"m2": quantity(M2, "kg")})
+    assert law_of_runs(make_experiments(rig, "all")) is None
+    shaken_rig = shaken(tmp_path / "run", 0.0)
+    runs = [BaseRun(shaken_rig.tables[0], shaken_rig, FrictionModel(constant=True))]
+    assert law_of_runs(runs) == FrictionModel(constant=True)
+    assert law_of_runs([*runs, *make_experiments(rig, "all")]) is None
 
 
 @pytest.mark.slow
@@ -153,10 +179,16 @@ def test_correlated_noise_is_fitted_without_a_word(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_wrong_friction_law_is_no_coloured_noise(tmp_path: Path) -> None:
+def test_a_wrong_friction_law_is_named(tmp_path: Path) -> None:
     """Kinetic friction of 0.8 of static friction instead of 0.5, fitted with eq. (1)."""
-    result = fit(shaken(tmp_path, 0.9, ratio=0.8), budget=None)
+    result = fit(shaken(tmp_path / "first", 0.9, ratio=0.8), budget=None)
     failed = {finding.code for finding in result.findings if finding.level == "fail"}
     assert "runs.repeated" in failed
     assert result.trust == "not trusted"
-    assert 'free = ["ratio"]' in next(result.text(f) for f in result.findings if f.code == "runs.repeated")
+    (law,) = [finding for finding in result.findings if finding.code == "runs.laws"]
+    assert 'write in [model] of rig.toml: free = ["ratio"]' in result.text(law)
+    # its remedy
+    rig = shaken(tmp_path / "remedy", 0.9, ratio=0.8)
+    better = fit(replace(rig, model=replace(rig.model, free=("ratio",))), budget=None)
+    assert not better.failed
+    assert abs(better.summary.loc["ratio", "value"] - 0.8) < 3.5 * better.summary.loc["ratio", "sd"]

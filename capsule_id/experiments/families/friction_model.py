@@ -254,6 +254,10 @@ class SurfaceExperiment(Experiment):
     def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> "tuple[SurfaceExperiment, ...]":
         return (cls(table, rig, friction),)  # type: ignore[call-arg, arg-type]  # pyright: ignore
 
+    def with_friction(self, friction: FrictionModel) -> "SurfaceExperiment":
+        """Return the same readings with another friction law."""
+        return type(self)(self.table, self.rig, friction)  # type: ignore[call-arg, arg-type]  # pyright: ignore
+
 
 class GroundExperiment(SurfaceExperiment):
     """An experiment whose capsule slides on a track that may have a slope, with a force besides the weight.

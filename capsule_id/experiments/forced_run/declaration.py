@@ -141,6 +141,15 @@ def _second_fit(facts: Facts) -> str:
     )
 
 
+def _laws(facts: Facts) -> str:
+    """The friction law that explains the runs better, its line, and what it changes."""
+    moved = ", ".join(f"{name} from {old:.4g} to {new:.4g}" for name, old, new in facts["moved"])
+    return (
+        f'the friction law "{facts["law"]}" explains the runs better than {facts["own"]} (penalised log-posterior '
+        f"{facts['gain']:+.0f}). It moves {moved}, in SI units. To use it, write in [model] of rig.toml: {facts['line']}"
+    )
+
+
 def _repeated(facts: Facts) -> str:
     """The record whose residuals repeat, and the friction laws to compare."""
     laws = facts["other_laws"]
@@ -256,6 +265,15 @@ MESSAGES = {
             "error without the error of the model. Natural logarithm of the posterior density."
         ),
         changes_model=True,
+    ),
+    "runs.laws": Message(
+        "friction law of runs",
+        ok="{own} explains the runs as well as the other friction laws in the table, although residuals are correlated",
+        warn=_laws,
+        caption=(
+            "The runs fitted with other friction laws: ± is the standard error without the error of the model; difference "
+            "of log-posteriors, less ln(readings)/2 per parameter (Schwarz 1978)."
+        ),
     ),
     "runs.repeated": Message(
         "repeated misfit",

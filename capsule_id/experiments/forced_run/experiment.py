@@ -25,11 +25,11 @@ from capsule_id.experiments.families.inclined import ground_of
 from capsule_id.experiments.forced_run.checks.feasibility import check_feasible
 from capsule_id.experiments.forced_run.checks.predictability import check_predictable, predictable_parts
 from capsule_id.experiments.forced_run.checks.repeated import check_repeated
-from capsule_id.experiments.forced_run.coloured_noise import coloured_starts, second_fit_table
 from capsule_id.experiments.forced_run.declaration import NOISE
 from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts, stated_sds
 from capsule_id.experiments.forced_run.panels import filtered_record, run_comparisons
 from capsule_id.experiments.forced_run.parts import parts_of
+from capsule_id.experiments.forced_run.second_fit import coloured_starts, second_fit_table
 from capsule_id.experiments.forced_run.start_state.restart import corrected_start
 from capsule_id.experiments.forced_run.start_state.rough import AboutRun, RunStart, rough_start
 from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
@@ -156,9 +156,7 @@ class ForcedRun(CapsuleForward):
         self.delay_sd, self.has_delay = stated_sds(settings, self.channels, "delay")
         self.second_reading = self.driven_by_current and self.drive_sd > 0.0
         self.coloured = coloured or settings.noise == "ar1"
-        rough = self.first_state(table)
-        if capsule_rate is not None:
-            rough = replace(rough, capsule_rate=capsule_rate, kind="stuck" if capsule_rate == 0.0 else "moving")
+        rough = self.first_state(table).at_rate(capsule_rate)
         is_open = settings.start == "auto" or not leads
         start = rough.kind if is_open else settings.start
         self.settled = start == "settled"
@@ -182,17 +180,19 @@ class ForcedRun(CapsuleForward):
     def parts(self, seconds: float) -> "tuple[ForcedRun, ...]":
         """Divide the record into parts of about ``seconds``; return the run itself if it is not longer."""
         tables = parts_of(self.table, seconds)
-        if len(tables) == 1:
-            return (self,)
-        return tuple(self._remade(table, self.about.leads and i == 0) for i, table in enumerate(tables))
+        made = (self._remade(table, self.about.leads and i == 0) for i, table in enumerate(tables))
+        return tuple(made) if len(tables) > 1 else (self,)
 
     def restarted(self, capsule_rate: float) -> "ForcedRun":
         """Return the same record with this capsule speed at the first sample, m/s; 0: stuck."""
         return self._remade(self.table, self.about.leads, capsule_rate)
 
-    def _remade(self, table: Table, leads: bool, rate: float | None = None, coloured: bool = False) -> "ForcedRun":
-        record, coloured = self.about.record, coloured or self.coloured
-        return type(self)(table, self.rig, self.friction, record, leads, rate, coloured).with_smoothing(self.smoothing)
+    def with_friction(self, friction: FrictionModel) -> "ForcedRun":
+        return self._remade(self.table, self.about.leads, self.rough.capsule_rate, friction=friction)
+
+    def _remade(self, table: Table, leads: bool, rate: float | None = None, **changed: Any) -> "ForcedRun":
+        own = {"friction": self.friction, "part_of": self.about.record, "coloured": self.coloured, **changed}
+        return type(self)(table, self.rig, leads=leads, capsule_rate=rate, **own).with_smoothing(self.smoothing)
 
     def noise_facts(self) -> Facts:
         return {**super().noise_facts(), "noise": "ar1" if self.coloured else self.table.settings.noise}
@@ -204,8 +204,8 @@ class ForcedRun(CapsuleForward):
     def with_coloured_noise(self, theta: ValuesBySymbol) -> "tuple[ForcedRun, dict[str, float]] | None":
         if self.coloured or self.table.settings.noise is not None:
             return None
-        coloured = self._remade(self.table, self.about.leads, self.rough.capsule_rate, coloured=True)
-        return coloured, coloured_starts(self, theta)
+        leads, rate = self.about.leads, self.rough.capsule_rate
+        return self._remade(self.table, leads, rate, coloured=True), coloured_starts(self, theta)
 
     @property
     def excitation_period(self) -> float | None:
@@ -339,8 +339,7 @@ class ForcedRun(CapsuleForward):
         return filtered_record(self, theta)
 
     def records(self, theta: ValuesBySymbol) -> list[tuple[str, np.ndarray]]:
-        scaled = self.scaled(theta, np)[: len(self.channels)]
-        parts = zip(self.channels, scaled, strict=True)
+        parts = zip(self.channels, self.scaled(theta, np), strict=False)  # a second reading of P_d is no record
         return [(f"{self.label} {name}", np.asarray(part.at_nuisance_mean(np)[0])) for name, part in parts]
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

@@ -1,27 +1,24 @@
 """Stages of the point fit: bench tests in closed form, division of unpredictable runs, joint fit.
 
 experiments -> fit of the bench tests in closed form -> divide runs that amplify initial errors -> LogPosterior -> joint fit
-    -> second joint fit with coloured noise where residuals of runs are correlated
+    -> where residuals of runs are correlated: second joint fit with coloured noise, and fits with other friction laws
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks.series import correlated_records
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.fit.joint_fit import joint_fit
 from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.inference.fit.second_fits import compare_laws, fit_coloured
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import sample
 from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.interruption import threads
-from capsule_id.parameters import is_stated
 from capsule_id.views import Finding
 
 #: emcee steps of the bench sample, which measures the precision gained from runs and their agreement.
@@ -75,6 +72,7 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
         own = beside.submit(_bench_sample, alone, bench, seed) if alone and bench and sampled else None
         target, joint, wavering = _fit_with_right_starts(target, known, seed)
         target, joint, second = fit_coloured(target, joint, seed)
+        second += compare_laws(target, joint, seed)
         bench_fit = BenchFit(bench, None if own is None else own.result())
     return PointStage(target, joint, bench_fit, seed, (*findings, *wavering, *second))
 
@@ -99,44 +97,6 @@ def _fit_with_right_starts(
     doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
     facts = {"labels": ", ".join(doubtful), "rounds": ROUNDS}
     return target, joint, [Finding("runs.start", "fail", facts, doubtful[0])]
-
-
-def fit_coloured(target: LogPosterior, first: PointFit, seed: int) -> tuple[LogPosterior, PointFit, list[Finding]]:
-    """Fit runs again with coloured noise where their residuals are correlated and the settings state no noise.
-
-    The second fit is returned where it explains the readings better, and a finding that shows both.
-    """
-    values = target.mapping(target.theta(first.u))
-    correlated = {one.experiment.shares_noise for one in correlated_records(target.experiments, values)[0]}
-    changed = [
-        e.with_coloured_noise(e.local(values)) if e.shares_noise in correlated else None for e in target.experiments
-    ]
-    if not any(changed):
-        return target, first, []
-    release_memory()
-    experiments = [e if new is None else new[0] for e, new in zip(target.experiments, changed, strict=True)]
-    starts = {name: value for new in changed if new is not None for name, value in new[1].items()}
-    second_target = LogPosterior(target.rig, experiments)
-    second = joint_fit(second_target, {**values, **starts}, seed)
-    rows = [_fit_row("first, white noise", target, first), _fit_row("quoted, AR(1) noise", second_target, second)]
-    penalty = 0.5 * (second_target.dimension - target.dimension) * np.log(sum(e.n for e in experiments))
-    if rows[1]["log-posterior"] < rows[0]["log-posterior"] + penalty:
-        return target, first, []
-    records = list(dict.fromkeys(e.shares_noise for e, new in zip(target.experiments, changed, strict=True) if new))
-    return second_target, second, [Finding("runs.second_fit", "warn", {"records": records, "fits": rows}, records[0])]
-
-
-def _fit_row(name: str, target: LogPosterior, fit: PointFit) -> dict[str, object]:
-    """Row of a table that compares fits of the same readings."""
-    physical = [row for row in target.parameters if row.physical and not is_stated(row.name)]
-    listed = [f"{row.name} = {fit.values[row.name]:.5g} ± {fit.standard_errors[row.name]:.2g}" for row in physical]
-    correlated, _ = correlated_records(target.experiments, target.mapping(target.theta(fit.u)))
-    return {
-        "fit": name,
-        "parameters": ", ".join(listed),
-        "log-posterior": float(np.max(fit.log_posterior)),
-        "residuals white": "no" if correlated else "yes",
-    }
 
 
 def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:

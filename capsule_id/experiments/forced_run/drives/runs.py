@@ -12,8 +12,8 @@ from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks.context import RunRecord
 from capsule_id.experiments.forced_run.checks.predictability import check_predictable
 from capsule_id.experiments.forced_run.checks.repeated import check_repeated
-from capsule_id.experiments.forced_run.coloured_noise import second_fit_table
 from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.second_fit import second_fit_table
 from capsule_id.experiments.forced_run.tables import predicted_motion
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives.pulses import Pulses

@@ -1,7 +1,7 @@
 """Starting values of a forced run: state and drive at the first sample, estimated from the record."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -42,6 +42,12 @@ class RunStart:
     amplitude: float
     phase: float
     noise: Mapping[str, float]
+
+    def at_rate(self, capsule_rate: float | None) -> "RunStart":
+        """The same values with another speed of the capsule, m/s, 0 for stuck; None: these."""
+        if capsule_rate is None:
+            return self
+        return replace(self, capsule_rate=capsule_rate, kind="stuck" if capsule_rate == 0.0 else "moving")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Coloured noise of a run in a second fit, where the residuals of the first one are correlated.
+"""Second fits of a run, where the residuals of the first one are correlated: starts of coloured noise, and tables.
 
 A real sensor filters, and no model is exact, so that residuals of dense samples are hardly ever white. White noise then
 gives intervals that are far too short.
@@ -33,10 +33,12 @@ def coloured_starts(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]
 
 
 def second_fit_table(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
-    """Compare both fits of the runs whose noise a second fit has changed; [] without one."""
+    """Tables of the second fits of runs: coloured noise, and other friction laws; [] without one."""
     del runs
-    found = next((finding for finding in fit.findings if finding.code == "runs.second_fit"), None)
-    if found is None:
-        return []
-    frame = pd.DataFrame(found.facts["fits"]).set_index("fit")
-    return [ResultTable("runs.second_fit", frame)]
+    found = {finding.code: finding.facts for finding in fit.findings}
+    tables = {"runs.second_fit": "fits", "runs.laws": "laws"}
+    return [
+        ResultTable(code, pd.DataFrame(found[code][rows]).set_index("fit"))
+        for code, rows in tables.items()
+        if code in found
+    ]
