@@ -142,11 +142,14 @@ def _second_fit(facts: Facts) -> str:
 
 
 def _laws(facts: Facts) -> str:
-    """The friction law that explains the runs better, its line, and what it changes."""
+    """The friction law that explains the runs best, or as well with fewer parameters; its line, and what it changes."""
     moved = ", ".join(f"{name} from {old:.4g} to {new:.4g}" for name, old, new in facts["moved"])
+    how = f"as well as {facts['own']}, with fewer parameters"
+    if facts["better"]:
+        how = f"better than {facts['own']} (penalised log-posterior {facts['gain']:+.0f})"
     return (
-        f'the friction law "{facts["law"]}" explains the runs better than {facts["own"]} (penalised log-posterior '
-        f"{facts['gain']:+.0f}). It moves {moved}, in SI units. To use it, write in [model] of rig.toml: {facts['line']}"
+        f'the friction law "{facts["law"]}" explains the runs {how}. It moves {moved}, in SI units. To use it, write in '
+        f"[model] of rig.toml: {facts['line']}"
     )
 
 
@@ -271,8 +274,9 @@ MESSAGES = {
         ok="{own} explains the runs as well as the other friction laws in the table, although residuals are correlated",
         warn=_laws,
         caption=(
-            "The runs fitted with other friction laws: ± is the standard error without the error of the model; difference "
-            "of log-posteriors, less ln(readings)/2 per parameter (Schwarz 1978)."
+            "The runs fitted with other friction laws; ± of a parameter is the standard error without the error of the model. "
+            "Behind the best: difference of log-posteriors, less ln(readings)/2 per parameter (Schwarz 1978); where the best "
+            "law leaves correlated residuals, with its standard error from parts of the record."
         ),
     ),
     "runs.repeated": Message(

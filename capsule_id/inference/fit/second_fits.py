@@ -5,13 +5,15 @@ first joint fit -> residuals correlated -> joint fit with AR(1) noise, quoted wh
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.checks.series import correlated_records
+from capsule_id.experiments.checks.series import Whiteness, correlated_records
 from capsule_id.experiments.families.friction_model import FrictionModel, SurfaceExperiment
 from capsule_id.experiments.families.friction_variants import model_lines
 from capsule_id.inference.fit.joint_fit import joint_fit
@@ -26,6 +28,68 @@ from capsule_id.views import Finding
 LAWS = (FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",)))
 #: Difference of penalised log-posteriors that rejects a simpler law: "strong" (Kass & Raftery 1995).
 STRONG = 3.0
+#: Standard errors of the difference that reject a simpler law where every law leaves correlated residuals.
+ERRORS = 2.0
+#: Parts of an excitation period.
+PHASES = 6
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A target and its point fit."""
+
+    target: LogPosterior
+    fit: PointFit
+
+    @classmethod
+    def of(
+        cls, other: LogPosterior, experiments: Sequence[Experiment], known: Mapping[str, float], seed: int
+    ) -> "_Fit":
+        """Fit other models of the same readings, from values by name."""
+        release_memory()
+        target = LogPosterior(other.rig, experiments)
+        return cls(target, joint_fit(target, known, seed))
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Parameters and constants by name, SI."""
+        return self.target.mapping(self.target.theta(self.fit.u))
+
+    @property
+    def correlated(self) -> list[Whiteness]:
+        """Records whose residuals are not white."""
+        return correlated_records(self.target.experiments, self.values)[0]
+
+    @property
+    def height(self) -> float:
+        """Largest log-posterior, less Schwarz's penalty for the number of parameters."""
+        readings = sum(e.n for e in self.target.experiments)
+        return float(np.max(self.fit.log_posterior)) - 0.5 * self.target.dimension * float(np.log(readings))
+
+    @property
+    def physical(self) -> list[str]:
+        """Names of the physical parameters that are no stated values."""
+        return [row.name for row in self.target.parameters if row.physical and not is_stated(row.name)]
+
+    def row(self, name: str) -> dict[str, Any]:
+        """Row of a table that compares fits of the same readings."""
+        values, errors = self.fit.values, self.fit.standard_errors
+        return {
+            "fit": name,
+            "parameters": ", ".join(f"{own} = {values[own]:.5g} ± {errors[own]:.2g}" for own in self.physical),
+            "log-posterior": float(np.max(self.fit.log_posterior)),
+            "residuals white": "no" if self.correlated else "yes",
+        }
+
+    def densities(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Cycle, and log-density up to a constant, of every reading of each record (n,)."""
+        values, found = self.values, []
+        for e in self.target.experiments:
+            if e.cycles is not None:
+                misfit, channels = e.misfit(e.local(values)), e.n // len(e.cycles)
+                density = -0.5 * misfit.at_nuisance_mean(np)[0] ** 2 - np.log(misfit.sd)
+                found.append((np.tile(e.cycles, channels), density[: channels * len(e.cycles)]))
+        return found
 
 
 def fit_coloured(target: LogPosterior, first: PointFit, seed: int) -> tuple[LogPosterior, PointFit, list[Finding]]:
@@ -33,8 +97,8 @@ def fit_coloured(target: LogPosterior, first: PointFit, seed: int) -> tuple[LogP
 
     The second fit is returned where it explains the readings better, and a finding that shows both.
     """
-    values = target.mapping(target.theta(first.u))
-    correlated = {one.experiment.shares_noise for one in correlated_records(target.experiments, values)[0]}
+    white = _Fit(target, first)
+    values, correlated = white.values, {one.experiment.shares_noise for one in white.correlated}
     changed = [
         e.with_coloured_noise(e.local(values)) if e.shares_noise in correlated else None for e in target.experiments
     ]
@@ -42,12 +106,13 @@ def fit_coloured(target: LogPosterior, first: PointFit, seed: int) -> tuple[LogP
         return target, first, []
     experiments = [e if new is None else new[0] for e, new in zip(target.experiments, changed, strict=True)]
     starts = {name: value for new in changed if new is not None for name, value in new[1].items()}
-    second_target, second = _fitted(target, experiments, {**values, **starts}, seed)
-    if _height(second_target, second) < _height(target, first):
+    coloured = _Fit.of(target, experiments, {**values, **starts}, seed)
+    if coloured.height < white.height:
         return target, first, []
-    rows = [_row("first, white noise", target, first), _row("quoted, AR(1) noise", second_target, second)]
+    rows = [white.row("first, white noise"), coloured.row("quoted, AR(1) noise")]
     records = list(dict.fromkeys(e.shares_noise for e, new in zip(target.experiments, changed, strict=True) if new))
-    return second_target, second, [Finding("runs.second_fit", "warn", {"records": records, "fits": rows}, records[0])]
+    finding = Finding("runs.second_fit", "warn", {"records": records, "fits": rows}, records[0])
+    return coloured.target, coloured.fit, [finding]
 
 
 def compare_laws(target: LogPosterior, fit: PointFit, seed: int) -> list[Finding]:
@@ -55,40 +120,52 @@ def compare_laws(target: LogPosterior, fit: PointFit, seed: int) -> list[Finding
 
     Only where runs alone measure friction: friction tests compare the laws themselves.
     """
-    values = target.mapping(target.theta(fit.u))
-    own = law_of_runs(target.experiments)
-    correlated, _ = correlated_records(target.experiments, values)
-    if own is None or not any(one.experiment.event_driven for one in correlated):
+    quoted, own = _Fit(target, fit), law_of_runs(target.experiments)
+    correlated = [one.experiment for one in quoted.correlated if one.experiment.event_driven]
+    if own is None or not correlated:
         return []
-    fits = {own: (target, fit)}
+    fits = {own: quoted}
     for law in LAWS:
-        if law not in fits:
+        if law != own:
             experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in target.experiments]
-            try:
-                fits[law] = _fitted(target, experiments, values, seed)
-            except InputError:
-                continue  # no motion with this law is finite
-    height = {law: _height(*one) for law, one in fits.items()}
-    best = max(height.values())
-    rows = [
-        {**_row(law.name, *fits[law]), "difference": height[law] - best}
-        for law in sorted(fits, key=lambda a: -height[a])
-    ]
-    simplest = min(
-        (law for law in fits if height[law] >= best - STRONG), key=lambda law: (len(law.parameters), law.free)
-    )
-    chosen = own if height[own] >= best - STRONG and len(own.parameters) <= len(simplest.parameters) else simplest
-    shown = [row.name for row in target.parameters if row.physical and not is_stated(row.name)]
-    moved = [(name, values[name], fits[chosen][1].values[name]) for name in shown if name in fits[chosen][1].values]
+            with suppress(InputError):  # no motion with this law is finite
+                fits[law] = _Fit.of(target, experiments, quoted.values, seed)
+    best = max(fits.values(), key=lambda one: one.height)
+    behind = {law: _behind(one, best) for law, one in fits.items()}
+    close = [law for law, (difference, error) in behind.items() if difference <= max(STRONG, ERRORS * error)]
+    chosen = min(close, key=lambda law: (len(law.parameters), law != own))
+    new = fits[chosen].fit.values
     facts = {
         "own": own.name,
         "law": chosen.name,
         "line": model_lines(chosen),
-        "gain": height[chosen] - height[own],
-        "moved": moved,
-        "laws": rows,
+        "better": own not in close,
+        "gain": behind[own][0] - behind[chosen][0],
+        "moved": [(name, quoted.values[name], new[name]) for name in quoted.physical if name in new],
+        "laws": [
+            {**fits[law].row(law.name), "behind the best": f"{difference:.0f} ± {error:.0f}"}
+            for law, (difference, error) in sorted(behind.items(), key=lambda item: item[1][0])
+        ],
     }
-    return [Finding("runs.laws", "ok" if chosen == own else "warn", facts, correlated[0].experiment.label)]
+    return [Finding("runs.laws", "ok" if chosen == own else "warn", facts, correlated[0].label)]
+
+
+def _behind(one: _Fit, best: _Fit) -> tuple[float, float]:
+    """Penalised log-posterior of the ``best`` fit less that of ``one``, and its standard error.
+
+    Where the best fit leaves white residuals, the standard error is 0. Else every model has an error, and likelihoods
+    count the readings as more than they are: the standard error is that of a sum over parts of the records, over whole
+    periods or over phases of the excitation, whichever is larger.
+    """
+    difference = best.height - one.height
+    if one is best or not best.correlated:
+        return difference, 0.0
+    by_period, by_phase = [], []
+    for (cycles, high), (_, low) in zip(best.densities(), one.densities(), strict=True):
+        by_period.append(np.bincount((cycles - cycles[0]).astype(int), high - low))
+        by_phase.append(np.bincount((cycles % 1.0 * PHASES).astype(int), high - low))
+    sums = [np.concatenate(parts) for parts in (by_period, by_phase)]
+    return difference, max(float(np.sqrt(len(part) * np.var(part, ddof=1))) for part in sums)
 
 
 def law_of_runs(experiments: Sequence[Experiment]) -> FrictionModel | None:
@@ -97,31 +174,3 @@ def law_of_runs(experiments: Sequence[Experiment]) -> FrictionModel | None:
     users = [e for e in experiments if symbols & {row.symbol for row in e.parameters}]
     laws = [e.friction for e in users if isinstance(e, SurfaceExperiment) and e.event_driven and e.time_series]
     return laws[0] if laws and len(laws) == len(users) and laws[0].law is CoulombStribeck else None
-
-
-def _fitted(
-    target: LogPosterior, experiments: Sequence[Experiment], values: Mapping[str, float], seed: int
-) -> tuple[LogPosterior, PointFit]:
-    """Fit other models of the same readings, from ``values`` by name."""
-    release_memory()
-    other = LogPosterior(target.rig, experiments)
-    return other, joint_fit(other, values, seed)
-
-
-def _height(target: LogPosterior, fit: PointFit) -> float:
-    """Largest log-posterior, less Schwarz's penalty for the number of parameters."""
-    readings = sum(e.n for e in target.experiments)
-    return float(np.max(fit.log_posterior)) - 0.5 * target.dimension * float(np.log(readings))
-
-
-def _row(name: str, target: LogPosterior, fit: PointFit) -> dict[str, Any]:
-    """Row of a table that compares fits of the same readings."""
-    physical = [row for row in target.parameters if row.physical and not is_stated(row.name)]
-    listed = [f"{row.name} = {fit.values[row.name]:.5g} ± {fit.standard_errors[row.name]:.2g}" for row in physical]
-    correlated, _ = correlated_records(target.experiments, target.mapping(target.theta(fit.u)))
-    return {
-        "fit": name,
-        "parameters": ", ".join(listed),
-        "log-posterior": float(np.max(fit.log_posterior)),
-        "residuals white": "no" if correlated else "yes",
-    }
