@@ -114,10 +114,10 @@ def second_of(findings: tuple[Finding, ...]) -> list[Finding]:
     return [finding for finding in findings if finding.code == "runs.second_fit"]
 
 
-def at_truth(target: LogPosterior, known: Mapping[str, float], seed: int) -> PointFit:
+def at_truth(target: LogPosterior, known: Mapping[str, float], seed: int, starts: np.ndarray | None = None) -> PointFit:
     """In place of a fit: the true values, the noise as known, and the largest likelihood there."""
-    del seed
-    values = {"noise_x_capsule[shaken]": NOISE, "ratio": 0.8, **known, **TRUTH, "x_start[shaken]": float(base(0.0))}
+    del seed, starts
+    values = {"noise_x_capsule[shaken]": NOISE, **known, **TRUTH, "ratio": 0.8, "x_start[shaken]": float(base(0.0))}
     u = target.unconstrain(np.array([values[name] for name in target.names]))
     own = target.mapping(target.theta(u))
     height = sum(float(e.log_likelihood(e.local(own), np)) for e in target.experiments)

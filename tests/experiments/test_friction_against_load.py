@@ -1,5 +1,6 @@
 """Friction against load: a normal force in every row, sliding without a speed, and what does not go with them."""
 
+import warnings
 from contextlib import suppress
 from pathlib import Path
 from typing import cast
@@ -250,3 +251,20 @@ def test_forces_below_the_weight_along_the_slope_are_refused(tmp_path: Path, kin
     assert "load_is" in caught.value.remedy
     assert cli.fit_params([str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_equal_readings_at_one_load_hide_no_other_load(tmp_path: Path) -> None:
+    """Before: no finding, and warnings of SciPy, because one load had no variance of its own."""
+    ratio = np.array([0.292, 0.292, 0.292, 0.280, 0.281, 0.282, 0.269, 0.270, 0.271, 0.259, 0.260, 0.261])
+    load = np.repeat([6.0, 8.0, 10.0, 12.2], 3)
+    order = np.random.default_rng(1).permutation(len(load))
+    entry = Entry("static_friction", "table", {"force [N]": (ratio * load)[order], "normal_force [N]": load[order]})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = cid.fit(rig(tmp_path, entry), budget=None)
+    assert "trials.loads" in {finding.code for finding in result.findings if finding.level == "fail"}
+    # negative control: the same coefficients at other loads
+    mixed = np.random.default_rng(3).permutation(load)
+    entry = Entry("static_friction", "table", {"force [N]": ratio * mixed, "normal_force [N]": mixed})
+    result = cid.fit(rig(tmp_path / "mixed", entry), budget=None)
+    assert "trials.loads" not in {finding.code for finding in result.findings if finding.level == "fail"}

@@ -172,9 +172,11 @@ def _of_levels(groups: Sequence[np.ndarray]) -> float:
     """
     if sum(map(len, groups)) == len(groups) or between(groups)[0] <= SMALLEST_FACTOR:
         return 1.0
-    if min(map(len, groups)) >= ROWS_OF_A_LOAD:
-        return float(stats.alexandergovern(*groups).pvalue)
-    return between(groups)[1]
+    scatters = [float(np.ptp(group)) for group in groups]
+    if min(map(len, groups)) < ROWS_OF_A_LOAD or max(scatters) == 0.0:
+        return between(groups)[1]
+    # Equal readings at one load give it no variance of its own to test with.
+    return float((stats.alexandergovern if min(scatters) > 0.0 else stats.f_oneway)(*groups).pvalue)
 
 
 def trend(residuals: np.ndarray, load: np.ndarray, seed: int = 0) -> float:

@@ -5,7 +5,7 @@ are white noise, projected and divided in the same way, so that like is compared
 parameters the p-values hold for any noise level, and for parameters that other experiments share.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 from scipy.fft import dct
@@ -108,15 +108,19 @@ def _linearised(e: Experiment, theta: Mapping[str, float]) -> tuple[np.ndarray, 
     return residuals(at), columns[:, size > 0.0] / size[size > 0.0]
 
 
-def check_statistics(s: SampledFit) -> list[Finding]:
-    """Compare runs of signs, largest residual and trend of every bench test with replicates."""
+def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding]:
+    """Compare runs of signs, largest residual and trend of every bench test with replicates.
+
+    Tests with outliers, and the ``known`` ones, whose trials are known not to be alike, are left out: their residuals
+    have a named cause.
+    """
     findings, judged = [], 0
     for e in s.experiments:
-        if not e.bench or e.event_driven or e.n > MOST_READINGS:
+        if not e.bench or e.event_driven or e.n > MOST_READINGS or e.label in {*s.flagged, *known}:
             continue
         found = experiment_p_values(e, e.local(s.values))
         judged += bool(found)
         if found and min(found.values()) * len(found) < LEVEL:
             worst = min(found, key=lambda name: found[name])
-            findings.append(Finding("residuals.statistics", "warn", {"statistic": worst, "p": found[worst]}, e.label))
+            findings.append(Finding("residuals.statistics", "fail", {"statistic": worst, "p": found[worst]}, e.label))
     return findings or [Finding("residuals.statistics", "ok", {"number": judged})] * bool(judged)

@@ -18,6 +18,9 @@ from capsule_id.views import Finding
 
 #: Smallest part of a prior's variance that the data count as removing: below, rounding of the sample decides.
 SMALLEST_REDUCTION = 0.2
+#: A parameter this many widths from the centre of its prior is pulled by it. A scatter is then too small, and so is every
+#: sd that it gives.
+PRIOR_PULL = 2.5
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,10 @@ def check_priors(s: SampledFit) -> list[Finding]:
     """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
     findings = []
     found = conflicts(s)
+    scatters = {row.name for row in s.target.parameters if row.scatter} - set(s.rig.priors)
     for name, conflict in found.items():
         p = float(2.0 * stats.norm.sf(abs(conflict.z)))
-        if p * len(found) < LEVEL:
+        if p * len(found) < LEVEL or (name in scatters and conflict.z > PRIOR_PULL):
             findings.append(_finding(s, name, conflict, p))
     return findings or [Finding("priors.conflict", "ok", {"number": len(found)})]
 

@@ -1,7 +1,8 @@
 """Which numbers of a fit may be quoted, from its findings.
 
 A failed check makes the parameters that its experiment informs not trusted. Without a sample, where the data do not
-inform a parameter, and where a warning names it, its number is not judged: no check can tell.
+inform a parameter, where a warning names it, and where every table that informs it has too few rows to show its
+scatter, its number is not judged: no check can tell.
 """
 
 from collections.abc import Sequence
@@ -31,6 +32,12 @@ def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:
     """
     failed = [concerned(f, sampled.experiments) for f in sampled.findings if f.level == "fail"]
     doubtful = {name for f in sampled.findings if f.level == "warn" for name in f.parameters}
+    few = {f.experiment for f in sampled.findings if f.code == "readings.few"}
+    sizes: dict[str, list[bool]] = {}
+    for e in sampled.experiments:
+        for row in e.parameters:
+            sizes.setdefault(row.name, []).append(e.table.label in few)
+    doubtful |= {name for name, are_few in sizes.items() if all(are_few)}
     words: dict[str, Trust] = {}
     for row, known in zip(sampled.target.parameters, informed, strict=True):
         judged = sampled.posterior is not None and (known or is_stated(row.name)) and row.name not in doubtful

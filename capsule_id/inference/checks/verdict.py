@@ -15,7 +15,7 @@ from capsule_id.inference.checks.experiment_checks import check_outliers, check_
 from capsule_id.inference.checks.modes import check_maximum, check_starts
 from capsule_id.inference.checks.order import check_trials
 from capsule_id.inference.checks.predictive import check_statistics
-from capsule_id.inference.checks.priors import check_priors
+from capsule_id.inference.checks.priors import PRIOR_PULL, check_priors
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
@@ -25,8 +25,6 @@ from capsule_id.views import Finding
 
 #: The data inform a parameter where posterior sd / prior sd (in u) is at most this, dimensionless.
 INFORMED_RATIO = 0.9
-#: A physical parameter this many prior sds from the prior's centre is biased by the prior.
-PRIOR_PULL = 2.5
 
 
 def run_checks(sampled: SampledFit) -> SampledFit:
@@ -34,6 +32,7 @@ def run_checks(sampled: SampledFit) -> SampledFit:
     whiteness = check_whiteness(sampled)
     outliers, flagged = check_outliers(sampled)
     sampled = replace(sampled, flagged=flagged)
+    trials = check_trials(sampled)
     findings = [
         *check_starts(sampled.fit, sampled.target, sampled.posterior),
         *check_maximum(sampled),
@@ -41,8 +40,8 @@ def run_checks(sampled: SampledFit) -> SampledFit:
         *whiteness,
         *outliers,
         *check_stated_errors(sampled),
-        *check_trials(sampled),
-        *check_statistics(sampled),
+        *trials,
+        *check_statistics(sampled, {finding.experiment for finding in trials if finding.level == "fail"}),
         *_declared_findings(sampled, bench=True),
         *_informed(sampled),
         *check_priors(sampled),
@@ -115,7 +114,8 @@ def _informed(s: SampledFit) -> list[Finding]:
 
 
 def _boundary(s: SampledFit) -> list[Finding]:
-    """Find parameters whose posterior lies in the tail of the prior."""
+    """Find parameters whose posterior lies in the tail of the prior; ``check_priors`` finds such scatters."""
     z = np.abs(s.target.prior_residuals(s.fit.u))
-    names = [row.name for row, pull in zip(s.target.parameters, z, strict=True) if pull > PRIOR_PULL]
+    pulls = zip(s.target.parameters, z, strict=True)
+    names = [row.name for row, pull in pulls if pull > PRIOR_PULL and not row.scatter]
     return [Finding("priors.tails", "warn" if names else "ok", {"names": ", ".join(names)})]

@@ -45,10 +45,19 @@ class _Fit:
     def of(
         cls, other: LogPosterior, experiments: Sequence[Experiment], known: Mapping[str, float], seed: int
     ) -> "_Fit":
-        """Fit other models of the same readings, from values by name."""
+        """Fit other models of the same readings, from many starts about values by name."""
         release_memory()
         target = LogPosterior(other.rig, experiments)
         return cls(target, joint_fit(target, known, seed))
+
+    def with_law(self, law: FrictionModel, seed: int) -> "_Fit":
+        """Fit another friction law from this fit alone: the motion is known, and only a comparison needs the result."""
+        release_memory()
+        experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in self.target.experiments]
+        target = LogPosterior(self.target.rig, experiments)
+        values = {**{name: start.centre for name, start in target.starts().items()}, **self.values}
+        start = target.unconstrain(np.array([values[name] for name in target.names]))
+        return _Fit(target, joint_fit(target, values, seed, starts=start[None]))
 
     @property
     def values(self) -> Mapping[str, float]:
@@ -127,9 +136,8 @@ def compare_laws(target: LogPosterior, fit: PointFit, seed: int) -> list[Finding
     fits = {own: quoted}
     for law in LAWS:
         if law != own:
-            experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in target.experiments]
             with suppress(InputError):  # no motion with this law is finite
-                fits[law] = _Fit.of(target, experiments, quoted.values, seed)
+                fits[law] = quoted.with_law(law, seed)
     best = max(fits.values(), key=lambda one: one.height)
     behind = {law: _behind(one, best) for law, one in fits.items()}
     close = [law for law, (difference, error) in behind.items() if difference <= max(STRONG, ERRORS * error)]

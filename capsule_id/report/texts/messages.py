@@ -152,7 +152,7 @@ def _tables_disagree(facts: Facts) -> str:
     estimates = ", ".join(f"{value:.4g}{unit} by {label}" for label, value in facts["estimates"])
     return (
         f"expected tables that agree; found {facts['name']} = {estimates} (p = {facts['p']:.1g}). It depends on "
-        f"what differs between them, such as load, day or speed; the sd is too small by a factor of about "
+        f"what differs between them, such as load, day or speed; an sd of independent trials is too small by a factor of about "
         f"{facts['factor']:.1f}. Find the cause, or fit each table in a folder of its own."
     )
 
@@ -208,8 +208,8 @@ FIT_MESSAGES: Mapping[str, Message] = {
         ok="residuals of neighbouring rows are uncorrelated in {number:# table}",
         fail=(
             "expected residuals without order; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
-            "(p = {p:.1g}). The trials drift or come in sessions, and the sd is too small by a factor of about {factor:.1f}. "
-            "Repeat the trials in random order, with the test set up anew between them."
+            "(p = {p:.1g}). The trials drift or come in sessions: an sd of independent trials is too small by a factor "
+            "of about {factor:.1f}. Repeat the trials in random order, with the test set up anew between them."
         ),
     ),
     "trials.tables": Message(
@@ -225,7 +225,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
     "residuals.statistics": Message(
         "residuals like noise",
         ok="signs, largest residual and trend of {number:# bench test} are those of random noise",
-        warn=lambda facts: (
+        fail=lambda facts: (
             f"expected residuals like random noise; {_STATISTICS[facts['statistic']]} (p = {facts['p']:.1g}). A larger "
             "scatter does not explain this. Look at the residuals: a bend, a wrong model or a wrong reading."
         ),

@@ -141,9 +141,32 @@ def test_readings_that_the_default_prior_excludes_fail(
     tmp_path: Path, rows: Callable[..., Callable[[Path], Rig]]
 ) -> None:
     make = tilts(1e-9) if rows is tilts else pushes()
-    result, (text,) = fit(make, tmp_path / "default")
+    result, texts = fit(make, tmp_path / "default")
     assert result.trust == "not trusted"
-    assert "the default prior of mu" in text
+    (text,) = [text for text in texts if "the default prior of mu" in text]
     if rows is pushes:  # the prior that the text proposes is accepted and ends the conflict
         proposed = re.findall(r"state \[prior\] (mu = \{.*?\})", text)[0]
-        assert fit(pushes(proposed), tmp_path / "stated")[1] == []
+        # Speeds of km/s scatter more than usual ones, too.
+        assert not any("prior of mu " in text for text in fit(pushes(proposed), tmp_path / "stated")[1])
+
+
+def scattered(degrees: float, prior: str = "") -> Callable[[Path], Rig]:
+    """Ten tilts whose scatter is exactly ``degrees``."""
+    z = np.random.default_rng(2).standard_normal(10)
+    angle = 24.0 + degrees * (z - np.mean(z)) / np.std(z, ddof=1)
+    return _with_prior(Entry("static_friction", "tilts", {"angle [deg]": angle}), prior)
+
+
+def test_a_scatter_far_above_its_default_prior_is_not_trusted(tmp_path: Path) -> None:
+    """Before: trusted, with an sd 30 % short of that of the mean; a warning named the prior."""
+    result, (text,) = fit(scattered(3.7), tmp_path / "default")
+    assert "the default prior of tilt_sd" in text
+    assert result.summary.at["mu", "trust"] == "not trusted"
+    proposed = re.findall(r"state \[prior\] (tilt_sd = \{.*?\})", text)[0]
+    stated, texts = fit(scattered(3.7, proposed), tmp_path / "stated")
+    assert texts == []
+    of_mean = np.deg2rad(3.7) / np.sqrt(10.0) / np.cos(np.deg2rad(24.0)) ** 2
+    assert stated.summary.at["mu", "sd"] == pytest.approx(of_mean, rel=0.15)
+    assert result.summary.at["mu", "sd"] < 0.8 * of_mean
+    # negative control: a usual scatter
+    assert fit(scattered(1.0), tmp_path / "usual")[1] == []

@@ -68,5 +68,14 @@ def test_a_warning_that_names_parameters_leaves_them_not_judged(sampled: Sampled
     assert [name for name, word in found.items() if word == "not judged"] == ["K"]
 
 
+def test_what_only_very_few_rows_inform_is_not_judged(sampled: SampledFit) -> None:
+    """Before: a calibration of four rows along a curve was trusted."""
+    few = [Finding("readings.few", "warn", {}, "motor_current")]
+    assert words(sampled, *few)["K"] == "not judged"
+    assert words(sampled, *few, Finding("x", "fail", {}, "motor_current"))["K"] == "not trusted"
+    # Other records inform k1 too.
+    assert words(sampled, Finding("readings.few", "warn", {}, "free_vibration_1"))["k1"] == "trusted"
+
+
 def test_the_words_are_ordered_from_best_to_worst() -> None:
     assert get_args(Trust) == ("trusted", "not judged", "not trusted")
