@@ -211,6 +211,32 @@ def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
         assert (found.start, found.rest, found.stop) == (0.0, 0.0, None)
 
 
+def tapped(blow: float) -> tuple[np.ndarray, np.ndarray]:
+    """Acceleration of a beam after a tap at 25 ms: modes of 7.9, 50 and 680 Hz, the fast ones ``blow`` times as large."""
+    time = np.arange(8192) / 2048.0
+    after = np.clip(time - 0.025, 0.0, None)
+    size, rate, frequency = (
+        np.array([1.0, 3.0 * blow, 20.0 * blow]),
+        np.array([0.7, 12.0, 150.0]),
+        np.array([7.9, 50.0, 680.0]),
+    )
+    waves = np.sin(2.0 * np.pi * frequency * after[:, None]) * np.exp(-rate * after[:, None])
+    return time, waves @ size + 0.003 * np.random.default_rng(0).standard_normal(len(time))
+
+
+def test_a_free_decay_after_a_tap_begins_when_its_fast_modes_have_died_out() -> None:
+    """Before: "the energy grows after 0.107 s", and a stop that left the tap alone."""
+    found = cast(FreeDecay, find_free_decay(*tapped(1.0)))
+    assert found.stop is None
+    assert 0.025 < found.start < 0.6
+    assert found.period == pytest.approx(1.0 / 7.9, rel=0.02)
+    # negative control: a second blow after ten periods
+    time, values = tapped(1.0)
+    second = np.concatenate([np.zeros(2600), 0.3 * values[: len(values) - 2600]])
+    again = cast(FreeDecay, find_free_decay(time, values + second))
+    assert again.stop == pytest.approx(2600 / 2048.0, abs=0.15)
+
+
 def pushed(slowing: float, release: float = 0.3 * PERIOD) -> np.ndarray:
     """A decay (800,) after a push from 70 % of the first deflection to all of it; x slows down by this factor."""
     rise = np.linspace(-np.arccos(0.7), 0.0, round(release * slowing * RATE), endpoint=False)

@@ -201,7 +201,7 @@ class MarginalPosterior:
             known, terms, integrals = self._terms(v, shifted)
             highest = np.max(terms, axis=-1, keepdims=True)
             # No walker accepts a place without density: its draw has no effect.
-            sums = np.cumsum(np.exp(terms - np.where(np.isfinite(highest), highest, 0.0)), axis=-1)
+            sums = np.cumsum(np.exp(np.where(np.isfinite(highest), terms - highest, 0.0)), axis=-1)
             node = np.sum(sums < chance[..., None] * sums[..., -1:], axis=-1)
             t = shifted.start + node * grid.step
             chosen = np.take_along_axis(terms, node[..., None], axis=-1)[..., 0] - log_stretch(t, grid.bend, np)

@@ -121,7 +121,7 @@ def _windows(
         known, density, integral = terms(probes, grid)
         # A walker without density keeps its window, because it has no mass either.
         density = np.where(np.any(np.isfinite(density), axis=-1, keepdims=True), density, 0.0)
-        density = np.where(np.isnan(density), -np.inf, density)
+        density = np.where(np.isfinite(density), density, -np.inf)
         density = density - np.max(density, axis=-1, keepdims=True)
         core = low + np.argmax(density > -CORE, axis=-1) * grid.step
         # The maximum may lie between two nodes, so the window includes one more node on either side.

@@ -18,6 +18,8 @@ GROWTH = 1.15
 NOISE_HEIGHT = 5.0
 #: Shortest rest before the release that matters, in periods.
 SHORTEST_REST = 0.5
+#: Shortest free decay between two excitations, in periods.
+SHORTEST_DECAY = 2.0
 #: The motion begins where the record leaves its first value by this fraction of its range, and by the noise above.
 DEPARTURE = 0.05
 #: The free decay begins at the first half cycle of at least this fraction of the largest one.
@@ -90,16 +92,31 @@ def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = F
     start = float(times[0]) if pushed else start
     before = start - float(time[0])
     starts_at_once = before < SHORTEST_REST * period and not pushed
-    later, height = times[largest:], heights[largest:]
-    floor = max(NOISE_HEIGHT * noise, 0.25 * REST_HEIGHT * height[0])
-    # The energy of a free decay never grows. Two half cycles must show it, so that one disturbed reading does not.
-    pairs = np.maximum(height[:-1], height[1:])  # one low half cycle alone is a disturbance too
-    lowest = np.minimum.accumulate(np.concatenate([height[:1], height[:1], pairs[:-1]]))
-    grown = (height > GROWTH * lowest + floor) & (height > 2.0 * floor)
-    twice = np.flatnonzero(grown[1:] & grown[:-1])
-    stop = float(later[max(twice[0] - 1, 0)]) if len(twice) else None
+    first, stop = largest, _growth(times[largest:], heights[largest:], noise)
+    # A blow excites other modes too: the free decay of the slow one begins when they have died out.
+    while stop is not None and stop - float(times[largest]) < SHORTEST_DECAY * period:
+        after = np.flatnonzero((times > stop) & (times < stop + SHORTEST_DECAY * period))
+        if not len(after):
+            break
+        largest = int(after[np.argmax(heights[after])])
+        stop = _growth(times[largest:], heights[largest:], noise)
+    if largest > first:
+        return FreeDecay(float(times[largest]), stop, float(times[largest] - time[0]), period)
     start, before = (float(time[0]), 0.0) if starts_at_once else (start, before)
     return FreeDecay(start, stop, before, period, pushed)
+
+
+def _growth(times: np.ndarray, heights: np.ndarray, noise: float) -> float | None:
+    """Time before half cycles at ``times`` (h,), with ``heights`` (h,), grow; None where none does.
+
+    The energy of a free decay never grows. Two half cycles must show it, so that one disturbed reading does not.
+    """
+    floor = max(NOISE_HEIGHT * noise, 0.25 * REST_HEIGHT * heights[0])
+    pairs = np.maximum(heights[:-1], heights[1:])  # one low half cycle alone is a disturbance too
+    lowest = np.minimum.accumulate(np.concatenate([heights[:1], heights[:1], pairs[:-1]]))
+    grown = (heights > GROWTH * lowest + floor) & (heights > 2.0 * floor)
+    twice = np.flatnonzero(grown[1:] & grown[:-1])
+    return float(times[max(twice[0] - 1, 0)]) if len(twice) else None
 
 
 def _pushed(time: np.ndarray, values: np.ndarray, turning: float, period: float, noise: float) -> bool:
