@@ -148,6 +148,11 @@ class Experiment(eqx.Module):
         return (None,)
 
     @property
+    def explains_trend(self) -> bool:
+        """Whether the noise model holds a slow drift, so that slow residuals are no misfit."""
+        return False
+
+    @property
     def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Normal force of every trial, N, and its friction coefficient, (n,) each, where the force is stated row by row."""
         return None

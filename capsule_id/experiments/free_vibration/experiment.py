@@ -178,6 +178,10 @@ class FreeVibration(SurfaceExperiment):
         return self.about.screened is not None
 
     @property
+    def explains_trend(self) -> bool:
+        return self.model.drift == "gp"
+
+    @property
     def closed(self) -> bool:
         """Whether the solution is closed and linear in its initial conditions."""
         return not self.model.symbols

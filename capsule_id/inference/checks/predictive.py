@@ -91,7 +91,8 @@ def experiment_p_values(e: Experiment, theta: Mapping[str, float]) -> dict[str, 
     # Rows of a calibration line or of slides may have any order: they follow their abscissa.
     abscissa = next((getattr(e, name) for name in ("x", "speed") if hasattr(e, name)), np.arange(len(residuals)))
     order = np.argsort(abscissa, kind="stable") if len(abscissa) == len(residuals) else np.arange(len(residuals))
-    return p_values(residuals[order], columns[order])
+    found = p_values(residuals[order], columns[order])
+    return {name: p for name, p in found.items() if name != "trend" or not e.explains_trend}
 
 
 def _linearised(e: Experiment, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:

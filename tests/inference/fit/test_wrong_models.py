@@ -8,6 +8,7 @@ from capsule_id.experiments.forced_run.twin import NOISE_SD
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.checks.experiment_checks import check_whiteness
 from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.inference.fit import point_stage
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
@@ -46,6 +47,12 @@ def whiteness_of(**departures: float) -> Finding:
     return check_whiteness(SampledFit(stage.target, stage.fit, None, values))[0]
 
 
+@pytest.fixture(autouse=True)
+def _no_other_laws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other friction laws are fitted after the verdict, and take as long as the rest."""
+    monkeypatch.setattr(point_stage, "compare_laws", lambda *_: [])
+
+
 def test_the_papers_model_leaves_white_residuals() -> None:
     assert whiteness_of().level == "ok"
 
@@ -54,7 +61,7 @@ def test_the_papers_model_leaves_white_residuals() -> None:
     "departure", [{"backward": 1.1}, {"k1_cubic": 2e7}], ids=["friction 10 % higher backward", "cubic term in k1"]
 )
 def test_another_model_is_reported(departure: dict[str, float]) -> None:
-    """The cubic term stiffens the rod by 3 % at 1.5 mm."""
+    """The cubic term stiffens the rod by 3 % at 1.5 mm. The coloured noise of the second fit does not hide it."""
     found = whiteness_of(**departure)
     assert (found.level, found.experiment) == ("fail", "run_1")
     assert "not to be trusted" in finding_text(found, FIT_MESSAGES)
