@@ -90,6 +90,8 @@ class Experiment(eqx.Module):
     event_driven: ClassVar[bool] = False
     #: Whether an estimate from these readings alone may be negative, as the slope of a falling line is.
     estimates_may_be_negative: ClassVar[bool] = False
+    #: Whether the noise model holds a slow drift, so that slow residuals are no misfit.
+    explains_trend: ClassVar[bool] = False
     #: Checks of the fitted experiments that declare them, and tables of the report; each is called once.
     checks: ClassVar[tuple[Check, ...]] = ()
     tables: ClassVar[tuple[TableMaker, ...]] = ()
@@ -146,11 +148,6 @@ class Experiment(eqx.Module):
     def scatters(self) -> tuple[str | None, ...]:
         """Symbol of the scatter of each of ``misfits``; None where its sd is known."""
         return (None,)
-
-    @property
-    def explains_trend(self) -> bool:
-        """Whether the noise model holds a slow drift, so that slow residuals are no misfit."""
-        return False
 
     @property
     def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -300,12 +297,8 @@ class Experiment(eqx.Module):
         return self.label
 
     def with_coloured_noise(self, theta: ValuesBySymbol) -> tuple[Self, dict[str, float]] | None:
-        """Replace white noise, where no noise is stated, by coloured noise.
-
-        Return the new experiment and the values, SI, by name, from which a fit starts. None: the noise stays as it is.
-        """
+        """Replace white noise that is not stated by coloured noise; also return its starts, SI, by name. None: it stays."""
         del theta
-        return None
 
     def corrected_start(self, theta: ValuesBySymbol) -> tuple[Self, dict[str, float]] | None:
         """Replace the kind of initial state where the readings contradict that of ``theta``.

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
 from capsule_id.records.faults.phase import Jump, jump_or_noise, phase_jump
-from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.records.faults.timing import Gaps, dropouts, find_gaps, frozen_samples, time_rounding
 from tests.experiments.bench import K1, M1, C, released
 
@@ -187,110 +185,6 @@ def test_coloured_noise_is_no_jump(correlation: float) -> None:
         noise = np.asarray(signal.lfilter([1.0], [1.0, -correlation], shocks))[300:]
         found += phase_jump(decay(noise=0.0) + 0.03 * noise, SAMPLES) is not None
     assert found <= 1
-
-
-@pytest.mark.parametrize("held", [True, False])
-def test_the_release_is_found_after_rest(held: bool) -> None:
-    before = 1.3
-    time = np.arange(round(before * RATE) + len(TIME)) / RATE
-    rest = np.full(round(before * RATE), 2.0 if held else 0.0) + 0.02 * np.random.default_rng(1).standard_normal(2600)
-    values = np.concatenate([rest, decay()])
-    found = cast(FreeDecay, find_free_decay(time, values))
-    assert before - 0.05 * PERIOD <= found.start <= before + 0.6 * PERIOD
-    assert found.rest == found.start - time[0]
-    assert found.stop is None
-    assert found.period == pytest.approx(PERIOD, rel=0.05)
-    inside = time >= found.start
-    again = cast(FreeDecay, find_free_decay(time[inside], values[inside]))
-    assert again.rest == 0.0
-
-
-def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
-    for make in (decay, encoder):
-        found = cast(FreeDecay, find_free_decay(TIME, make()))
-        assert (found.start, found.rest, found.stop) == (0.0, 0.0, None)
-
-
-def tapped(blow: float) -> tuple[np.ndarray, np.ndarray]:
-    """Acceleration of a beam after a tap at 25 ms: modes of 7.9, 50 and 680 Hz, the fast ones ``blow`` times as large."""
-    time = np.arange(8192) / 2048.0
-    after = np.clip(time - 0.025, 0.0, None)
-    size, rate, frequency = (
-        np.array([1.0, 3.0 * blow, 20.0 * blow]),
-        np.array([0.7, 12.0, 150.0]),
-        np.array([7.9, 50.0, 680.0]),
-    )
-    waves = np.sin(2.0 * np.pi * frequency * after[:, None]) * np.exp(-rate * after[:, None])
-    return time, waves @ size + 0.003 * np.random.default_rng(0).standard_normal(len(time))
-
-
-def test_a_free_decay_after_a_tap_begins_when_its_fast_modes_have_died_out() -> None:
-    """Before: "the energy grows after 0.107 s", and a stop that left the tap alone."""
-    found = cast(FreeDecay, find_free_decay(*tapped(1.0)))
-    assert found.stop is None
-    assert 0.025 < found.start < 0.6
-    assert found.period == pytest.approx(1.0 / 7.9, rel=0.02)
-    # negative control: a second blow after ten periods
-    time, values = tapped(1.0)
-    second = np.concatenate([np.zeros(2600), 0.3 * values[: len(values) - 2600]])
-    again = cast(FreeDecay, find_free_decay(time, values + second))
-    assert again.stop == pytest.approx(2600 / 2048.0, abs=0.15)
-
-
-def pushed(slowing: float, release: float = 0.3 * PERIOD) -> np.ndarray:
-    """A decay (800,) after a push from 70 % of the first deflection to all of it; x slows down by this factor."""
-    rise = np.linspace(-np.arccos(0.7), 0.0, round(release * slowing * RATE), endpoint=False)
-    free = decay(time=TIME[: 800 - len(rise)])
-    return np.concatenate([2.0 * np.cos(rise) + 0.02 * np.random.default_rng(2).standard_normal(len(rise)), free])
-
-
-@pytest.mark.parametrize("slowing", [1.0, 1.4])
-def test_a_slow_push_to_the_first_turning_point_is_no_free_decay(slowing: float) -> None:
-    time, values = TIME[:800], pushed(slowing)
-    found = cast(FreeDecay, find_free_decay(time, values, displacement=True))
-    assert found.pushed
-    assert found.rest == found.start == pytest.approx(0.3 * PERIOD * slowing, abs=0.05 * PERIOD)
-    inside = time >= found.start
-    again = cast(FreeDecay, find_free_decay(time[inside], values[inside], displacement=True))
-    assert (again.pushed, again.rest) == (False, 0.0)
-    # Velocities and accelerations do not show it.
-    other = cast(FreeDecay, find_free_decay(time, values))
-    assert not other.pushed
-
-
-def test_a_decay_recorded_from_any_phase_is_not_pushed() -> None:
-    """Viscous, dry, quadratic damping and cubic springs, in white and correlated noise."""
-    rng = np.random.default_rng(0)
-    time, found = np.arange(250) / 500.0, 0
-    for more in ({}, {"F_dry": 0.05 * K1 * 2e-3}, {"c_q": 20.0}, {"k_cubic": 0.3 * K1 / 4e-6}):
-        for _ in range(25):
-            forces = {"k1": K1, "c": rng.choice([0.3, 1.0]), "m1": M1, **more}
-            x = rubbed(time + rng.uniform(0.0, PERIOD), forces, 2e-3, 0.0, 40).x_rel
-            rho = rng.choice([0.0, 0.9, 0.98])
-            noise = np.asarray(signal.lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal(len(time))))
-            free = cast(FreeDecay, find_free_decay(time, np.asarray(x) + 4e-5 * noise, displacement=True))
-            found += free.pushed
-    assert found == 0
-
-
-def test_a_drift_of_the_zero_is_no_rest() -> None:
-    """The rest position at the release differs from that at the end by 20 % of the deflection, to either side."""
-    time = TIME[::4]
-    noise = 0.02 * np.random.default_rng(0).standard_normal(len(time))
-    for size in (-0.4, 0.4):
-        found = cast(FreeDecay, find_free_decay(time, released(time, 2.0, c=1.0) + size * np.exp(-4.0 * time) + noise))
-        assert (found.start, found.rest) == (0.0, 0.0)
-
-
-def test_a_second_excitation_ends_the_decay() -> None:
-    values = np.concatenate([decay(1)[:500], decay(2)])
-    time = np.arange(len(values)) / RATE
-    found = cast(FreeDecay, find_free_decay(time, values))
-    stop = cast(float, found.stop)
-    assert 0.25 - PERIOD <= stop <= 0.25 + 0.1 * PERIOD
-    inside = time <= stop
-    again = cast(FreeDecay, find_free_decay(time[inside], values[inside]))
-    assert again.stop is None
 
 
 def rows(values: np.ndarray, label: str = "a", record: bool = True) -> Readings:
