@@ -32,6 +32,7 @@ FIRST = ("test_project.py", "test_notebooks.py", "test_notebooks_even.py", "test
 NOT_OPTIMISED = {
     "test_block_means.py",
     "test_capsule_bench.py",
+    "test_coloured_runs.py",
     "test_decay_channels.py",
     "test_decays.py",
     "test_displacement.py",

@@ -2,14 +2,19 @@
 
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.settings import DecayModel
 from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.checks.predictive import STATISTICS, experiment_p_values, p_values
+from capsule_id.inference.checks.predictive import STATISTICS, check_statistics, experiment_p_values, p_values
+from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.scipy_decay import scipy_decay
 
@@ -81,3 +86,37 @@ def test_the_noise_level_does_not_matter() -> None:
     r, columns = rng.standard_normal(40), rng.standard_normal((40, 3))
     assert p_values(r, columns) == pytest.approx(p_values(10.0 * r, columns))
     assert p_values(r, columns) == pytest.approx(p_values(r + columns @ [5.0, -2.0, 1.0], columns))
+
+
+def finding_of(made: Twin) -> Finding:
+    """The finding on one experiment at these values."""
+    e, values = made
+    named = {row.name: values[row.symbol] for row in e.parameters}
+    return check_statistics(cast(Any, SimpleNamespace(experiments=(e,), values={**values, **named}, flagged={})))[0]
+
+
+@pytest.mark.parametrize(
+    ("made", "level", "statistic"),
+    [
+        (partial(line, 3), "ok", None),
+        (partial(line, 3, bend=4e7), "fail", "trend"),
+        (partial(decay, 3, F_dry=0.05), "fail", "sign runs"),
+        (partial(decay, 3, outlier=8.0), "warn", "largest"),
+    ],
+)
+def test_slow_residuals_fail_and_a_large_one_is_a_warning(
+    made: Callable[[], Twin], level: str, statistic: str | None
+) -> None:
+    """Before: a decay whose residuals kept their sign was trusted, with a warning."""
+    found = finding_of(made())
+    assert found.level == level
+    if statistic:
+        assert found.facts["statistic"] in (statistic, "trend")
+
+
+def test_a_modelled_drift_explains_slow_residuals() -> None:
+    e, values = decay(0)
+    drifting = cast(FreeVibration, e).with_model(DecayModel(drift="gp"))
+    own = {"drift_ratio": 1.0, "drift_time": 0.3}
+    assert "trend" in experiment_p_values(e, values)
+    assert "trend" not in experiment_p_values(drifting, {**values, **own})
