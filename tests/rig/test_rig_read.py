@@ -75,7 +75,6 @@ def test_everything_is_si(tmp_path: Path) -> None:
         "Omega": 34.56,
         "P_d": Quantity(4.0, 0.1),
         "start": "auto",
-        "noise": None,
     }
     np.testing.assert_array_equal(run.rows, np.arange(2, 11))
 
