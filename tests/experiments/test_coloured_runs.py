@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -57,9 +58,8 @@ def values_of(run: BaseRun) -> dict[str, float]:
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
 def test_coloured_noise_starts_at_the_correlation_of_the_residuals(tmp_path: Path, rho: float) -> None:
     rig = shaken(tmp_path, rho)
-    found = BaseRun(rig.tables[0], rig).with_coloured_noise(values_of(BaseRun(rig.tables[0], rig)))
-    assert found is not None
-    run, starts = found
+    white = BaseRun(rig.tables[0], rig)
+    run, starts = cast(tuple[BaseRun, dict[str, float]], white.with_coloured_noise(values_of(white)))
     assert run.coloured
     assert "ar1_x_capsule" in {row.symbol for row in run.parameters}
     assert np.tanh(starts["ar1_x_capsule[shaken]"]) == pytest.approx(rho, abs=0.1)
@@ -92,16 +92,12 @@ def test_noise_repeats_at_the_stated_rate_only(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     p = np.array([found[1] for _ in range(150) if (found := repetition(run, rng.standard_normal(600)))])
     assert np.mean(p < 0.05) == pytest.approx(0.05, abs=0.055)
-    cycles = np.arange(600) / RATE * 2.0
-    repeated = 0.5 * np.sin(2.0 * np.pi * 3.0 * cycles)
-    assert run.cycles is not None
-    found = repetition(run, repeated + rng.standard_normal(600))
-    assert found is not None
-    assert found[1] < LEVEL
+    cycles = cast(np.ndarray, run.cycles)
+    repeated = 0.5 * np.sin(2.0 * np.pi * 3.0 * cycles) + rng.standard_normal(600)
+    assert cast(tuple[float, float], repetition(run, repeated))[1] < LEVEL
     # negative control: the same size at a frequency that is no harmonic
-    other = repetition(run, 0.5 * np.sin(2.0 * np.pi * 3.37 * cycles) + rng.standard_normal(600))
-    assert other is not None
-    assert other[1] > LEVEL
+    other = 0.5 * np.sin(2.0 * np.pi * 3.37 * cycles) + rng.standard_normal(600)
+    assert cast(tuple[float, float], repetition(run, other))[1] > LEVEL
 
 
 def test_few_periods_show_no_repetition(tmp_path: Path) -> None:
