@@ -7,13 +7,14 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
 
-from capsule_id.inference.result import Result
+from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
 from capsule_id.report.console_table import table_text
@@ -114,8 +115,7 @@ def test_findings_in_json_name_their_experiment(result: Result) -> None:
         Finding("errors.stated", "ok"),
     )
     content = parameters_json(dataclasses.replace(result, findings=findings))
-    verdict = content["verdict"]
-    assert isinstance(verdict, dict)
+    verdict = cast(dict[str, Any], content["verdict"])
     assert verdict["clean"] is False
     slip, white, errors = verdict["findings"]
     assert (slip["check"], slip["code"], slip["level"]) == ("free decay", "decays.slip", "fail")
@@ -127,8 +127,7 @@ def test_findings_in_json_name_their_experiment(result: Result) -> None:
 
 def test_a_finding_without_words_is_given_by_its_facts(result: Result) -> None:
     content = parameters_json(dataclasses.replace(result, findings=(Finding("balance", "ok", {"kg": 2.5}, "run_1"),)))
-    verdict = content["verdict"]
-    assert isinstance(verdict, dict)
+    verdict = cast(dict[str, Any], content["verdict"])
     said = {"check": "balance", "level": "ok", "text": "run_1: kg = 2.5", "code": "balance"}
     assert verdict["findings"] == [{**said, "experiment": "run_1", "parameters": []}]
 
@@ -214,8 +213,7 @@ def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType
     data = arviz.from_netcdf(str(folder / "posterior.nc"))
     read = {"posterior", "sample_stats", "observed_data", "log_likelihood", "posterior_predictive", "prior"}
     assert set(data.groups()) == read
-    posterior = result.posterior
-    assert posterior is not None
+    posterior = cast(Posterior, result.posterior)
     ensembles, draws, walkers, _ = posterior.draws.shape
     assert dict(data.posterior.sizes) == {
         "chain": ensembles * walkers, "draw": draws, "spring": 3, "noise_sd_of": 3, "scatter_of": 4,
@@ -230,8 +228,7 @@ def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType
 
 
 def test_every_draw_is_in_its_place(folder: Path, result: Result) -> None:
-    posterior = result.posterior
-    assert posterior is not None
+    posterior = cast(Posterior, result.posterior)
     walkers = posterior.draws.shape[2]
     with xr.open_dataset(folder / "posterior.nc", group="posterior", engine="h5netcdf") as data:
         for e, draw, walker in ((0, 0, 0), (2, 5, 3), (3, 59, 7)):
@@ -261,12 +258,12 @@ def test_the_other_groups_hold_what_was_given(folder: Path, result: Result) -> N
             if group == "prior":
                 np.testing.assert_array_equal(data["k2"].sel(spring="stiff")[0], result.prior["k2[stiff]"])
                 continue
-            assert result.pointwise is not None
+            pointwise = cast(Pointwise, result.pointwise)
             if group == "log_likelihood":
-                for label, values in result.pointwise.log_likelihood.items():
+                for label, values in pointwise.log_likelihood.items():
                     np.testing.assert_array_equal(data["readings"][..., data["experiment"] == label], values)
                 continue
-            given = result.observed if group == "observed_data" else result.pointwise.replicates
+            given = result.observed if group == "observed_data" else pointwise.replicates
             for label, values in given.items():
                 np.testing.assert_array_equal(data[label], values)
                 assert data[label].dims[-1] == f"{label}_row"

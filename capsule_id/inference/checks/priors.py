@@ -13,7 +13,7 @@ from scipy import stats
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.target.priors import prior_of
-from capsule_id.parameters import is_stated
+from capsule_id.parameters import Parameter, is_stated
 from capsule_id.views import Finding
 
 #: Smallest part of a prior's variance that the data count as removing: below, rounding of the sample decides.
@@ -56,17 +56,22 @@ def conflicts(s: SampledFit) -> dict[str, Conflict]:
         alone, alone_sd = middle + (centre[i] - middle) / informed, sd[i] / np.sqrt(informed)
         value, scale = (np.exp(alone), np.exp(alone)) if prior.lognormal else (alone, 1.0)
         z = (centre[i] - middle) / (width * np.sqrt(informed))
-        if row.scatter and row.name not in s.rig.priors:
+        if default_scatter(s, row):
             z = max(z, 0.0)
         found[row.name] = Conflict(float(z), float(value), float(scale * alone_sd), informed)
     return found
+
+
+def default_scatter(s: SampledFit, row: Parameter) -> bool:
+    """Whether ``row`` is a scatter without a stated prior."""
+    return row.scatter and row.name not in s.rig.priors
 
 
 def check_priors(s: SampledFit) -> list[Finding]:
     """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
     findings = []
     found = conflicts(s)
-    scatters = {row.name for row in s.target.parameters if row.scatter} - set(s.rig.priors)
+    scatters = {row.name for row in s.target.parameters if default_scatter(s, row)}
     for name, conflict in found.items():
         p = float(2.0 * stats.norm.sf(abs(conflict.z)))
         if p * len(found) < LEVEL or (name in scatters and conflict.z > PRIOR_PULL):

@@ -37,7 +37,7 @@ def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:
     for e in sampled.experiments:
         for row in e.parameters:
             sizes.setdefault(row.name, []).append(e.table.label in few)
-    doubtful |= {name for name, are_few in sizes.items() if all(are_few)}
+    doubtful |= {name for name, are_few in sizes.items() if all(are_few) and not is_stated(name)}
     words: dict[str, Trust] = {}
     for row, known in zip(sampled.target.parameters, informed, strict=True):
         judged = sampled.posterior is not None and (known or is_stated(row.name)) and row.name not in doubtful

@@ -15,7 +15,7 @@ from capsule_id.inference.checks.experiment_checks import check_outliers, check_
 from capsule_id.inference.checks.modes import check_maximum, check_starts
 from capsule_id.inference.checks.order import check_trials
 from capsule_id.inference.checks.predictive import check_statistics
-from capsule_id.inference.checks.priors import PRIOR_PULL, check_priors
+from capsule_id.inference.checks.priors import PRIOR_PULL, check_priors, default_scatter
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
@@ -114,8 +114,8 @@ def _informed(s: SampledFit) -> list[Finding]:
 
 
 def _boundary(s: SampledFit) -> list[Finding]:
-    """Find parameters whose posterior lies in the tail of the prior; ``check_priors`` finds such scatters."""
+    """Find parameters whose posterior lies in the tail of the prior; ``check_priors`` finds scatters by default priors."""
     z = np.abs(s.target.prior_residuals(s.fit.u))
-    pulls = zip(s.target.parameters, z, strict=True)
-    names = [row.name for row, pull in pulls if pull > PRIOR_PULL and not row.scatter]
+    judged = [(row.name, pull) for row, pull in zip(s.target.parameters, z, strict=True) if not default_scatter(s, row)]
+    names = [name for name, pull in judged if pull > PRIOR_PULL]
     return [Finding("priors.tails", "warn" if names else "ok", {"names": ", ".join(names)})]

@@ -170,3 +170,10 @@ def test_a_scatter_far_above_its_default_prior_is_not_trusted(tmp_path: Path) ->
     assert result.summary.at["mu", "sd"] < 0.8 * of_mean
     # negative control: a usual scatter
     assert fit(scattered(1.0), tmp_path / "usual")[1] == []
+
+
+def test_a_stated_prior_of_a_scatter_that_pulls_is_still_named(tmp_path: Path) -> None:
+    result, texts = fit(scattered(1.8, 'tilt_sd = { scale = 0.55, unit = "deg" }'), tmp_path)
+    assert texts == []
+    (tails,) = [finding for finding in result.findings if finding.code == "priors.tails"]
+    assert (tails.level, tails.facts["names"]) == ("warn", "tilt_sd")

@@ -1,6 +1,7 @@
 """The word of a parameter follows from the findings about the experiments that inform it."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -15,6 +16,7 @@ from capsule_id.inference.result import Posterior
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.synthetic import synthesize
 from capsule_id.views import Finding, Trust
+from tests.measured.folders import Entry, make_rig, quantity
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +77,15 @@ def test_what_only_very_few_rows_inform_is_not_judged(sampled: SampledFit) -> No
     assert words(sampled, *few, Finding("x", "fail", {}, "motor_current"))["K"] == "not trusted"
     # Other records inform k1 too.
     assert words(sampled, Finding("readings.few", "warn", {}, "free_vibration_1"))["k1"] == "trusted"
+
+
+def test_a_stated_slope_is_trusted_beside_very_few_rows(sampled: SampledFit, tmp_path: Path) -> None:
+    pulls = Entry("static_friction", "pulls", {"force [N]": np.array([4.1, 4.2, 4.3])})
+    slope = '{ value = 1.0, sd = 0.1, unit = "deg" }'
+    rig = make_rig(tmp_path, pulls, head={"m1": quantity(0.11, "kg"), "m2": quantity(0.53, "kg"), "slope": slope})
+    target = LogPosterior(rig, make_experiments(rig))
+    found = words(replace(sampled, target=target), Finding("readings.few", "warn", {}, "pulls"))
+    assert (found["mu"], found["slope"]) == ("not judged", "trusted")
 
 
 def test_the_words_are_ordered_from_best_to_worst() -> None:
