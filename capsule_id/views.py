@@ -21,21 +21,36 @@ Facts = Mapping[str, Any]
 #: A format string over facts, or a function of them. ``{rows:# row}`` writes a count: ``1 row``, ``2 rows``.
 Text = str | Callable[[Facts], str]
 
+#: Smaller probabilities of a test are not printed.
+SMALLEST_P = 1e-10
+
 
 def counted(number: int, noun: str) -> str:
     """``1 row``, ``2 rows``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def stated_p(p: float) -> str:
+    """``p = 0.01``, or ``p < 1e-10`` for a smaller one: so far out, no distribution is known."""
+    return f"p = {p:.2g}" if p >= SMALLEST_P else f"p < {SMALLEST_P:g}"
+
+
 class _Texts(Formatter):
-    """Fills in facts; the format ``# noun`` writes a count."""
+    """Fills in facts; the format ``# noun`` writes a count, the format ``p`` a probability."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         """The text of one fact."""
-        return counted(value, format_spec[2:]) if format_spec.startswith("# ") else format(value, format_spec)
+        if format_spec.startswith("# "):
+            return counted(value, format_spec[2:])
+        return stated_p(value) if format_spec == "p" else format(value, format_spec)
 
 
 _TEXTS = _Texts()
+
+
+def filled_in(text: str, facts: Facts) -> str:
+    """``text`` with its ``{names}`` replaced by facts; formats as of ``str.format``, and ``# noun`` and ``p``."""
+    return _TEXTS.vformat(text, (), facts)
 
 
 @dataclass(frozen=True)
@@ -100,10 +115,10 @@ class Message:
             If a function returns no string.
         """
         text: Text = getattr(self, part)
-        filled_in = _TEXTS.vformat(text, (), facts) if isinstance(text, str) else text(facts)
-        if not isinstance(filled_in, str):
-            raise TypeError(f"the text must be a string, found {filled_in!r}")
-        return filled_in
+        found = filled_in(text, facts) if isinstance(text, str) else text(facts)
+        if not isinstance(found, str):
+            raise TypeError(f"the text must be a string, found {found!r}")
+        return found
 
 
 @dataclass(frozen=True)

@@ -286,3 +286,22 @@ def test_the_remedy_of_a_run_names_other_laws_and_no_noise_that_is_stated(consta
     assert ('remove noise = "white"' in advice) == (noise == "white")
     assert ('compare it with friction = "constant" or free = ["ratio"] in [model]' in advice) == (not constant)
     assert 'free = ["ratio"]' not in "".join(other_laws(FrictionModel(free=("ratio",))))
+
+
+@pytest.mark.parametrize("spring", [False, True])
+@pytest.mark.parametrize("code", ["residuals.white", "runs.repeated"])
+def test_the_remedy_of_a_run_names_a_spring_only_where_the_run_has_one(code: str, spring: bool) -> None:
+    """Before: "check spring and gap" for a shaken frame, and "p = 0" where a probability underflows."""
+    facts = {
+        "record": "run",
+        "Q": 99.0,
+        "F": 9.0,
+        "lags": 20,
+        "p": 0.0,
+        "model": "capsule",
+        "noise": None,
+        "spring": spring,
+    }
+    advice = text(Finding(code, "fail", {**facts, "law": "", "other_laws": ()}, "run"))
+    assert ("spring" in advice) == ("gap" in advice) == spring
+    assert "p < 1e-10" in advice

@@ -111,9 +111,9 @@ MESSAGES = {
     ),
     "friction.order": Message(
         "friction against speed",
-        ok="the residuals show no order in speed (p = {p:.2g})",
+        ok="the residuals show no order in speed ({p:p})",
         fail=(
-            "{labels}: expected residuals without order in speed; found neighbours of one sign under {name} (p = {p:.2g}). "
+            "{labels}: expected residuals without order in speed; found neighbours of one sign under {name} ({p:p}). "
             "Compare the friction laws in the report, or repeat the readings at more speeds."
         ),
     ),
@@ -125,7 +125,7 @@ MESSAGES = {
         ),
         fail=(
             "{tilts} and {slides}: expected one surface; found mu = {mu_tilts:.3f} at rest and {mu_slides:.3f} by "
-            "sliding (p = {p:.2g}). Measure both on the same surface, and read the tilt or pull at break-away. Static friction "
+            "sliding ({p:p}). Measure both on the same surface, and read the tilt or pull at break-away. Static friction "
             "above sliding friction is no fault, but constant friction cannot show it: give the slides a column speed and "
             'state friction = "stribeck", or fit both in folders of their own.'
         ),

@@ -24,7 +24,7 @@ MESSAGES = {
         ok="no bend in {number:# calibration line}",
         fail=(
             "expected a straight line; a parabola departs from it by {departure:.1%} of the range at mid range "
-            "(p = {p:.1g}), so {name} depends on where it is read. Use the part of the range that the runs use."
+            "({p:p}), so {name} depends on where it is read. Use the part of the range that the runs use."
         ),
     ),
     "lines.replicates": Message(
@@ -32,7 +32,7 @@ MESSAGES = {
         ok="the means of repeated readings lie on {number:# calibration line}",
         fail=(
             "expected the means of repeated readings on the line; they deviate by {deviation:.1f} sd of a reading "
-            "(p = {p:.1g}), so {name} has errors that repetition does not show. Set {x} anew before each reading, and check "
+            "({p:p}), so {name} has errors that repetition does not show. Set {x} anew before each reading, and check "
             "for hysteresis."
         ),
     ),

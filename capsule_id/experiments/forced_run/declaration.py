@@ -16,7 +16,7 @@ from capsule_id.rig.domains import ANY, NOT_NEGATIVE
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings, NameRule, QuantityRule
-from capsule_id.views import Facts, Finding, Message
+from capsule_id.views import Facts, Finding, Message, stated_p
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
@@ -157,10 +157,11 @@ def _repeated(facts: Facts) -> str:
     """The record whose residuals repeat, and the friction laws to compare."""
     laws = facts["other_laws"]
     compare = f"The fit has {facts['law']}; compare it with {' or '.join(laws)} in [model]. " if laws else ""
+    check = "the support spring, the gap and the frequency" if facts.get("spring") else "the frequency"
     return (
         f"{facts['record']}: expected residuals that do not repeat with every excitation period, but they do (F = "
-        f"{facts['F']:.3g}, p = {facts['p']:.1g}). An error that repeats is no noise: the model lacks a force, or a sensor has "
-        f"an error. {compare}Check spring, gap and the frequency of the drive."
+        f"{facts['F']:.3g}, {stated_p(facts['p'])}). An error that repeats is no noise: the model lacks a force, or a sensor "
+        f"has an error. {compare}Check {check} of the drive."
     )
 
 
@@ -281,7 +282,7 @@ MESSAGES = {
     ),
     "runs.repeated": Message(
         "repeated misfit",
-        ok="the residuals of no run repeat with the excitation (smallest p = {p:.2g})",
+        ok="the residuals of no run repeat with the excitation (smallest {p:p})",
         fail=_repeated,
     ),
     "runs.groups": Message(

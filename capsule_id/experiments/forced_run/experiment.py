@@ -195,7 +195,8 @@ class ForcedRun(CapsuleForward):
         return type(self)(table, self.rig, leads=leads, capsule_rate=rate, **own).with_smoothing(self.smoothing)
 
     def noise_facts(self) -> Facts:
-        return {**super().noise_facts(), "noise": "ar1" if self.coloured else self.table.settings.noise}
+        noise = "ar1" if self.coloured else self.table.settings.noise
+        return {**super().noise_facts(), "noise": noise, "spring": self.spring is not None}
 
     @property
     def shares_noise(self) -> str:

@@ -4,7 +4,7 @@ from capsule_id.experiments.free_vibration.kinematics import MESSAGES as KINEMAT
 from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
 from capsule_id.experiments.free_vibration.lint import line_of
 from capsule_id.experiments.free_vibration.settings import DAMPING
-from capsule_id.views import Facts, Message
+from capsule_id.views import Facts, Message, filled_in
 
 
 def _second_fit(facts: Facts) -> str:
@@ -48,29 +48,33 @@ def _smaller(facts: Facts) -> str:
     """How to leave out the large amplitudes of a record."""
     if facts["start"] is None:
         return "record again from smaller deflections"
-    return f"leave out the larger half of the amplitudes: add {line_of('start').format(**facts)} to the experiment in rig.toml"
+    line = filled_in(line_of("start"), facts)
+    return f"leave out the larger half of the amplitudes: add {line} to the experiment in rig.toml"
 
 
 def _position(facts: Facts) -> str:
-    return (
-        "{label}: the residuals must not depend on the position of the rod, but they do (p = {p:.1g}), most from {low:.4g} to "
+    seen = (
+        "{label}: the residuals must not depend on the position of the rod, but they do ({p:p}), most from {low:.4g} to "
         "{high:.4g} {unit}. The sensor has an error there, or the model lacks a force. Calibrate the sensor, or "
-    ).format(**facts) + f"{_smaller(facts)}."
+    )
+    return filled_in(seen, facts) + f"{_smaller(facts)}."
 
 
 def _residuals(facts: Facts) -> str:
-    return (
-        "{label}: the residuals must not be larger where the motion is larger, but they are, {ratio:.1f} times (p = {p:.1g}). "
+    seen = (
+        "{label}: the residuals must not be larger where the motion is larger, but they are, {ratio:.1f} times ({p:p}). "
         "What was fitted as noise is an error of the model there, such as a stiffness or a damping that depends on the "
         "amplitude, or an error of the sensor in proportion to the motion. To find the cause, "
-    ).format(**facts) + f"{_smaller(facts)}, and compare the results."
+    )
+    return filled_in(seen, facts) + f"{_smaller(facts)}, and compare the results."
 
 
 def _drift(facts: Facts) -> str:
-    return (
+    seen = (
         "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at its "
         "frequency. It hides an error of the model. Where dry friction ends the motion, state an earlier stop; else "
-    ).format(**facts) + f"{_smaller(facts)}."
+    )
+    return filled_in(seen, facts) + f"{_smaller(facts)}."
 
 
 MESSAGES = {
@@ -78,10 +82,10 @@ MESSAGES = {
     **KINEMATICS_MESSAGES,
     "decays.stiffness": Message(
         "stiffness against amplitude",
-        ok="k1 is the same in all {records} records (p = {p:.2g})",
+        ok="k1 is the same in all {records} records ({p:p})",
         fail=(
             "expected one k1 for all releases (linear near the working point); the {records} records give {low:.5g} to "
-            "{high:.5g} N/m (chi-square {chi_square:.1f}, p = {p:.1g}). Release from smaller deflections, or use k1 at this "
+            "{high:.5g} N/m (chi-square {chi_square:.1f}, {p:p}). Release from smaller deflections, or use k1 at this "
             "amplitude only."
         ),
     ),
@@ -115,12 +119,12 @@ MESSAGES = {
     ),
     "decays.position": Message(
         "position of a decay",
-        ok="{labels}: the residuals do not depend on position and direction (p = {p:.2g})",
+        ok="{labels}: the residuals do not depend on position and direction ({p:p})",
         fail=_position,
     ),
     "decays.residuals": Message(
         "residuals and amplitude of a decay",
-        ok="{labels}: the residuals do not grow with the amplitude (p = {p:.2g})",
+        ok="{labels}: the residuals do not grow with the amplitude ({p:p})",
         fail=_residuals,
     ),
     "decays.drift": Message(

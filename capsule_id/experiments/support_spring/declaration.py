@@ -62,9 +62,9 @@ TEMPLATE = """\
 
 CANTILEVER = Message(
     "cantilever law",
-    ok="k2 ~ L^({exponent:.3f} ± {sd:.3f}), p = {p:.2g} for the -3 of a cantilever",
+    ok="k2 ~ L^({exponent:.3f} ± {sd:.3f}), {p:p} for the -3 of a cantilever",
     warn=(
-        "expected k2 ~ L^-3, as a cantilever has; found L^({exponent:.3f} ± {sd:.3f}), p = {p:.2g}. Check the clamp and the "
+        "expected k2 ~ L^-3, as a cantilever has; found L^({exponent:.3f} ± {sd:.3f}), {p:p}. Check the clamp and the "
         "stated lengths; k2 of each spring stays a parameter of its own."
     ),
 )

@@ -5,9 +5,9 @@ from typing import Literal
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
-from capsule_id.report.texts.posterior import POSTERIOR_MESSAGES, stated_p
+from capsule_id.report.texts.posterior import POSTERIOR_MESSAGES
 from capsule_id.report.texts.readings import DATA_MESSAGES
-from capsule_id.views import Facts, Finding, Level, Message, ResultTable, counted
+from capsule_id.views import Facts, Finding, Level, Message, ResultTable, counted, stated_p
 
 #: Errors of a text that does not match its facts.
 TEXT_ERRORS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
@@ -71,7 +71,7 @@ def _coloured_residuals(facts: Facts) -> str:
     seen = (
         f"{facts['record']}: expected residuals without correlation in time (white); found Ljung–Box "
         f"Q = {facts['Q']:.0f} over {facts['lags']} lags "
-        f"(p = {facts['p']:.1g}). The model lacks an effect or the noise is coloured, and the intervals are not to be "
+        f"({stated_p(facts['p'])}). The model lacks an effect or the noise is coloured, and the intervals are not to be "
         "trusted."
     )
     remedy = {"capsule": _capsule_remedy(facts), "decay": _decay_remedy(facts)}.get(
@@ -82,7 +82,9 @@ def _coloured_residuals(facts: Facts) -> str:
 
 def _capsule_remedy(facts: Facts) -> str:
     """What to compare: the friction law, of which the fit knows one alone, and the noise."""
-    advice = "Look at the residuals and the phase portrait, check spring and gap."
+    advice = "Look at the residuals and the phase portrait."
+    if facts.get("spring"):
+        advice += " Check the support spring and the gap."
     if laws := facts.get("other_laws", ()):
         advice += f" The fit has {facts['law']}; compare it with {' or '.join(laws)} in [model]."
     if facts.get("noise") == "white":
@@ -141,7 +143,7 @@ def _outliers(facts: Facts) -> str:
         for name, unit, value, without in facts["estimates"]
     )
     return (
-        f"{facts['file']} {where} {facts['score']:.3g} standard deviations off the others (p = {facts['p']:.1g}).{more} "
+        f"{facts['file']} {where} {facts['score']:.3g} standard deviations off the others ({stated_p(facts['p'])}).{more} "
         f"{change}. Nothing was dropped: check the reading, then correct it or remove it yourself."
     )
 
@@ -151,7 +153,7 @@ def _tables_disagree(facts: Facts) -> str:
     unit = _after_number(facts["unit"])
     estimates = ", ".join(f"{value:.4g}{unit} by {label}" for label, value in facts["estimates"])
     return (
-        f"expected tables that agree; found {facts['name']} = {estimates} (p = {facts['p']:.1g}). It depends on "
+        f"expected tables that agree; found {facts['name']} = {estimates} ({stated_p(facts['p'])}). It depends on "
         f"what differs between them, such as load, day or speed; an sd of independent trials is too small by a factor of about "
         f"{facts['factor']:.1f}. Find the cause, or fit each table in a folder of its own."
     )
@@ -163,7 +165,7 @@ def _loads_differ(facts: Facts) -> str:
     shown = means if len(means) <= 6 else [means[0], means[len(means) // 2], means[-1]]
     values = ", ".join(f"{coefficient:.3g} at {load:.3g} N" for load, coefficient in shown)
     return (
-        f"expected friction in proportion to the normal force; found a coefficient of {values} (p = {facts['p']:.1g}). One "
+        f"expected friction in proportion to the normal force; found a coefficient of {values} ({stated_p(facts['p'])}). One "
         "coefficient does not hold for all loads. Fit the rows of similar loads in a folder of their own, and use the load "
         "that is nearest to the weight of the capsule. Where the speed changes with the load, look first at the friction law."
     )
@@ -179,7 +181,7 @@ _STATISTICS: Mapping[str, str] = {
 
 def _unlike_noise(facts: Facts) -> str:
     return (
-        f"expected residuals like random noise; {_STATISTICS[facts['statistic']]} (p = {facts['p']:.1g}). A larger scatter "
+        f"expected residuals like random noise; {_STATISTICS[facts['statistic']]} ({stated_p(facts['p'])}). A larger scatter "
         "does not explain this. Look at the residuals: a bend, a wrong model or a wrong reading."
     )
 
@@ -215,7 +217,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
         ok="residuals of neighbouring rows are uncorrelated in {number:# table}",
         fail=(
             "expected residuals without order; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
-            "(p = {p:.1g}). The trials drift or come in sessions: an sd of independent trials is too small by a factor "
+            "({p:p}). The trials drift or come in sessions: an sd of independent trials is too small by a factor "
             "of about {factor:.1f}. Repeat the trials in random order, with the test set up anew between them."
         ),
     ),
@@ -249,7 +251,7 @@ FIT_MESSAGES: Mapping[str, Message] = {
         ok="stated reading errors explain the scatter",
         fail=(
             "expected a chi-square of about {freedom} from the stated reading errors; found {chi_square:.0f} "
-            "(p = {p:.1g}). The errors are larger than stated, or the line is not straight."
+            "({p:p}). The errors are larger than stated, or the line is not straight."
         ),
     ),
     "bench_and_runs.agree": Message(

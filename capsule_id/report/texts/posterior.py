@@ -2,15 +2,10 @@
 
 from collections.abc import Mapping
 
-from capsule_id.views import Facts, Message
+from capsule_id.views import Facts, Message, stated_p
 
 #: A larger difference in log-posterior is not printed: it may be that of a place which the model excludes.
 FAR_BELOW = 1000
-
-
-def stated_p(p: float) -> str:
-    """``p = 0.01``; a bound where the number underflows."""
-    return f"p = {p:.2g}" if p > 1e-300 else "p < 1e-300"
 
 
 def _disagreeing_starts(facts: Facts) -> str:

@@ -13,7 +13,6 @@ from scipy import stats
 
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.checks.series import LEVEL
-from capsule_id.experiments.families.friction_model import other_laws
 from capsule_id.views import Finding
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def check_repeated(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
     findings = []
     for run, label, F, p in tests:
         if p * len(tests) < LEVEL:
-            facts = {"record": label, "F": F, "p": p, "law": run.friction.name, "other_laws": other_laws(run.friction)}
+            facts = {"record": label, "F": F, "p": p, **run.noise_facts()}
             findings.append(Finding("runs.repeated", "fail", facts, run.label))
     if findings or not tests:
         return findings
