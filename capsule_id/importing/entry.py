@@ -11,7 +11,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
 from capsule_id.experiments.registry import default_registry
-from capsule_id.importing.guess import TIME, ColumnGuess, Guess, disordered_times, free_part, guess
+from capsule_id.importing.guess import TIME, ColumnGuess, Guess, are_turning_points, disordered_times, free_part, guess
 from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
 from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.filters import dominant_frequency
@@ -167,6 +167,10 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
     time, values = _times(found, guessed), found.columns[guessed.columns[channel].index]
     here = np.isfinite(values) & np.isfinite(time)
     time, values = time[here], values[here]
+    if "samples" in kind.setting_rules and are_turning_points(values):
+        reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
+        yield _commented('samples = "turning_points"', "unsure", reason)
+        return
     if "start" in kind.setting_rules and (part := free_part(time, values)) is not None:
         start, stop = part
         yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")

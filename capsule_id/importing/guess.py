@@ -288,6 +288,8 @@ def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | Non
             for (index, _), pair in zip(wanted, units, strict=True)
             if pair is not None
         }
+        if times and (named := _score(found, times[0], TIME, "s", dimensions)) is not None:
+            columns[TIME] = named[1]
         if len(columns) == len(wanted):
             candidates.append(_Candidate(kind, columns, 0.0))
     by_motion = _by_motion(found, candidates)
@@ -320,6 +322,14 @@ def _is_even(values: np.ndarray) -> bool:
     """Whether values increase by nearly equal steps."""
     steps = np.diff(values)
     return bool(len(steps) and np.all(steps > 0.0) and np.max(steps) < 3.0 * np.median(steps))
+
+
+def are_turning_points(values: np.ndarray) -> bool:
+    """Whether the few readings of a table can be the amplitudes of a decay, on one side or on both sides in turn."""
+    sizes, signs = np.abs(values), np.sign(values)
+    sides = signs[1:] * signs[:-1]
+    falls = bool(np.all(np.diff(sizes) <= 0.0)) and sizes[-1] < sizes[0]
+    return len(values) < FEWEST_SAMPLES and falls and bool(np.all(sides == sides[0])) and sides[0] != 0.0
 
 
 def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None] | None:

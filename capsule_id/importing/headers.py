@@ -8,7 +8,7 @@ from capsule_id.rig.units import UnitError, factor_to_si
 
 #: Words for a column of a kind, without accents, by its name; a column is always known by its own name too.
 WORDS: Mapping[str, tuple[str, ...]] = {
-    "time": ("time", "t", "zeit", "temps", "tiempo", "tempo", "elapsed", "timestamp", "clock", "value"),
+    "time": ("time", "t", "zeit", "messzeit", "temps", "tiempo", "tempo", "elapsed", "timestamp", "clock", "value"),
     "x_rel": (
         "relative",
         "displacement",
@@ -23,6 +23,10 @@ WORDS: Mapping[str, tuple[str, ...]] = {
         "desplazamiento",
         "deplacement",
         "spostamento",
+        "amplitude",
+        "amplitudes",
+        "peak",
+        "ausschlag",
     ),
     "x_capsule": ("capsule", "kapsel", "housing"),
     "x_base": ("base", "shaker"),
@@ -32,7 +36,7 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "current": ("current", "strom", "i", "courant", "amps", "coil"),
     "force": ("force", "kraft", "f", "load", "friction", "weight", "pull", "fs", "fk", "fr"),
     "normal_force": ("normal", "normalkraft", "fn"),
-    "angle": ("angle", "tilt", "winkel", "inclination", "neigung", "theta", "alpha"),
+    "angle": ("angle", "tilt", "winkel", "inclination", "incline", "slope", "neigung", "steigung", "theta", "alpha"),
     "height": ("height", "hoehe", "hohe", "h"),
     "length": ("length", "laenge", "lange", "l", "board"),
     "speed": ("speed", "velocity", "v", "v0", "geschwindigkeit", "vitesse"),
@@ -45,6 +49,8 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "session": ("session", "day"),
     "reading": ("reading", "counts", "adc", "raw", "cell"),
 }
+#: Fewest letters of a word that can end a compound.
+SHORTEST_HEAD = 5
 #: Units of headers that state none: names that programs give to their columns.
 UNITS_OF_NAMES: Mapping[str, str] = {"X_Value": "s"}
 #: Other ways to write a unit.
@@ -101,7 +107,10 @@ def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | No
 
 
 def fits_name(name: str, column: str) -> int:
-    """3 for the name of the column itself, 2 for one of its words, 0 for another name."""
+    """3 for the name of the column itself, 2 for one of its words, 1 for a compound that ends with one, 0 for another name.
+
+    ``Federkraft`` ends with ``kraft``.
+    """
     # Letters without their accents.
     bare = "".join(
         mark for mark in unicodedata.normalize("NFKD", name.strip().lower()) if not unicodedata.combining(mark)
@@ -109,7 +118,11 @@ def fits_name(name: str, column: str) -> int:
     if re.sub(r"[\W_]+", "_", bare) == column.lower():
         return 3
     words = re.split(r"[\W_]+", bare)
-    return 2 if any(word in words for word in WORDS.get(column, ())) else 0
+    known = WORDS.get(column, ())
+    if any(word in words for word in known):
+        return 2
+    heads = tuple(word for word in known if len(word) >= SHORTEST_HEAD)
+    return 1 if any(word.endswith(heads) for word in words) else 0
 
 
 def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:

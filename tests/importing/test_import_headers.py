@@ -171,3 +171,54 @@ def test_whole_numbers_below_two_names_are_two_columns(
     said = capsys.readouterr().out
     assert f"4 rows of {columns} column" in said
     assert ('decimal = "."' if columns == 2 else "1.2") in said
+
+
+@pytest.mark.parametrize("sides", [1.0, -1.0])
+def test_a_table_of_amplitudes_is_proposed_as_turning_points_and_can_be_fitted(tmp_path: Path, sides: float) -> None:
+    """Before: a record of ten samples, whose times were too far apart."""
+    turns = np.arange(10)
+    x = 20.0 * np.exp(-0.1 * turns) * sides**turns
+    rows = "".join(f"{0.9 * k:.1f};{value:.1f}\n" for k, value in enumerate(x))
+    (tmp_path / "a.csv").write_text(f"Zeit (s);Amplitude (mm)\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "a.csv")
+    assert 'samples = "turning_points"  # unsure: ' in entry
+    masses = '[rig]\nname = "a"\nm1 = { value = 0.02, unit = "kg" }\n\n'
+    (tmp_path / "rig.toml").write_text(masses + entry, encoding="utf-8")
+    (table,) = capsule_id.read_rig(tmp_path).tables
+    assert table.settings.samples == "turning_points"
+
+
+def test_few_rows_of_a_swing_are_no_turning_points(tmp_path: Path) -> None:
+    x = 20.0 * np.cos(np.arange(12))
+    rows = "".join(f"{0.1 * k:.1f},{value:.2f}\n" for k, value in enumerate(x))
+    (tmp_path / "a.csv").write_text(f"time (s),position (mm)\n{rows}", encoding="utf-8")
+    assert "turning_points" not in capsule_id.propose_entry(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("header", "kind", "lines"),
+    [
+        ("Federkraft (N);Verformung (mm)", "support_spring", ("force = ", "deflection = ")),
+        ("Haftreibungskraft (N);Normalkraft (N)", "static_friction", ("force = ", "normal_force = ")),
+        ("Versuch;slope (deg)", "static_friction", ("angle = ",)),
+    ],
+)
+def test_compounds_and_slopes_are_known(tmp_path: Path, header: str, kind: str, lines: tuple[str, ...]) -> None:
+    """``Federkraft`` is a force, and of two forces ``Normalkraft`` is the normal one."""
+    rows = "".join(f"{k + 1},{k};{2.1 * k + 3.0:.1f}\n".replace(".", ",") for k in range(6))
+    (tmp_path / "a.csv").write_text(f"{header}\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "a.csv")
+    assert f'kind = "{kind}"' in entry
+    names = header.split(";")
+    for line, name in zip(lines, names[-len(lines) :], strict=True):
+        assert f'{line}{{ from = "{name}"' in entry
+
+
+def test_only_the_column_without_a_name_is_called_so(tmp_path: Path) -> None:
+    """Before: "no header names the column" for a column named Time too."""
+    time = np.arange(0.0, 10.0, 0.1)
+    rows = "".join(f"{t:.2f},{20.0 * np.exp(-0.3 * t) * np.cos(5.0 * t):.5f}\n" for t in time)
+    (tmp_path / "a.csv").write_text(f"Time,Channel 1\n{rows}", encoding="utf-8")
+    entry = capsule_id.propose_entry(tmp_path / "a.csv")
+    assert 'time = { from = "Time", unit = "s" }  # unsure: the file states no unit' in entry
+    assert 'x_rel = { from = "Channel 1", unit = "m" }  # unsure: no header names the column' in entry
