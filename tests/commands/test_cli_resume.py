@@ -98,7 +98,15 @@ def test_an_ensemble_never_repeats_itself(here: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "draws"), [("point fit", 0), ("pilot", 0), ("e", 1), ("e", 35), ("e", 100), ("report", 0)]
+    ("stage", "draws"),
+    [
+        ("point fit", 0),
+        ("pilot", 0),
+        pytest.param("e", 1, marks=pytest.mark.slow),
+        ("e", 35),
+        pytest.param("e", 100, marks=pytest.mark.slow),
+        ("report", 0),
+    ],
 )
 def test_interrupted_and_resumed(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stage: str, draws: int
@@ -139,7 +147,15 @@ def test_killed_inside_emcee_and_spoilt_afterwards(here: Path, monkeypatch: pyte
     _remove(here / "out")
 
 
-@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "missing"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param("truncated", marks=pytest.mark.slow),
+        "flipped",
+        pytest.param("empty", marks=pytest.mark.slow),
+        "missing",
+    ],
+)
 def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPatch, damage: str) -> None:
     with monkeypatch.context() as patch:
         die_in_progress(patch, "e", 80, lambda: (_ for _ in ()).throw(KeyboardInterrupt))

@@ -18,7 +18,7 @@ def test_a_drifting_decay_is_clean_and_right() -> None:
     assert np.max(np.abs(found.z)) < 4.0
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_rod_that_dry_friction_stops_is_clean_and_right(seed: int) -> None:
     """Few swings: before, halves were fitted about a rough stiffness (seed 0), and one stroke was refused (seed 1)."""
     found = outcome("dry", seed)

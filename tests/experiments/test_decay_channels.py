@@ -91,7 +91,9 @@ def test_a_velocity_called_an_acceleration_gives_another_force() -> None:
     assert abs(found.values["F_dry"] - DRY["F_dry"]) > 4.0 * found.errors["F_dry"]
 
 
-@pytest.mark.parametrize("fraction", [0.03, 0.165, 0.19])
+@pytest.mark.parametrize(
+    "fraction", [pytest.param(0.03, marks=pytest.mark.slow), 0.165, pytest.param(0.19, marks=pytest.mark.slow)]
+)
 def test_a_second_fit_of_an_acceleration_finds_dry_friction(fraction: float) -> None:
     """The acceleration jumps where the rod turns: no fault of the record. Small peaks after it sticks do not count."""
     force = fraction * bench.K1 * RELEASE

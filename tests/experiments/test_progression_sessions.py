@@ -29,7 +29,7 @@ from tests.experiments.summed_sessions import integrated
 from tests.inference.three_settings import THETA, three_settings
 
 
-@pytest.mark.parametrize("lone", [(), (0,), (1, 3), (0, 1, 2)])
+@pytest.mark.parametrize("lone", [(), (0,), (1, 3), pytest.param((0, 1, 2), marks=pytest.mark.slow)])
 def test_sums_over_groups_give_the_density_of_the_trials(lone: tuple[int, ...]) -> None:
     """Two settings in two sessions each, of which some are integrated out, against SciPy."""
     rng, scatters, z = (
@@ -152,7 +152,7 @@ def test_a_misfit_is_about_the_z_that_is_most_probable(tmp_path: Path) -> None:
         assert np.sum(rest[own] ** 2) + held == pytest.approx(least, rel=1e-2)
 
 
-@pytest.mark.parametrize("sessions", [2, 11])
+@pytest.mark.parametrize("sessions", [2, pytest.param(11, marks=pytest.mark.slow)])
 def test_an_outlying_trial_is_found(tmp_path: Path, sessions: int) -> None:
     """The columns of discrepancies span those of the parameters, which must not hide the trial."""
     design = RobotDesign(1e-3 * np.arange(60.0, 170.0, 10.0), np.full(11, 0.3), sessions=sessions)

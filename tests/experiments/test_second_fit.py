@@ -76,9 +76,9 @@ def test_false_alarms_are_rare() -> None:
 @pytest.mark.parametrize(
     ("disturbance", "extra", "expected"),
     [
-        (0.0, DRY, DecayModel(("dry",))),
+        pytest.param(0.0, DRY, DecayModel(("dry",)), marks=pytest.mark.slow),
         (0.0, {"c_q": 10.0}, DecayModel(("quadratic",))),
-        (0.0, {"k_cubic": 0.03 * bench.K1 / RELEASE**2}, DecayModel(cubic=True)),
+        pytest.param(0.0, {"k_cubic": 0.03 * bench.K1 / RELEASE**2}, DecayModel(cubic=True), marks=pytest.mark.slow),
         (0.0, {**DRY, "k_cubic": -0.03 * bench.K1 / RELEASE**2}, DecayModel(("dry",), cubic=True)),
         (20.0 * TIME, {}, DecayModel(drift="linear")),
         (10.0 * np.sin(6.0 * TIME), {}, DecayModel(drift="gp")),

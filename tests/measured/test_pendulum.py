@@ -111,6 +111,7 @@ def test_the_whole_record_is_cut_at_its_release_and_its_sensor_error_is_named(tm
     assert rows.loc["k_cubic", "value"] == pytest.approx(-rows.loc["k1", "value"] / 6.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_drift_of_the_highest_swing_is_no_drift(tmp_path: Path) -> None:
     """Record 1 swings from 135 deg, where no cubic spring is a pendulum. Its twin is in test_decay_channels."""
     time, angle = pendulum(1)
@@ -125,6 +126,7 @@ def test_the_drift_of_the_highest_swing_is_no_drift(tmp_path: Path) -> None:
     assert (finding.level, finding.experiment) == ("fail", "swing")
 
 
+@pytest.mark.slow
 def test_the_highest_swing_late_on_cannot_tell_viscous_from_dry(tmp_path: Path) -> None:
     """From 3.2 s on it fits as viscous, c = 0.55 beside 0.21 in record 3. Its twin is in test_hidden_terms."""
     time, angle = pendulum(1)
