@@ -18,7 +18,7 @@ from capsule_id.experiments.forced_run.checks.repeated import FEWEST_PERIODS, re
 from capsule_id.experiments.registry import default_registry
 from capsule_id.inference.fit import second_fits
 from capsule_id.inference.fit.point_stage import fit_points
-from capsule_id.inference.fit.second_fits import law_of_runs
+from capsule_id.inference.fit.second_fits import error_of_sum, law_of_runs
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
@@ -153,6 +153,14 @@ def test_the_law_that_explains_the_runs_is_named(tmp_path: Path, monkeypatch: py
     assert next(row["fit"] for row in law.facts["laws"]) == "eq. (1), free ratio"
     # negative control: eq. (1) is right
     assert found[0.5] == []
+
+
+def test_the_error_of_a_sum_is_that_of_its_parts() -> None:
+    """And a record of one period gives no warning."""
+    parts = np.random.default_rng(0).normal(1.0, 2.0, (2000, 30))
+    sums, errors = np.sum(parts, axis=1), [error_of_sum(row) for row in parts]
+    assert np.mean(errors) == pytest.approx(np.std(sums), rel=0.05)
+    assert error_of_sum(np.array([5.0])) == 0.0
 
 
 def test_friction_tests_beside_runs_compare_the_laws_themselves(tmp_path: Path) -> None:

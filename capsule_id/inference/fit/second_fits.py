@@ -172,8 +172,12 @@ def _behind(one: _Fit, best: _Fit) -> tuple[float, float]:
     for (cycles, high), (_, low) in zip(best.densities(), one.densities(), strict=True):
         by_period.append(np.bincount((cycles - cycles[0]).astype(int), high - low))
         by_phase.append(np.bincount((cycles % 1.0 * PHASES).astype(int), high - low))
-    sums = [np.concatenate(parts) for parts in (by_period, by_phase)]
-    return difference, max(float(np.sqrt(len(part) * np.var(part, ddof=1))) for part in sums)
+    return difference, max(error_of_sum(np.concatenate(parts)) for parts in (by_period, by_phase))
+
+
+def error_of_sum(parts: np.ndarray) -> float:
+    """Standard error of the sum of independent ``parts`` (n,); 0 for a single one, which tells nothing of it."""
+    return float(np.sqrt(len(parts) * np.var(parts, ddof=1))) if len(parts) > 1 else 0.0
 
 
 def law_of_runs(experiments: Sequence[Experiment]) -> FrictionModel | None:
