@@ -260,6 +260,11 @@ def test_remedies_name_only_the_words_that_the_entry_states(tmp_path: Path, stat
     (e,) = make_experiments(read_rig(write(tmp_path / "rig", time, decay(time, 1), lines), KINDS))
     white = {"record": "a", "Q": 99.0, "lags": 20, "p": 1e-9, **e.noise_facts()}
     coloured = text(Finding("residuals.white", "fail", white, "a"))
+    start = white["start"]
+    assert 0.0 < start < time[-1]
+    assert f'write start = {{ value = {start:.10g}, unit = "s" }} in its entry' in coloured
+    left = np.abs(e.values[e.time >= start])
+    assert 0.4 < np.max(left) / np.max(np.abs(e.values)) < 0.52
     halves = {
         "label": "a",
         "name": "k1",

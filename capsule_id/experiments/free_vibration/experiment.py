@@ -12,7 +12,7 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol
 from capsule_id.experiments.clock import clock_parameters, stated_rate, stretch
 from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
-from capsule_id.experiments.free_vibration.checks import CHECKS
+from capsule_id.experiments.free_vibration.checks import CHECKS, later_start
 from capsule_id.experiments.free_vibration.decay_models import (
     decay,
     decay_moments,
@@ -341,7 +341,12 @@ class FreeVibration(SurfaceExperiment):
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.condensed[0]))))
 
     def noise_facts(self) -> Facts:
-        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}
+        facts = {
+            "present": self.model.additions,
+            "second": self.replaced,
+            "lines": self.model.lines,
+            **later_start(self),
+        }
         return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend()}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

@@ -100,6 +100,8 @@ def _decay_remedy(facts: Facts) -> str:
         return ""
     present = f"Present in the fitted model: {', '.join(facts['present'])}. " if facts["present"] else ""
     cut = "Cut the record to free decay with start and stop"
+    if (start := facts.get("start")) is not None:
+        cut = f'Leave out the larger half of the amplitudes: write start = {{ value = {start:.10g}, unit = "s" }} in its entry'
     if facts["second"]:
         return f"{present}No model that a second fit offers passes. {cut}, or record again with less disturbance."
     if not facts.get("stated"):
