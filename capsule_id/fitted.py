@@ -53,10 +53,11 @@ class Fit(Result):
         return sorted({title_of(finding.code, messages) for finding in self.findings if finding.level == "fail"})
 
     @property
-    def changes_of_model(self) -> list[str]:
-        """Texts of the findings that change the model of the quoted values from the stated one."""
+    def remarks(self) -> list[str]:
+        """Texts that the console shows under the table: a quoted model that is not the stated one, and unusual magnitudes."""
         messages = messages_of(self.registry)
-        return [self.text(f) for f in self.findings if f.code in messages and messages[f.code].changes_model]
+        found = [f for f in self.findings if f.code in messages and messages[f.code].on_console and f.level != "ok"]
+        return list(dict.fromkeys(self.text(f) for f in found))
 
     def text(self, item: Finding | ResultTable) -> str:
         """What a finding says (what was expected, what was found, what to do), or the caption of a table."""
@@ -72,10 +73,10 @@ class Fit(Result):
 
     def __str__(self) -> str:
         table = table_text(self.summary, synthetic=self.rig.synthetic)
-        return "\n".join([table, *wrapped(self.changes_of_model), verdict_text(self.trust, self.failed)])
+        return "\n".join([table, *wrapped(self.remarks), verdict_text(self.trust, self.failed)])
 
     def _repr_html_(self) -> str:
-        return summary_html(self, self.failed, self.changes_of_model)
+        return summary_html(self, self.failed, self.remarks)
 
     def to_dataframe(self) -> pd.DataFrame:
         """The content of parameters.csv: a row per parameter, noise levels included (``role``), SI."""

@@ -116,6 +116,13 @@ class Parameter:
         return kind in ("lognormal", "halfnormal") or (kind == "normal" and self.physical)
 
     @property
+    def prior_key(self) -> str:
+        """Its key in ``[prior]``, as TOML; "" where no prior can be stated. Of bracketed names only k2 has one."""
+        if not self.prior_can_be_stated or (self.of and self.symbol != "k2"):
+            return ""
+        return f'"{self.name}"' if self.of else self.name
+
+    @property
     def optional(self) -> bool:
         """Whether a fit samples it only where ``[model] free`` names it."""
         return self.default is not None and self.prior is not None

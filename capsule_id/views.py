@@ -94,7 +94,8 @@ class ResultTable:
 class Message:
     """The words of one code: its title, the text of a finding of each level, the caption of a table.
 
-    ``changes_model``: a finding of this code changes the model of the quoted values; the console shows its text.
+    ``on_console``: the console shows the warning or failure of this code: it says which model is quoted, or names a number
+    that is probably in another unit.
     """
 
     title: str
@@ -102,7 +103,7 @@ class Message:
     warn: Text = ""
     fail: Text = ""
     caption: Text = ""
-    changes_model: bool = False
+    on_console: bool = False
 
     def text(self, part: Literal["ok", "warn", "fail", "caption"], facts: Facts) -> str:
         """The text of ``part`` with ``facts`` filled in.

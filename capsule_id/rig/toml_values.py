@@ -160,7 +160,8 @@ def _read_scaled(
     if not isfinite(scaled):
         raise document.error(place, f"{name} must be a finite number", shown(number), "correct the value")
     if not is_plausible(scaled):
-        rule = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
+        zero = "be 0 or " if domain.holds(0.0) else ""
+        rule = f"{name} must {zero}lie between {SMALLEST:g} and {LARGEST:g} in SI units"
         raise document.error(place, rule, shown(number), "correct the value or its unit")
     if not domain.holds(scaled):
         raise document.error(place, f"{name} must {domain.text}", shown(number), "correct the value")

@@ -52,7 +52,7 @@ def test_a_change_of_the_model_stands_below_the_line_of_its_rig(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     changed = property(lambda fit: ["the second fit is quoted"] if fit.rig.name == "tilts" else [])
-    monkeypatch.setattr("capsule_id.fitted.Fit.changes_of_model", changed)
+    monkeypatch.setattr("capsule_id.fitted.Fit.remarks", changed)
     fit_params(["tilts", "spring", "--no-sample", "--quiet"])
     first, second, third = capsys.readouterr().out.splitlines()
     assert (first.split(":")[0], second, third.split(":")[0]) == ("tilts", "the second fit is quoted", "spring")

@@ -88,11 +88,11 @@ def test_chosen_levels_are_no_reading_step(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"force_sd": quantity(1e-300, "N"), "current_sd": quantity(1e-3, "A")}, "force_sd must be 0 or lie between"),
-        ({"force_sd": quantity(1e300, "N")}, "force_sd must be 0 or lie between"),
+        ({"force_sd": quantity(1e-300, "N"), "current_sd": quantity(1e-3, "A")}, "force_sd must lie between"),
+        ({"force_sd": quantity(1e300, "N")}, "force_sd must lie between"),
         ({"force_sd": quantity(1e-20, "N")}, "force_sd must not be below 1e-12 of the largest reading"),
-        ({"sd_ratio": quantity(1e300, "N/A")}, "sd_ratio must be 0 or lie between"),
-        ({"sd_ratio": quantity(1e-300, "N/A")}, "sd_ratio must be 0 or lie between"),
+        ({"sd_ratio": quantity(1e300, "N/A")}, "sd_ratio must lie between"),
+        ({"sd_ratio": quantity(1e-300, "N/A")}, "sd_ratio must lie between"),
     ],
 )
 def test_an_absurd_stated_error_is_refused_at_its_place(tmp_path: Path, settings: dict[str, str], words: str) -> None:
@@ -103,7 +103,7 @@ def test_an_absurd_stated_error_is_refused_at_its_place(tmp_path: Path, settings
 
 
 def test_absurd_masses_and_readings_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="m1 must be 0 or lie between"):
+    with pytest.raises(InputError, match="m1 must lie between"):
         make_rig(tmp_path / "mass", motor(3), head={"m1": quantity(1e-320, "g")})
     push = {"speed [m/s]": np.array([0.5]), "distance [mm]": np.array([1e-300])}
     with pytest.raises(InputError, match="distance must be 0 or lie between"):

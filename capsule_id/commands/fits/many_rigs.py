@@ -125,7 +125,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
             for path in folder.rglob("*")
             if path.is_file() and path.name not in WORK_FILES
         }
-    changes = "".join(f"\n{line}" for line in wrapped(result.changes_of_model))
+    changes = "".join(f"\n{line}" for line in wrapped(result.remarks))
     return FittedRig(files, changes, verdict_text(result.trust, result.failed), result.clean)
 
 

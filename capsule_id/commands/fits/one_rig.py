@@ -135,7 +135,7 @@ def fit_one(
 
         def show_point(first: "Fit") -> None:
             write_report(first, partial)
-            table = [table_text(first.summary, synthetic=rig.synthetic), *wrapped(first.changes_of_model)]
+            table = [table_text(first.summary, synthetic=rig.synthetic), *wrapped(first.remarks)]
             progress.note("\n".join([f"point fit, before the sample; report: {partial / 'report.html'}", *table]))
 
         # A fit of bench tests ends as soon.
@@ -147,7 +147,7 @@ def fit_one(
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
     else:
         table = table_text(result.summary, synthetic=rig.synthetic)
-        changes = wrapped(result.changes_of_model)
+        changes = wrapped(result.remarks)
         say("\n".join([table, *changes, f"report: {report}", verdict_text(result.trust, failed)]))
     if result.clean:
         return 0

@@ -23,6 +23,8 @@ from capsule_id.views import Comparison, Curve, Finding, Points
 
 #: Lower bound of v_s in the paper's fit, m/s.
 LOWEST_V_S = 1e-6
+#: Largest v_s that readings tell, in units of their largest speed: far above it eq. (1) is level.
+LARGEST_V_S = 100.0
 
 
 def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
@@ -33,8 +35,9 @@ def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
 def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, float]:
     """Fit eq. (1) by least squares to points (speed, coefficient), as in the paper; static points have speed 0.
 
-    Return mu and, with at least one sliding point, v_s. v_s is left out where its standard error exceeds its value, and
-    everything where the fit does not converge or ends at its lower bound of v_s: mu is then not determined either.
+    Return mu and, with at least one sliding point, v_s. v_s is left out where its standard error exceeds its value or
+    readings show no fall with speed. Everything is left out where the fit does not converge or ends at its lower bound of
+    v_s: mu is then not determined either.
     """
     sliding = speed > 0.0
     if not sliding.any():
@@ -57,7 +60,7 @@ def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, 
     if v_s < 1.01 * LOWEST_V_S:
         return {}
     # Two points determine both values, without a standard error.
-    known = len(speed) == 2 or np.sqrt(covariance[1, 1]) <= v_s
+    known = v_s <= LARGEST_V_S * np.max(speed) and (len(speed) == 2 or np.sqrt(covariance[1, 1]) <= v_s)
     return {"mu": float(mu), "v_s": float(v_s)} if known else {"mu": float(mu)}
 
 

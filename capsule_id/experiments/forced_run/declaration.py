@@ -268,7 +268,7 @@ MESSAGES = {
             "Both fits of the readings: the first, with white noise, and the quoted one, with AR(1) noise. ± is the standard "
             "error without the error of the model. Natural logarithm of the posterior density."
         ),
-        changes_model=True,
+        on_console=True,
     ),
     "runs.laws": Message(
         "friction law of runs",

@@ -341,13 +341,8 @@ class FreeVibration(SurfaceExperiment):
         return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.condensed[0]))))
 
     def noise_facts(self) -> Facts:
-        facts = {
-            "present": self.model.additions,
-            "second": self.replaced,
-            "lines": self.model.lines,
-            **later_start(self),
-        }
-        return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend()}
+        facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}
+        return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend(), **later_start(self)}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return decay_comparison(self, theta, draws)

@@ -120,7 +120,9 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
     per_period = 1.0 / (median_step(time) * frequency)
     coarse = per_period < SAMPLES_PER_PERIOD
     inside = median / factor <= k1 <= median * factor
-    if not coarse and (inside or (stated is None and per_period >= SAMPLES_WITHOUT_ALIAS)):
+    # A sampling that cannot show the usual frequency shows another one instead.
+    blind = 0.5 / median_step(time) < np.sqrt(default.location / rig.m1.value) / (2.0 * np.pi)
+    if not coarse and (inside or (stated is None and per_period >= SAMPLES_WITHOUT_ALIAS and not blind)):
         return
     part = loudest_part(values)
     others = aliases(time[part], values[part], frequency)
@@ -130,9 +132,9 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
         facts = {
             "file": table.file,
             "frequency": frequency,
-            "others": ", ".join(f"{f:.4g}" for f in others[possible][:3]),
+            "others": ", ".join(dict.fromkeys(f"{f:.4g}" for f in others[possible][:3])),
             "k1": k1,
-            "k1s": ", ".join(f"{k:.4g}" for k in stiffnesses[possible][:3]),
+            "k1s": ", ".join(dict.fromkeys(f"{k:.4g}" for k in stiffnesses[possible][:3])),
             "range": (median / factor, median * factor),
             "factor": PROPOSED_FACTOR,
         }
@@ -212,8 +214,8 @@ def line_of(key: str) -> str:
 
 _ALIAS = (
     "{file}: the sampling cannot tell {frequency:.4g} Hz (k1 = {k1:.4g} N/m) from {others} Hz (k1 = {k1s} N/m). Sample "
-    'faster; or state what is known: k1 = {{ median = ..., factor = ..., unit = "N/m" }} in [prior], narrow enough '
-    "to hold one of them only."
+    "faster. If {frequency:.4g} Hz is right, state a prior that holds it alone, such as "
+    'k1 = {{ median = {k1:.4g}, factor = 1.2, unit = "N/m" }} in [prior].'
 )
 _DEFAULT_PRIOR = (
     "{file}: k1 = {k1:.4g} N/m lies outside the range of its default prior, {range[0]:.3g} to {range[1]:.3g} N/m. An "

@@ -154,7 +154,7 @@ MESSAGES = {
     ),
     "decays.second_fit": Message(
         "second fit of free decays",
-        changes_model=True,
+        on_console=True,
         warn=_second_fit,
         caption=(
             "Free decays alone, under the stated model and under the model of the quoted values, both by maximum likelihood on "

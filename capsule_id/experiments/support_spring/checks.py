@@ -40,4 +40,9 @@ def check_cantilever(springs: "Sequence[SupportSpring]", fit: Fitted) -> list[Fi
     length, length_sd = np.array([(quantity.value, quantity.sd) for _, quantity in pairs]).T
     exponent, error, p = cantilever_exponent(length, length_sd, k2, sd / k2)
     facts = {"exponent": exponent, "sd": error, "p": p}
-    return [Finding("springs.cantilever", "warn" if p < LEVEL else "ok", facts)]
+    if p >= LEVEL or exponent <= 0.0:
+        return [Finding("springs.cantilever", "warn" if p < LEVEL else "ok", facts)]
+    order = [pairs[i][0] for i in np.argsort(length)]
+    facts |= {"shortest": order[0].label, "longest": order[-1].label}
+    names = dict.fromkeys(e.slope.name for e in order)
+    return [Finding("springs.cantilever", "fail", facts, parameters=tuple(names))]

@@ -67,6 +67,10 @@ CANTILEVER = Message(
         "expected k2 ~ L^-3, as a cantilever has; found L^({exponent:.3f} ± {sd:.3f}), {p:p}. Check the clamp and the "
         "stated lengths; k2 of each spring stays a parameter of its own."
     ),
+    fail=(
+        "a longer cantilever must be softer, but {longest} is stiffer than {shortest}: k2 ~ L^({exponent:.3f} ± {sd:.3f}), "
+        "{p:p} for the -3 of a cantilever. Check whether the files or the lengths of these two are exchanged."
+    ),
 )
 
 KIND = Kind(

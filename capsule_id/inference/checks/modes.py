@@ -34,7 +34,7 @@ def check_maximum(s: SampledFit) -> list[Finding]:
     for i, row in enumerate(s.target.parameters):
         if not row.physical:
             continue
-        facts = {"name": row.name, "unit": row.unit, "maximum": s.values[row.name]}
+        facts = {"name": row.name, "key": row.prior_key, "unit": row.unit, "maximum": s.values[row.name]}
         low, median, high = np.quantile(u[:, i], [0.15865, 0.5, 0.84135])
         # A weighed constant with an sd of rounding size has no spread to compare with.
         distance = float(abs(s.fit.u[i] - median) / max(0.5 * (high - low), 1e-12))

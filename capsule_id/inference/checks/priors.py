@@ -96,6 +96,7 @@ def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
     facts = {
         "name": name,
+        "key": "" if is_stated(name) else row.prior_key,
         "unit": "" if row.unit == "1" else f" {row.unit}",
         "prior": prior_of(row).describe(),
         "stated": "rig" if is_stated(name) else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",

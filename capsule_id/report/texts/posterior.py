@@ -38,6 +38,7 @@ def _maxima_with_mass(facts: Facts) -> str:
 def _conflict(facts: Facts) -> str:
     """The prior, what the rest of the data give, and which entry to look at."""
     name, unit, experiments = facts["name"], facts["unit"], facts["experiments"]
+    key, scale = facts["key"], f'scale = {facts["fitted"]:.2g}, unit = "{unit.strip() or 1}"'
     default = f'median = {facts["fitted"]:.3g}, factor = 10, unit = "{unit.strip() or 1}"'
     source, remedy = {
         "rig": (
@@ -50,12 +51,13 @@ def _conflict(facts: Facts) -> str:
         ),
         "": (
             f"the default prior of {name}",
-            f"Check the units in {experiments}; if they are right, state [prior] {name} = {{ {default} }}.",
+            f"Check the units in {experiments}"
+            + (f"; if they are right, write in [prior] {key} = {{ {default} }}." if key else "."),
         ),
         "scatter": (
             f"the default prior of {name}",
-            f"Either the model does not follow {experiments}, or the trials scatter this much: look at the curve, then state "
-            f'[prior] {name} = {{ scale = {facts["fitted"]:.2g}, unit = "{unit.strip() or 1}" }}.',
+            f"The model does not follow {experiments}, or the readings scatter this much: look at the curve and the residuals"
+            + (f". If the model is right, write in [prior] {key} = {{ {scale} }}." if key else "."),
         ),
     }[facts["stated"]]
     if facts["informed"] > 0.5:
@@ -70,19 +72,28 @@ def _conflict(facts: Facts) -> str:
 
 def _modes(facts: Facts) -> str:
     """The modes of a parameter with their weights, or how far its maximum lies from the sample."""
-    name, unit = facts["name"], facts["unit"]
+    name, unit = facts["name"], "" if facts["unit"] == "1" else f" {facts['unit']}"
+    prior = f", or state what you know of the rig as a prior of {facts['key']} in [prior]" if facts["key"] else ""
     if "modes" in facts:
-        seen = " and ".join(f"{value:.4g} {unit} with weight {weight:.2f}" for value, weight in facts["modes"])
+        seen = " and ".join(f"{value:.4g}{unit} with weight {weight:.2f}" for value, weight in facts["modes"])
         return (
             f"expected one mode of the posterior of {name}; found {seen}. Median and sd describe none of them. Add a test "
-            f"that tells them apart, or state [prior] {name} from what you know of the rig."
+            f"that tells them apart{prior}."
         )
     return (
-        f"expected the maximum of the posterior within 3 sd of its sample; {name} = {facts['maximum']:.4g} {unit} at the "
-        f"maximum, {facts['median']:.4g} ± {facts['sd']:.2g} {unit} in the sample ({facts['distance']:.1f} sd apart). The "
+        f"expected the maximum of the posterior within 3 sd of its sample; {name} = {facts['maximum']:.4g}{unit} at the "
+        f"maximum, {facts['median']:.4g} ± {facts['sd']:.2g}{unit} in the sample ({facts['distance']:.1f} sd apart). The "
         f"residuals and curves are those of the maximum, so no check covers the quoted number. Add readings that determine "
-        f"{name}, or state its [prior]."
+        f"{name}{prior}."
     )
+
+
+def _tails(facts: Facts) -> str:
+    """The parameters whose priors pull, and those of them whose prior can be stated."""
+    seen = f"{facts['names']} ended in the tail of the prior, which pulls the estimate."
+    if not facts["keys"]:
+        return f"{seen} Check the values and units of the readings and of rig.toml."
+    return f"{seen} In [prior] state a wider or better placed prior of {facts['keys']}."
 
 
 _CHAINS = (
@@ -127,6 +138,6 @@ POSTERIOR_MESSAGES: Mapping[str, Message] = {
     "priors.tails": Message(
         "boundary effects",
         ok="no parameter ends in the tail of its prior",
-        warn="{names} ended in the tail of the prior, which pulls the estimate. State a wider or better placed [prior].",
+        warn=_tails,
     ),
 }

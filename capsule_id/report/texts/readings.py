@@ -62,15 +62,15 @@ DATA_MESSAGES: Mapping[str, Message] = {
     "readings.repeated_file": Message(
         "repeated readings",
         fail=(
-            "{file} has the same content as the file of {first}, so each reading counts twice. Remove one of the two "
-            "experiments."
+            "{file} has the same content as the file of {first}, so each reading counts more than once. Remove one of "
+            "the two experiments."
         ),
     ),
     "readings.repeated": Message(
         "repeated readings",
         fail=_repeated,
     ),
-    "readings.magnitude": Message("magnitudes", warn=_unusual),
+    "readings.magnitude": Message("magnitudes", warn=_unusual, on_console=True),
     "readings.gaps": Message(
         "gaps in a record",
         warn=(

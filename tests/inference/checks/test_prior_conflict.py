@@ -145,7 +145,7 @@ def test_readings_that_the_default_prior_excludes_fail(
     assert result.trust == "not trusted"
     (text,) = [text for text in texts if "the default prior of mu" in text]
     if rows is pushes:  # the prior that the text proposes is accepted and ends the conflict
-        proposed = re.findall(r"state \[prior\] (mu = \{.*?\})", text)[0]
+        proposed = re.findall(r"write in \[prior\] (mu = \{.*?\})", text)[0]
         # Speeds of km/s scatter more than usual ones, too.
         assert not any("prior of mu " in text for text in fit(pushes(proposed), tmp_path / "stated")[1])
 
@@ -162,7 +162,7 @@ def test_a_scatter_far_above_its_default_prior_is_not_trusted(tmp_path: Path) ->
     result, (text,) = fit(scattered(3.7), tmp_path / "default")
     assert "the default prior of tilt_sd" in text
     assert result.summary.at["mu", "trust"] == "not trusted"
-    proposed = re.findall(r"state \[prior\] (tilt_sd = \{.*?\})", text)[0]
+    proposed = re.findall(r"write in \[prior\] (tilt_sd = \{.*?\})", text)[0]
     stated, texts = fit(scattered(3.7, proposed), tmp_path / "stated")
     assert texts == []
     of_mean = np.deg2rad(3.7) / np.sqrt(10.0) / np.cos(np.deg2rad(24.0)) ** 2
