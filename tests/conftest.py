@@ -53,7 +53,6 @@ NOT_OPTIMISED = {
     "test_hidden_terms.py",
     "test_likelihoods.py",
     "test_misfit.py",
-    "test_predictability.py",
     "test_progression.py",
     "test_simulate.py",
     "test_single_run.py",
