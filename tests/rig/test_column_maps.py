@@ -60,10 +60,9 @@ LAB = "Time (s),Disp (mm)\n" + rows(",")
 def test_the_proposed_line_reads_the_file(tmp_path: Path) -> None:
     fault = fault_of(tmp_path, {"lab.csv": LAB}, 'file = "lab.csv"')
     assert (fault.line, fault.column) == (1, 1)
-    proposed = re.search(r"columns = \{.*\} \}", fault.remedy)
-    assert proposed is not None
-    assert proposed[0] == MAP
-    assert_read(rig_of(tmp_path, {}, f'file = "lab.csv"\n{proposed[0]}'))
+    (proposed,) = re.findall(r"columns = \{.*\} \}", fault.remedy)
+    assert proposed == MAP
+    assert_read(rig_of(tmp_path, {}, f'file = "lab.csv"\n{proposed}'))
 
 
 def test_the_command_reads_a_raw_export_by_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

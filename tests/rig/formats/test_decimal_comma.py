@@ -16,10 +16,9 @@ def test_a_decimal_comma_in_a_single_column_must_be_stated(tmp_path: Path) -> No
     fault = fault_of(tmp_path, {"x.txt": text}, lines)
     assert (fault.file, fault.line) == (str(tmp_path / "x.txt"), 1)
     assert "comma between digits" in fault.rule
-    stated = re.search(r'decimal = ","', fault.remedy)
-    assert stated is not None
+    (stated,) = re.findall(r'decimal = ","', fault.remedy)
     for head in ("", "Disp\n"):
-        assert_read(rig_of(tmp_path, {"x.txt": head + text}, f"{lines}\n{stated[0]}"))
+        assert_read(rig_of(tmp_path, {"x.txt": head + text}, f"{lines}\n{stated}"))
     whole = "".join(f"{i},{i * i}\n" for i in range(12))  # two columns of whole numbers
     lines = 'file = "x.txt"\ncolumns = { time = { from = 1, unit = "s" }, x_rel = { from = 2, unit = "mm" } }'
     assert "comma between digits" in fault_of(tmp_path, {"x.txt": whole}, lines).rule
