@@ -23,6 +23,7 @@ from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
+from tests import forced_runs
 from tests.experiments.test_base_run import BASE, M2, TRUTH, N, base
 from tests.measured.folders import Entry, make_rig, quantity
 from tests.scipy_general import simulate_general
@@ -65,6 +66,13 @@ def test_coloured_noise_starts_at_the_correlation_of_the_residuals(tmp_path: Pat
     assert np.tanh(starts["ar1_x_capsule[shaken]"]) == pytest.approx(rho, abs=0.1)
     assert starts["noise_x_capsule[shaken]"] == pytest.approx(NOISE * np.sqrt(1.0 - rho**2), rel=0.15)
     assert run.with_coloured_noise(values_of(run)) is None
+
+
+def test_a_run_says_whether_it_has_a_spring_and_which_noise_is_stated(tmp_path: Path) -> None:
+    """The remedies of its findings name no spring where there is none."""
+    rig = shaken(tmp_path, 0.0, noise='"white"')
+    facts = [run.noise_facts() for run in (BaseRun(rig.tables[0], rig), forced_runs.make(1))]
+    assert [(one["spring"], one["noise"]) for one in facts] == [(False, "white"), (True, None)]
 
 
 @pytest.mark.parametrize("noise", ["white", "ar1"])
