@@ -94,6 +94,20 @@ class Column:
         """Stated error and the rounding error of the reading step, step/sqrt(12), added in quadrature; SI."""
         return float(np.hypot(self.sd or 0.0, (self.resolution or 0.0) / np.sqrt(12.0)))
 
+    @property
+    def unstated_step(self) -> float:
+        """Step of the last decimal digit of the values in their unit, at most 1 of it; SI.
+
+        0 beyond ten decimals, and where an error or a reading step is stated. It is not the spacing of the levels, which
+        may be chosen, such as known weights.
+        """
+        if self.sd is not None or self.resolution is not None:
+            return 0.0
+        values = self.values * self.to_display
+        error = 1e-12 * float(np.max(np.abs(values), initial=0.0))
+        digits = (10.0**-k for k in range(11) if np.max(np.abs(values - np.round(values, k))) <= error)
+        return next(digits, 0.0) / self.to_display
+
 
 @dataclass(frozen=True)
 class Settings:

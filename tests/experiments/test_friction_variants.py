@@ -104,7 +104,9 @@ def test_readings_at_one_speed_have_no_order_in_speed() -> None:
 def rack(folder: Path, speed: np.ndarray, coefficient: np.ndarray, model: str = "") -> Rig:
     rig = make_rig(folder, Entry("sliding_friction", "slide", {"speed [m/s]": speed, "coefficient [1]": coefficient}))
     toml = folder / "rig.toml"
-    toml.write_text(toml.read_text() + (f"\n[model]\n{model.replace(' and ', chr(10))}\n" if model else ""))
+    toml.write_text(
+        toml.read_text() + (f"\n[model]\n{model.replace(', and on the next line ', chr(10))}\n" if model else "")
+    )
     return cid.read_rig(folder) if model else rig
 
 
@@ -144,6 +146,5 @@ def test_the_papers_v_s_is_left_out_where_its_error_exceeds_it() -> None:
 
 def test_lines_of_model() -> None:
     assert model_lines(FrictionModel()) == 'friction = "stribeck"'
-    assert (
-        model_lines(FrictionModel(free=("viscous",), constant=True)) == 'friction = "constant" and free = ["viscous"]'
-    )
+    lines = model_lines(FrictionModel(free=("viscous",), constant=True))
+    assert lines == 'friction = "constant", and on the next line free = ["viscous"]'

@@ -69,6 +69,23 @@ def test_ten_turning_points(tmp_path: Path, both: bool, extra: dict[str, float])
         assert wrong.values["c"] > 1.5 * FORCES["c"]
 
 
+def test_times_without_scatter_have_the_error_of_their_digits(tmp_path: Path) -> None:
+    """Times that are multiples of one period, as computed from it: without an error the maximum had no end."""
+    _, x = turning_points(False, {}, 3)
+    period = 2.03
+    settings, texts = 'samples = "turning_points"\n', []
+    for stated in ("", 'time_resolution = { value = 0.01, unit = "s" }\n', 'time_sd = { value = 5, unit = "ms" }\n'):
+        path = folder(tmp_path / str(len(texts)), np.round(period * np.arange(10), 2), x, settings + stated)
+        result = cid.fit(read_rig(path), 0, budget=None)
+        assert [f.level for f in result.findings if f.code == "starts.agree"] == ["ok"]
+        assert result.summary.loc["k1", "sd"] > 9.6 * 0.01 / np.sqrt(12.0) / (9.0 * period)
+        texts.append([result.text(f) for f in result.findings if f.code == "decays.step"])
+    # The remedies of the text, followed, end the finding.
+    assert texts[1:] == [[], []]
+    assert "time_resolution or time_sd" in texts[0][0]
+    assert "0.01 s" in texts[0][0]
+
+
 @pytest.mark.parametrize(
     ("time", "turning"),
     [

@@ -134,6 +134,13 @@ def test_drop_outs_repeat_one_value_far_from_their_neighbours() -> None:
         assert set(found) <= set(places)
         assert len(found) == len(places)
     assert len(dropouts(values)) == 0
+    # Noise of a hold that is a small part of a record at rest; and a drop-out there.
+    rest = 0.01 * np.random.default_rng(3).standard_normal(44_000)
+    rest[42_000:43_000] += 2.0
+    for noise_of in (rest, np.round(rest, 2)):
+        assert len(dropouts(noise_of)) == 0
+    rest[42_500] = 1000.0
+    assert dropouts(rest).tolist() == [42_500]
     # Impacts are short peaks of different heights.
     hits = 0.1 * np.random.default_rng(1).standard_normal(1200)
     hits[50::100] += np.random.default_rng(2).uniform(2.0, 6.0, 12)

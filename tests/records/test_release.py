@@ -28,6 +28,24 @@ def test_the_release_is_found_after_rest(held: bool) -> None:
     assert again.rest == 0.0
 
 
+@pytest.mark.parametrize("before", [1.0, 7.0])
+@pytest.mark.parametrize("hold", [0.15, 0.5])
+def test_a_release_after_a_hold_is_found(before: float, hold: float) -> None:
+    """The rod rests, is pulled within 0.2 s, is held, and is released."""
+    parts = np.zeros(round(before * RATE)), np.linspace(0.0, 2.0, 400), np.full(round(hold * RATE), 2.0)
+    quiet = np.concatenate(parts)
+    values = np.concatenate([quiet + 0.02 * np.random.default_rng(3).standard_normal(len(quiet)), decay()])
+    time, release = np.arange(len(values)) / RATE, len(quiet) / RATE
+    found = cast(FreeDecay, find_free_decay(time, values, displacement=True))
+    assert found.start == pytest.approx(release, abs=0.1 * PERIOD)
+    assert found.rest == pytest.approx(found.start)
+    assert found.stop is None
+    assert found.period == pytest.approx(PERIOD, rel=0.05)
+    # Negative control: a slowly damped decay without a hold begins with the record.
+    slow = released(TIME, 2.0, c=0.1)
+    assert cast(FreeDecay, find_free_decay(TIME, slow, displacement=True)).start == 0.0
+
+
 def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
     for make in (decay, encoder):
         found = cast(FreeDecay, find_free_decay(TIME, make()))

@@ -61,11 +61,11 @@ class Variant:
 
 
 def model_lines(model: FrictionModel) -> str:
-    """What ``[model]`` must say for the law ``model``; " and " stands between two lines."""
+    """What ``[model]`` must say for the law ``model``."""
     lines = ['friction = "constant"'] if model.constant else []
     if model.free:
         lines.append("free = [" + ", ".join(f'"{symbol}"' for symbol in model.free) + "]")
-    return " and ".join(lines) or 'friction = "stribeck"'
+    return ", and on the next line ".join(lines) or 'friction = "stribeck"'
 
 
 def candidates(experiments: "Sequence[FrictionExperiment]") -> list[FrictionModel]:

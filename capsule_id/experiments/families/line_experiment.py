@@ -109,15 +109,6 @@ def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
     return [ResultTable("lines.slopes", pd.DataFrame(rows).set_index("table"))]
 
 
-def last_digit(values: np.ndarray) -> float:
-    """Step of the last decimal digit of ``values`` (n,), at most 1; 0 beyond ten decimals.
-
-    It is not the spacing of the levels: the levels of a calibration are chosen, such as known weights.
-    """
-    error = 1e-12 * float(np.max(np.abs(values), initial=0.0))
-    return next((10.0**-k for k in range(11) if np.max(np.abs(values - np.round(values, k))) <= error), 0.0)
-
-
 class Line(Experiment):
     """A line y against x; subclasses name the columns and the slope.
 
@@ -159,8 +150,7 @@ class Line(Experiment):
         self.width = NUISANCE_WIDTH * size
         self.sd_ratio = sd_ratio
         self.errors_known = x_column.sd is not None and y_column.sd is not None
-        stated = y_column.sd is not None or y_column.resolution is not None
-        step = 0.0 if stated else last_digit(self.y * y_column.to_display) / y_column.to_display
+        step = y_column.unstated_step
         self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
         self.y_sd = max(self.y_sd, self.step / np.sqrt(12.0))
         factor = SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW

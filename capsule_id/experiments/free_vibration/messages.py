@@ -11,8 +11,8 @@ def _second_fit(facts: Facts) -> str:
     """The records that contradict the stated model, the quoted model and the lines that state it."""
     return (
         f"{', '.join(facts['labels'])}: the record contradicts the first model ({facts['first']}). The quoted values are those "
-        f"of a second fit: {facts['second']}.{facts['drift']} To state it, write {facts['lines']}. To keep the first model, "
-        f"state its words."
+        f"of a second fit: {facts['second']}.{facts['drift']} To state it, add these lines to its entry: "
+        f"{facts['lines']}. To keep the first model, state its words."
     )
 
 
@@ -116,6 +116,13 @@ MESSAGES = {
         ok="{labels}: no further force explains the turning points better",
         warn=_forces,
         fail=_forces,
+    ),
+    "decays.step": Message(
+        "noise of turning points",
+        warn=(
+            "{label}: the noise of {column} is below the rounding error of its digits (step {step:g} {unit}), so the sd of "
+            "{name} follows from that step. State {column}_resolution or {column}_sd."
+        ),
     ),
     "decays.position": Message(
         "position of a decay",

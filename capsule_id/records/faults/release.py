@@ -1,12 +1,12 @@
 """Finds the free decay inside a record: rest or a push before the release, and a second excitation after it."""
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.records.noise import NORMAL_QUARTILE
+from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part
 from capsule_id.rig.formats.columns import release
 
@@ -26,6 +26,9 @@ DEPARTURE = 0.05
 FIRST_HEIGHT = 0.9
 #: A release from a held deflection: the deflection is at least this fraction of the largest half cycle.
 HELD_HEIGHT = 0.8
+#: A deflection is held where the record stays above this fraction of its largest value for this many times as long as it
+#: then takes to pass the rest position; a free oscillation stays there for less than one such time.
+HOLD_LEVEL, HOLD_TIME = 0.9, 5.0
 #: Fractions of the first turning point's height between which the motion before it is compared with that after it.
 LOW_HEIGHT, HIGH_HEIGHT = 0.6, 0.95
 #: A free decay is faster before a turning point than after it. From this ratio of durations on, a push has slowed it.
@@ -67,9 +70,14 @@ def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = F
     whole, (time, values) = time, shortened(time, values)
     if len(time) < len(whole):
         time[[0, -1]] = whole[[0, -1]]
+    hold = _hold(time, values) if displacement else 0
+    if hold > 0:
+        decay = find_free_decay(time[hold:], values[hold:], displacement)
+        if decay is not None:
+            return replace(decay, rest=decay.start - float(time[0]))
     even = np.linspace(time[0], time[-1], len(time))
     on_grid = np.interp(even, time, values)
-    noise = _noise(on_grid)
+    noise = noise_level(on_grid)
     moves = _departure(on_grid, noise)
     moving_time, moving = even[moves:], on_grid[moves:]
     try:
@@ -170,6 +178,23 @@ def shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     return means[0], means[1]
 
 
+def _hold(time: np.ndarray, values: np.ndarray) -> int:
+    """Index of the first sample of a deflection that is held before its release; 0 where there is none.
+
+    A record that begins with it begins at its departure; see ``_departure``.
+    """
+    away = values - float(np.median(values[-max(1, len(values) // 4) :]))
+    far = np.abs(away) >= HOLD_LEVEL * np.max(np.abs(away))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], far, [0]])))
+    begins, ends = edges[::2], edges[1::2] - 1
+    longest = int(np.argmax(time[ends] - time[begins]))
+    begin, end = int(begins[longest]), int(ends[longest])
+    passed = np.flatnonzero(np.sign(away[end:]) == -np.sign(away[end]))
+    if not len(passed):
+        return 0
+    return begin if time[end] - time[begin] > HOLD_TIME * (time[end + passed[0]] - time[end]) else 0
+
+
 def _departure(values: np.ndarray, noise: float) -> int:
     """Index of the last sample before the record leaves its first value for good."""
     first = float(np.median(values[: max(3, min(len(values) // 50, 50))]))
@@ -196,9 +221,3 @@ def _half_cycles(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.n
     edges = np.concatenate([[0], np.flatnonzero(np.diff(np.signbit(values))) + 1, [len(values)]])
     index = [left + int(np.argmax(np.abs(values[left:right]))) for left, right in itertools.pairwise(edges)]
     return time[index], np.abs(values[index])
-
-
-def _noise(values: np.ndarray) -> float:
-    """Noise level by third differences."""
-    differences = np.abs(np.diff(values, 3))
-    return float(np.median(differences)) / (NORMAL_QUARTILE * np.sqrt(20.0))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capsule_id.records.faults.duplicates import reading_step
+from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import largest_offset, median_step, pieces, thinned
 
 #: Share of steps that must equal the sampling step before a longer one counts as a gap.
@@ -15,10 +16,15 @@ STEP_TOLERANCE = 0.1
 ROUNDING = (0.02, 1.01)
 #: A drop-out departs from both neighbours by this fraction of the range of the other samples.
 DROPOUT_RANGE = 0.5
+#: Noise levels that count as that range where the motion is a small part of the record, and their largest share of the
+#: whole range: of coarse samples the noise level shows the motion.
+DROPOUT_NOISE, LARGEST_SHARE = 20.0, 0.5
 #: A single value this many ranges away is a drop-out by itself.
 EXTREME = 50.0
 #: Most samples of one drop-out; fewest equal values of a frozen sensor.
 LONGEST_DROPOUT, FROZEN = 3, 6
+#: Samples from which a record shows its noise level.
+FEWEST_OF_NOISE = 20
 
 
 @dataclass(frozen=True)
@@ -75,19 +81,21 @@ def dropouts(values: np.ndarray) -> np.ndarray:
     ----------
     values : (n,) readings of one channel
     """
-    # Nine in ten samples hold no drop-out, so their range is that of the motion.
+    # Nine in ten samples hold no drop-out, so their range is that of the motion, or of the noise of a long rest.
     low, high = np.quantile(thinned(values), [0.05, 0.95])
+    noise = DROPOUT_NOISE * noise_level(values) if len(values) > FEWEST_OF_NOISE else 0.0
+    spread = max(high - low, min(noise, LARGEST_SHARE * float(np.ptp(values))))
     runs = [np.empty((0, 2), int)]
     for part in pieces(len(values)):
         first = max(part.start - LONGEST_DROPOUT - 1, 0)
-        found = first + _far_runs(values[first : part.stop + LONGEST_DROPOUT + 1], high - low)
+        found = first + _far_runs(values[first : part.stop + LONGEST_DROPOUT + 1], spread)
         runs.append(found[(found[:, 0] >= part.start) & (found[:, 0] < part.stop)])
     starts, ends = np.concatenate(runs).T
     own = values[starts]
     # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
     levels, counts = np.unique(own, return_counts=True)
     repeated = np.isin(own, levels[counts > 1])
-    extreme = np.maximum(low - own, own - high) > EXTREME * (high - low)
+    extreme = np.maximum(low - own, own - high) > EXTREME * spread
     chosen = repeated | extreme | (own == 0.0)
     pairs = zip(starts[chosen], ends[chosen], strict=True)
     return np.concatenate([np.arange(s, e) for s, e in pairs]) if chosen.any() else np.arange(0)

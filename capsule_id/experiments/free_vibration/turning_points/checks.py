@@ -1,7 +1,9 @@
-"""Checks of turning points: no further force explains them better, and both halves give the same parameters."""
+"""Checks of turning points: step of their digits, further forces, and the parameters of both halves."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from capsule_id.experiments.checks.context import Fitted
 from capsule_id.experiments.free_vibration.turning_points.linear import (
@@ -18,6 +20,27 @@ from capsule_id.views import Finding
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.turning_points.experiment import TurningPoints
+
+
+def check_steps(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding]:
+    """Warn where the readings are more regular than their digits show, so that the rounding error is all that is known."""
+    findings = []
+    for e in tables:
+        theta = e.local(fit.values)
+        # The positions tell the damping, the times the stiffness.
+        for name, symbol, told, step in zip(("x_rel", "time"), e.scatters, ("c", "k1"), e.steps, strict=True):
+            if theta[symbol] >= step / np.sqrt(12.0):
+                continue
+            column = e.table.columns[name]
+            facts = {
+                "label": e.label,
+                "column": name,
+                "unit": column.unit,
+                "step": step * column.to_display,
+                "name": told,
+            }
+            findings.append(Finding("decays.step", "warn", facts, e.label, (told,)))
+    return findings
 
 
 def check_forces(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding]:

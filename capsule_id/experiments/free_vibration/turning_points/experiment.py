@@ -17,7 +17,7 @@ from capsule_id.experiments.free_vibration.decrement import Decrement
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
 from capsule_id.experiments.free_vibration.starts import further_parameters
-from capsule_id.experiments.free_vibration.turning_points.checks import check_forces, check_halves
+from capsule_id.experiments.free_vibration.turning_points.checks import check_forces, check_halves, check_steps
 from capsule_id.experiments.free_vibration.turning_points.linear import reduced_points
 from capsule_id.experiments.free_vibration.turning_points.second_fit import second_fit_table, second_models
 from capsule_id.experiments.linear import NUISANCE_WIDTH
@@ -34,7 +34,8 @@ class TurningPoints(SurfaceExperiment):
     """Positions and times of turning points, both with white noise.
 
     Turning points of both sides have a free rest position. Those of one side are amplitudes, counted from the rest
-    position; one lies a period after the other. A larger step of the times counts as missed turning points.
+    position; one lies a period after the other. A larger step of the times counts as missed turning points. The
+    rounding error of the last digit (``steps``: of the positions and the times) is a part of the noise.
     """
 
     time: np.ndarray
@@ -46,11 +47,12 @@ class TurningPoints(SurfaceExperiment):
     reading_sd: float
     time_reading_sd: float
     clock_rate: float | None
+    steps: tuple[float, ...] = eqx.field(static=True)
     last: int = eqx.field(static=True)
     both_sides: bool = eqx.field(static=True)
     model: DecayModel = eqx.field(static=True)
 
-    checks = (check_forces, check_halves, check_hidden_terms)
+    checks = (check_steps, check_forces, check_halves, check_hidden_terms)
     tables = (second_fit_table,)
 
     def __init__(
@@ -68,7 +70,13 @@ class TurningPoints(SurfaceExperiment):
         self.sides = first * np.where(index % 2 == 0, 1.0, -1.0)
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.time_width = NUISANCE_WIDTH * float(self.time[-1])
-        self.reading_sd, self.time_reading_sd = table.columns["x_rel"].reading_sd, table.columns["time"].reading_sd
+        columns = [table.columns[name] for name in ("x_rel", "time")]
+        self.steps = tuple(column.unstated_step for column in columns)
+        errors = [
+            float(np.hypot(column.reading_sd, step / np.sqrt(12.0)))
+            for column, step in zip(columns, self.steps, strict=True)
+        ]
+        self.reading_sd, self.time_reading_sd = errors
         scales = float(np.ptp(self.values)), float(np.median(step))
         noise = [Prior("lognormal", NOISE_FRACTION * scale, NOISE_FACTOR) for scale in scales]
         self.clock_rate = stated_rate(table)
