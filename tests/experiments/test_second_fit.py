@@ -137,7 +137,7 @@ def test_coloured_noise_is_found() -> None:
 def test_the_lines_of_the_finding_state_the_quoted_model() -> None:
     (second,), (finding,) = second_models([record(0.0, DRY)])
     text = MESSAGES["decays.second_fit"].text("warn", finding.facts)
-    lines = text.split("write ")[1].split(". To keep")[0]
+    lines = text.split("add these lines to its entry: ")[1].split(". To keep")[0]
     stated = tomllib.loads(
         lines.replace(", stiffness", "\nstiffness")
         .replace(", drift", "\ndrift")
