@@ -1,9 +1,10 @@
 """Free decays by SciPy's DOP853 with located turning points: an independent route to the package's forward model."""
 
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import OdeSolution, solve_ivp
 
 
 def scipy_decay(time: np.ndarray, forces: Mapping[str, float], amplitude: float, turning_time: float) -> np.ndarray:
@@ -37,9 +38,8 @@ def scipy_decay(time: np.ndarray, forces: Mapping[str, float], amplitude: float,
             dense_output=True,
         )
         inside = (time >= start) & (time <= part.t[-1])
-        assert part.sol is not None
         if inside.any():
-            state = part.sol(time[inside])
+            state = cast(OdeSolution, part.sol)(time[inside])
             motion[:, inside] = [*state, acceleration(state)]
         start, x, direction = part.t[-1], float(part.y[0, -1]), -direction
     stuck = np.isnan(motion[0])

@@ -76,9 +76,8 @@ def test_an_unknown_column_proposes_a_map(tmp_path: Path) -> None:
     # K is no unit of a rig folder; the map leaves this column out.
     fault = fault_of(tmp_path, {"t.csv": text}, 'file = "t.csv"')
     assert (fault.line, fault.column) == (1, 10)
-    proposed = re.search(r"columns = \{.*\} \}", fault.remedy)
-    assert proposed is not None
-    assert_read(rig_of(tmp_path, {}, f'file = "t.csv"\n{proposed[0]}'))
+    (proposed,) = re.findall(r"columns = \{.*\} \}", fault.remedy)
+    assert_read(rig_of(tmp_path, {}, f'file = "t.csv"\n{proposed}'))
 
 
 def test_files_in_another_order_than_time_are_named(tmp_path: Path) -> None:
@@ -216,9 +215,8 @@ def test_matlab_files_are_merged_by_name(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig.tables[0]["x_rel"], 1e-3 * DISP, atol=1e-15)
     assert {"s_x.mat", "s_y.mat"} < set(rig.files)
     fault = fault_of(tmp_path, {}, 'file = "s_x.mat"')
-    proposed = re.search(r"columns = \{.*\} \}", fault.remedy)
-    assert proposed is not None
-    rig_of(tmp_path, {}, f'file = "s_x.mat"\n{proposed[0]}')
+    (proposed,) = re.findall(r"columns = \{.*\} \}", fault.remedy)
+    rig_of(tmp_path, {}, f'file = "s_x.mat"\n{proposed}')
     savemat(tmp_path / "s_y.mat", {"t": TIME + 1e-6, "y": y})
     fault = fault_of(tmp_path, {}, f'files = ["s_x.mat", "s_y.mat"]\n{source}')
     assert "must be the same" in fault.rule
@@ -305,10 +303,9 @@ def test_remedies_for_the_layout_work(tmp_path: Path) -> None:
         text = "a, b, c\n" + first + rows(";")
         lines = 'file = "t.txt"\ncolumns = { time = { from = 1, unit = "s" }, x_rel = { from = 2, unit = "mm" } }'
         fault = fault_of(tmp_path, {"t.txt": text}, lines)
-        stated = re.search(r"data_from_line = \d+", fault.remedy)
-        assert stated is not None
-        assert stated[0] == f"data_from_line = {line}"
-        assert_read(rig_of(tmp_path, {}, f"{stated[0]}\n{lines}"))
+        (stated,) = re.findall(r"data_from_line = \d+", fault.remedy)
+        assert stated == f"data_from_line = {line}"
+        assert_read(rig_of(tmp_path, {}, f"{stated}\n{lines}"))
 
 
 def test_a_header_that_occurs_twice_needs_its_number(tmp_path: Path) -> None:
