@@ -118,14 +118,36 @@ def emulation(
         if np.any(np.isfinite(log_weight)) and effective_size(log_weight) >= ENOUGH * len(checked):
             break
     walkers = _inside(target, drawn)[: max(WALKERS, 2 * drawn.shape[1])] if last_rounds else drawn
+    found = _adapted(target, known, proposal, drawn, large, random)
     for _ in range(last_rounds):
-        emulated = target.emulated(*known)
-        proposal, drawn = _follow(emulated, proposal, drawn, large, random)
-        moves = delayed_moves(emulated.parts, proposal, drawn, STEPS, target.scaled, OTHER)
+        moves = delayed_moves(found.target.parts, found.proposal, found.start.v, STEPS, target.scaled, OTHER)
         walkers = _chain(target, walkers, moves, random).run(EXACT_STEPS, store=False).state.coords
-        known = known.more(target, _last_places(emulated, proposal, walkers, random))
+        found = corrected(target, found, walkers, large, random)
+    return found
+
+
+def corrected(
+    target: Emulable, before: Emulation, walkers: np.ndarray, large: list[bool], random: np.random.RandomState
+) -> Emulation:
+    """Emulate ``target`` with further exact motions about ``walkers`` (w, d) of delayed acceptance by ``before``.
+
+    Walkers stay where the emulated density is far too small, so that the motions added there correct it.
+    """
+    known = before.known.more(target, _last_places(before.target, before.proposal, walkers, random))
+    return _adapted(target, known, before.proposal, before.start.v, large, random)
+
+
+def _adapted(
+    target: Emulable,
+    known: ExactMotions,
+    proposal: BlockProposal,
+    v: np.ndarray,
+    large: list[bool],
+    random: np.random.RandomState,
+) -> Emulation:
+    """Emulator of ``known``, with the proposal and the draws of a chain from v (w, d) that follow it."""
     emulated = target.emulated(*known)
-    proposal, drawn = _follow(emulated, proposal, drawn, large, random)
+    proposal, drawn = _follow(emulated, proposal, v, large, random)
     return Emulation(emulated, known, proposal, Places(drawn))
 
 

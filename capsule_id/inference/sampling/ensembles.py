@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from emcee import State
@@ -24,7 +24,7 @@ from capsule_id.inference.sampling.diagnostics import (
     pooled_time,
     split_rhat,
 )
-from capsule_id.inference.sampling.emulation import Places, emulation
+from capsule_id.inference.sampling.emulation import Emulation, Places, corrected, emulation
 from capsule_id.inference.sampling.ensemble import Ensemble, OpenBackend, initial_state
 from capsule_id.inference.sampling.moves import Moves, block_move, delayed_moves, other_moves
 from capsule_id.inference.sampling.proposal import BlockProposal, block_proposal
@@ -69,6 +69,8 @@ PILOT_STEPS, LONG_PILOT_STEPS = 60, 300
 #: Name of the first move, and of that of an emulated posterior with its number of steps.
 FIRST = "block independence + differential evolution"
 DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
+#: Largest number of corrections of an emulator, and places of every walker that one learns from.
+CORRECTIONS, PLACES = 3, 3
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
 #: Other kinds of moves are tried only where the block proposal stays above this, in steps.
@@ -198,29 +200,65 @@ def _converged(draws: np.ndarray, ess: float) -> bool:
 def pilot(target: Target, seed: int) -> Schedule:
     """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
     random = np.random.RandomState(seed)
-    if target.can_be_emulated:
-        emulated = emulation(target, *laplace_proposal(target), random)
-        begin, name = emulated.start, DELAYED
-        first = delayed_moves(emulated.target.parts, emulated.proposal, begin.v, DELAYED_STEPS, target.scaled)
-    else:
-        proposal = adapted_proposal(target, random)
-        begin, name, first = proposal, FIRST, block_move(proposal)
-    ensemble = Ensemble(target.parts, _initial(target, begin, random), first)
-    moves, measured = {name: first, **other_moves()}, dict[str, float]()
-    # The most promising move runs first, briefly, then longer. The other moves come last, because they are slow.
-    plan = [(name, PILOT_STEPS), (name, LONG_PILOT_STEPS), *((name, LONG_PILOT_STEPS) for name in other_moves())]
-    for name, steps in plan:
-        if name in other_moves() and min(measured.values()) < FAIR_TAU:
-            break
-        ensemble = Ensemble(target.parts, ensemble.state, moves[name]).run(steps)
-        measured[name] = float(np.max(ensemble_time(ensemble.chain[None])))
+    begin, name, first, ensemble = (_emulated if target.can_be_emulated else _proposed)(target, random)
+    moves, measured = {name: first, **other_moves()}, {name: _longest_time(ensemble)}
+    # The first move runs longer where that was not enough. The other moves come last, because they are slow.
+    for other in moves:
         # A longer measurement of delayed acceptance takes longer than what it could save.
-        if measured[name] < (FAIR_TAU if name == DELAYED else GOOD_TAU):
+        if min(measured.values()) < (GOOD_TAU if other == FIRST else FAIR_TAU):
             break
+        ensemble = Ensemble(target.parts, ensemble.state, moves[other]).run(LONG_PILOT_STEPS)
+        measured[other] = _longest_time(ensemble)
     best = min(measured, key=lambda name: measured[name])
     tau = measured[best]
     thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
     return Schedule(begin, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
+
+
+class _Pilot(NamedTuple):
+    """Density of the first walkers, name of a move and the move, and walkers that it has moved for ``PILOT_STEPS``."""
+
+    start: BlockProposal | Places
+    name: str
+    moves: Moves
+    ensemble: Ensemble
+
+
+def _proposed(target: Target, random: np.random.RandomState) -> _Pilot:
+    """Moves by an adapted proposal."""
+    proposal = adapted_proposal(target, random)
+    moves = block_move(proposal)
+    walkers = Ensemble(target.parts, _initial(target, proposal, random), moves)
+    return _Pilot(proposal, FIRST, moves, walkers.run(PILOT_STEPS))
+
+
+def _emulated(target: Target, random: np.random.RandomState) -> _Pilot:
+    """Moves of delayed acceptance by an emulated posterior.
+
+    A long autocorrelation time shows that walkers stay where the emulator is wrong: it learns the motions there.
+    """
+    laplace, large = laplace_proposal(target)
+    found = emulation(target, laplace, large, random)
+    pilot = _delayed(target, found, random)
+    for _ in range(CORRECTIONS):
+        if _longest_time(pilot.ensemble) < GOOD_TAU:
+            break
+        walkers = np.concatenate(pilot.ensemble.chain[:: -(PILOT_STEPS // PLACES)])
+        found = corrected(target, found, walkers, large, random)
+        pilot = _delayed(target, found, random)
+    return pilot
+
+
+def _delayed(target: Target, found: Emulation, random: np.random.RandomState) -> _Pilot:
+    """Moves of delayed acceptance by the emulated posterior ``found``."""
+    moves = delayed_moves(found.target.parts, found.proposal, found.start.v, DELAYED_STEPS, target.scaled)
+    walkers = Ensemble(target.parts, _initial(target, found.start, random), moves)
+    return _Pilot(found.start, DELAYED, moves, walkers.run(PILOT_STEPS))
+
+
+def _longest_time(ensemble: Ensemble) -> float:
+    """Largest autocorrelation time of a parameter, in steps."""
+    return float(np.max(ensemble_time(ensemble.chain[None])))
 
 
 def adapted_proposal(

@@ -14,7 +14,7 @@ from capsule_id.experiments.emulator import Emulator, _cosine
 from capsule_id.experiments.progression.density.run_emulator import RunEmulator
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.result import PointFit, Posterior
-from capsule_id.inference.sampling import ensembles, moves
+from capsule_id.inference.sampling import emulation, ensembles, moves
 from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, Places
 from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
 from capsule_id.inference.sampling.ensembles import DELAYED, sample
@@ -55,6 +55,52 @@ def test_a_wrong_emulator_does_not_change_the_posterior(monkeypatch: pytest.Monk
     accept = moves.accept
     monkeypatch.setattr(moves, "accept", lambda *args: accept(*args[:4], np.zeros_like(args[4]), args[5]))
     assert np.max(np.abs(scores(draw().draws, Gaussian(MEAN, SIGMA)))) > LIMIT
+
+
+class Tail(Gaussian):
+    """A known density, far too small in a tail that holds a tenth of it."""
+
+    def __init__(self) -> None:
+        super().__init__(MEAN, SIGMA, BLOCKS)
+
+    def parts(self, v: np.ndarray) -> np.ndarray:
+        parts = super().parts(v)
+        parts[:, 0] -= 12.0 * (v[:, 0] > MEAN[0] + 1.3 * np.sqrt(SIGMA[0, 0]))
+        return parts
+
+
+class Learner(Gaussian):
+    """A known density whose emulator misses its tail, until it knows the motions at enough places."""
+
+    can_be_emulated = True
+
+    def __init__(self, enough: int) -> None:
+        super().__init__(MEAN, SIGMA, BLOCKS)
+        self.enough, self.known = enough, list[int]()
+
+    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Gaussian:
+        self.known.append(len(v))
+        return Gaussian(MEAN, SIGMA, BLOCKS) if len(v) >= self.enough else Tail()
+
+
+def test_an_emulator_learns_where_walkers_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until the autocorrelation times are short. Negative control: without corrections they are long."""
+    # Differential evolution shortens the times of three parameters.
+    monkeypatch.setattr(ensembles, "GOOD_TAU", 4.0)
+    monkeypatch.setattr(emulation, "DRAWS", 256)
+    with monkeypatch.context() as without:
+        without.setattr(ensembles, "CORRECTIONS", 0)
+        stuck = Learner(enough=10**9)
+        (long,) = ensembles.pilot(stuck, 2).measured.values()
+    assert long > ensembles.GOOD_TAU
+    learner = Learner(enough=stuck.known[-1] + 1)
+    (short,) = ensembles.pilot(learner, 2).measured.values()
+    assert short < ensembles.GOOD_TAU
+    assert len(learner.known) == len(stuck.known) + 1
+    # An emulator that never learns is corrected a few times, not without an end.
+    never = Learner(enough=10**9)
+    ensembles.pilot(never, 2)
+    assert len(never.known) == len(stuck.known) + ensembles.CORRECTIONS
 
 
 def test_short_walks_keep_the_exact_posterior() -> None:
