@@ -69,8 +69,8 @@ PILOT_STEPS, LONG_PILOT_STEPS = 60, 300
 #: Name of the first move, and of that of an emulated posterior with its number of steps.
 FIRST = "block independence + differential evolution"
 DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
-#: Largest number of corrections of an emulator, and places of every walker that one learns from.
-CORRECTIONS, PLACES = 3, 3
+#: Largest number of corrections of an emulator, and states of the pilot that each of them learns from.
+CORRECTIONS, STATES = 3, 3
 #: The pilot stops once a move has an autocorrelation time below this, in steps.
 GOOD_TAU = 10.0
 #: Other kinds of moves are tried only where the block proposal stays above this, in steps.
@@ -243,7 +243,7 @@ def _emulated(target: Target, random: np.random.RandomState) -> _Pilot:
     for _ in range(CORRECTIONS):
         if _longest_time(pilot.ensemble) < GOOD_TAU:
             break
-        walkers = np.concatenate(pilot.ensemble.chain[:: -(PILOT_STEPS // PLACES)])
+        walkers = np.concatenate(pilot.ensemble.chain[:: -(PILOT_STEPS // STATES)])
         found = corrected(target, found, walkers, large, random)
         pilot = _delayed(target, found, random)
     return pilot
