@@ -4,7 +4,8 @@ Each round adds exact motions about draws of the emulated posterior of the round
 the posterior is. An emulator whose density is far too small in some region gets no draws there, so that these rounds do not
 correct it. The last rounds therefore use walkers of delayed acceptance, which can enter such regions, and draws of the
 proposal, which has heavier tails. (J. A. Christen, C. Fox, *Markov
-chain Monte Carlo using an approximation*, Journal of Computational and Graphical Statistics 14, 2005, 795.)
+chain Monte Carlo using an approximation*, Journal of Computational and Graphical Statistics 14, 2005, 795.) Where the
+sampler's pilot shows that walkers stay somewhere, ``corrected`` adds exact motions about them.
 """
 
 from typing import NamedTuple, Protocol, Self
@@ -194,7 +195,7 @@ def _last_places(
     wide = wide[np.all(np.isfinite(wide), axis=1)]
     least = np.median(np.sum(emulated.parts(walkers), axis=1)) - FAR
     wide = wide[np.sum(emulated.parts(wide), axis=1) > least][:DRAWS]
-    return np.concatenate([wide, *(_around(walkers, random) for _ in range(DRAWS // len(walkers)))])
+    return np.concatenate([wide, *(_around(walkers, random) for _ in range(max(1, DRAWS // len(walkers))))])
 
 
 def _follow(

@@ -71,9 +71,9 @@ FIRST = "block independence + differential evolution"
 DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
 #: Largest number of corrections of an emulator, and states of the pilot that each of them learns from.
 CORRECTIONS, STATES = 3, 3
-#: The pilot stops once a move has an autocorrelation time below this, in steps.
+#: The pilot of an adapted proposal stops, and an emulator is not corrected, at autocorrelation times below this, in steps.
 GOOD_TAU = 10.0
-#: Other kinds of moves are tried only where the block proposal stays above this, in steps.
+#: Delayed acceptance is not measured again, and other kinds of moves are not tried, below this, in steps.
 FAIR_TAU = 100.0
 
 
@@ -204,7 +204,7 @@ def pilot(target: Target, seed: int) -> Schedule:
     moves, measured = {name: first, **other_moves()}, {name: _longest_time(ensemble)}
     # The first move runs longer where that was not enough. The other moves come last, because they are slow.
     for other in moves:
-        # A longer measurement of delayed acceptance takes longer than what it could save.
+        # A longer measurement of delayed acceptance, or of a slow move, takes longer than what it could save.
         if min(measured.values()) < (GOOD_TAU if other == FIRST else FAIR_TAU):
             break
         ensemble = Ensemble(target.parts, ensemble.state, moves[other]).run(LONG_PILOT_STEPS)
@@ -235,25 +235,25 @@ def _proposed(target: Target, random: np.random.RandomState) -> _Pilot:
 def _emulated(target: Target, random: np.random.RandomState) -> _Pilot:
     """Moves of delayed acceptance by an emulated posterior.
 
-    A long autocorrelation time shows that walkers stay where the emulator is wrong: it learns the motions there.
+    A long autocorrelation time may mean that walkers stay where the emulator is wrong: it learns the motions there. The
+    same walkers then go on, because new ones would seldom begin there.
     """
     laplace, large = laplace_proposal(target)
     found = emulation(target, laplace, large, random)
-    pilot = _delayed(target, found, random)
+    first = _delayed(target, found, _initial(target, found.start, random))
     for _ in range(CORRECTIONS):
-        if _longest_time(pilot.ensemble) < GOOD_TAU:
+        if _longest_time(first.ensemble) < GOOD_TAU:
             break
-        walkers = np.concatenate(pilot.ensemble.chain[:: -(PILOT_STEPS // STATES)])
+        walkers = np.concatenate(first.ensemble.chain[:: -(PILOT_STEPS // STATES)])
         found = corrected(target, found, walkers, large, random)
-        pilot = _delayed(target, found, random)
-    return pilot
+        first = _delayed(target, found, first.ensemble.state)
+    return first
 
 
-def _delayed(target: Target, found: Emulation, random: np.random.RandomState) -> _Pilot:
-    """Moves of delayed acceptance by the emulated posterior ``found``."""
+def _delayed(target: Target, found: Emulation, state: State) -> _Pilot:
+    """Moves of delayed acceptance by the emulated posterior ``found``, and walkers that they move from ``state`` on."""
     moves = delayed_moves(found.target.parts, found.proposal, found.start.v, DELAYED_STEPS, target.scaled)
-    walkers = Ensemble(target.parts, _initial(target, found.start, random), moves)
-    return _Pilot(found.start, DELAYED, moves, walkers.run(PILOT_STEPS))
+    return _Pilot(found.start, DELAYED, moves, Ensemble(target.parts, state, moves).run(PILOT_STEPS))
 
 
 def _longest_time(ensemble: Ensemble) -> float:
