@@ -11,7 +11,7 @@ from capsule_id.errors import InputError
 def test_bad_input_is_a_value_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"rig\.toml") as caught:
         capsule_id.read_rig(tmp_path)
-    assert isinstance(caught.value, InputError)
+    assert caught.type is InputError
 
 
 @pytest.mark.parametrize(
