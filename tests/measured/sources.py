@@ -44,6 +44,11 @@ def pendulum(record: int) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(angle.size) / rate, angle
 
 
+def counted_pendulum(length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Swing of a string of 20 or 29 cm, read by an encoder: time, s, unevenly spaced, and angle, rad, (n,) each."""
+    return tuple(np.loadtxt(measured_file(f"pendulum_phy180/L{length}.csv"), delimiter=",", skiprows=1).T)
+
+
 def coil_spring() -> tuple[np.ndarray, np.ndarray]:
     """Deflection, cm, and added mass, g, (10,) each, in the order of the file."""
     return tuple(

@@ -16,7 +16,7 @@ from scipy.signal import find_peaks
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.free_vibration.checks import check_drift
+from capsule_id.experiments.free_vibration.checks import check_drift, check_zero
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms
@@ -24,7 +24,7 @@ from capsule_id.experiments.free_vibration.second_fit.screening import second_mo
 from capsule_id.inference.result import Posterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
-from tests.measured.sources import pendulum
+from tests.measured.sources import counted_pendulum, pendulum
 
 #: Where the swing of record 3 is down to 24 deg, s after its first sample: from there sin x is x to 3 %.
 START = 3.3
@@ -35,6 +35,15 @@ def _rig(folder: Path, time: np.ndarray, angle: np.ndarray) -> Rig:
     settings = {"start": quantity(START, "s"), "x_rel_resolution": quantity(float(RESOLUTION), "m")}
     entry = Entry("free_vibration", "swing", {"time [s]": time, "x_rel [m]": angle}, settings)
     return make_rig(folder, entry, head={"m1": quantity(1.0, "kg")})
+
+
+def _second_fit(folder: Path, entry: Entry) -> tuple[FreeVibration, SimpleNamespace]:
+    """The record under the model of its second fit, and the values of that, as the checks read them."""
+    rig = make_rig(folder, entry, head={"m1": quantity(1.0, "kg")})
+    ((record,), _) = second_models(cast(list[FreeVibration], make_experiments(rig)))
+    found = cast(Screened, record.about.screened)
+    values = {row.name: found.values.get(row.symbol, found.noise) for row in record.parameters}
+    return record, SimpleNamespace(values={"m1": 1.0, **values})
 
 
 @pytest.fixture(scope="module")
@@ -116,12 +125,8 @@ def test_the_drift_of_the_highest_swing_is_no_drift(tmp_path: Path) -> None:
     """Record 1 swings from 135 deg, where no cubic spring is a pendulum. Its twin is in test_decay_channels."""
     time, angle = pendulum(1)
     entry = Entry("free_vibration", "swing", {"time [s]": time, "x_rel [m]": angle}, {})
-    rig = make_rig(tmp_path, entry, head={"m1": quantity(1.0, "kg")})
-    ((record,), _) = second_models(cast(list[FreeVibration], make_experiments(rig)))
+    record, fit = _second_fit(tmp_path, entry)
     assert record.model.drift == "gp"
-    found = cast(Screened, record.about.screened)
-    values = {row.name: found.values.get(row.symbol, found.noise) for row in record.parameters}
-    fit = SimpleNamespace(values={"m1": 1.0, **values})
     (finding,) = check_drift([record], fit)  # type: ignore[arg-type]  # pyright: ignore
     assert (finding.level, finding.experiment) == ("fail", "swing")
 
@@ -131,12 +136,20 @@ def test_the_highest_swing_late_on_cannot_tell_viscous_from_dry(tmp_path: Path) 
     """From 3.2 s on it fits as viscous, c = 0.55 beside 0.21 in record 3. Its twin is in test_hidden_terms."""
     time, angle = pendulum(1)
     entry = Entry("free_vibration", "swing", {"time [s]": time, "x_rel [m]": angle}, {"start": quantity(3.2, "s")})
-    rig = make_rig(tmp_path, entry, head={"m1": quantity(1.0, "kg")})
-    ((record,), _) = second_models(cast(list[FreeVibration], make_experiments(rig)))
+    record, fit = _second_fit(tmp_path, entry)
     assert record.model.damping == ()
-    found = cast(Screened, record.about.screened)
-    values = {row.name: found.values.get(row.symbol, found.noise) for row in record.parameters}
-    fit = SimpleNamespace(values={"m1": 1.0, **values})
     (finding,) = check_hidden_terms([record], fit)  # type: ignore[arg-type]  # pyright: ignore
     assert (finding.level, finding.parameters, finding.facts["symbols"][0]) == ("fail", ("c",), "F_dry")
     assert finding.facts["low"] < 0.21 < finding.facts["high"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("length", "level"), [(20, "fail"), (29, "ok")])
+def test_an_encoder_that_loses_counts_is_named(tmp_path: Path, length: int, level: str) -> None:
+    """Its zero jumps by counts of 2.6 mrad. The longer string has a kink in its stiffness instead."""
+    time, angle = counted_pendulum(length)
+    entry = Entry("free_vibration", "swing", {"time [s]": time, "x_rel [m]": angle}, {})
+    record, fit = _second_fit(tmp_path, entry)
+    (finding,) = check_zero([record], fit)  # type: ignore[arg-type]  # pyright: ignore
+    assert (finding.code, finding.level) == ("decays.zero", level)
+    assert level == "ok" or 1e-3 < finding.facts["jump"] < 2.6e-3

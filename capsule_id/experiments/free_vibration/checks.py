@@ -1,4 +1,4 @@
-"""Checks of free decays: equal stiffness at every amplitude, equal halves, no slip, no contact, no error of position."""
+"""Checks of free decays: equal stiffness at every amplitude, equal halves, no slip, no contact, no error of the sensor."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -13,6 +13,7 @@ from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL
 from capsule_id.experiments.free_vibration.decrement import equilibrium
 from capsule_id.experiments.free_vibration.readings.noise import drift_by_shape
+from capsule_id.experiments.free_vibration.readings.zero import zero_jumps
 from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import sensitivities, whitened
 from capsule_id.experiments.free_vibration.settings import decay_window
@@ -36,6 +37,8 @@ FAST_NOISE = 0.25
 LARGER = 1.3
 #: Steps of the readings in which a motion is lost, and fewest readings before that.
 STEPS, FEWEST_SIZES = 3.0, 30
+#: Largest sum of squares of zeros that jump, relative to that of zeros that move slowly.
+JUMPING = 0.5
 #: Directions of the offsets that are shorter than this, relative to the longest one, are combinations of the others.
 UNSEEN = 1e-8
 
@@ -131,6 +134,22 @@ def check_drift(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding
             level = "fail" if drift > max(FAST_DRIFT * motion, FAST_NOISE * noise) else "ok"
             facts = {"label": e.label, "share": drift / max(motion, FAST_NOISE * noise), **later_start(e)}
             findings.append(Finding("decays.drift", level, facts, e.label))
+    return findings
+
+
+def check_zero(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """Check that the zero of the sensor does not jump where the rod turns."""
+    compared, findings = [], []
+    for e in records:
+        if (found := zero_jumps(e, e.local(fit.values))) is None:
+            continue
+        compared.append(e.label)
+        if found.ratio < JUMPING:
+            facts = {"label": e.label, "jump": found.size * e.column.to_display, "unit": e.column.unit}
+            facts |= {"ratio": found.ratio, "half_swings": found.half_swings}
+            findings.append(Finding("decays.zero", "fail", facts, e.label))
+    if compared and not findings:
+        findings.append(Finding("decays.zero", "ok", {"labels": ", ".join(compared)}))
     return findings
 
 
@@ -271,4 +290,12 @@ def _estimates(half: "FreeVibration", theta: Mapping[str, float]) -> tuple[dict[
 
 
 #: All checks of records of free decays but that on hidden forces, which needs the second fit.
-CHECKS = (check_stiffness, check_free_decay, check_halves, check_positions, check_size_of_residuals, check_drift)
+CHECKS = (
+    check_stiffness,
+    check_free_decay,
+    check_halves,
+    check_positions,
+    check_size_of_residuals,
+    check_drift,
+    check_zero,
+)

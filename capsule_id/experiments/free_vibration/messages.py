@@ -139,6 +139,15 @@ MESSAGES = {
         ok="{label}: the fitted drift of the zero is slower than the motion ({share:.1%} of it at its frequency)",
         fail=_drift,
     ),
+    "decays.zero": Message(
+        "zero of a decay",
+        ok="{labels}: the zero of the sensor does not jump where the rod turns",
+        fail=(
+            "{label}: the zero of the sensor must stay, but it jumps where the rod turns, by {jump:.2g} {unit} (rms). A zero "
+            "for each of {half_swings} half swings leaves {ratio:.0%} of the variance that a slow drift leaves. A loose sensor "
+            "does that, or an encoder that loses counts. No fit corrects it. Fasten the sensor or replace it, and record again."
+        ),
+    ),
     "decays.halves": Message(
         "halves of a decay",
         ok="{labels}: the estimates of both halves of each record agree within 3 joint sd",
