@@ -7,7 +7,9 @@ The shapes and types that ``CHECKED`` modules annotate hold for every call.
 import gc
 import os
 import shutil
+import signal
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -129,3 +131,11 @@ def _optimisation(request: pytest.FixtureRequest) -> None:
 def cases() -> Cases:
     """The 25 reference cases as one batch."""
     return read_cases()
+
+
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    """SIGINT arrives: a shell without job control lets the processes that it starts in the background ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

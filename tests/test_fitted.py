@@ -120,10 +120,11 @@ def test_it_shows_itself_in_short(fitted: Fit) -> None:
 
 def test_the_table_is_parameters_csv(fitted: Fit, tmp_path: Path) -> None:
     fitted.write(tmp_path / "one")
-    read = pd.read_csv(tmp_path / "one" / "parameters.csv", index_col="name")
+    # As text: pandas 2 reads numbers with an error in the last digits.
+    read = pd.read_csv(tmp_path / "one" / "parameters.csv", index_col="name", dtype={"value": str})
     table = fitted.to_dataframe()
     assert list(read.columns) == list(table.columns)
-    np.testing.assert_array_equal(read["value"], table["value"].astype(float))
+    np.testing.assert_array_equal(read["value"].to_numpy(float), table["value"].to_numpy(float))
 
 
 @pytest.mark.parametrize(

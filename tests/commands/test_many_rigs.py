@@ -123,14 +123,6 @@ def test_a_result_that_cannot_be_written_does_not_stop_the_others(
     assert (here / "results" / "spring" / "report.html").is_file()
 
 
-@pytest.fixture
-def interrupts() -> Iterator[None]:
-    """SIGINT arrives: a shell without job control lets the processes that it starts in the background ignore it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize("scheduler", [(), ("--scheduler", "threads")], ids=["in turn", "threads"])
 def test_an_interruption_ends_the_study(

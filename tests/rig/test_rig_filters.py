@@ -79,15 +79,16 @@ def test_long_windows_keep_their_digits_where_powers_lose_them() -> None:
     t = time / time[-1]
     quintic = 1.0 + t - 3.0 * t**2 + t**5
     assert np.max(np.abs(savitzky_golay(time, quintic, 1001 * STEP, 5) - quintic)) < 1e-13
-    assert abs(savgol_coeffs(1001, 5, use="dot") @ quintic[:1001] - quintic[500]) > 1e-3
+    # 1e-6 to 1e-3 with different versions of SciPy.
+    assert abs(savgol_coeffs(1001, 5, use="dot") @ quintic[:1001] - quintic[500]) > 1e-7
 
 
-def test_scipy_loses_the_order_in_use_on_very_long_windows() -> None:
-    """SciPy's filter fails on a parabola at order 3 and 30,001 samples."""
+def test_scipy_loses_digits_on_very_long_windows() -> None:
+    """On a parabola at order 3 and 30,001 samples; some versions of SciPy lose the order in use."""
     t = np.linspace(-1.0, 1.0, 30_001)
     parabola = 1.0 + t**2
     assert abs(savitzky_golay(STEP * np.arange(30_001), parabola, 30_001 * STEP, 3)[15_000] - 1.0) < 1e-12
-    assert abs(savgol_coeffs(30_001, 3, use="dot") @ parabola - 1.0) > 1e-3
+    assert abs(savgol_coeffs(30_001, 3, use="dot") @ parabola - 1.0) > 1e-9
 
 
 def test_the_chosen_window_is_the_longest_that_passes_the_motion() -> None:

@@ -141,11 +141,12 @@ MESSAGES = {
     ),
     "decays.zero": Message(
         "zero of a decay",
-        ok="{labels}: the zero of the sensor does not jump where the rod turns",
+        ok="{labels}: no jump of the sensor's zero stands out where the rod turns",
         fail=(
-            "{label}: the zero of the sensor must stay, but it jumps where the rod turns, by {jump:.2g} {unit} (rms). A zero "
-            "for each of {half_swings} half swings leaves {ratio:.0%} of the variance that a slow drift leaves. A loose sensor "
-            "does that, or an encoder that loses counts. No fit corrects it. Fasten the sensor or replace it, and record again."
+            "{label}: the zero of the sensor must stay the same, but it jumps where the rod turns; the rms change from a half "
+            "swing to the next is {jump:.2g} {unit}. With one zero per half swing ({half_swings}), the squared residuals are "
+            "{ratio:.0%} of those with a zero that changes elsewhere. A loose sensor can cause this, or an encoder that loses "
+            "counts. No fit corrects it. Fasten the sensor or replace it, and record again."
         ),
     ),
     "decays.halves": Message(

