@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,7 +17,7 @@ MOTION = ("simulate", "--k2", "18960", "--P_d", "4", "--Omega", "34.56", "--G", 
 
 
 def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation.sys, "modules", {})
+    monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={}))
     emitter, loop = compilation.XLA_EMITTER_OPTION, compilation.XLA_LOOP_OPTION
     for before, after in (
         ("", f"{emitter} {loop}"),
@@ -30,7 +31,7 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("XLA_FLAGS", "")
     compilation.set_xla_options(loop=False)
     assert compilation.os.environ["XLA_FLAGS"] == emitter
-    monkeypatch.setattr(compilation.sys, "modules", {"jax": None})
+    monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={"jax": None}))
     compilation.set_xla_options()
     assert compilation.os.environ["XLA_FLAGS"] == emitter
 
@@ -75,7 +76,7 @@ def variables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, str]
     """The environment of a process that has not imported JAX; the user's cache directory is ``tmp_path``."""
     environ = {"XDG_CACHE_HOME": str(tmp_path), "HOME": str(tmp_path)}
     monkeypatch.setattr(compilation.os, "environ", environ)
-    monkeypatch.setattr(compilation.sys, "modules", {})
+    monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={}))
     return environ
 
 
