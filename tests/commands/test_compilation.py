@@ -27,7 +27,8 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
     ):
         monkeypatch.setenv("XLA_FLAGS", before)
         compilation.set_xla_options()
-        assert compilation.os.environ["XLA_FLAGS"] == after
+        # jaxlib 0.11 and later have no emitter option: its place is empty then.
+        assert compilation.os.environ["XLA_FLAGS"].split() == after.split()
     monkeypatch.setenv("XLA_FLAGS", "")
     compilation.set_xla_options(loop=False)
     assert compilation.os.environ["XLA_FLAGS"] == emitter
