@@ -60,7 +60,7 @@ def test_one_count_lost_in_two_swings_is_named() -> None:
 
 
 def test_jumps_a_little_after_the_turning_point_are_named() -> None:
-    later = np.round(2.0 * TIME / PERIOD - 0.05).astype(int)
+    later = np.round(2.0 * TIME / PERIOD - 0.09).astype(int)
     assert finding(ZERO[later], VISCOUS)[0].level == "fail"
 
 

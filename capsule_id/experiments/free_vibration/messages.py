@@ -145,7 +145,7 @@ MESSAGES = {
         fail=(
             "{label}: the zero of the sensor must stay the same, but it jumps where the rod turns; the rms change from a half "
             "swing to the next is {jump:.2g} {unit}. With one zero per half swing ({half_swings}), the squared residuals are "
-            "{ratio:.0%} of those with a zero that changes elsewhere. A loose sensor can cause this, or an encoder that loses "
+            "{ratio:.0%} of those with a zero that changes slowly. A loose sensor can cause this, or an encoder that loses "
             "counts. No fit corrects it. Fasten the sensor or replace it, and record again."
         ),
     ),

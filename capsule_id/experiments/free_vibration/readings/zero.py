@@ -29,9 +29,8 @@ class Jumps(NamedTuple):
     Attributes
     ----------
     size : rms change of the zero from one half swing to the next, SI, without what alternates
-    ratio : sum of squares of the residuals that zeros of half swings leave, relative to the smaller one of two others:
-        of a zero that moves in straight lines from the middle of each half swing to that of the next, and of a zero that
-        jumps at these middles. All have about the same number of parameters
+    ratio : sum of squares of the residuals that zeros of half swings leave, relative to that of a zero that moves in straight
+        lines from the middle of each half swing to that of the next. Both have the same number of parameters
     half_swings : number of zeros
     """
 
@@ -43,7 +42,7 @@ class Jumps(NamedTuple):
 def zero_jumps(e: "FreeVibration", theta: ValuesBySymbol) -> Jumps | None:
     """Zeros of the half swings of a record; None for too few readings, and where the readings are no displacement.
 
-    Three things are projected out of all descriptions: what the fitted parameters can take up, a zero for each direction
+    Three things are projected out of both descriptions: what the fitted parameters can take up, a zero for each direction
     of the motion (as of dry friction or hysteresis), and one in proportion to the amplitude.
     """
     time, values = e.whole
@@ -73,7 +72,6 @@ def zero_jumps(e: "FreeVibration", theta: ValuesBySymbol) -> Jumps | None:
     middle = np.bincount(number, weights=part.time[kept]) / count
     own = np.eye(len(count))
     lines = np.stack([np.interp(part.time[kept], middle, zero) for zero in own], axis=1)
-    shifted = np.eye(len(count) + 1)[np.searchsorted(middle, part.time[kept])]
     ahead = np.where(rate > 0.0, 1.0, -1.0)
     amplitude = np.interp(part.time, turned[:-1], 0.5 * np.abs(np.diff(curve[turns])))
     known = np.column_stack([design, ahead, ahead * amplitude, *moved.values()])[kept]
@@ -81,8 +79,8 @@ def zero_jumps(e: "FreeVibration", theta: ValuesBySymbol) -> Jumps | None:
     # What a zero for each direction could take up is shared between both at will: it is left out of the jumps.
     shared = np.stack([np.bincount(number, weights=x[kept]) / count for x in (ahead, ahead * amplitude)], axis=1)
     zeros = zeros - shared @ np.linalg.lstsq(shared, zeros)[0]
-    others = [_least_squares(known, columns, left[kept])[0] for columns in (lines, shifted)]
-    ratio = jumping / min(others) if min(others) > 0.0 else 1.0
+    moving_slowly, _ = _least_squares(known, lines, left[kept])
+    ratio = jumping / moving_slowly if moving_slowly > 0.0 else 1.0
     return Jumps(float(np.sqrt(np.mean(np.diff(zeros) ** 2))), ratio, len(count))
 
 
