@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import capsule_id as cid
 from capsule_id.errors import InputError
 from capsule_id.fitted import Fit, compare
-from capsule_id.inference.result import Posterior
+from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.synthetic import truth_beside
 from tests.cli_tools import DATA, listing, small_rig
 
@@ -237,8 +237,9 @@ def test_arviz_needs_no_arguments(capsule: Fit, tmp_path: Path) -> None:
 
 def test_replicates_scatter_as_the_readings(capsule: Fit) -> None:
     """Replicates of a decay that the model fits: the readings lie in the 95 % band of their replicates."""
-    assert capsule.pointwise is not None
-    low, high = np.quantile(capsule.pointwise.replicates["free_vibration_1"], [0.025, 0.975], axis=(0, 1))
+    low, high = np.quantile(
+        cast(Pointwise, capsule.pointwise).replicates["free_vibration_1"], [0.025, 0.975], axis=(0, 1)
+    )
     y = capsule.observed["free_vibration_1"]
     assert np.mean((low <= y) & (y <= high)) == pytest.approx(0.95, abs=0.025)
 

@@ -11,7 +11,6 @@ import arviz
 import emcee
 import numpy as np
 import pytest
-import xarray as xr
 from scipy import stats
 
 import capsule_id as cid
@@ -125,7 +124,6 @@ def test_groups_and_dimensions(job: Job) -> None:
     for label, data in job.idata.observed_data.data_vars.items():
         assert job.idata.posterior_predictive[label].shape[-1] == data.size
         assert int(np.sum(job.idata.log_likelihood["experiment"] == label)) == data.size
-    assert isinstance(posterior, xr.Dataset)
 
 
 def split_rhat(chains: np.ndarray) -> float:

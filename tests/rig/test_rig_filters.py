@@ -1,5 +1,7 @@
 """Savitzky–Golay filters: exact on polynomials, gain on cosines, and the reason for raw records in likelihoods."""
 
+from importlib.metadata import version
+
 import numpy as np
 import pytest
 from scipy.signal import savgol_coeffs, savgol_filter
@@ -17,6 +19,8 @@ from capsule_id.rig.filters import (
 )
 
 STEP = 1.0 / 2000.0  # s
+#: What SciPy's coefficients lose at least on long windows. From 1.17 on they lose the order in use, before only digits.
+LOST = 1e-3 if tuple(map(int, version("scipy").split(".")[:2])) >= (1, 17) else 1e-9
 
 
 def test_polynomials_pass_unchanged_up_to_the_edges() -> None:
@@ -79,16 +83,15 @@ def test_long_windows_keep_their_digits_where_powers_lose_them() -> None:
     t = time / time[-1]
     quintic = 1.0 + t - 3.0 * t**2 + t**5
     assert np.max(np.abs(savitzky_golay(time, quintic, 1001 * STEP, 5) - quintic)) < 1e-13
-    # 1e-6 to 1e-3 with different versions of SciPy.
-    assert abs(savgol_coeffs(1001, 5, use="dot") @ quintic[:1001] - quintic[500]) > 1e-7
+    assert abs(savgol_coeffs(1001, 5, use="dot") @ quintic[:1001] - quintic[500]) > LOST
 
 
-def test_scipy_loses_digits_on_very_long_windows() -> None:
-    """On a parabola at order 3 and 30,001 samples; some versions of SciPy lose the order in use."""
+def test_scipy_loses_the_order_in_use_on_very_long_windows() -> None:
+    """SciPy's filter fails on a parabola at order 3 and 30,001 samples."""
     t = np.linspace(-1.0, 1.0, 30_001)
     parabola = 1.0 + t**2
     assert abs(savitzky_golay(STEP * np.arange(30_001), parabola, 30_001 * STEP, 3)[15_000] - 1.0) < 1e-12
-    assert abs(savgol_coeffs(30_001, 3, use="dot") @ parabola - 1.0) > 1e-9
+    assert abs(savgol_coeffs(30_001, 3, use="dot") @ parabola - 1.0) > LOST
 
 
 def test_the_chosen_window_is_the_longest_that_passes_the_motion() -> None:

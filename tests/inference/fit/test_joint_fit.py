@@ -236,7 +236,7 @@ def test_ctrl_c_in_python_stops_the_searches_that_run_side_by_side(monkeypatch: 
     def search(_: LogPosterior, start: np.ndarray, limit: float) -> Any:
         if not np.isfinite(limit):
             return first
-        for _step in range(3000):
+        for _step in range(600):
             stop_if_interrupted()
             steps.append(time.monotonic())
             if len(steps) == 20:
@@ -247,7 +247,7 @@ def test_ctrl_c_in_python_stops_the_searches_that_run_side_by_side(monkeypatch: 
     monkeypatch.setattr(module, "_search", search)
     with pytest.raises(KeyboardInterrupt):
         joint_fit(target, {}, 0, starts=np.stack([fit.u] * 3))
-    assert len(steps) < 3000  # half of what both searches take
+    assert len(steps) < 200
     stop_if_interrupted()  # the flag of that fit is not left behind
 
 
