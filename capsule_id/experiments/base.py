@@ -219,6 +219,10 @@ class Experiment(eqx.Module):
     def starts(self) -> dict[str, Start]:
         """Start of every parameter of this experiment, by name, estimated roughly from its own readings."""
 
+    def nested_starts(self) -> Sequence[Mapping[str, float]]:
+        """Values, SI, by name, of fits of simpler models of the readings, from which a fit starts too."""
+        return ()
+
     @abstractmethod
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         """Compare readings and prediction at the point fit ``theta``, with a band from ``draws`` (may be [])."""

@@ -14,7 +14,6 @@ from capsule_id.experiments.free_vibration.decay_models import (
     decay,
     decay_moments,
     fold,
-    rates,
     uniform_step,
     viscous_basis,
 )
@@ -36,7 +35,8 @@ def integrate(rate: Rate, state: list[float], time: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("gamma", [GAMMA, 1e-2, 1e-9])
 def test_moments_equal_direct_sums(n: int, gamma: float) -> None:
     y = np.random.default_rng(2).standard_normal(n) + 3.0
-    a = np.stack([np.exp(-gamma * TIME[:n]) * f(OMEGA * TIME[:n]) for f in (np.cos, np.sin)] + [np.ones(n)], axis=1)
+    cosine, sine = (np.exp(-gamma * TIME[:n]) * f(OMEGA * TIME[:n]) for f in (np.cos, np.sin))
+    a = np.stack([cosine + gamma / OMEGA * sine, np.hypot(gamma, OMEGA) / OMEGA * sine, np.ones(n)], axis=1)
     yy, ay, aa = decay_moments(fold(y), n, 1.0 / 2000.0, gamma, OMEGA)
     assert float(yy) == pytest.approx(float(y @ y), rel=1e-13)
     np.testing.assert_allclose(ay, a.T @ y, rtol=1e-12, atol=1e-13 * n)
@@ -52,12 +52,37 @@ def test_uniform_step() -> None:
 
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_viscous_decay(xp: object) -> None:
-    gamma, omega = rates(K1, C, M1, xp)  # type: ignore[arg-type]
-    cosine, sine = np.asarray(viscous_basis(TIME, K1, C, M1, xp)).T  # type: ignore[arg-type]
-    x = 2e-3 * (cosine + float(gamma / omega) * sine)
+    at_rest, struck = np.asarray(viscous_basis(TIME, K1, C, M1, xp)).T  # type: ignore[arg-type]
+    x = 2e-3 * at_rest
     np.testing.assert_allclose(x, released(TIME, 2e-3), rtol=0, atol=1e-17)
+    np.testing.assert_allclose(
+        struck, np.sqrt(K1 / M1) / OMEGA * np.exp(-GAMMA * TIME) * np.sin(OMEGA * TIME), atol=1e-15
+    )
     expected = integrate(lambda t, s: [s[1], -(K1 * s[0] + C * s[1]) / M1], [2e-3, 0.0], TIME)
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.999, 1.0 - 1e-9, 1.0 + 1e-9, 1.01, 1.5, 30.0])
+def test_viscous_decay_of_any_damping(ratio: float) -> None:
+    """Both solutions against DOP853; their derivatives in k1 and c against central differences of those of SciPy."""
+    c = 2.0 * ratio * np.sqrt(K1 * M1)
+
+    def scipy(k1: float, c: float) -> np.ndarray:
+        omega = np.sqrt(k1 / M1)
+        states: list[list[float]] = [[1.0, 0.0], [0.0, float(omega)]]
+        return np.stack(
+            [integrate(lambda t, s: [s[1], -(k1 * s[0] + c * s[1]) / M1], state, TIME) for state in states], axis=1
+        )
+
+    found = jit_quickly(viscous_basis)(jnp.asarray(TIME), K1, c, M1)
+    np.testing.assert_allclose(found, scipy(K1, c), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found, viscous_basis(TIME, K1, c, M1, np), rtol=0, atol=1e-14)
+    slopes = jax.jacfwd(viscous_basis, (1, 2))(jnp.asarray(TIME), K1, c, M1)
+    for slope, (up, down), step in zip(
+        slopes, (((1.001 * K1, c), (0.999 * K1, c)), ((K1, 1.001 * c), (K1, 0.999 * c))), (K1, c), strict=True
+    ):
+        quotient = (scipy(*up) - scipy(*down)) / 2e-3
+        np.testing.assert_allclose(step * slope, quotient, rtol=0, atol=2e-5)
 
 
 #: Forces besides viscous damping and linear spring, all signs and sums.

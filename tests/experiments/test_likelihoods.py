@@ -140,10 +140,12 @@ def test_support_spring() -> None:
 
 
 def basis(time: np.ndarray, k1: float, c: float) -> np.ndarray:
-    """(n, 3) the two viscous solutions and the offset, from the complex exponential."""
+    """(n, 3) release at rest, a blow at rest, both of unit size, and the offset, from the complex exponential."""
     root = -c / (2 * bench.M1) + 1j * np.sqrt(k1 / bench.M1 - (c / (2 * bench.M1)) ** 2)
     z = np.exp(root * time)
-    return np.stack([z.real, z.imag, np.ones(len(time))], axis=1)
+    return np.stack(
+        [z.real - root.real / root.imag * z.imag, abs(root) / root.imag * z.imag, np.ones(len(time))], axis=1
+    )
 
 
 def record(time: np.ndarray, *damping: str, sd: float | None = None, **settings: str) -> FreeVibration:

@@ -131,9 +131,14 @@ def check_drift(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding
     findings = []
     for e in records:
         if e.model.drift == "gp" and (parts := fast_parts(e, e.local(fit.values))) is not None:
-            drift, motion, noise = parts
-            level = "fail" if drift > max(FAST_DRIFT * motion, FAST_NOISE * noise) else "ok"
-            facts = {"label": e.label, "share": drift / max(motion, FAST_NOISE * noise), **later_start(e)}
+            drift, motion, noise, larger = parts
+            level = "fail" if larger or drift > max(FAST_DRIFT * motion, FAST_NOISE * noise) else "ok"
+            facts = {
+                "larger": larger,
+                "label": e.label,
+                "share": drift / max(motion, FAST_NOISE * noise),
+                **later_start(e),
+            }
             findings.append(Finding("decays.drift", level, facts, e.label))
     return findings
 
@@ -197,15 +202,21 @@ def later_start(e: "FreeVibration") -> Facts:
     return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
 
 
-def fast_parts(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float] | None:
-    """Rms of drift and motion at the frequency of the motion, and rms of the residuals left; SI. None for a short record."""
+def fast_parts(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float, bool] | None:
+    """Rms of drift and motion at the frequency of the motion, SI, of the residuals left, and whether the drift is larger.
+
+    None for a short record.
+    """
     half = np.pi * np.sqrt(theta["m1"] / theta["k1"])
     raw, design = e.unwhitened(theta, np)
     residuals = raw - design @ np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
     shape = {symbol: theta[symbol] for symbol in e.model.shapes}
     drift = np.asarray(drift_by_shape(e.times, np.asarray(residuals), e.model.noise, shape))
-    fast, motion = fast_rms(e.time, drift, half), fast_rms(e.time, e.values - residuals, half)
-    return None if fast is None or motion is None else (fast, motion, float(np.std(residuals - drift)))
+    curve = e.values - residuals
+    fast, motion = fast_rms(e.time, drift, half), fast_rms(e.time, curve, half)
+    if fast is None or motion is None:
+        return None
+    return fast, motion, float(np.std(residuals - drift)), bool(np.std(drift) > np.std(curve))
 
 
 def fast_rms(time: np.ndarray, values: np.ndarray, half: float) -> float | None:

@@ -8,11 +8,14 @@ the decrement, and dry friction increases it. A drift of the frequency indicates
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import least_squares, nnls
 
-from capsule_id.records.noise import noise_level
+from capsule_id.experiments.free_vibration.decay_models import viscous_basis
+from capsule_id.records.noise import length_of_motion, noise_level
+from capsule_id.rig.filters import dominant_frequency
 from capsule_id.views import Facts
 
 #: Smallest peak in standard deviations of the noise.
@@ -28,6 +31,16 @@ REPORTED = 5.0
 FEWEST_HALF_CYCLES = 6
 #: Smallest peak in noise standard deviations; noise biases lower peaks upwards.
 TREND_NOISE_RATIO = 20.0
+#: Grid of the search for a viscous decay: frequencies from this many rad over the record on and their number, damping
+#: ratios of all of them and of those near the peak of the spectrum, and number of its best points that are refined.
+SLOWEST, WIDE_POINTS, NEAR_POINTS, REFINED = 0.3, 48, 9, 3
+LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5, 3.0)
+#: Limits of the damping ratio of the search, and largest one whose decrement is quoted as a rough value.
+SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
+#: Smallest distance from rest of a swing, relative to the record's range.
+SMALLEST_SWING = 0.05
+#: Samples that are searched: at least, at most on the grid, and at most in the refinement.
+FEWEST_SEARCHED, MOST_SEARCHED, MOST_REFINED = 16, 1000, 20_000
 
 
 @dataclass(frozen=True)
@@ -129,27 +142,129 @@ def logarithmic_decrement(
     return Decrement(times, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * m1)))
 
 
-def crossing_decrement(time: np.ndarray, values: np.ndarray, m1: float) -> Decrement:
-    """Rough estimate from the first zero crossings, where there are too few peaks; a typical damping stands in.
+class ViscousFit(NamedTuple):
+    """Least-squares fit of one viscous decay of any damping to a record, beside an offset; see ``viscous_fit``.
 
-    Beside a single crossing, half a period lies between the extremes on both sides of it; where the record begins between
-    two turning points, twice the time from the crossing to the next extreme is longer.
+    Attributes
+    ----------
+    gamma, square : c/(2 m1), 1/s, and k1/m1, 1/s^2
+    parts : (3,) coefficients of ``viscous_basis`` and offset, unit of the readings
+    left : (n,) residuals, unit of the readings
     """
-    x = values - equilibrium(values)
-    # The noise of a rod at rest crosses zero too, so only swings beyond it count.
-    swings = np.flatnonzero(np.abs(x) > max(PEAK_NOISE_RATIO * noise_level(values), 0.1 * np.ptp(x)))
-    crossings = swings[1:][np.diff(np.signbit(x[swings]))]
-    if len(crossings) > 1:
-        spacing = float(np.median(np.diff(time[crossings])))
-    elif len(crossings) == 1:
-        crossing = int(crossings[0])
-        before, after = int(np.argmax(np.abs(x[:crossing]))), crossing + int(np.argmax(np.abs(x[crossing:])))
-        spacing = float(max(time[after] - time[before], 2.0 * (time[after] - time[crossing])))
-    else:
-        spacing = 0.5 * float(time[-1])
-    omega = float(np.pi / spacing)
-    k1 = m1 * omega**2
-    return Decrement(np.array([0.0]), x[:1], omega, 0.6, k1, 0.2 * float(np.sqrt(k1 * m1)))
+
+    gamma: float
+    square: float
+    parts: np.ndarray
+    left: np.ndarray
+
+    @property
+    def omega(self) -> float:
+        """omega_0, rad/s."""
+        return float(np.sqrt(self.square))
+
+    @property
+    def ratio(self) -> float:
+        """Damping ratio."""
+        return self.gamma / self.omega
+
+    @property
+    def fastest(self) -> float:
+        """Rate of the fastest change, rad/s or 1/s: beyond critical damping that of the faster exponential."""
+        return self.omega * (1.0 if self.ratio < 1.0 else self.ratio + float(np.sqrt(self.ratio**2 - 1.0)))
+
+    def decrement(self, m1: float) -> Decrement:
+        """Values of the fit in place of the paper's; its peak is the last turning point before the record, or its start."""
+        time, peak = 0.0, float(self.parts[0])
+        if self.ratio < 1.0:
+            omega = self.omega * float(np.sqrt(1.0 - self.ratio**2))
+            # The rate is proportional to exp(-gamma t) (b omega cos(omega t) - (a omega_0 + b gamma) sin(omega t)).
+            at_rest, struck = self.parts[:2]
+            time = float(np.arctan2(struck * omega, at_rest * self.omega + struck * self.gamma)) / omega
+            time -= np.pi / omega if time > 0.0 else 0.0
+            basis = viscous_basis(np.array([-time]), self.square, -2.0 * self.gamma, 1.0, np)
+            peak = float(basis[0] @ (self.parts[:2] * [1.0, -1.0]))
+        ratio = min(self.ratio, LARGEST_RATIO)
+        delta = 2.0 * np.pi * ratio / float(np.sqrt(1.0 - ratio**2))
+        return Decrement(np.array([time]), np.array([peak]), self.omega, delta, m1 * self.square, 2.0 * m1 * self.gamma)
+
+
+def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -> ViscousFit:
+    """Fit a viscous decay of any damping to a record of displacements, velocities or accelerations.
+
+    Its motions and the offset are linear. Frequency and damping ratio are searched on a grid, and about the highest peak
+    of the spectrum where the decay is light, then refined by least squares.
+
+    Parameters
+    ----------
+    time, values : (n,) s, increasing, and readings
+    held : fit a single stroke instead, after which dry friction holds the rod, to this derivative of x_rel; the time of
+        its stop is searched too
+    """
+    time = time - time[0]
+    rest = np.mean(values[-max(len(values) // 5, 4) :])
+    end = max(2 * length_of_motion(values - rest), FEWEST_SEARCHED)
+    length, step = float(time[:end][-1]), float(np.median(np.diff(time)))
+    grid = np.linspace(0.0, length, len(time[:end]))
+    peak = 2.0 * np.pi * dominant_frequency(grid, np.interp(grid, time[:end], values[:end]))
+    near = peak + np.pi / length * np.linspace(-1.0, 1.0, NEAR_POINTS)
+    wide = np.geomspace(SLOWEST / length, np.pi / step, WIDE_POINTS)
+    tried = [*itertools.product(near[near > 0.0], LIGHT_RATIOS), *itertools.product(wide, STRONG_RATIOS)]
+
+    def fitted(z: np.ndarray, part: slice) -> ViscousFit:
+        omega, ratio, *share = np.exp(z)
+        t = time[part]
+        if held is None:
+            basis = viscous_basis(t, omega**2, 2.0 * ratio * omega, 1.0, np)
+        else:  # backwards in time from the stop, at a share of the half period, damping is negative
+            left = share[0] * np.pi / (omega * np.sqrt(1.0 - ratio**2)) - t
+            basis = viscous_basis(np.maximum(left, 0.0), omega**2, -2.0 * ratio * omega, 1.0, np)
+            basis = (basis[:, :1], basis[:, 1:], basis * (left > 0.0)[:, None])[held]
+        design = np.column_stack([basis, np.ones(len(t))])
+        parts = np.linalg.lstsq(design, values[part])[0]
+        return ViscousFit(float(ratio * omega), float(omega**2), parts, values[part] - design @ parts)
+
+    unknowns = 2 if held is None else 3
+    few, fine = (slice(0, end, -(-end // most)) for most in (MOST_SEARCHED, MOST_REFINED))
+    points = [np.log([*pair, 0.9])[:unknowns] for pair in tried if held is None or pair[1] < LARGEST_RATIO]
+    starts = sorted(points, key=lambda z: float(np.sum(fitted(z, few).left ** 2)))[:REFINED]
+    strongest = LARGEST_SEARCHED if held is None else LARGEST_RATIO
+    low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
+    ends = [
+        least_squares(lambda z: fitted(z, fine).left, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)
+        for z in starts
+    ]
+    return fitted(min(ends, key=lambda one: one.cost).x, slice(None))
+
+
+def exponential_fit(time: np.ndarray, values: np.ndarray) -> ViscousFit:
+    """Fit one exponential and an offset: what a far overdamped decay leaves of its motion; parameters as ``viscous_fit``."""
+    time = time - time[0]
+
+    def fitted(logarithm: float) -> ViscousFit:
+        rate = float(np.exp(logarithm))
+        design = np.stack([np.exp(-rate * time), np.ones_like(time)], axis=1)
+        parts = np.linalg.lstsq(design, values)[0]
+        return ViscousFit(np.inf, np.inf, parts, values - design @ parts)
+
+    grid = np.log(np.geomspace(0.1, 10.0 * len(time), WIDE_POINTS) / time[-1])
+    best = min(range(1, WIDE_POINTS - 1), key=lambda i: float(np.sum(fitted(grid[i]).left ** 2)))
+    low, high = grid[best - 1], grid[best + 1]
+    found = least_squares(lambda z: fitted(z[0]).left, grid[best : best + 1], bounds=(low, high))
+    return fitted(found.x[0])
+
+
+def likelihood_gain(one: ViscousFit, other: ViscousFit) -> float:
+    """Twice the log-likelihood of ``other`` less that of ``one``, of the same readings with white noise."""
+    return len(one.left) * float(np.log(np.sum(one.left**2) / np.sum(other.left**2)))
+
+
+def swings_enough(values: np.ndarray) -> bool:
+    """Whether a record passes its rest position twice, or once where it then stays there."""
+    size = (values - equilibrium(values)) / np.ptp(values)
+    swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > SMALLEST_SWING]))))
+    stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SMALLEST_SWING
+    # Where friction stops the rod, its two strokes show their duration and what each of them loses.
+    return swings >= (1 if stuck else 2)
 
 
 def damping_of_peaks(decrement: Decrement, m1: float, deflection: float, symbols: Sequence[str]) -> dict[str, float]:

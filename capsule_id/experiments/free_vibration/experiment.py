@@ -1,6 +1,6 @@
 """Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -24,18 +24,23 @@ from capsule_id.experiments.free_vibration.decay_models import (
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import (
     Decrement,
-    crossing_decrement,
     damping_of_peaks,
     equilibrium,
     logarithmic_decrement,
     trend,
+    viscous_fit,
 )
 from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, default_block_size, is_even
 from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Channel, channel_of
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms, reduced_record
 from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
-from capsule_id.experiments.free_vibration.starts import decay_starts, first_turning_point, further_parameters
+from capsule_id.experiments.free_vibration.starts import (
+    decay_starts,
+    first_turning_point,
+    further_parameters,
+    nested_starts,
+)
 from capsule_id.experiments.free_vibration.tables import damping_table, decay_comparison, decay_table, second_fit_table
 from capsule_id.experiments.linear import NUISANCE_WIDTH
 from capsule_id.experiments.misfit import Misfit, Moments
@@ -52,15 +57,24 @@ if TYPE_CHECKING:
 
 #: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
+#: Twice the damping ratio up to which an even record is summed in closed form.
+UNIFORM = 0.6
 #: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
 SMOOTHING_ORDER = 3
 
 
 @dataclass(frozen=True)
 class DecayAbout(About):
-    """``screened``: a fit of the record by a screening of models; it gives the starting point of a fit."""
+    """Further inputs of a decay.
+
+    Attributes
+    ----------
+    screened : a fit of the record by a screening of models; it gives the starting point of a fit
+    rough : the paper's estimate, or that of a least-squares fit where there are too few peaks
+    """
 
     screened: "Screened | None" = field(default=None, compare=False)
+    rough: Decrement | None = field(default=None, compare=False)
 
 
 def stated_model(table: Table) -> DecayModel:
@@ -124,10 +138,13 @@ class FreeVibration(SurfaceExperiment):
         self.relative_sd = np.squeeze(1.0 / np.sqrt(self.times.count))
         self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
         self.reading_sd = table.columns[channel_of(table)].reading_sd
+        self.about = DecayAbout(table, rig, (), screened)
+        rough = self._rough()
+        self.about = replace(self.about, rough=rough)
         step = uniform_step(self.time)
-        self.uniform = (
-            step is not None and self.model == DecayModel(thin=self.model.thin) and self.relative_sd.ndim == 0
-        )
+        linear = self.model == DecayModel(thin=self.model.thin) and self.relative_sd.ndim == 0
+        # The sums over an even record have no values at critical damping and beyond.
+        self.uniform = step is not None and linear and bool(rough.c < UNIFORM * np.sqrt(rough.k1 * self.mass))
         if self.uniform:
             # Means of equal blocks of a viscous decay are such a decay, sampled at their middles.
             self.nodes, self.weights = self.time[:, None], np.ones((len(self.time), 1))
@@ -135,13 +152,12 @@ class FreeVibration(SurfaceExperiment):
         self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
         self.side, self.half_cycles = 1.0, 0
         self.clock_rate = stated_rate(table)
-        self.about = DecayAbout(table, rig, (), screened)
         rows = [parameter("k1"), parameter("c"), self.channel.noise.named(table.label, self.noise_prior())]
         if self.model.whitened:
-            period = 2.0 * np.pi / self.rough_decrement().Omega_o
+            period = 2.0 * np.pi / rough.Omega_o
             rows += noise_parameters(self.model, self.time, period, table.label)
         if not self.closed:
-            rough, turning = self.rough_decrement(), first_turning_point(self)
+            turning = first_turning_point(self)
             self.side = float(np.sign(turning[1]))
             # The margin allows for a frequency 1.25 times the rough estimate.
             self.half_cycles = int(1.25 * rough.Omega_o * float(self.time[-1]) / np.pi) + 5
@@ -152,7 +168,7 @@ class FreeVibration(SurfaceExperiment):
                 ),
                 TURNING_TIME.named(table.label, Prior("normal", 0.0, float(self.time[-1]))),
             ]
-        self.about = DecayAbout(table, rig, (*rows, *clock_parameters(table, rig)), screened)
+        self.about = replace(self.about, parameters=(*rows, *clock_parameters(table, rig)))
 
     def with_model(self, model: DecayModel, screened: "Screened | None" = None) -> "FreeVibration":
         """Return the same record with another model; its fit ``screened`` gives the starting point."""
@@ -298,11 +314,14 @@ class FreeVibration(SurfaceExperiment):
         return self.rig.mass("m1")
 
     def rough_decrement(self) -> Decrement:
-        """The paper's estimate, or one from the first zero crossings where there are too few peaks."""
+        """The paper's estimate, or that of a least-squares fit where there are too few peaks."""
+        return self.about.rough or self._rough()
+
+    def _rough(self) -> Decrement:
         decrement = self.decrement()
         if decrement is not None and decrement.delta > 0.0:
             return decrement
-        return crossing_decrement(self.time, self.values, self.mass)
+        return viscous_fit(self.time, self.values).decrement(self.mass)
 
     def rough_damping(self, symbols: Sequence[str]) -> dict[str, float]:
         """Rough c, and those of F_dry and c_q in ``symbols``, SI, from the peaks; {} with too few of them."""
@@ -311,6 +330,9 @@ class FreeVibration(SurfaceExperiment):
 
     def starts(self) -> dict[str, Start]:
         return decay_starts(self)
+
+    def nested_starts(self) -> Sequence[Mapping[str, float]]:
+        return nested_starts(self)
 
     # -- interface to the report and the checks ---------------------------------------------------------------------
 

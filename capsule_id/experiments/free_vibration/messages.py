@@ -70,6 +70,9 @@ def _residuals(facts: Facts) -> str:
 
 
 def _drift(facts: Facts) -> str:
+    if facts["larger"]:
+        seen = "{label}: the fitted drift of the zero is larger than the motion, so the motion may be part of it. "
+        return filled_in(seen, facts) + "State the start and stop of the free decay."
     seen = (
         "{label}: a drift of the zero must be slower than the motion, but the fitted one has {share:.1%} of the motion at its "
         "frequency. It hides an error of the model. Where dry friction ends the motion, state an earlier stop; else "

@@ -126,6 +126,21 @@ class DecayModel:
         return tuple(symbol for symbol in FURTHER if symbol not in self.symbols)
 
     @property
+    def _terms(self) -> set[str]:
+        """Everything that the model adds to the simplest one."""
+        noise = {"white": (), "ar1": ("ar1",), "arma": ("ar1", "white")}[self.noise]
+        return {*self.symbols, *noise, *(() if self.drift == "none" else (self.drift,))}
+
+    @property
+    def size(self) -> int:
+        """Number of terms that it adds to the simplest model; a model contains only smaller ones."""
+        return len(self._terms)
+
+    def nested_in(self, other: "DecayModel") -> bool:
+        """Whether ``other`` contains this model."""
+        return self._terms < other._terms
+
+    @property
     def whitened(self) -> bool:
         """Whether noise or drift correlate the readings."""
         return self.noise != "white" or self.drift == "gp"

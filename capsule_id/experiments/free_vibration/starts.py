@@ -14,6 +14,8 @@ from capsule_id.records.noise import noise_level
 LATEST_TURNING_POINT = 0.1
 #: Log-normal priors of dry friction and quadratic damping: median relative to k1 x and m1/x, and factor.
 FURTHER_MEDIAN, FURTHER_FACTOR = 0.05, 100.0
+#: Start of a term that a simpler model lacks, relative to its usual start.
+ABSENT = 1e-4
 
 if TYPE_CHECKING:
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -69,6 +71,21 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
             floor = 1e-3 * near.centre if row.positive else -np.inf
             starts[row.name] = Start(max(value, floor), 0.3 * near.spread)
     return starts
+
+
+def nested_starts(e: "FreeVibration") -> list[dict[str, float]]:
+    """Values by name, SI, of the fits of simpler models of the record ``e``; an absent term is far below its usual start."""
+    if e.about.screened is None:
+        return []
+    usual = {name: start.centre for name, start in decay_starts(e).items()}
+    return [
+        {
+            row.name: max(values[row.symbol], ABSENT * usual[row.name]) if row.positive else values[row.symbol]
+            for row in e.parameters
+            if row.symbol in values and row.name in usual
+        }
+        for values in e.about.screened.nested
+    ]
 
 
 def first_turning_point(e: "FreeVibration") -> tuple[float, float]:

@@ -27,10 +27,8 @@ def decay(
     rate: float = 2000.0,
 ) -> dict[str, np.ndarray]:
     """Simulate a decay from rest at ``release`` m at time 0; the noise sd is ``relative_sd`` of the release."""
-    from capsule_id.experiments.free_vibration.decay_models import rates, viscous_basis
+    from capsule_id.experiments.free_vibration.decay_models import viscous_basis
 
     time = np.arange(round(duration * rate)) / rate
-    gamma, omega = rates(k1, c, m1, np)
-    cosine, sine = viscous_basis(time, k1, c, m1, np).T
-    x = release * (cosine + gamma / omega * sine)
+    x = release * viscous_basis(time, k1, c, m1, np)[:, 0]
     return {"time [s]": time, "x_rel [mm]": 1e3 * (x + relative_sd * release * rng.standard_normal(time.size))}

@@ -59,10 +59,14 @@ def point_fit(
     ----------
     seed : seed of the dispersed starting points
     further : (d,) u of one more starting point
+
+    Starts at fits of simpler models come on top. They are reported only where one of them leads to the highest maximum.
     """
     starts = dispersed_starts(target, seed, number_of_starts)
     if further is not None:
         starts = np.concatenate([starts, further[None]])
+    reported = len(starts)
+    starts = np.concatenate([starts, target.nested_starts()])
     located, density = target.located, density_of(target)
     # Compile the log-posterior at the same time as least squares, to save time.
     with ThreadPoolExecutor(1) as pool:
@@ -71,6 +75,8 @@ def point_fit(
         compiled.result()
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
+    # Least squares knows no scatter: it may end at a lower density than it began with.
+    ends = np.where((in_batches(density, ends) >= in_batches(density, starts))[:, None], ends, starts)
     scale = _information(target, ends[rough.best]) ** -0.5
     whitening = root_of_inverse(-hessian(density, ends[rough.best], scale))
     # Every batch runs in the pool of threads, so the starts need their own.
@@ -80,6 +86,14 @@ def point_fit(
         polished = list(threads.map(lambda end: _polish(density, end, whitening), ends))
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
+    kept = np.union1d(np.arange(reported), best)
+    starts, u, value, converged, best = (
+        starts[kept],
+        u[kept],
+        value[kept],
+        converged[kept],
+        int(np.argmax(kept == best)),
+    )
     scale = _information(target, u[best]) ** -0.5
     root = root_of_inverse(-hessian(density, u[best], scale))
     spread = np.sqrt(np.sum(root**2, axis=1))

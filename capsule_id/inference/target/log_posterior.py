@@ -268,6 +268,16 @@ class LogPosterior(eqx.Module):
                 merged[row.name] = Start(prior.median, float(min(spread, WIDEST_START)))
         return merged
 
+    def nested_starts(self) -> np.ndarray:
+        """(k, d) u of starts at fits of simpler models of the readings; a parameter without one has its usual start."""
+        own = [experiment.nested_starts() for experiment in self.experiments]
+        usual = {name: start.centre for name, start in self.starts().items()}
+        found = []
+        for k in range(max(map(len, own), default=0)):
+            values = {name: value for starts in own for name, value in (starts[k : k + 1] or [{}])[0].items()}
+            found.append(self.unconstrain(np.array([values.get(name, usual[name]) for name in self.names])))
+        return np.reshape(found, (-1, self.dimension))
+
     def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, np.ndarray]:
         """Return ``size`` prior draws of every parameter, SI."""
         return {row.name: prior_of(row).sample(rng, size) for row in self.parameters}

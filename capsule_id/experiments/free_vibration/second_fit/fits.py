@@ -1,6 +1,6 @@
 """Maximum-likelihood fits of single decays, with the noise level in closed form, for the ranking of models."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 #: Largest number of evaluations in a fit, and relative step of its difference quotients.
 EVALUATIONS, STEP = 40, 1e-5
+#: Distance of starts from the bounds, and of the start of a term that a nested model lacks.
+INSIDE, ABSENT = 1e-3, 1e-9
 #: Replaces the effect of an unknown that the record does not depend on.
 UNKNOWN = 1e-12
 #: Replaces residuals, relative to the scatter of the readings, where the model has no motion.
@@ -60,6 +62,7 @@ class Screened:
     values, errors : estimates and standard errors of the free unknowns by symbol, SI; all values, fixed ones included
     noise : innovation sd of the noise, m
     residuals : (n,) whitened
+    nested : values of the fits of models that this one contains
     """
 
     bic: float
@@ -67,6 +70,7 @@ class Screened:
     errors: Mapping[str, float]
     noise: float
     residuals: np.ndarray
+    nested: tuple[Mapping[str, float], ...] = ()
 
 
 def free_symbols(model: DecayModel) -> list[str]:
@@ -170,21 +174,24 @@ class Screening:
                 z[NAMES.index(name)] = np.log(values[name] / unit)
         return z
 
-    def start(self, model: DecayModel, near: np.ndarray | None) -> np.ndarray:
-        """(names,) scaled starting values; absent terms are switched off."""
+    def start(self, model: DecayModel, near: np.ndarray | None, absent: bool = False) -> np.ndarray:
+        """(names,) scaled starting values; terms that the model lacks are switched off, ``absent`` those ``near`` lacks too."""
         z = self.scaled(self.rough_damping(model.symbols)) if near is None else near.copy()
         free = free_symbols(model)
         for name, value in (("F_dry", 0.02), ("c_q", 0.05), ("k_cubic", 0.0), ("drift_time", 1.0)):
             i = NAMES.index(name)
-            z[i] = (z[i] or value) if name in free else 0.0
+            z[i] = (z[i] or value * (not absent)) if name in free else 0.0
         off = -1e3
-        for name, value, absent in (
+        white = near is None or near[NAMES.index("white_ratio")] > BOUNDS["white_ratio"][1]
+        if absent and white:
+            z[NAMES.index("noise_time")] = BOUNDS["noise_time"][0]
+        for name, value, unused in (
             ("white_ratio", 0.0, off if model.noise == "ar1" else np.log(WHITE)),
             ("drift_ratio", np.log(3.0), off),
         ):
             i = NAMES.index(name)
-            inside = BOUNDS[name][0] < z[i] < BOUNDS[name][1]
-            z[i] = (z[i] if inside and near is not None else value) if name in free else absent
+            known = near is not None and BOUNDS[name][0] < z[i] < BOUNDS[name][1]
+            z[i] = (z[i] if known else BOUNDS[name][0] if absent else value) if name in free else unused
         return z
 
     def dry_starts(self, start: np.ndarray) -> np.ndarray:
@@ -212,10 +219,16 @@ class Screening:
             )
         return moved.reshape(-1, len(NAMES))
 
-    def fit(self, model: DecayModel, near: np.ndarray | None = None) -> tuple[Screened, np.ndarray]:
-        """Fit ``model`` from the scaled values ``near``; return also the scaled values found.
+    def fit(
+        self,
+        model: DecayModel,
+        near: np.ndarray | None = None,
+        nested: Sequence[tuple[Screened, np.ndarray]] = (),
+    ) -> tuple[Screened, np.ndarray]:
+        """Fit ``model`` from the scaled values ``near`` and from the best of ``nested``, fits of models that it contains.
 
-        Where the model has no motion at ``near``, as beyond critical damping, the fit starts from rough estimates.
+        Return also the scaled values found. Where the model has no motion at ``near``, as beyond critical damping, the fit
+        starts from rough estimates.
         """
         start, free = self.start(model, near), [NAMES.index(name) for name in free_symbols(model)]
         sloped = float(model.drift == "linear")
@@ -242,34 +255,49 @@ class Screening:
             return points[0]
 
         low, high = np.array([BOUNDS[NAMES[i]] for i in free]).T
-        if near is not None and (residuals(np.clip(start[free], low + 1e-3, high - 1e-3)) == UNFIT).any():
-            return self.fit(model)
+        inside = low + INSIDE, high - INSIDE
+        if near is not None and (residuals(np.clip(start[free], *inside)) == UNFIT).any():
+            return self.fit(model, None, nested)
         starts = [start]
         if near is None and "dry" in model.damping:
             offered = self.dry_starts(start)
             parts = offered.reshape(-1, len(NAMES) + 1, len(NAMES))
             costs = np.concatenate([np.sum(whitened(part) ** 2, axis=1) for part in parts])
             starts = list(offered[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:DRY_FITS]])
+        first = [np.clip(one[free], *inside) for one in starts]
+        if nested:
+            best = min(nested, key=lambda one: one[0].noise)[1]
+            first.append(np.clip(self.start(model, best, absent=True)[free], low + ABSENT, high - ABSENT))
         ends = [
             least_squares(
                 residuals,
-                np.clip(one[free], low + 1e-3, high - 1e-3),
+                one,
                 jac=lambda z: jacobians[z.tobytes()],  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
                 bounds=(low, high),
                 x_scale="jac",
                 max_nfev=EVALUATIONS,
             )
-            for one in starts
+            for one in first
         ]
         found = min(ends, key=lambda end: end.cost)
         start[free] = found.x
-        return self._summary(model, start, found, unit), start
+        return self._summary(model, start, found, unit, tuple(one.values for one, _ in nested)), start
+
+    def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predicted motion and measured minus predicted readings, (n,) each, SI, at scaled unknowns (names,)."""
+        thetas = {name: jnp.asarray(value) for name, value in self.theta(np.tile(z, (len(NAMES) + 1, 1))).items()}
+        paths = _paths(thetas, self.number)
+        motion = self.side * np.asarray(_readings(paths, self.nodes, self.weights, self.order))[0]
+        return motion, self.values - motion
+
+    def drowned(self, z: np.ndarray) -> bool:
+        """Whether drift and noise are larger than the motion."""
+        motion, rest = self.parts(z)
+        return not np.std(rest) <= np.std(motion)
 
     def drift(self, z: np.ndarray) -> float:
         """Range of the mean over one period of measured minus predicted readings, SI, at scaled unknowns (names,)."""
-        thetas = {name: jnp.asarray(value) for name, value in self.theta(np.tile(z, (len(NAMES) + 1, 1))).items()}
-        paths = _paths(thetas, self.number)
-        raw = self.values - self.side * np.asarray(_readings(paths, self.nodes, self.weights, self.order))[0]
+        raw = self.parts(z)[1]
         time = self.times.time
         window = 2.0 * np.pi / self.omega
         first, last = np.searchsorted(time, time - 0.5 * window), np.searchsorted(time, time + 0.5 * window)
@@ -278,7 +306,14 @@ class Screening:
         whole = means[(time > 0.5 * window) & (time < time[-1] - 0.5 * window)]
         return float(np.ptp(whole)) if len(whole) else 0.0
 
-    def _summary(self, model: DecayModel, z: np.ndarray, found: OptimizeResult, unit: float) -> Screened:
+    def _summary(
+        self,
+        model: DecayModel,
+        z: np.ndarray,
+        found: OptimizeResult,
+        unit: float,
+        nested: tuple[Mapping[str, float], ...],
+    ) -> Screened:
         """Estimates at the end ``found`` of a fit, at the scaled unknowns ``z`` (names,); ``unit`` of its residuals."""
         free = free_symbols(model)
         n, unknowns = len(self.values), len(free) + 2 + int(model.drift == "linear")
@@ -298,4 +333,4 @@ class Screening:
                 if "drift_ratio" in each:
                     each["drift_ratio"] /= WHITE
         noise = float(np.sqrt(2.0 * found.cost / n)) * unit
-        return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun)
+        return Screened(float(deviance + unknowns * np.log(n)), values, errors, noise, found.fun, nested)

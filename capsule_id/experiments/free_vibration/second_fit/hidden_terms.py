@@ -31,6 +31,8 @@ LIMIT = 0.975
 #: Changes of c and of k1 by a force at its limit that matter: relative to the value, and in standard errors.
 CHANGES: Mapping[str, float] = {"c": 0.2, "k1": 0.05}
 CHANGE_IN_ERRORS = 3.0
+#: Responses to a force that are shorter than this beside the nuisances, relative to their length, are rounding.
+UNSEEN = 1e-6
 #: Estimates further below zero, in standard errors, count as this one.
 LOWEST = -30.0
 
@@ -95,6 +97,7 @@ def check_hidden_terms(records: Sequence[Decay], fit: Fitted) -> list[Finding]:
     findings, compared = [], []
     for (offered, _, offers_cubic), members in groups.items():
         terms = hidden_terms(members, fit.values)
+        offered = tuple(symbol for symbol in offered if symbol in terms)
         facts = {"labels": [e.label for e in members], "offers_cubic": offers_cubic}
         compared += facts["labels"]
         findings += [
@@ -138,13 +141,16 @@ def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[
     model = records[0].model
     names = ("k1", "c", *model.symbols)
     size = np.linalg.norm(known, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
     inverse = np.linalg.pinv(known / size) / size[:, None]
     errors = dict(zip(names, np.linalg.norm(inverse, axis=1), strict=True))
     found = {}
     for symbol, column in zip(model.absent, further.T, strict=True):
         change = inverse @ column
         own = column - known @ change
-        power = float(own @ own)
+        if not column.any():
+            continue
+        power = max(float(own @ own), np.finfo(float).tiny)
         slopes = dict(zip(names, -change, strict=True))
         found[symbol] = Hidden(-float(own @ left) / power, power**-0.5, slopes, errors)
     return found
@@ -162,6 +168,8 @@ def reduced_record(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[np.n
         for part in (shared, np.column_stack([further[s] for s in e.model.absent]), left[:, None])
     ]
     known, others, residuals = (part - own @ (own.T @ part) for part in parts)
+    # The offset takes up dry friction in a decay that does not swing: only rounding is left of it.
+    others[:, np.linalg.norm(others, axis=0) <= UNSEEN * np.linalg.norm(parts[1], axis=0)] = 0.0
     misfit = residuals - known @ np.linalg.lstsq(known, residuals, rcond=None)[0]
     noise = np.sqrt(np.sum(misfit**2) / max(e.n - own.shape[1] - known.shape[1], 1))
     return known / noise, others / noise, residuals[:, 0] / noise

@@ -15,6 +15,8 @@ from scipy import stats
 
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.checks.series import LEVEL, ljung_box
+from capsule_id.experiments.free_vibration.decay_models import STRONGEST
+from capsule_id.experiments.free_vibration.decrement import viscous_fit
 from capsule_id.experiments.free_vibration.readings.blocks import block_size
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import force_responses
@@ -61,14 +63,18 @@ def open_models(record: "FreeVibration") -> tuple[list[DecayModel], list[DecayMo
 
 
 def demands_another(record: "FreeVibration", level: float) -> bool:
-    """Whether ``record`` contradicts its model at this false-alarm rate: residuals, or responses to further forces."""
+    """Whether ``record`` contradicts its model at this false-alarm rate: residuals, or responses to further forces.
+
+    A decay beyond ``STRONGEST`` damping keeps its model, because no other one is offered.
+    """
+    rough = record.rough_decrement()
+    if rough.c > 2.0 * STRONGEST * np.sqrt(rough.k1 * record.mass):
+        return False
     if not record.closed or record.model.whitened:
         return ljung_box(Screening(record).fit(record.model)[0].residuals)[1] < level
-    rough = record.rough_decrement()
+    rough = viscous_fit(record.time, record.values).decrement(record.mass)
     noise = max(noise_level(record.values), 1e-6 * float(np.ptp(record.values)))
-    # Steps of the fit must not start from an overdamped decay.
-    c = min(rough.c, float(np.sqrt(rough.k1 * record.mass)))
-    theta = {"m1": record.mass, "k1": rough.k1, "c": c, record.scatters[0]: noise}
+    theta = {"m1": record.mass, "k1": rough.k1, "c": rough.c, record.scatters[0]: noise}
     theta |= {symbol: value for symbol, (value, _) in refit(record, theta, []).items()}
     residuals = np.asarray(record.residuals(theta, np))[: record.n]
     return ljung_box(residuals)[1] < level or response_p(record, theta) < level
@@ -114,16 +120,30 @@ class Ranking:
 
 
 def rank(screenings: Sequence[Screening], models: Iterable[DecayModel], near: Ranking | None = None) -> list[Ranking]:
-    """Fit every model to all records, from the values of ``near``; lowest BIC first."""
+    """Fit every model to all records, from the values of ``near`` and from the best nested model; lowest BIC first.
+
+    So no model has a lower likelihood than one that it contains.
+    """
     starts = [None] * len(screenings) if near is None else [z for _, z in near.fits]
+    done: list[Ranking] = []
 
     def fitted(model: DecayModel) -> Ranking:
-        fits = tuple(one.fit(model, start) for one, start in zip(screenings, starts, strict=True))
-        return Ranking(model, sum(screened.bic for screened, _ in fits), fits)
+        nested = [one for one in done if one.model.nested_in(model)]
+        fits = tuple(
+            screening.fit(model, start, [one.fits[i] for one in nested])
+            for i, (screening, start) in enumerate(zip(screenings, starts, strict=True))
+        )
+        # A drift larger than the motion would take the motion itself for a drift, and an alias for the motion.
+        drowned = model.drift != "none" and any(
+            screening.drowned(z) for screening, (_, z) in zip(screenings, fits, strict=True)
+        )
+        return Ranking(model, np.inf if drowned else sum(screened.bic for screened, _ in fits), fits)
 
-    first, *others = models
     # The first model compiles the programs that all threads then call.
-    return sorted([fitted(first), *pool().map(fitted, others)], key=lambda one: one.bic)
+    for _, same_size in itertools.groupby(sorted(models, key=lambda one: one.size), lambda one: one.size):
+        first, *level = same_size
+        done += [*([] if done else [fitted(first)]), *pool().map(fitted, [first, *level] if done else level)]
+    return sorted(done, key=lambda one: one.bic)
 
 
 def simplest(ranked: Sequence[Ranking]) -> Ranking:
@@ -136,15 +156,30 @@ def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
     """Return the model with the lowest BIC of all ``records`` together, thinned until its residuals are white.
 
     The forces are chosen first on thinned records, with the richest noise that the settings leave open, then drift and
-    noise. At high sampling rates no offered noise may be white. Fewer samples then lose little, because they are
-    correlated.
+    noise. The fits of fewer forces become starts of the quoted fit.
     """
     forces, others = open_models(records[0])
     coarse = thinning(records[0], READINGS_PER_PERIOD)
     thinned = [Screening(record, coarse) for record in records]
-    best = simplest(rank(thinned, [replace(model, noise=others[-1].noise) for model in forces]))
+    by_forces = rank(thinned, [replace(model, noise=others[-1].noise) for model in forces])
+    best = simplest(by_forces)
     others = [replace(model, damping=best.model.damping, cubic=best.model.cubic) for model in others]
-    ranked = rank(thinned, others, best)
+    chosen = _with_noise(records, rank(thinned, others, best), others, coarse)
+    simpler = [one.fits for one in by_forces if set(one.model.symbols) < set(chosen.model.symbols)]
+    fits = [
+        (replace(screened, nested=(*screened.nested, *(each[i][0].values for each in simpler))), z)
+        for i, (screened, z) in enumerate(chosen.fits)
+    ]
+    return replace(chosen, fits=tuple(fits))
+
+
+def _with_noise(
+    records: Sequence["FreeVibration"], ranked: list[Ranking], others: Sequence[DecayModel], coarse: int
+) -> Ranking:
+    """Choose drift and noise, from the ranking of all of them on records thinned by ``coarse``.
+
+    At high sampling rates no offered noise may be white. Fewer samples then lose little, because they are correlated.
+    """
     best = ranked[0]
     if records[0].table.settings.thin is not None:
         return best

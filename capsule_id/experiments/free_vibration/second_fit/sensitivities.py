@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lsim
 
 from capsule_id.experiments.clock import stretch
-from capsule_id.experiments.free_vibration.decay_models import rates
+from capsule_id.experiments.free_vibration.decay_models import viscous_state
 from capsule_id.experiments.free_vibration.readings.noise import whiten
 from capsule_id.experiments.free_vibration.settings import DAMPING, FURTHER
 
@@ -70,11 +70,7 @@ def force_responses(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str,
     length = float(time[-1])
     points = max(FEWEST_POINTS, int(RESPONSE_POINTS * length * np.sqrt(k1 / m1) / (2.0 * np.pi)))
     grid = np.linspace(0.0, length, points)
-    gamma, omega = rates(k1, c, m1, np)
-    rate_of = complex(-gamma, omega)
-    # The readings are the real part of A exp(rate t); x_rel is that of A exp(rate t) / rate^order.
-    curve = complex(parts[0], -parts[1]) / rate_of**e.order * np.exp(rate_of * grid)
-    x, rate = curve.real, (rate_of * curve).real
+    x, rate = viscous_state(grid, theta, parts, e.order)
     system = ([1.0 / m1], [1.0, c / m1, k1 / m1])
     found = {}
     for name, force in zip(FURTHER, (np.sign(rate), rate * np.abs(rate), x**3), strict=True):
