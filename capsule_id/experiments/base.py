@@ -220,8 +220,7 @@ class Experiment(eqx.Module):
         """Start of every parameter of this experiment, by name, estimated roughly from its own readings."""
 
     def nested_starts(self) -> Sequence[Mapping[str, float]]:
-        """Values, SI, by name, of fits of simpler models of the readings, from which a fit starts too."""
-        return ()
+        return ()  # values, SI, by name, of fits of simpler models, from which a fit starts too
 
     @abstractmethod
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

@@ -142,10 +142,13 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
     checked = replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
     widened = beside_stated(checked, {**widenings(checked), **record_widenings(checked)})
-    if not widened:
-        return checked
-    facts = {"factors": [(name, one.factor, one.parts) for name, one in widened.items()]}
-    return replace(checked, widened=widened, findings=(*checked.findings, Finding("model.error", "warn", facts)))
+    findings = list(checked.findings)
+    for lost in (False, True):
+        factors = [(name, one.factor, one.parts) for name, one in widened.items() if one.no_number == lost]
+        if factors:
+            names = tuple(name for name, *_ in factors) if lost else ()
+            findings.append(Finding("model.error", "fail" if lost else "warn", {"factors": factors}, parameters=names))
+    return replace(checked, widened=widened, findings=tuple(findings))
 
 
 def unfinished(point: PointStage, before: Sequence[Finding] = ()) -> SampledFit:

@@ -16,7 +16,7 @@ from capsule_id.experiments.free_vibration.readings.noise import drift_by_shape
 from capsule_id.experiments.free_vibration.readings.zero import zero_jumps
 from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import sensitivities, whitened
-from capsule_id.experiments.free_vibration.settings import decay_window
+from capsule_id.experiments.free_vibration.settings import EFFECTS, decay_window
 from capsule_id.parameters import parameter
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.noise import length_of_motion
@@ -33,6 +33,8 @@ INTERVALS, READINGS_PER_INTERVAL = 12, 5
 FAST_DRIFT = 0.01
 #: Largest part of a drift that is as fast as the motion, relative to the residuals left: about half of what white noise gives.
 FAST_NOISE = 0.25
+#: Distance from 0, in sds, of a force that a second fit has found and that counts as seen.
+FARTHER = 3.0
 #: Smallest ratio of the residuals of the larger half of the amplitudes to those of the smaller half that counts.
 LARGER = 1.3
 #: Steps of the readings in which a motion is lost, and fewest readings before that.
@@ -123,6 +125,19 @@ def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
     if compared and not findings:
         facts = {"labels": ", ".join(e.label for *_, e in compared), "p": min(p for p, *_ in compared)}
         findings.append(Finding("decays.position", "ok", facts))
+    return findings
+
+
+def check_found_forces(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """Check that the forces that a second fit has chosen, and no setting states, are far from 0 in the sample."""
+    findings = []
+    found = {symbol: e for e in records if e.replaced for symbol in e.model.symbols}
+    for symbol, e in found.items() if fit.draws else ():
+        values = np.array([draw[symbol] for draw in fit.draws])
+        z = float(abs(np.mean(values)) / np.std(values))
+        if z < FARTHER:
+            facts = {"label": e.label, "name": symbol, "z": z, "effect": EFFECTS[symbol]}
+            findings.append(Finding("decays.found", "warn", facts, e.label, (symbol,)))
     return findings
 
 
@@ -308,6 +323,7 @@ CHECKS = (
     check_halves,
     check_positions,
     check_size_of_residuals,
+    check_found_forces,
     check_drift,
     check_zero,
 )

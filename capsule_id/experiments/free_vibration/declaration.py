@@ -145,7 +145,7 @@ def _check_swings(tables: Sequence[Table[DecaySettings]]) -> None:
         if likelihood_gain(fit, viscous_fit(time, values, held=CHANNELS[channel].order)) > BETTER:
             value = f"one stroke of {len(values)} samples, after which dry friction holds the rod"
             raise InputError(rule, value, "release it from a larger deflection, or reduce the friction", *place)
-        if likelihood_gain(exponential_fit(time, values), fit) < BETTER:
+        if likelihood_gain(exponential_fit(time, values), fit) < 2.0 * BETTER:
             remedy = (
                 'where each row is a turning point, state samples = "turning_points"; else record from the release on, with '
                 "at least 10 samples before the rod is at half its deflection"

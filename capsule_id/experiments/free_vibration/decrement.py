@@ -37,6 +37,8 @@ SLOWEST, WIDE_POINTS, NEAR_POINTS, REFINED = 0.3, 48, 9, 3
 LIGHT_RATIOS, STRONG_RATIOS = (0.001, 0.01, 0.03, 0.1), (0.2, 0.4, 0.7, 1.0, 1.5, 3.0)
 #: Limits of the damping ratio of the search, and largest one whose decrement is quoted as a rough value.
 SMALLEST_RATIO, LARGEST_SEARCHED, LARGEST_RATIO = 1e-6, 30.0, 0.9
+#: Unknowns of a viscous decay: k1, c, two initial conditions, offset.
+UNKNOWNS = 5
 #: Smallest distance from rest of a swing, relative to the record's range.
 SMALLEST_SWING = 0.05
 #: Samples that are searched: at least, at most on the grid, and at most in the refinement.
@@ -96,7 +98,7 @@ def half_cycle_extremes(
 
     ``guide`` (smoothed, about its equilibrium) only locates the half cycles. They count from the start of the record
     until the first peak below ``lowest``. The first and the last may be incomplete, so an extremum at an end of the
-    record does not count.
+    record does not count, nor does one of readings that are all 0.
     """
     edges = np.concatenate([[0], np.flatnonzero(np.diff(np.signbit(guide))) + 1, [len(guide)]])
     times, peaks = [], []
@@ -106,7 +108,7 @@ def half_cycle_extremes(
                 break
             continue
         index = left + int(np.argmax(np.abs(values[left:right])))
-        if 0 < index < len(values) - 1:
+        if 0 < index < len(values) - 1 and values[index] != 0.0:
             times.append(time[index])
             peaks.append(values[index])
     return np.array(times), np.array(peaks)
@@ -200,7 +202,7 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -
     held : fit a single stroke instead, after which dry friction holds the rod, to this derivative of x_rel; the time of
         its stop is searched too
     """
-    time = time - time[0]
+    time, size = time - time[0], float(np.std(values))
     rest = np.mean(values[-max(len(values) // 5, 4) :])
     end = max(2 * length_of_motion(values - rest), FEWEST_SEARCHED)
     length, step = float(time[:end][-1]), float(np.median(np.diff(time)))
@@ -230,7 +232,7 @@ def viscous_fit(time: np.ndarray, values: np.ndarray, held: int | None = None) -
     strongest = LARGEST_SEARCHED if held is None else LARGEST_RATIO
     low, high = np.log([[0.1 * SLOWEST / length, SMALLEST_RATIO, 0.01], [np.pi / step, strongest, 1.0]])[:, :unknowns]
     ends = [
-        least_squares(lambda z: fitted(z, fine).left, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)
+        least_squares(lambda z: fitted(z, fine).left / size, np.clip(z, low, high), bounds=(low, high), x_scale=0.1)
         for z in starts
     ]
     return fitted(min(ends, key=lambda one: one.cost).x, slice(None))
@@ -249,19 +251,23 @@ def exponential_fit(time: np.ndarray, values: np.ndarray) -> ViscousFit:
     grid = np.log(np.geomspace(0.1, 10.0 * len(time), WIDE_POINTS) / time[-1])
     best = min(range(1, WIDE_POINTS - 1), key=lambda i: float(np.sum(fitted(grid[i]).left ** 2)))
     low, high = grid[best - 1], grid[best + 1]
-    found = least_squares(lambda z: fitted(z[0]).left, grid[best : best + 1], bounds=(low, high))
+    found = least_squares(lambda z: fitted(z[0]).left / np.std(values), grid[best : best + 1], bounds=(low, high))
     return fitted(found.x[0])
 
 
 def likelihood_gain(one: ViscousFit, other: ViscousFit) -> float:
-    """Twice the log-likelihood of ``other`` less that of ``one``, of the same readings with white noise."""
-    return len(one.left) * float(np.log(np.sum(one.left**2) / np.sum(other.left**2)))
+    """Twice the log-likelihood of ``other`` less that of ``one``, of the same readings with white noise.
+
+    The readings count as so many fewer as there are unknowns: both fits take up noise.
+    """
+    return max(len(one.left) - UNKNOWNS, 1) * float(np.log(np.sum(one.left**2) / np.sum(other.left**2)))
 
 
 def swings_enough(values: np.ndarray) -> bool:
     """Whether a record passes its rest position twice, or once where it then stays there."""
     size = (values - equilibrium(values)) / np.ptp(values)
-    swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > SMALLEST_SWING]))))
+    smallest = max(SMALLEST_SWING, PEAK_NOISE_RATIO * noise_level(values) / float(np.ptp(values)))
+    swings = int(np.count_nonzero(np.diff(np.sign(size[np.abs(size) > smallest]))))
     stuck = np.ptp(size[-max(len(size) // 5, 4) :]) < SMALLEST_SWING
     # Where friction stops the rod, its two strokes show their duration and what each of them loses.
     return swings >= (1 if stuck else 2)

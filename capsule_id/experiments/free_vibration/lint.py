@@ -239,7 +239,7 @@ def _hidden(facts: Facts) -> str:
     lines = [(f"damping = [{all_words}]", 'damping = ["viscous"]')] if words else []
     lines += [('stiffness = "cubic"', 'stiffness = "linear"')] if "k_cubic" in facts["symbols"] else []
     free, known = ([line[i] for line in lines] for i in (0, 1))
-    remedies = ["Record more periods with less noise"]
+    remedies = ["Record more periods with less noise"] if facts["swings"] else ["Release from smaller deflections"]
     if "k_cubic" in facts["symbols"] and not facts["offers_cubic"]:
         free.remove('stiffness = "cubic"')
         remedies.append("release from smaller deflections")
@@ -267,6 +267,7 @@ MESSAGES = {
     "decays.hidden": Message(
         "further forces of a decay",
         ok="{labels}: no further force that the records allow changes c or k1 by much",
+        warn=_hidden,
         fail=_hidden,
     ),
     "decays.thinned": Message(

@@ -142,6 +142,13 @@ MESSAGES = {
         ok="{label}: the fitted drift of the zero is slower than the motion ({share:.1%} of it at its frequency)",
         fail=_drift,
     ),
+    "decays.found": Message(
+        "further forces of a decay",
+        warn=(
+            "{label}: the second fit contains {effect}, but {name} is only {z:.1f} sd from 0, so this number is not judged. "
+            "Record more periods with less noise, or state the damping and the stiffness in its entry."
+        ),
+    ),
     "decays.zero": Message(
         "zero of a decay",
         ok="{labels}: no jump of the sensor's zero stands out where the rod turns",

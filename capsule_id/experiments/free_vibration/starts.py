@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.experiments.base import Start
-from capsule_id.experiments.free_vibration.decrement import Decrement, equilibrium
+from capsule_id.experiments.free_vibration.decrement import UNKNOWNS, Decrement, equilibrium, viscous_fit
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.noise import noise_level
 
@@ -35,12 +35,18 @@ def further_parameters(symbols: Sequence[str], k1: float, m1: float, size: float
 
 
 def decay_starts(e: "FreeVibration") -> dict[str, Start]:
-    """Start of every parameter of the record ``e``, from its paper's estimate or the values of a screening."""
-    rough = e.rough_decrement()
+    """Start of every parameter of the record ``e``, from its paper's estimate or the values of a screening.
+
+    A viscous decay without drift starts at its least-squares fit, whose residuals show the noise at any sampling rate.
+    """
+    rough, noise = e.rough_decrement(), noise_level(e.values)
+    if e.closed and e.model.drift == "none":
+        fit = viscous_fit(e.time, e.values)
+        rough, noise = fit.decrement(e.mass), min(noise, float(np.sqrt(np.sum(fit.left**2) / max(e.n - UNKNOWNS, 1))))
     # A phase error of the start over the decay leads the fit to a side lobe, a local maximum.
     ringing = min(e.time[-1], 4.0 * e.mass / rough.c)
     spread = min(0.3, 1.0 / (rough.Omega_o * ringing))
-    noise = max(noise_level(e.values), 1e-4 * float(np.ptp(e.values)))
+    noise = max(noise, 1e-4 * float(np.ptp(e.values)))
     starts = {
         "k1": Start(rough.k1, spread),
         "c": Start(rough.c, 0.3),

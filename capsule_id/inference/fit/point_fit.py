@@ -68,32 +68,11 @@ def point_fit(
     reported = len(starts)
     starts = np.concatenate([starts, target.nested_starts()])
     located, density = target.located, density_of(target)
-    # Compile the log-posterior at the same time as least squares, to save time.
-    with ThreadPoolExecutor(1) as pool:
-        compiled = pool.submit(density, np.repeat(starts[:1], BATCH, axis=0))
-        rough = least_squares(HeldResiduals(target, jnp.asarray(starts[0])), starts[:, located], BASIN_SOLVER)
-        compiled.result()
-    ends = starts.copy()
-    ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
-    # Least squares knows no scatter: it may end at a lower density than it began with.
-    ends = np.where((in_batches(density, ends) >= in_batches(density, starts))[:, None], ends, starts)
-    scale = _information(target, ends[rough.best]) ** -0.5
-    whitening = root_of_inverse(-hessian(density, ends[rough.best], scale))
-    # Every batch runs in the pool of threads, so the starts need their own.
-    with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
-        # SciPy hides this warning itself, but its way is not safe in threads.
-        warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
-        polished = list(threads.map(lambda end: _polish(density, end, whitening), ends))
-    u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
+    u, value, converged = _maxima(target, starts)
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     kept = np.union1d(np.arange(reported), best)
-    starts, u, value, converged, best = (
-        starts[kept],
-        u[kept],
-        value[kept],
-        converged[kept],
-        int(np.argmax(kept == best)),
-    )
+    starts, u, value, converged = (each[kept] for each in (starts, u, value, converged))
+    best = int(np.searchsorted(kept, best))
     scale = _information(target, u[best]) ** -0.5
     root = root_of_inverse(-hessian(density, u[best], scale))
     spread = np.sqrt(np.sum(root**2, axis=1))
@@ -112,6 +91,29 @@ def point_fit(
         stalled=~converged | ~np.isfinite(value),
         shares=variance_shares(target, at_fit, _owners(target, theta)),
     )
+
+
+def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Maxima (s, d) from ``starts`` (s, d), log-posteriors there, and whether each has converged, (s,) each."""
+    located, density = target.located, density_of(target)
+    # Compile the log-posterior at the same time as least squares, to save time.
+    with ThreadPoolExecutor(1) as pool:
+        compiled = pool.submit(density, np.repeat(starts[:1], BATCH, axis=0))
+        rough = least_squares(HeldResiduals(target, jnp.asarray(starts[0])), starts[:, located], BASIN_SOLVER)
+        compiled.result()
+    ends = starts.copy()
+    ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
+    # Least squares knows no scatter: it may end at a lower density than it began with.
+    ends = np.where((in_batches(density, ends) >= in_batches(density, starts))[:, None], ends, starts)
+    scale = _information(target, ends[rough.best]) ** -0.5
+    whitening = root_of_inverse(-hessian(density, ends[rough.best], scale))
+    # Every batch runs in the pool of threads, so the starts need their own.
+    with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
+        # SciPy hides this warning itself, but its way is not safe in threads.
+        warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
+        polished = list(threads.map(lambda end: _polish(density, end, whitening), ends))
+    u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
+    return u, value, converged
 
 
 def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray:

@@ -74,6 +74,8 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
     """Columns with the error of the model; the ends of an interval move in u, so that they keep their sign."""
     if widening is None:
         return {}
+    if widening.no_number:
+        return {"widening": widening.factor, **dict.fromkeys(("value", "sd", "lower", "upper"), np.nan)}
     found: dict[str, object] = {
         "widening": widening.factor,
         "sd": widening.factor * entry["sd"],
@@ -93,7 +95,7 @@ def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]
     ± describes no posterior where 2 sd below a positive value are not positive, or where one arm of the interval is
     more than ``LARGEST_SKEW`` times as long as the other. Without a sample there is no interval to quote.
     """
-    if "lower" not in entry:
+    if "lower" not in entry or not np.isfinite(entry["value"]):
         return "sd"
     short, long = sorted((entry["value"] - entry["lower"], entry["upper"] - entry["value"]))
     outside = positive and entry["value"] <= 2.0 * entry["sd"]

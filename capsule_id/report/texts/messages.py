@@ -246,6 +246,11 @@ FIT_MESSAGES: Mapping[str, Message] = {
             + ", ".join(f"{factor:.3g} for {name} ({parts} parts)" for name, factor, parts in facts["factors"])
             + ". It is an estimate of the model's error; find its cause before you use the number."
         ),
+        fail=lambda facts: (
+            "parts of the data contradict each other, so there is no number for "
+            + ", ".join(f"{name} (its sd would be multiplied by {factor:.3g})" for name, factor, _ in facts["factors"])
+            + ". The model does not describe these readings: find the cause that the other failed checks name."
+        ),
     ),
     "outliers": Message("outliers", ok="no reading stands apart from the others of its table", fail=_outliers),
     "errors.stated": Message(

@@ -26,8 +26,8 @@ FEWEST_PARTS, MOST_PARTS = 4, 8
 ROWS_PER_UNKNOWN = 2
 #: Largest sd of a part that determines a parameter, relative to its value.
 LARGEST_RELATIVE_SD = 0.5
-#: Smallest factor of an sd that counts.
-SMALLEST_FACTOR = 1.01
+#: Smallest factor of an sd that counts, and largest one beside which the fit still gives a number.
+SMALLEST_FACTOR, LARGEST_FACTOR = 1.01, 30.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,11 @@ class Widening:
     def stretch(self) -> float:
         """Factor of the half-length of the 95 % interval."""
         return self.factor * self.quantile
+
+    @property
+    def no_number(self) -> bool:
+        """Whether the parts contradict each other so far that the fit gives no number."""
+        return not self.factor <= LARGEST_FACTOR
 
 
 def widenings(s: SampledFit) -> dict[str, Widening]:
