@@ -137,7 +137,7 @@ class Experiment(eqx.Module):
     @property
     def n(self) -> int:
         """Number of readings that enter the likelihood."""
-        return self.observed.shape[0]
+        return len(self.observed)
 
     @property
     def scale_known(self) -> bool:
@@ -220,7 +220,7 @@ class Experiment(eqx.Module):
         """Start of every parameter of this experiment, by name, estimated roughly from its own readings."""
 
     def nested_starts(self) -> Sequence[Mapping[str, float]]:
-        return ()  # values, SI, by name, of fits of simpler models, from which a fit starts too
+        return ()  # values, SI, by name, of fits of simpler models: further starts
 
     @abstractmethod
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

@@ -99,7 +99,7 @@ def test_a_record_of_amplitudes_alone_is_refused_with_its_place(
 ) -> None:
     x = scipy_decay(time, FORCES, 2.5, 0.0)[0] + 2e-3 * np.random.default_rng(1).standard_normal(len(time))
     rig = cid.read_rig(folder(tmp_path, time, x))
-    with pytest.raises(InputError, match="one exponential in 1[24] samples, which gives c/k1 alone") as refused:
+    with pytest.raises(InputError, match=r"one exponential in 1[24] samples, which gives c/k1 alone") as refused:
         cid.fit(rig, budget=None)
     assert (refused.value.file, refused.value.line) == ("decay.csv", 2)
     if turning:

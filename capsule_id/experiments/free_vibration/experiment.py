@@ -30,11 +30,11 @@ from capsule_id.experiments.free_vibration.decrement import (
     trend,
     viscous_fit,
 )
-from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, default_block_size, is_even
+from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, is_even
 from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Channel, channel_of
 from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms, reduced_record
-from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window
+from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window, stated_model
 from capsule_id.experiments.free_vibration.starts import (
     decay_starts,
     first_turning_point,
@@ -75,14 +75,6 @@ class DecayAbout(About):
 
     screened: "Screened | None" = field(default=None, compare=False)
     rough: Decrement | None = field(default=None, compare=False)
-
-
-def stated_model(table: Table) -> DecayModel:
-    """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
-    model = DecayModel.stated(table.settings)
-    if table.settings.thin is not None:
-        return model
-    return replace(model, thin=default_block_size(*decay_window(table)))
 
 
 class FreeVibration(SurfaceExperiment):

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from capsule_id.experiments.free_vibration.readings.blocks import default_block_size
 from capsule_id.experiments.free_vibration.readings.channels import channel_of
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
@@ -180,6 +181,14 @@ def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
     """Return (time, channel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
     inside = window_of(table)
     return table["time"][inside], table[channel_of(table)][inside]
+
+
+def stated_model(table: Table) -> DecayModel:
+    """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
+    model = DecayModel.stated(table.settings)
+    if table.settings.thin is not None:
+        return model
+    return replace(model, thin=default_block_size(*decay_window(table)))
 
 
 def release_time(decay: FreeDecay) -> float:

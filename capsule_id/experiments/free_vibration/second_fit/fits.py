@@ -238,10 +238,8 @@ class Screening:
 
         def whitened(whole: np.ndarray) -> np.ndarray:
             """(names + 1, n) residuals at as many scaled unknowns."""
-            thetas = {name: jnp.asarray(value) for name, value in self.theta(whole).items()}
-            paths = _paths(thetas, self.number)
-            raw = self.values[None] - self.side * _readings(paths, self.nodes, self.weights, self.order)
-            return np.asarray(_whitened(self.times, raw, thetas, sloped)) / unit
+            thetas, motion = self.motions(whole)
+            return np.asarray(_whitened(self.times, self.values - motion, thetas, sloped)) / unit
 
         def residuals(z: np.ndarray) -> np.ndarray:
             """(n,) residuals at (free,); one batch of fixed size also gives the Jacobian, which is kept for its turn."""
@@ -258,46 +256,36 @@ class Screening:
         inside = low + INSIDE, high - INSIDE
         if near is not None and (residuals(np.clip(start[free], *inside)) == UNFIT).any():
             return self.fit(model, None, nested)
-        starts = [start]
+        starts = start[None]
         if near is None and "dry" in model.damping:
-            offered = self.dry_starts(start)
-            parts = offered.reshape(-1, len(NAMES) + 1, len(NAMES))
+            starts = self.dry_starts(start)
+            parts = starts.reshape(-1, len(NAMES) + 1, len(NAMES))
             costs = np.concatenate([np.sum(whitened(part) ** 2, axis=1) for part in parts])
-            starts = list(offered[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:DRY_FITS]])
-        first = [np.clip(one[free], *inside) for one in starts]
+            starts = starts[np.argsort(np.where(np.isfinite(costs), costs, np.inf))[:DRY_FITS]]
+        first = list(np.clip(starts[:, free], *inside))
         if nested:
             best = min(nested, key=lambda one: one[0].noise)[1]
             first.append(np.clip(self.start(model, best, absent=True)[free], low + ABSENT, high - ABSENT))
-        ends = [
-            least_squares(
-                residuals,
-                one,
-                jac=lambda z: jacobians[z.tobytes()],  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
-                bounds=(low, high),
-                x_scale="jac",
-                max_nfev=EVALUATIONS,
-            )
-            for one in first
-        ]
+        options: Any = {"jac": lambda z: jacobians[z.tobytes()], "bounds": (low, high), "x_scale": "jac"}
+        ends = [least_squares(residuals, one, max_nfev=EVALUATIONS, **options) for one in first]
         found = min(ends, key=lambda end: end.cost)
         start[free] = found.x
         return self._summary(model, start, found, unit, tuple(one.values for one, _ in nested)), start
 
-    def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predicted motion and measured minus predicted readings, (n,) each, SI, at scaled unknowns (names,)."""
-        thetas = {name: jnp.asarray(value) for name, value in self.theta(np.tile(z, (len(NAMES) + 1, 1))).items()}
-        paths = _paths(thetas, self.number)
-        motion = self.side * np.asarray(_readings(paths, self.nodes, self.weights, self.order))[0]
-        return motion, self.values - motion
+    def motions(self, whole: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
+        """Values by symbol and predicted readings (names + 1, n), SI, at as many scaled unknowns."""
+        thetas = {name: jnp.asarray(value) for name, value in self.theta(whole).items()}
+        readings = _readings(_paths(thetas, self.number), self.nodes, self.weights, self.order)
+        return thetas, self.side * np.asarray(readings)
 
     def drowned(self, z: np.ndarray) -> bool:
-        """Whether drift and noise are larger than the motion."""
-        motion, rest = self.parts(z)
-        return not np.std(rest) <= np.std(motion)
+        """Whether drift and noise at scaled unknowns (names,) are larger than the motion."""
+        motion = self.motions(np.tile(z, (len(NAMES) + 1, 1)))[1][0]
+        return not np.std(self.values - motion) <= np.std(motion)
 
     def drift(self, z: np.ndarray) -> float:
         """Range of the mean over one period of measured minus predicted readings, SI, at scaled unknowns (names,)."""
-        raw = self.parts(z)[1]
+        raw = self.values - self.motions(np.tile(z, (len(NAMES) + 1, 1)))[1][0]
         time = self.times.time
         window = 2.0 * np.pi / self.omega
         first, last = np.searchsorted(time, time - 0.5 * window), np.searchsorted(time, time + 0.5 * window)
