@@ -31,8 +31,8 @@ def test_a_few_rigs(rigs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], n) / n)
     assert low < found.sd < high
     assert abs(found.mean) < stats.norm.ppf(0.9995) / np.sqrt(n)
-    # The budget is short: chains may be found wanting, nothing else.
-    assert {check for outcome in outcomes for check, _ in outcome.failed} <= {"chains converged"}
+    # The budget is short: chains may be found wanting, which fails no check.
+    assert [check for outcome in outcomes for check, _ in outcome.failed] == []
 
 
 @pytest.mark.slow

@@ -238,7 +238,7 @@ def drawn(result: Result) -> tuple[Picture, ...]:
 def unclean(result: Result) -> Result:
     """The same from a real rig, with two failures."""
     bad = (
-        Finding("chains.converged", "fail", CHAINS),
+        Finding("errors.stated", "fail", {"freedom": 3, "chi_square": 40.0, "p": 1e-8}),
         Finding("residuals.white", "fail", COLOURED, "free_vibration_2"),
     )
     return dataclasses.replace(

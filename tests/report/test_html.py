@@ -107,8 +107,8 @@ def test_verdict_strip_has_text_beside_colour(unclean: Result) -> None:
     page = render(unclean, ())
     cells = re.findall(r'<li class="(\w+)"><b>([^<]+)</b>([^<]+)</li>', page)
     assert [(level, check) for level, check, _ in cells] == [
-        ("ok", "starts agree"), ("fail", "chains converged"), ("fail", "residuals white"), ("warn", "outliers"),
-        ("ok", "linearity"), ("warn", "parameters informed"),
+        ("ok", "starts agree"), ("ok", "chains converged"), ("fail", "residuals white"), ("warn", "outliers"),
+        ("ok", "linearity"), ("warn", "parameters informed"), ("fail", "stated errors"),
     ]  # fmt: skip
     words = {"ok": "ok", "warn": "warning", "fail": "failed"}
     assert all(words[level] in text for level, _, text in cells)
@@ -125,7 +125,7 @@ def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean:
     """Before the contents list: the verdict, a row per parameter, what to do."""
     text = render(unclean, ())
     first = Page(text.partition("<nav")[0] + "</body></html>").text
-    assert "Verdict: not trusted. Failed: chains converged, residuals white." in first
+    assert "Verdict: not trusted. Failed: stated errors, residuals white." in first
     assert 'class="untrusted"' in text
     for row in table_rows(unclean.summary):
         assert row.plus_minus("value", "sd", row.decimals) in first

@@ -89,7 +89,12 @@ def _chains(s: SampledFit) -> list[Finding]:
         "length_wanted": LENGTH_IN_TAU,
         "rhat_wanted": MAX_RHAT,
     }
-    return [Finding("chains.converged", "ok" if p.converged else "fail", facts)]
+    if p.converged:
+        return [Finding("chains.converged", "ok", facts)]
+    # What no check can judge is not judged: the draws may be right.
+    short = (p.rhat > MAX_RHAT) | (sizes < p.ess_wanted) | (p.draws.shape[1] < LENGTH_IN_TAU * p.tau)
+    names = tuple(name for name, own in zip(p.names, short, strict=True) if own)
+    return [Finding("chains.converged", "warn", {**facts, "names": ", ".join(names)}, parameters=names)]
 
 
 def informed(target: LogPosterior, posterior: Posterior | None, fit: PointFit) -> np.ndarray:

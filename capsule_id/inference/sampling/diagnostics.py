@@ -39,19 +39,29 @@ def ensemble_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
     centred = draws - np.mean(draws, axis=(1, 2), keepdims=True)
     spectrum = np.abs(np.fft.rfft(centred, n=2 * n, axis=1)) ** 2
     covariance = np.mean(np.fft.irfft(spectrum, n=2 * n, axis=1)[:, :n], axis=2) / np.arange(n, 0, -1)[:, None]
-    sums = 2.0 * np.cumsum(covariance / covariance[:, :1], axis=1) - 1.0
+    # Draws that never change have the longest time.
+    first = np.broadcast_to(covariance[:, :1], covariance.shape)
+    share = np.divide(covariance, first, out=np.ones_like(covariance), where=first > 0.0)
+    sums = 2.0 * np.cumsum(share, axis=1) - 1.0
     enough = np.arange(n)[:, None] >= WINDOW * sums
     enough[:, -1] = True
     return np.take_along_axis(sums, np.argmax(enough, axis=1)[:, None], axis=1)[:, 0]
 
 
 def pooled_time(draws: Draws) -> Float[np.ndarray, " d"]:
-    """(d,) integrated autocorrelation time as in ``ensemble_time``, over the walkers of all ensembles together.
+    """(d,) integrated autocorrelation time of the normal scores, over the walkers of all ensembles together.
 
-    Covariances are about the mean of all ensembles: where they disagree, the time is long.
+    Covariances are about the mean of all ensembles: where they disagree, the time is long. Of values themselves a single
+    walker far out in a tail would decide the time.
     """
     ensembles, number, walkers, d = draws.shape
-    return ensemble_time(np.moveaxis(draws, 0, 1).reshape(1, number, ensembles * walkers, d))[0]
+    return ensemble_time(np.moveaxis(normal_scores(draws), 0, 1).reshape(1, number, ensembles * walkers, d))[0]
+
+
+def normal_scores(draws: Draws) -> Draws:
+    """Normal scores of the ranks of every parameter over all ensembles (Vehtari et al. 2021, section 4.1)."""
+    flat = draws.reshape(-1, draws.shape[-1])
+    return ndtri((rankdata(flat, axis=0) - 0.375) / (len(flat) + 0.25)).reshape(draws.shape)
 
 
 def split_rhat(draws: Draws) -> Float[np.ndarray, " d"]:
@@ -83,7 +93,6 @@ def bulk_and_tail_size(draws: Draws) -> Float[np.ndarray, "2 d"]:
     draw lies below the 5 % or the 95 % quantile. Both use ``ensemble_time``, which holds for short chains.
     """
     flat = draws.reshape(-1, draws.shape[-1])
-    scores = ndtri((rankdata(flat, axis=0) - 0.375) / (len(flat) + 0.25)).reshape(draws.shape)
     tails = [np.asarray(draws <= edge, dtype=float) for edge in np.quantile(flat, TAILS, axis=0)]
-    bulk, *ends = (effective_sample_size(x, ensemble_time(x)) for x in (scores, *tails))
+    bulk, *ends = (effective_sample_size(x, ensemble_time(x)) for x in (normal_scores(draws), *tails))
     return np.stack([bulk, np.min(ends, axis=0)])

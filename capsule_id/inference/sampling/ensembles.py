@@ -43,8 +43,10 @@ LENGTH_IN_TAU = 20.0
 DEFAULT_ESS = 4000.0
 #: Convergence requires a split R-hat of at most this for every parameter.
 MAX_RHAT = 1.01
-#: Stored draws of an ensemble before the first convergence check, and between later checks.
-FIRST_CHECK, CHECK_EVERY = 60, 20
+#: Stored draws of an ensemble before the first convergence check, and between later checks: so many, or this part of all.
+FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 60, 20, 5
+#: Readings that the evaluations of the default budget may read in all, where no motion of the capsule is integrated.
+MOST_READINGS = 5e7
 #: Parameters of the smallest large block among those with a motion of the capsule: a forced run correlates all its
 #: parameters and determines them well, so that the Laplace approximation is tried as it is.
 LARGE = 9
@@ -102,6 +104,11 @@ class Target(Protocol):
     event_driven: list[bool]
 
     @property
+    def readings(self) -> int:
+        """Readings of an evaluation; 1 where it integrates motions of the capsule."""
+        ...
+
+    @property
     def can_be_emulated(self) -> bool: ...
 
     @property
@@ -135,7 +142,7 @@ def sample(
     Parameters
     ----------
     seed : the same seed gives the same draws, also when an interrupted run resumes from ``store``
-    budget : emcee steps of an ensemble after burn-in
+    budget : emcee steps of an ensemble after burn-in; fewer in proportion where many readings make them slow
     store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
     progress : called with (draws done, draws until the next check, name of the stage)
     ess : bulk and tail effective sample size of every parameter at which the sampling stops
@@ -149,7 +156,9 @@ def sample(
         with ThreadPoolExecutor(CORES) as threads:
             samplers = list(threads.map(lambda *one: _sampler(target, schedule, *one), seeds, backends))
         draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
-        last = max(budget // schedule.thin, 2)
+        walkers = ENSEMBLES * len(samplers[0].state.coords)
+        share = min(1.0, MOST_READINGS / (DEFAULT_BUDGET * walkers * target.readings))
+        last = max(int(budget * share) // schedule.thin, 2)
         for goal in _checks(min(sampler.stored for sampler in samplers), last):
             for done in _advance(samplers, goal, schedule.thin):
                 if chains is not None:
@@ -192,9 +201,9 @@ def _completed(target: Target, samplers: Sequence[Ensemble], goal: int) -> tuple
 
 def _converged(draws: np.ndarray, ess: float) -> bool:
     """Whether draws (ensemble, draw, walker, d) are long enough and their ensembles agree."""
-    tau, rhat = pooled_time(draws), split_rhat(draws)
-    long_enough = np.all(draws.shape[1] > LENGTH_IN_TAU * tau) and np.all(rhat <= MAX_RHAT)
-    return bool(long_enough and np.all(bulk_and_tail_size(draws) >= ess))
+    if not np.all(split_rhat(draws) <= MAX_RHAT) or not np.all(bulk_and_tail_size(draws) >= ess):
+        return False
+    return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * pooled_time(draws)))
 
 
 def pilot(target: Target, seed: int) -> Schedule:
@@ -287,8 +296,12 @@ def laplace_proposal(target: Target) -> tuple[BlockProposal, list[bool]]:
 
 
 def _checks(done: int, last: int) -> Iterator[int]:
-    """Numbers of stored draws at which convergence is checked, from ``done`` on."""
-    yield from (goal for goal in range(FIRST_CHECK, last, CHECK_EVERY) if goal >= done)
+    """Numbers of stored draws at which convergence is checked, from ``done`` on: a check reads all draws."""
+    goal = FIRST_CHECK
+    while goal < last:
+        if goal >= done:
+            yield goal
+        goal += max(CHECK_EVERY, goal // CHECK_SHARE)
     yield last
 
 

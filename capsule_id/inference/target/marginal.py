@@ -134,6 +134,12 @@ class MarginalPosterior:
         return self.target.theta(u)
 
     @property
+    def readings(self) -> int:
+        """Readings that an evaluation reads; 1 where it integrates motions of the capsule, which take far longer."""
+        experiments = self.target.experiments
+        return 1 if any(e.event_driven for e in experiments) else max(1, sum(e.n for e in experiments))
+
+    @property
     def can_be_emulated(self) -> bool:
         """Whether there are motions to compute, and all of them are trials of a few numbers each."""
         slow = [e for e in self.target.experiments if e.event_driven]

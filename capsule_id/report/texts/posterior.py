@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from capsule_id.views import Facts, Message, stated_p
+from capsule_id.views import Facts, Message, filled_in, stated_p
 
 #: A larger difference in log-posterior is not printed: it may be that of a place which the model excludes.
 FAR_BELOW = 1000
@@ -102,6 +102,18 @@ _CHAINS = (
 )
 
 
+def _chains(facts: Facts) -> str:
+    """The parameters whose sample is too short, or that there is no sample."""
+    if not facts:
+        return "no sample was drawn: there are no intervals"
+    return filled_in(
+        "the steps were used up before the sample of {names} was long enough, so these numbers are not judged. Expected more "
+        "than {length_wanted:.0f} autocorrelation times, bulk and tail effective sample sizes of {size_wanted:.0f}, and R-hat "
+        f"<= {{rhat_wanted}}; found {_CHAINS}. Raise --max-steps, or look for a parameter that the data do not inform.",
+        facts,
+    )
+
+
 POSTERIOR_MESSAGES: Mapping[str, Message] = {
     "starts.agree": Message(
         "starts agree",
@@ -112,13 +124,7 @@ POSTERIOR_MESSAGES: Mapping[str, Message] = {
     "chains.converged": Message(
         "chains converged",
         ok=_CHAINS,
-        warn="no sample was drawn: there are no intervals",
-        fail=(
-            "expected more than {length_wanted:.0f} autocorrelation times, bulk and tail effective sample sizes of "
-            "{size_wanted:.0f}, and R-hat <= {rhat_wanted}; found "
-            + _CHAINS
-            + " when the steps were used up. Raise --max-steps, or look for a parameter that the data do not inform."
-        ),
+        warn=_chains,
     ),
     "sample.unfinished": Message(
         "sample", warn="the sample is still to be drawn: this is the point fit alone, without intervals and figures"
