@@ -140,6 +140,11 @@ class Experiment(eqx.Module):
         return len(self.observed)
 
     @property
+    def work(self) -> int:
+        """Time of an evaluation of the likelihood, in units of that of one reading."""
+        return self.n
+
+    @property
     def scale_known(self) -> bool:
         """Whether the sd of every misfit is known, so that chi-square tests the fit."""
         return False

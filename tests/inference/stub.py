@@ -49,7 +49,7 @@ class Gaussian:
     OFF, WIDE = 0.5, 1.3
     fingerprint = "a known normal density"
     can_be_emulated = False
-    readings = 1
+    work = 1
 
     def __init__(self, mean: np.ndarray, sigma: np.ndarray, blocks: Sequence[np.ndarray] | None = None) -> None:
         self.mean, self.sigma = mean, sigma

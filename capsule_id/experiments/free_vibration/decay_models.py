@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-#: Runge–Kutta steps per half cycle. Errors relative to the amplitude (tested): x_rel 1e-8, velocity 1e-7 omega,
-#: acceleration 5e-6 omega^2.
-STEPS = 24
+#: Runge–Kutta steps per half cycle, and of a decay that may have more half cycles than ``LONG``, each of which changes it
+#: little. Errors relative to the amplitude (tested): x_rel 1e-8, velocity 1e-7 omega, acceleration 5e-6 omega^2; of a long
+#: decay x_rel 2e-6.
+STEPS, FEWER_STEPS, LONG = 24, 8, 100
 #: Butcher's method of order 6 (1964): weights of earlier slopes at each stage, and of all slopes in the step.
 STAGES = (
     (),
@@ -101,7 +102,7 @@ class HalfCycles(NamedTuple):
     ----------
     times, amplitudes : (half_cycles,) s and m, of the turning points; the rod sticks at an amplitude of at most ``rest``
     rest : () m, where the spring balances dry friction
-    node_times, positions, velocities, accelerations : (half_cycles, STEPS + 1), both ends of the half cycle included
+    node_times, positions, velocities, accelerations : (half_cycles, steps + 1), both ends of the half cycle included
     """
 
     times: Any
@@ -111,6 +112,11 @@ class HalfCycles(NamedTuple):
     positions: Any
     velocities: Any
     accelerations: Any
+
+
+def steps_of(number: int) -> int:
+    """Runge–Kutta steps in each of so many half cycles."""
+    return FEWER_STEPS if number > LONG else STEPS
 
 
 @partial(jax.jit, static_argnames="number")
@@ -128,7 +134,8 @@ def half_cycles(theta: Mapping[str, Any], amplitude: Any, turning_time: Any, num
     rest = F_dry / k1
     for _ in range(NEWTON_STEPS if "k_cubic" in theta else 0):
         rest = rest - (k1 * rest + k_cubic * rest**3 - F_dry) / (k1 + 3.0 * k_cubic * rest**2)
-    width = np.pi / STEPS
+    steps = steps_of(number)
+    width = np.pi / steps
 
     def slope(r: Any, cosine: Any, sine: Any, stretch: Any) -> tuple[Any, Any]:
         # Acceleration besides that of the linear spring, over stretch omega r.
@@ -150,7 +157,7 @@ def half_cycles(theta: Mapping[str, Any], amplitude: Any, turning_time: Any, num
         )
         return (r, t, stretch), (r, t)
 
-    stages = width * (np.arange(STEPS)[:, None] + np.array([sum(weights) for weights in STAGES]))
+    stages = width * (np.arange(steps)[:, None] + np.array([sum(weights) for weights in STAGES]))
     trigonometry = jnp.asarray(np.cos(stages)), jnp.asarray(np.sin(stages))
 
     def half(state: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], tuple[Any, ...]]:
@@ -160,14 +167,14 @@ def half_cycles(theta: Mapping[str, Any], amplitude: Any, turning_time: Any, num
         first = r, start, 1.0 / jnp.sqrt(1.0 + (STRETCH * c_q * r / m1) ** 2)
         r, t = jax.lax.scan(step, first, trigonometry)[1]
         r, t = jnp.append(first[0], r), jnp.append(start, t)
-        t = jnp.where(moves, t, start + np.pi / omega * np.linspace(0.0, 1.0, STEPS + 1))
+        t = jnp.where(moves, t, start + np.pi / omega * np.linspace(0.0, 1.0, steps + 1))
         # A stuck rod keeps its position; the next half cycle counts it from the other side.
         end = jnp.where(moves, r[-1] - rest, -a)
         return (t[-1], end), (start, a, jnp.where(moves, r, 0.0), t, first[2])
 
     release = jnp.asarray(turning_time, dtype=float), jnp.asarray(amplitude, dtype=float)
     _, (times, amplitudes, r, t, stretch) = jax.lax.scan(half, release, None, length=number)
-    nodes = np.pi / STEPS * np.arange(STEPS + 1)[None]
+    nodes = width * np.arange(steps + 1)[None]
     x = jnp.where(r > 0.0, rest + r * np.cos(nodes), amplitudes[:, None])
     y = -stretch[:, None] * omega * r * np.sin(nodes)
     pull = k1 * x + k_cubic * x**3 - F_dry + c * y - c_q * y**2
@@ -195,8 +202,9 @@ def interpolate(path: HalfCycles, time: Any) -> Motion:
     before the first turning point continue the first polynomial.
     """
     number = path.times.shape[0]
-    node = jnp.clip(jnp.searchsorted(path.node_times[:, :-1].ravel(), time, side="right") - 1, 0, number * STEPS - 1)
-    half, left = node // STEPS, node % STEPS
+    steps = path.node_times.shape[1] - 1
+    node = jnp.clip(jnp.searchsorted(path.node_times[:, :-1].ravel(), time, side="right") - 1, 0, number * steps - 1)
+    half, left = node // steps, node % steps
     t, t_next, x, x_next, y, y_next, a, a_next = (values[half, at] for values in path[3:] for at in (left, left + 1))
     h = t_next - t
     s = (time - t) / h

@@ -24,6 +24,7 @@ from capsule_id.experiments.free_vibration.settings import (
     check_ground,
     cut_at_release,
     decay_window,
+    first_periods,
 )
 from capsule_id.experiments.free_vibration.twin import measure
 from capsule_id.experiments.kind import Kind, Values, made_by
@@ -186,7 +187,10 @@ def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "
     )
     if table.settings.samples == "turning_points":
         make = made_by("capsule_id.experiments.free_vibration.turning_points.experiment:TurningPoints")
-    return tuple(e for one in _channel_tables(cut_at_release(table)) for e in make(one, rig, friction))
+    table = cut_at_release(table)
+    if DecayModel.stated(table.settings).slow and table.settings.samples == "record":
+        table = first_periods(table)
+    return tuple(e for one in _channel_tables(table) for e in make(one, rig, friction))
 
 
 def _channel_tables(table: Table[DecaySettings]) -> list[Table[DecaySettings]]:

@@ -18,6 +18,7 @@ from capsule_id.experiments.free_vibration.decay_models import (
     decay_moments,
     fold,
     rates,
+    steps_of,
     uniform_step,
     viscous_basis,
 )
@@ -162,6 +163,10 @@ class FreeVibration(SurfaceExperiment):
             ]
         self.about = replace(self.about, parameters=(*rows, *clock_parameters(table, rig)))
 
+    def with_table(self, table: Table) -> "FreeVibration":
+        """Return the record of another part of its table, with the same model."""
+        return self if table is self.table else FreeVibration(table, self.rig, self.friction, self.model)
+
     def with_model(self, model: DecayModel, screened: "Screened | None" = None) -> "FreeVibration":
         """Return the same record with another model; its fit ``screened`` gives the starting point."""
         return FreeVibration(self.table, self.rig, self.friction, model, screened)
@@ -228,6 +233,11 @@ class FreeVibration(SurfaceExperiment):
     @property
     def observed(self) -> np.ndarray:
         return self.values
+
+    @property
+    def work(self) -> int:
+        # A step of a half cycle takes as long as three readings.
+        return self.n if self.closed else self.n + 3 * self.half_cycles * steps_of(self.half_cycles)
 
     @property
     def model_name(self) -> str:

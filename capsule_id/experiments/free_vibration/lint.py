@@ -11,8 +11,11 @@ from capsule_id.experiments.free_vibration.readings.blocks import block_size, de
 from capsule_id.experiments.free_vibration.settings import (
     DAMPING,
     EFFECTS,
+    MOST_PERIODS,
+    DecayModel,
     DecaySettings,
     decay_window,
+    first_periods,
     release_time,
     window_of,
 )
@@ -38,8 +41,6 @@ PROPOSED_FACTOR = 10
 FEWEST_PERIODS = 2
 #: Fewest block means in a period.
 FEWEST_MEANS = 4
-#: Number of readings whose fit takes minutes, and block means in a period that are proposed for it.
-MANY_READINGS, COARSE_MEANS = 6000, 8
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
 #: Ratios of units that are mistaken for each other.
@@ -179,16 +180,14 @@ def check_thin(entry: Entry[DecaySettings]) -> None:
 
 def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
     """Report that a long record is fitted by block means, where the settings leave that open."""
-    thin = default_block_size(time, values)
-    if table.settings.thin is None and table.settings.forward == "closed" and thin > 1:
-        facts = {"file": table.file, "samples": len(time), "thin": thin, "means": len(time) // thin}
+    thin, settings = default_block_size(time, values), table.settings
+    if settings.thin is None and settings.forward == "closed" and thin > 1:
+        wider = "less than 0.5 %" if thin <= block_size(time, values) else "some 3 %"
+        facts = {"file": table.file, "samples": len(time), "thin": thin, "means": len(time) // thin, "wider": wider}
         yield Finding("decays.thinned", "ok", facts, table.label)
-    readings = len(time) // (table.settings.thin or thin)
-    if readings > MANY_READINGS:
-        size = block_size(time, values, COARSE_MEANS)
-        late = " A stop ends the record earlier, which saves more." if len(time) // size > MANY_READINGS else ""
-        facts = {"file": table.file, "readings": readings, "thin": size, "means": COARSE_MEANS, "late": late}
-        yield Finding("decays.long", "warn", facts, table.label)
+    cut = first_periods(table).settings.stop
+    if DecayModel.stated(settings).slow and cut != settings.stop:
+        yield Finding("decays.long", "warn", {"file": table.file, "stop": cut, "periods": MOST_PERIODS}, table.label)
 
 
 def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
@@ -274,14 +273,14 @@ MESSAGES = {
         "length of a decay",
         ok=(
             "{file}: the fit uses {means} means of {thin} consecutive samples each instead of {samples} samples. That widens "
-            "intervals by less than 0.5 % and saves time. To fit every sample, add thin = 1 to the experiment in rig.toml."
+            "intervals by {wider} and saves time. To fit every sample, add thin = 1 to the experiment in rig.toml."
         ),
     ),
     "decays.long": Message(
         "length of a decay",
         warn=(
-            "{file}: the fit uses {readings} readings, and takes minutes. {means} means in a period widen the intervals by "
-            "some 3 %: add thin = {thin} to the experiment in rig.toml.{late}"
+            "{file}: the fit uses the first {periods} periods, because the stated model is slow. To confirm that, or to choose "
+            "another part, add a line to the experiment in rig.toml: " + line_of("stop")
         ),
     ),
     "decays.second": Message(

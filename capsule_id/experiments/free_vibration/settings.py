@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from capsule_id.experiments.free_vibration.readings.blocks import default_block_size
+from capsule_id.experiments.free_vibration.readings.blocks import block_size, default_block_size
 from capsule_id.experiments.free_vibration.readings.channels import channel_of
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.domains import ANY, NOT_NEGATIVE
@@ -20,6 +20,9 @@ DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 FURTHER = (*DAMPING.values(), "k_cubic")
 #: What every parameter of a further force stands for, in words.
 EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
+#: Periods of a record that a model with further forces, correlated noise or a Gaussian-process drift is fitted to, at most:
+#: its evaluations take milliseconds then.
+MOST_PERIODS = 250
 _DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
 _NOISES = {"ar1": "coloured noise (AR(1))", "arma": "white and coloured noise (ARMA)"}
 
@@ -142,6 +145,11 @@ class DecayModel:
         return self._terms < other._terms
 
     @property
+    def slow(self) -> bool:
+        """Whether an evaluation takes a time in proportion to the length of the record."""
+        return bool(self.symbols) or self.whitened
+
+    @property
     def whitened(self) -> bool:
         """Whether noise or drift correlate the readings."""
         return self.noise != "white" or self.drift == "gp"
@@ -189,6 +197,15 @@ def stated_model(table: Table) -> DecayModel:
     if table.settings.thin is not None:
         return model
     return replace(model, thin=default_block_size(*decay_window(table)))
+
+
+def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:
+    """Return the table with a stop after ``MOST_PERIODS``, where none is stated and the record is longer."""
+    time, values = decay_window(table)
+    last = MOST_PERIODS * block_size(time, values, 1.0)
+    if table.settings.stop is not None or last >= len(time) or block_size(time, values, 1.0) == 1:
+        return table
+    return replace(table, settings=replace(table.settings, stop=float(time[last])))
 
 
 def release_time(decay: FreeDecay) -> float:

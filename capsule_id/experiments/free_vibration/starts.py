@@ -40,7 +40,9 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
     A viscous decay without drift starts at its least-squares fit, whose residuals show the noise at any sampling rate.
     """
     rough, noise = e.rough_decrement(), noise_level(e.values)
-    if e.closed and e.model.drift == "none":
+    if e.about.screened is not None:
+        noise = e.about.screened.noise / float(np.mean(e.relative_sd))
+    elif e.closed and e.model.drift == "none":
         fit = viscous_fit(e.time, e.values)
         rough, noise = fit.decrement(e.mass), min(noise, float(np.sqrt(np.sum(fit.left**2) / max(e.n - UNKNOWNS, 1))))
     # A phase error of the start over the decay leads the fit to a side lobe, a local maximum.

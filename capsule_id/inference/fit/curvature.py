@@ -73,18 +73,6 @@ def value_and_gradient(function: Callable[[np.ndarray], np.ndarray], v: Vector) 
     return float(values[0]), (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
-def root_of_inverse(hessian: Matrix) -> Matrix:
-    """R (d, d) with R R' = H^-1; directions without positive curvature get the weakest positive curvature.
-
-    Away from the maximum H may be indefinite. There it serves as a metric only.
-    """
-    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), 1e-12))
-    eigenvalues, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    positive = eigenvalues > 1e-8 * eigenvalues[-1]
-    eigenvalues = np.where(positive, eigenvalues, np.min(eigenvalues[positive]))
-    return scale[:, None] * vectors / np.sqrt(eigenvalues)
-
-
 def jacobian(function: Callable[[np.ndarray], np.ndarray], u: Vector, step: Vector) -> Float[np.ndarray, "n d"]:
     """(n, d) Jacobian of ``function`` ((d,) -> (n,)) at u by central differences with ``step`` (d,)."""
     columns = []

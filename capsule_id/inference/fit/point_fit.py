@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
+from scipy.linalg import solve_triangular
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.inference.fit.covariance import covariance
@@ -22,7 +23,6 @@ from capsule_id.inference.fit.curvature import (
     hessian,
     in_batches,
     jacobian,
-    root_of_inverse,
     value_and_gradient,
 )
 from capsule_id.inference.fit.least_squares import Solver, least_squares
@@ -36,16 +36,20 @@ from capsule_id.interruption import stop_if_interrupted
 STARTS = 5
 #: Ends that differ by less than this many posterior standard deviations count as the same maximum.
 AGREEMENT = 0.05
+#: Smallest curvature that counts, relative to Gauss-Newton's.
+FLATTEST = 1e-4
+#: An end of least squares this near to a maximum, in posterior standard deviations, belongs to it.
+SAME_BASIN = 0.3
 #: Gradients per posterior standard deviation: quasi-Newton stops below the first, and its end counts as a maximum
 #: below the second. Rounding of the log-posterior may stop it in between.
-TOLERANCE, MAXIMUM = 1e-5, 1e-3
+TOLERANCE, MAXIMUM = 5e-4, 1e-3
 #: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
 #: Replaces a log-posterior that is not finite, because line searches need a finite number.
 LOG_POSTERIOR_FLOOR = -1e12
 #: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
 #: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
-BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=12)
+BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=40)
 #: Relative step of the difference quotients of residuals; their relative error is about 1e-10.
 DIFFERENCE = 1e-5
 
@@ -67,17 +71,16 @@ def point_fit(
         starts = np.concatenate([starts, further[None]])
     reported = len(starts)
     starts = np.concatenate([starts, target.nested_starts()])
-    located, density = target.located, density_of(target)
+    located = target.located
     u, value, converged = _maxima(target, starts)
     best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     kept = np.union1d(np.arange(reported), best)
     starts, u, value, converged = (each[kept] for each in (starts, u, value, converged))
     best = int(np.searchsorted(kept, best))
-    scale = _information(target, u[best]) ** -0.5
-    root = root_of_inverse(-hessian(density, u[best], scale))
+    at_fit = residual_jacobian(target, u[best])
+    root = _root_of_covariance(target, u[best], at_fit)
     spread = np.sqrt(np.sum(root**2, axis=1))
-    theta = target.theta(u[best])
-    at_fit = residual_jacobian(target, u[best])[:, located]
+    theta, at_fit = target.theta(u[best]), at_fit[:, located]
     return PointFit(
         names=target.names,
         u=u[best],
@@ -104,14 +107,25 @@ def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.nd
     ends = starts.copy()
     ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
     # Least squares knows no scatter: it may end at a lower density than it began with.
-    ends = np.where((in_batches(density, ends) >= in_batches(density, starts))[:, None], ends, starts)
-    scale = _information(target, ends[rough.best]) ** -0.5
-    whitening = root_of_inverse(-hessian(density, ends[rough.best], scale))
+    before, after = in_batches(density, starts), in_batches(density, ends)
+    ends = np.where((after >= before)[:, None], ends, starts)
+    best = int(np.argmax(np.nan_to_num(np.fmax(before, after), nan=-np.inf)))
+    whitening = _root_of_covariance(target, ends[best], residual_jacobian(target, ends[best]))
     # Every batch runs in the pool of threads, so the starts need their own.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
         # SciPy hides this warning itself, but its way is not safe in threads.
         warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
-        polished = list(threads.map(lambda end: _polish(density, end, whitening), ends))
+        highest = _polish(density, ends[best], whitening)
+        if not highest[2]:
+            # The best end of least squares may lie far from the maximum, where the curvature is another one.
+            whitening = _root_of_covariance(target, highest[0], residual_jacobian(target, highest[0]))
+            highest = _polish(density, highest[0], whitening)
+        # An end of least squares within a fraction of a standard deviation leads to the same maximum.
+        spread = np.sqrt(np.sum(whitening**2, axis=1))
+        away = np.any(np.abs(ends - highest[0])[:, located] > SAME_BASIN * spread[located], axis=1)
+        away[best] = False
+        others = list(threads.map(lambda end: _polish(density, end, whitening), ends[away]))
+    polished = [others.pop(0) if own else highest for own in away]
     u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
     return u, value, converged
 
@@ -160,15 +174,26 @@ def _steps(target: LogPosterior) -> np.ndarray:
     return DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd)
 
 
-def _information(target: LogPosterior, u: np.ndarray) -> np.ndarray:
-    """(d,) approximate diagonal information: squared residual Jacobian, and 2n for the scatter of n readings."""
-    jacobian = residual_jacobian(target, u)
+def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """R (d, d) with R R' the inverse Hessian of -log-posterior at u (d,), from the ``jacobian`` (n, d) of the residuals.
+
+    The Hessian is taken in coordinates that are whitened by Gauss-Newton's approximation, by an orthogonal factor. Where
+    the readings determine k1/m1 to six digits and m1 to two, no digit of the Hessian in u itself would be left.
+    """
+    located = target.located
     count = np.zeros(target.dimension)
     for experiment in target.experiments:
         for row in experiment.parameters:
             if row.scatter:
                 count[target.names.index(row.name)] += 2.0 * experiment.n
-    return np.maximum(np.where(target.scatter, count, np.sum(jacobian**2, axis=0)), 1e-2)
+    whitening = np.diag(np.maximum(count, 1e-2) ** -0.5)
+    triangle = np.linalg.qr(np.nan_to_num(jacobian[:, located], posinf=0.0, neginf=0.0), mode="r")
+    whitening[np.ix_(located, located)] = solve_triangular(triangle, np.eye(len(located)))
+    density = density_of(target)
+    curvature = hessian(lambda w: density(u + w @ whitening.T), np.zeros(len(u)), np.ones(len(u)))
+    # Away from a maximum a direction may have no positive curvature; there Gauss-Newton's stands.
+    values, vectors = np.linalg.eigh(np.nan_to_num(-curvature, nan=0.0, posinf=0.0, neginf=0.0))
+    return whitening @ (vectors / np.sqrt(np.where(values > FLATTEST, values, 1.0)))
 
 
 def residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:

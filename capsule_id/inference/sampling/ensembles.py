@@ -45,8 +45,8 @@ DEFAULT_ESS = 4000.0
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks: so many, or this part of all.
 FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 60, 20, 5
-#: Readings that the evaluations of the default budget may read in all, where no motion of the capsule is integrated.
-MOST_READINGS = 5e7
+#: Work of all evaluations of the default budget, at most, in readings: some 20 s on two cores.
+MOST_WORK = 1e9
 #: Parameters of the smallest large block among those with a motion of the capsule: a forced run correlates all its
 #: parameters and determines them well, so that the Laplace approximation is tried as it is.
 LARGE = 9
@@ -104,8 +104,8 @@ class Target(Protocol):
     event_driven: list[bool]
 
     @property
-    def readings(self) -> int:
-        """Readings of an evaluation; 1 where it integrates motions of the capsule."""
+    def work(self) -> int:
+        """Time of an evaluation, see ``MarginalPosterior``."""
         ...
 
     @property
@@ -142,7 +142,7 @@ def sample(
     Parameters
     ----------
     seed : the same seed gives the same draws, also when an interrupted run resumes from ``store``
-    budget : emcee steps of an ensemble after burn-in; fewer in proportion where many readings make them slow
+    budget : emcee steps of an ensemble after burn-in; fewer in proportion where an evaluation is slow
     store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
     progress : called with (draws done, draws until the next check, name of the stage)
     ess : bulk and tail effective sample size of every parameter at which the sampling stops
@@ -157,7 +157,7 @@ def sample(
             samplers = list(threads.map(lambda *one: _sampler(target, schedule, *one), seeds, backends))
         draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
         walkers = ENSEMBLES * len(samplers[0].state.coords)
-        share = min(1.0, MOST_READINGS / (DEFAULT_BUDGET * walkers * target.readings))
+        share = min(1.0, MOST_WORK / (DEFAULT_BUDGET * walkers * target.work))
         last = max(int(budget * share) // schedule.thin, 2)
         for goal in _checks(min(sampler.stored for sampler in samplers), last):
             for done in _advance(samplers, goal, schedule.thin):

@@ -134,10 +134,10 @@ class MarginalPosterior:
         return self.target.theta(u)
 
     @property
-    def readings(self) -> int:
-        """Readings that an evaluation reads; 1 where it integrates motions of the capsule, which take far longer."""
+    def work(self) -> int:
+        """Time of an evaluation in units of that of one reading; 1 where it integrates motions of the capsule."""
         experiments = self.target.experiments
-        return 1 if any(e.event_driven for e in experiments) else max(1, sum(e.n for e in experiments))
+        return 1 if any(e.event_driven for e in experiments) else max(1, sum(e.work for e in experiments))
 
     @property
     def can_be_emulated(self) -> bool:

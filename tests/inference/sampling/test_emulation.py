@@ -34,7 +34,7 @@ class Emulable(Gaussian):
     """A known density whose emulator is half an sd off, and a tenth too narrow."""
 
     can_be_emulated = True
-    readings = 1
+    work = 1
 
     def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Gaussian:
         assert len(v) == len(motions[0])
@@ -82,7 +82,7 @@ class Learner(Gaussian):
     """
 
     can_be_emulated = True
-    readings = 1
+    work = 1
 
     def __init__(self, rounds: int) -> None:
         super().__init__(MEAN, SIGMA, BLOCKS)

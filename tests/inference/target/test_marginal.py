@@ -15,7 +15,7 @@ import tests.experiments.bench as bench
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.fit.curvature import BATCH, hessian, root_of_inverse
+from capsule_id.inference.fit.curvature import BATCH, hessian
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior, conditional, density_of, uniform_at
@@ -85,7 +85,7 @@ def approximate(target: LogPosterior, known: dict[str, float]) -> PointFit:
     u = target.unconstrain(np.array([known[name] for name in target.names]))
     scale = np.full(target.dimension, 1e-3)
     for _ in range(3):
-        root = root_of_inverse(-hessian(target.batch, u, scale))
+        root = np.linalg.cholesky(np.linalg.inv(-hessian(target.batch, u, scale)))
         scale = np.sqrt(np.sum(root**2, axis=1))
     none = np.zeros((1, target.dimension))
     return PointFit(target.names, u, {}, root @ root.T, {}, none, none, np.zeros(1), *np.zeros((2, 1), dtype=bool))

@@ -18,8 +18,9 @@ from capsule_id.rig.formats.columns import release
 
 #: Block means per period that replace a long record; with more, a decay's parameters gain less than 0.5 % in precision.
 READINGS_PER_PERIOD = 32
-#: Shorter records, in samples, are used whole; a block has at least two samples.
-LONGEST_WHOLE = 2000
+#: Shorter records, in samples, are used whole; a block has at least two samples. Records of so many periods that more block
+#: means are left than this have fewer per period, but at least so many: intervals are then some 3 % wider.
+LONGEST_WHOLE, FEWEST_PER_PERIOD = 2000, 8
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,12 @@ def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READING
 
 def default_block_size(time: np.ndarray, values: np.ndarray) -> int:
     """Samples per block where the settings do not state it: 1 for records of at most ``LONGEST_WHOLE`` samples."""
-    return 1 if len(time) <= LONGEST_WHOLE else block_size(time, values)
+    if len(time) <= LONGEST_WHOLE:
+        return 1
+    size = block_size(time, values)
+    if len(time) <= size * LONGEST_WHOLE:
+        return size
+    return max(size, min(len(time) // LONGEST_WHOLE, block_size(time, values, FEWEST_PER_PERIOD)))
 
 
 def block_mean(values: Any, weights: Any, xp: Any) -> Any:

@@ -20,7 +20,7 @@ from capsule_id.experiments.free_vibration.decrement import viscous_fit
 from capsule_id.experiments.free_vibration.readings.blocks import block_size
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import force_responses
-from capsule_id.experiments.free_vibration.settings import DAMPING, DecayModel
+from capsule_id.experiments.free_vibration.settings import DAMPING, MOST_PERIODS, DecayModel, first_periods
 from capsule_id.physics.batches import pool
 from capsule_id.records.noise import noise_level
 from capsule_id.views import Finding
@@ -226,14 +226,17 @@ def second_models(
         contradicting = [e.label for e in own if e.n >= SHORTEST and demands_another(e, level)]
         if not contradicting:
             continue
+        own = [e.with_table(first_periods(e.table)) for e in own]
         ranking = demanded_model(own)
         model = ranking.model
         if model != own[0].model:
             facts = {"labels": contradicting, "first": own[0].model.name, "second": model.name, "lines": model.lines}
             facts["drift"] = _drift_text(own, ranking)
+            if model.slow and any(part.n < records[i].n for i, part in zip(members, own, strict=True)):
+                facts["drift"] += f" The second fit uses the first {MOST_PERIODS} periods of each record."
             findings.append(Finding("decays.second_fit", "warn", facts, contradicting[0]))
-            for i, (screened, _) in zip(members, ranking.fits, strict=True):
-                chosen[i] = records[i].with_model(model, screened)
+            for i, part, (screened, _) in zip(members, own, ranking.fits, strict=True):
+                chosen[i] = (part if model.slow else records[i]).with_model(model, screened)
     return chosen, findings
 
 
