@@ -21,6 +21,8 @@ SMALLEST_REDUCTION = 0.2
 #: A parameter this many widths from the centre of its prior is pulled by it. A scatter is then too small, and so is every
 #: sd that it gives.
 PRIOR_PULL = 2.5
+#: Largest distance of a ratio from 1000, in decades, that a wrong prefix explains.
+WRONG_PREFIX = 0.3
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,11 @@ def default_scatter(s: SampledFit, row: Parameter) -> bool:
     return row.scatter and row.name not in s.rig.priors
 
 
+def in_doubt(s: SampledFit) -> set[str]:
+    """Names of the parameters with an unusual scale: a wrong unit explains them, so no other prior is proposed."""
+    return {name for finding in s.findings if "scales" in finding.facts for name in finding.parameters}
+
+
 def check_priors(s: SampledFit) -> list[Finding]:
     """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
     findings = []
@@ -94,9 +101,12 @@ def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
     """The conflict of parameter ``name``; it concerns all parameters of the experiments that read it."""
     (row,) = [row for row in s.target.parameters if row.name == name]
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
+    ratio = abs(np.log10(abs(conflict.value / prior_of(row).median))) if prior_of(row).kind == "lognormal" else 0.0
+    unit = bool(abs(ratio - 3.0) < WRONG_PREFIX)
     facts = {
         "name": name,
-        "key": "" if is_stated(name) else row.prior_key,
+        "key": "" if is_stated(name) or unit or name in in_doubt(s) else row.prior_key,
+        "is_unit": unit,
         "unit": "" if row.unit == "1" else f" {row.unit}",
         "prior": prior_of(row).describe(),
         "stated": "rig" if is_stated(name) else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",
