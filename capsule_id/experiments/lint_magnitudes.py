@@ -30,9 +30,11 @@ USUAL: Mapping[str, tuple[float, float]] = {
     "1": (0.01, 10.0),
 }
 #: Usual ratios: m2 over m1, a force over the weight of the stated masses, k2 over k1, gap over amplitude.
-MASSES, FORCES, STIFFNESSES, GAPS = (0.03, 150.0), (0.01, 100.0), (0.05, 1000.0), (3e-3, 20.0)
-#: Usual amplitude of the acceleration of a decay, m/s^2: it holds the square of the unit of time.
-ACCELERATIONS = (3e-3, 1e4)
+MASSES, FORCES, STIFFNESSES, GAPS = (0.03, 150.0), (0.01, 100.0), (0.01, 1000.0), (3e-3, 20.0)
+#: Usual m1 of a rig without m2: no relation judges it.
+MASS_ALONE = (8e-3, 12.0)
+#: Usual period of a decay, s, and amplitude of its acceleration, m/s^2, which holds the square of the unit of time.
+PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
 #: Relations between two columns: their names, the words, the SI unit, the value, its usual interval.
 RELATIONS = (
     (("force", "current"), "force per current", "N/A", lambda x, y: np.ptp(x) / (np.ptp(y) or 1e-30), (0.03, 300.0)),
@@ -81,9 +83,15 @@ class Number:
         low, high = self.usual
         if self.value == 0.0 or low <= abs(self.value) <= high or set(self.scales) <= set(rig.confirmed):
             return
-        shown = {"value": self.value, "low": low, "high": high}
-        facts = {key: number * self.to_display for key, number in shown.items()}
-        facts |= {"name": self.name, "unit": self.unit or self.si, "scales": self.scales, "meant": self._meant()}
+        facts = {
+            "name": self.name,
+            "value": self.value * self.to_display,
+            "low": low * self.to_display,
+            "high": high * self.to_display,
+            "unit": self.unit or self.si,
+            "scales": self.scales,
+            "meant": self._meant(),
+        }
         yield Finding(self.code, "warn", facts, self.label)
 
     def _meant(self) -> str:
@@ -98,7 +106,7 @@ def lint_rig_quantities(rig: Rig) -> Iterable[Finding]:
     for name, rule in RIG_QUANTITIES.items():
         quantity: Quantity | None = getattr(rig, name)
         if quantity is not None:
-            usual = rule.usual or USUAL[rule.si]
+            usual = rule.usual or (USUAL[rule.si] if rig.m2 is not None else MASS_ALONE)
             yield from Number(f"{name} of [rig]", quantity.value, rule.si, usual, (name,)).unusual(rig)
     if rig.m1 is not None and rig.m2 is not None:
         yield from Number("m2 / m1", rig.m2.value / rig.m1.value, "1", MASSES, ("m1", "m2")).unusual(rig)
@@ -119,8 +127,7 @@ def lint_stated_sd(table: Table[Any], kind: Kind) -> Iterable[Finding]:
     for key in kind.setting_rules.keys() - GroundSettings.__dataclass_fields__.keys():
         stated = getattr(table.settings, key)
         if isinstance(stated, Quantity) and 0.0 < abs(stated.value) < 2.0 * stated.sd:
-            facts = {"name": key, "value": stated.value, "sd": stated.sd}
-            yield Finding("settings.sd", "warn", facts, table.label)
+            yield Finding("settings.sd", "warn", {"name": key, **vars(stated)}, table.label)
 
 
 def _numbers(table: Table[Any], kind: Kind, rig: Rig) -> Iterable[Number]:
@@ -140,7 +147,8 @@ def _numbers(table: Table[Any], kind: Kind, rig: Rig) -> Iterable[Number]:
             continue
         value, (usual, others) = stated.value if isinstance(stated, Quantity) else float(stated), _usual(rule, rig)
         if key == "gap" and "x_rel" in table.columns:
-            usual, others = _times(GAPS, float(np.ptp(table["x_rel"])) / 2.0), (f"{label}.x_rel",)
+            size = float(np.ptp(table["x_rel"])) / 2.0
+            usual, others = (GAPS[0] * size, GAPS[1] * size), (f"{label}.x_rel",)
         if usual is not None:
             yield Number(f"{key} of {label}", value, rule.si, usual, (f"{label}.{key}",), label, shared=others)
     for pair, words, si, relation, usual in RELATIONS:
@@ -155,12 +163,9 @@ def _usual(rule: ColumnRule | QuantityRule, rig: Rig) -> tuple[tuple[float, floa
     """The usual interval of a quantity, and the masses in it: forces of a rig grow with its weight."""
     masses = {name: getattr(rig, name).value for name in ("m1", "m2") if getattr(rig, name) is not None}
     if rule.si == "N" and rule.usual is None and masses:
-        return _times(FORCES, sum(masses.values()) * rig.g.value), tuple(masses)
+        weight = sum(masses.values()) * rig.g.value
+        return (FORCES[0] * weight, FORCES[1] * weight), tuple(masses)
     return rule.usual or USUAL.get(rule.si), ()
-
-
-def _times(interval: tuple[float, float], factor: float) -> tuple[float, float]:
-    return interval[0] * factor, interval[1] * factor
 
 
 def _against_k1(table: Table[Any], rig: Rig) -> Iterable[Number]:

@@ -17,7 +17,7 @@ from capsule_id.experiments.free_vibration.settings import (
     release_time,
     window_of,
 )
-from capsule_id.experiments.lint_magnitudes import ACCELERATIONS, USUAL, Number, frequency_of, lint_rig_quantities
+from capsule_id.experiments.lint_magnitudes import ACCELERATIONS, PERIODS, Number, frequency_of, lint_rig_quantities
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import parameter
 from capsule_id.records.faults.aliasing import aliases
@@ -99,14 +99,15 @@ def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[
 
 def _scales(table: Table[Any], rig: Rig, frequency: float, values: np.ndarray) -> Iterable[Finding]:
     """Report an unusual period, and an unusual acceleration of the rod at its start."""
-    column, (low, high), label = table.columns["time"], USUAL["Hz"], table.label
+    column, label, period = table.columns["time"], table.label, f"the period of {table.file}"
     channel = next(name for name in table.columns if name != "time")
-    words, usual, scales = f"the period of {table.file}", (1.0 / high, 1.0 / low), (f"{label}.time",)
-    written = label, column.unit, column.to_display, "decays.magnitude"
-    yield from Number(words, 1.0 / frequency, "s", usual, scales, *written).unusual(rig)
+    scales, written = (
+        (f"{label}.time", f"{label}.{channel}"),
+        (label, column.unit, column.to_display, "decays.magnitude"),
+    )
+    yield from Number(period, 1.0 / frequency, "s", PERIODS, scales[:1], *written).unusual(rig)
     size = 0.5 * float(np.ptp(values)) * (2.0 * np.pi * frequency) ** DERIVATIVES[channel]
-    words, scales = f"the acceleration in {table.file}", (*scales, f"{label}.{channel}")
-    yield from Number(words, size, "m/s^2", ACCELERATIONS, scales, label).unusual(rig)
+    yield from Number(f"the acceleration in {table.file}", size, "m/s^2", ACCELERATIONS, scales, label).unusual(rig)
 
 
 def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:

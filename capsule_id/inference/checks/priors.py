@@ -5,6 +5,7 @@ c + (x - c)/(1 - S/w²) with variance S/(1 - S/w²). Its distance from the prior
 normal where prior and data agree (Evans & Moshonov 2006). x is the logarithm where the prior is log-normal.
 """
 
+import math
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -101,14 +102,14 @@ def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
     """The conflict of parameter ``name``; it concerns all parameters of the experiments that read it."""
     (row,) = [row for row in s.target.parameters if row.name == name]
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
-    ratio = abs(np.log10(abs(conflict.value / prior_of(row).median))) if prior_of(row).kind == "lognormal" else 0.0
-    unit = bool(abs(ratio - 3.0) < WRONG_PREFIX)
+    prior = prior_of(row)
+    unit = prior.kind == "lognormal" and abs(abs(math.log10(conflict.value / prior.median)) - 3.0) < WRONG_PREFIX
     facts = {
         "name": name,
         "key": "" if is_stated(name) or unit or name in in_doubt(s) else row.prior_key,
         "is_unit": unit,
         "unit": "" if row.unit == "1" else f" {row.unit}",
-        "prior": prior_of(row).describe(),
+        "prior": prior.describe(),
         "stated": "rig" if is_stated(name) else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",
         "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
         "fitted": s.values[name],

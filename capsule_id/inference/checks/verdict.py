@@ -118,7 +118,7 @@ def _boundary(s: SampledFit) -> list[Finding]:
     z = np.abs(s.target.prior_residuals(s.fit.u))
     judged = [(row.name, pull) for row, pull in zip(s.target.parameters, z, strict=True) if not default_scatter(s, row)]
     names = [name for name, pull in judged if pull > PRIOR_PULL]
-    placed = [row for row in s.target.parameters if row.name in names and not is_stated(row.name)]
-    keys = [row.prior_key for row in placed if row.name not in in_doubt(s)]
+    out = {name for name in names if not is_stated(name)} - in_doubt(s)
+    keys = [row.prior_key for row in s.target.parameters if row.name in out]
     facts = {"names": ", ".join(names), "keys": ", ".join(filter(None, keys))}
     return [Finding("priors.tails", "warn" if names else "ok", facts, parameters=tuple(names))]
