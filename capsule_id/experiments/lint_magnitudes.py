@@ -35,6 +35,8 @@ MASSES, FORCES, STIFFNESSES, GAPS = (0.03, 150.0), (0.01, 100.0), (0.01, 1000.0)
 MASS_ALONE = (8e-3, 12.0)
 #: Usual period of a decay, s, and amplitude of its acceleration, m/s^2, which holds the square of the unit of time.
 PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
+#: Largest distance of a ratio from 1000, in decades, that a wrong prefix explains.
+WRONG_PREFIX = 0.3
 #: Relations between two columns: their names, the words, the SI unit, the value, its usual interval.
 RELATIONS = (
     (("force", "current"), "force per current", "N/A", lambda x, y: np.ptp(x) / (np.ptp(y) or 1e-30), (0.03, 300.0)),
@@ -96,9 +98,9 @@ class Number:
 
     def _meant(self) -> str:
         """The likeliest unit in which the written number would be usual; "" where there is none."""
-        written, (low, high) = self.value * self.to_display, self.usual
+        written, (low, high) = abs(self.value) * self.to_display, self.usual
         units = _ALTERNATIVES.get(self.si, ()) if len(self.scales) == 1 else ()
-        return next((unit for unit in units if low <= abs(written) * factor_to_si(unit, self.si) <= high), "")
+        return next((unit for unit in units if low <= written * factor_to_si(unit, self.si) <= high), "")
 
 
 def lint_rig_quantities(rig: Rig) -> Iterable[Finding]:
@@ -137,8 +139,7 @@ def _numbers(table: Table[Any], kind: Kind, rig: Rig) -> Iterable[Number]:
         rule = kind.columns[name]
         usual, masses = _usual(rule, rig)
         largest = float(max(np.max(column.values), -np.min(column.values)))
-        # A channel that may be constant, as a capsule at rest, has no smallest amplitude.
-        if usual is not None and (rule.varies or rule.domain.low == 0.0 or largest > usual[1]):
+        if usual is not None:
             words, written = f"the largest {name} of {table.file}", (label, column.unit, column.to_display)
             yield Number(words, largest, rule.si, usual, (f"{label}.{name}",), *written, shared=masses)
     for key, rule in kind.setting_rules.items():
@@ -176,8 +177,7 @@ def _against_k1(table: Table[Any], rig: Rig) -> Iterable[Number]:
     k1 = rig.m1.value * (2.0 * np.pi * frequency_of(decay["time"], decay["x_rel"])) ** 2
     ratio = float(np.ptp(table["force"]) / (np.ptp(table["deflection"]) or 1e-30)) / k1
     scales, shared = (f"{table.label}.force", f"{table.label}.deflection"), ("m1", f"{decay.label}.time")
-    words = f"stiffness of {table.file} over that of the rod"
-    yield Number(words, ratio, "1", STIFFNESSES, scales, table.label, shared=shared)
+    yield Number(f"k2 of {table.file} over k1", ratio, "1", STIFFNESSES, scales, table.label, shared=shared)
 
 
 def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
@@ -187,18 +187,17 @@ def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
     return dominant_frequency(even, np.interp(even, time[part], values[part]))
 
 
-def with_line(findings: Iterable[Finding], rig: Rig) -> Iterable[Finding]:
-    """The findings, those on scales with the line of rig.toml that confirms them all.
+def with_line(findings: Sequence[Finding], rig: Rig) -> Iterable[Finding]:
+    """The findings, those on scales once, with the line of rig.toml that confirms them all.
 
     A relation is left out where one of its scales is unusual by itself.
     """
-    unusual = [f.facts["scales"] for f in findings if "scales" in f.facts]
-    alone = {scales[0] for scales in unusual if len(scales) == 1}
-    line = f"confirmed = {json.dumps([*dict.fromkeys([*rig.confirmed, *(name for s in unusual for name in s)])])}"
-    shown = set[tuple[str, ...]]()
+    first = {f.facts["scales"]: f for f in reversed(findings) if "scales" in f.facts}
+    alone = {scales[0] for scales in first if len(scales) == 1}
+    names = dict.fromkeys([*rig.confirmed, *(name for scales in reversed(first) for name in scales)])
     for finding in findings:
-        if (scales := finding.facts.get("scales")) is None:
+        scales = finding.facts.get("scales")
+        if scales is None:
             yield finding
-        elif scales not in shown and (len(scales) == 1 or not alone.intersection(scales)):
-            shown.add(scales)
-            yield replace(finding, facts={**finding.facts, "line": line})
+        elif finding is first[scales] and (len(scales) == 1 or not alone.intersection(scales)):
+            yield replace(finding, facts={**finding.facts, "line": f"confirmed = {json.dumps([*names])}"})

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted import with_table, with_values
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
@@ -23,6 +22,7 @@ from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Finding
 from tests.cli_tools import DATA
 from tests.experiments import bench
+from tests.experiments.planted import with_table, with_values
 
 KINDS = default_registry()
 BENCH = tuple(table.label for table in read_rig(DATA, KINDS).tables if table.bench)
@@ -143,9 +143,13 @@ def test_light_and_heavy_benches_are_trusted(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+# Decays of two time scales are refitted far from any optimum.
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 @pytest.mark.parametrize("scale", SCALED)
 def test_no_parameter_with_a_wrong_scale_is_trusted(rig: Rig, scale: str, factor: float) -> None:
+    if scale == "static_friction.angle" and factor > 1.0:
+        pytest.skip("angles beyond 90 deg are an error")
     words = cid.fit(slipped(rig, scale, factor)).summary["trust"]
     assert "trusted" not in set(words[list(SCALED[scale])])
 

@@ -17,7 +17,14 @@ from capsule_id.experiments.free_vibration.settings import (
     release_time,
     window_of,
 )
-from capsule_id.experiments.lint_magnitudes import ACCELERATIONS, PERIODS, Number, frequency_of, lint_rig_quantities
+from capsule_id.experiments.lint_magnitudes import (
+    ACCELERATIONS,
+    PERIODS,
+    WRONG_PREFIX,
+    Number,
+    frequency_of,
+    lint_rig_quantities,
+)
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import parameter
 from capsule_id.records.faults.aliasing import aliases
@@ -144,7 +151,9 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
             "range": (median / factor, median * factor),
             "factor": PROPOSED_FACTOR,
             # A prior would hide a wrong unit.
-            "unit": bool(unusual) or any(f.facts["scales"] == ("m1",) for f in lint_rig_quantities(rig)),
+            "unit": bool(unusual)
+            or any(f.facts["scales"] == ("m1",) for f in lint_rig_quantities(rig))
+            or (stated is not None and abs(abs(np.log10(k1 / median)) - 3.0) < WRONG_PREFIX),
         }
         # The usual range is no measurement: small rigs and pendulums have a k1 outside it.
         certain = coarse or stated is not None

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.lint_magnitudes import WRONG_PREFIX
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.target.priors import prior_of
 from capsule_id.parameters import Parameter, is_stated
@@ -22,8 +23,6 @@ SMALLEST_REDUCTION = 0.2
 #: A parameter this many widths from the centre of its prior is pulled by it. A scatter is then too small, and so is every
 #: sd that it gives.
 PRIOR_PULL = 2.5
-#: Largest distance of a ratio from 1000, in decades, that a wrong prefix explains.
-WRONG_PREFIX = 0.3
 
 
 @dataclass(frozen=True)
