@@ -102,7 +102,11 @@ def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
     (row,) = [row for row in s.target.parameters if row.name == name]
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
     prior = prior_of(row)
-    unit = prior.kind == "lognormal" and abs(abs(math.log10(conflict.value / prior.median)) - 3.0) < WRONG_PREFIX
+    unit = (
+        name in s.rig.priors
+        and prior.kind == "lognormal"
+        and abs(abs(math.log10(conflict.value / prior.median)) - 3.0) < WRONG_PREFIX
+    )
     facts = {
         "name": name,
         "key": "" if is_stated(name) or unit or name in in_doubt(s) else row.prior_key,
