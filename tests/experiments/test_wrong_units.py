@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,6 +130,22 @@ def test_light_and_heavy_benches_rarely_need_the_line(tmp_path: Path) -> None:
     assert len(asked) <= 6
     for rig in asked:
         assert scales(replace(rig, confirmed=line_of(scales(rig)[0]))) == []
+
+
+def missed(rigs: Iterable[Rig]) -> list[tuple[str, str, float]]:
+    """The masses and columns, each wrong by a factor, that no finding names."""
+    slips = [(rig, scale, factor) for rig in rigs for scale in SCALED for factor in (1e-3, 1e3)]
+    named = [{name for found in scales(slipped(*slip)) for name in found.facts["scales"]} for slip in slips]
+    return [(rig.name, scale, f) for (rig, scale, f), names in zip(slips, named, strict=True) if scale not in names]
+
+
+def test_wrong_units_of_light_and_heavy_benches_are_named(tmp_path: Path) -> None:
+    assert missed([*heavy_and_light(tmp_path)][::10]) == []
+
+
+@pytest.mark.slow
+def test_at_most_1_percent_of_wrong_units_are_missed(tmp_path: Path) -> None:
+    assert len(missed(heavy_and_light(tmp_path))) <= 0.01 * 30 * 2 * len(SCALED)
 
 
 @pytest.mark.slow
