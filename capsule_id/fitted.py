@@ -19,6 +19,7 @@ from capsule_id.inference.prediction import DRAWS, predict
 from capsule_id.inference.result import Result
 from capsule_id.output import check_directory, publish, work_in_progress
 from capsule_id.parameters import is_stated
+from capsule_id.physics.contacts import warn_of_far_gap
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
 from capsule_id.report.columns import table_rows
@@ -117,14 +118,14 @@ class Fit(Result):
         times : (n,) s, increasing
         draws : number of draws, taken at random without repetition
         spring : name of the support spring, k2[spring]; None: no support spring
-        gap : G, m
+        gap : G, m; needed with ``spring``. One far beyond the motion is a warning
         given : leaves of ``CapsuleParameters`` that the fit does not have, SI by name
         seed : of the choice of draws
 
         Raises
         ------
         InputError
-            If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter is missing.
+            If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter or the gap is missing.
         """
         chosen = self._draws(draws, seed)
         stated = {name: self.rig.mass(name) for name in ("m1", "m2") if getattr(self.rig, name) is not None}
@@ -143,13 +144,19 @@ class Fit(Result):
             if f"k2[{spring}]" not in chosen:
                 known = ", ".join(name[3:-1] for name in chosen if name.startswith("k2["))
                 raise InputError("spring must be a fitted one", repr(spring), f"choose from {known or 'none'}")
+            if np.any(np.isinf(values["G"])):
+                raise InputError(
+                    "a support spring needs its gap", f"{spring!r} alone", "give gap=1e-3, in m, or spring=None"
+                )
             values["k2"] = chosen[f"k2[{spring}]"]
         leaves = fields(CapsuleParameters)
         if missing := [leaf.name for leaf in leaves if leaf.default is MISSING and leaf.name not in values]:
             rule, remedy = "simulate needs every parameter of the capsule", f"state given={{{missing[0]!r}: ...}}, SI"
             raise InputError(rule, f"the fit has no {', '.join(missing)}", remedy)
         p = CapsuleParameters(**{leaf.name: values[leaf.name] for leaf in leaves if leaf.name in values})
-        return simulate(p, drive, times)
+        motion = simulate(p, drive, times)
+        warn_of_far_gap(p.G, motion.x_rel)
+        return motion
 
     def _draws(self, number: int, seed: int) -> dict[str, np.ndarray]:
         """``number`` draws at random: name -> (number,), SI."""

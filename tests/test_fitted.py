@@ -179,6 +179,12 @@ def test_simulate_names_what_it_lacks(fitted: Fit, capsule: Fit) -> None:
     assert len(given) == 6
     with pytest.raises(InputError, match="choose from soft"):
         capsule.simulate(DRIVE, TIMES, draws=2, spring="stiff")
+    # Before: no contact, and not a word.
+    with pytest.raises(InputError, match="a support spring needs its gap, 'soft' alone, give gap=1e-3"):
+        capsule.simulate(DRIVE, TIMES, draws=2, spring="soft")
+    with pytest.warns(UserWarning, match=r"the gap is 1000 mm and the largest \|x_rel\| .* mm: no contact"):
+        capsule.simulate(DRIVE, TIMES, draws=2, spring="soft", gap=1.0)
+    assert np.all(np.asarray(capsule.simulate(DRIVE, TIMES, draws=2).contacts) == 0)
     with pytest.raises(InputError, match="give at most"):
         capsule.simulate(DRIVE, TIMES, draws=10**9)
 

@@ -70,6 +70,10 @@ def capsule_values(
             )
         _check_sign(name, value, f"--{name}" if text is not None else "the value")
         values[name] = value
+    fit = args.result or getattr(args, "posterior", None)
+    if args.spring is not None and (fit is None or values["G"] == math.inf):
+        remedy = "give --result DIR and --G X, in m, or remove --spring"
+        raise InputError("--spring needs the result that it is of, and a gap", "none", remedy)
     return values
 
 

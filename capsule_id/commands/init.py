@@ -37,6 +37,8 @@ name = "@NAME@"
 #: mass of the capsule, needed for forced runs, sliding forces and free vibrations with capsule = "free"
 # m2 = { value = 0.530, sd = 0.001, unit = "kg" }
 # g = { value = 9.81, unit = "m/s^2" }
+#: what has an unusual size and the right unit, as `capsule-id check` prints it: "m1", "LABEL.COLUMN", "LABEL.SETTING"
+# confirmed = ["m1"]
 #: slope of the track, +x_capsule uphill, and force that presses the capsule down besides its weight; exact without sd.
 #: An experiment may state its own; a tilt takes its own angle
 # slope = { value = 0, sd = 0.1, unit = "deg" }

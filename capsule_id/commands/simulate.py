@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
         keep_programs()
     import numpy as np
 
+    from capsule_id.physics.contacts import warn_of_far_gap
     from capsule_id.physics.model import Status, simulate, status_message
     from capsule_id.physics.smooth.engine import Smoothing
     from capsule_id.report.motion_files import write_motion
@@ -87,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("the run must be complete", status.name, status_message(t.status))
     if status is not Status.OK:
         print(f"capsule-id simulate: {status_message(t.status)}", file=sys.stderr)
+    warn_of_far_gap(p.G, t.x_rel)
     held = np.isin(times, grid)
     columns = {"time": times[held]} | {name: np.asarray(getattr(t, name))[held] for name in (*STATE, "x_rel")}
     try:

@@ -62,11 +62,16 @@ def make_experiments(
     for name, kind in kinds.items():
         kind.check([table for table in tables if table.kind == name])
     # The law loads JAX, which takes seconds. A faulty folder must be reported before.
-    from capsule_id.experiments.families.friction_model import friction_of
+    from capsule_id.experiments.families.friction_model import EQUATION_1, friction_of
 
     model = friction_of(rig, friction)
     model.check(kinds.parameters)
     made = tuple(e for table in tables for e in kinds[table.kind].make(table, rig, model))
+    absent = {row.symbol for row in EQUATION_1.law.parameters} - {row.symbol for row in model.law.parameters}
+    for e in made:
+        if taken := absent.intersection(row.symbol for row in e.parameters):
+            rule = f"the kind {e.kind} reads {min(taken)} of eq. (1), which the friction law {model.name} replaces"
+            raise InputError(rule, e.label, f"remove {e.label}, or fit without this law", rig.folder / "rig.toml")
     measured = {row.symbol for e in made for row in e.parameters}
     for symbol in rig.model.free if experiments == "all" else ():
         if symbol not in measured:

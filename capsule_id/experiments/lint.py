@@ -7,7 +7,12 @@ from typing import Any
 import numpy as np
 
 from capsule_id.experiments.kind import Estimate, Kind
-from capsule_id.experiments.lint_magnitudes import lint_magnitudes, lint_rig_quantities
+from capsule_id.experiments.lint_magnitudes import (
+    lint_magnitudes,
+    lint_rig_quantities,
+    lint_stated_sd,
+    with_line,
+)
 from capsule_id.records.faults.duplicates import Readings, repeated_blocks
 from capsule_id.rig.formats.columns import release
 from capsule_id.rig.formats.text.blocks import WINDOWS
@@ -27,9 +32,9 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     masses = (("m1", rig.m1), ("m2", rig.m2))
     exact = [name for name, mass in masses if mass is not None and mass.sd == 0.0]
     findings = [Finding("masses.exact", "warn", {"name": name}) for name in exact]
-    findings += lint_rig_quantities(rig)
+    findings += (*lint_rig_quantities(rig), *lint_magnitudes(tables, kinds, rig))
     for table in tables:
-        findings += lint_magnitudes(table, kinds[table.kind])
+        findings += lint_stated_sd(table, kinds[table.kind])
         _release(table)
         windows = {file: encoding for file, encoding in table.encodings.items() if encoding == WINDOWS}
         findings += [
@@ -45,7 +50,7 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
         for lint_table in kinds[table.kind].lint:
             findings += lint_table(table, rig)
             _release(table)
-    return (*findings, *_same_files(rig, tables), *_repeated_blocks(rig, tables))
+    return (*with_line(findings, rig), *_same_files(rig, tables), *_repeated_blocks(rig, tables))
 
 
 def _release(table: Table[Any]) -> None:

@@ -34,6 +34,7 @@ from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.model_error.record_widening import record_widenings
 from capsule_id.inference.checks.model_error.widening import beside_stated, widenings
 from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.inference.checks.trust import with_scaled
 from capsule_id.inference.checks.verdict import run_checks
 from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.point_stage import PointStage
@@ -138,7 +139,8 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     """
     stop_if_interrupted()
     release_memory()
-    checked = run_checks(sampled)
+    before = [with_scaled(finding, sampled.experiments) for finding in before]
+    checked = run_checks(replace(sampled, findings=before))
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
     checked = replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
     widened = beside_stated(checked, {**widenings(checked), **record_widenings(checked)})

@@ -3,12 +3,25 @@
 The exact engine integrates the linear spring as series coefficients (``exact.taylor``) and does not call ``support``.
 """
 
+import warnings
 from typing import Any
 
 import jax
+import numpy as np
 
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.smooth.steps import Array, smooth_ramp
+
+#: A gap is far beyond a motion from this multiple of its largest |r| on, and from this size on, m.
+FAR, FAR_GAP = 20.0, 0.1
+
+
+def warn_of_far_gap(G: Any, r: Any) -> None:
+    """Warn where every gap ``G``, m, is far beyond the motion ``r``, m; an infinite one means no spring."""
+    gap, reach = float(np.min(G)), float(np.nanmax(np.abs(r)))
+    if max(FAR * reach, FAR_GAP) < gap < np.inf:
+        text = f"the gap is {1e3 * gap:.4g} mm and the largest |x_rel| {1e3 * reach:.3g} mm: no contact. Is it in m?"
+        warnings.warn(text, stacklevel=3)
 
 
 def support(k2: Any, G: Any, r: Any) -> Any:

@@ -1,6 +1,6 @@
 """Reads ``[model]`` of ``rig.toml``, and checks choices of [rig] and of an experiment that depend on each other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import cos
 from typing import Any, get_args, get_type_hints
 
@@ -45,6 +45,26 @@ def read_model(document: TomlDocument) -> ModelChoices:
         raise document.error(path, "constant friction has no ratio", shown("ratio"), remedy)
     in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
     return ModelChoices(free=in_order, **choices)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+
+
+def read_confirmed(document: TomlDocument, tables: Sequence[Table[Any]], stated: Iterable[str]) -> tuple[str, ...]:
+    """Return the names in ``confirmed`` of [rig]; ``stated``: the quantities of [rig].
+
+    Raises
+    ------
+    InputError
+        If it is no list of names of [rig], or of columns and settings of experiments.
+    """
+    path, names = ("rig", "confirmed"), document.data["rig"].get("confirmed", [])
+    known = [*stated, *(f"{t.label}.{name}" for t in tables for name in (*t.columns, *vars(t.settings)))]
+    if not isinstance(names, list):
+        raise document.error(path, "confirmed must be a list of names", shown(names), 'write confirmed = ["m1"]')
+    for name in names:
+        if name not in known:
+            near = closest(name, known) if isinstance(name, str) else None
+            rule = "confirmed must name quantities of [rig], or LABEL.COLUMN or LABEL.SETTING of experiments"
+            raise document.error(path, rule, shown(name), f"write {near}" if near else "remove it")
+    return tuple(names)
 
 
 def check_masses_of_free(

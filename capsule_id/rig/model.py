@@ -172,6 +172,7 @@ class Rig:
     files : sha256 of every file read, by relative path
     model : the choices of ``[model]``
     slope, N0 : slope of the track, rad, and pressing force, N, of experiments that state no other (None: not stated)
+    confirmed : names of masses, columns and settings whose unusual values are right: ``m1``, ``decay_1.x_rel``
     """
 
     name: str
@@ -186,6 +187,7 @@ class Rig:
     model: ModelChoices = ModelChoices()
     slope: Quantity | None = None
     N0: Quantity | None = None
+    confirmed: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         kinds = Counter(table.kind for table in self.tables)

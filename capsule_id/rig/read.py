@@ -13,7 +13,7 @@ import numpy as np
 from capsule_id.errors import InputError, collecting, raise_all
 from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
-from capsule_id.rig.choices import check_masses_of_free, check_normal_forces, read_model
+from capsule_id.rig.choices import check_masses_of_free, check_normal_forces, read_confirmed, read_model
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.formats.text.decode import decode
 from capsule_id.rig.maps.declared import MAP_KEYS
@@ -97,6 +97,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         model=model,
         slope=stated.get("slope"),
         N0=stated.get("N0"),
+        confirmed=read_confirmed(document, tables, stated),
     )
 
 

@@ -242,6 +242,6 @@ RIG_QUANTITIES: Mapping[str, QuantityRule] = {
 }
 #: Keys of the tables of rig.toml that stand once.
 TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
-    "[rig]": ("name", "synthetic", *RIG_QUANTITIES),
+    "[rig]": ("name", "synthetic", "confirmed", *RIG_QUANTITIES),
     "[model]": ("friction", "free", "reaction"),
 }

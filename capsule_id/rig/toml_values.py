@@ -16,6 +16,8 @@ NAME_PATTERN = r"[A-Za-z0-9._-]+"
 _DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 #: No table of rig.toml, see ``refuse_unknown_keys``.
 NOWHERE: Mapping[str, Collection[str]] = MappingProxyType({})
+#: Units of masses and lengths. Positive ones are weighed or measured to better than half of their value.
+WEIGHED = ("kg", "m", "m/s^2")
 _LONGEST_SHOWN = 60  # characters of a faulty value in an error line
 
 
@@ -96,6 +98,9 @@ def read_quantity(
     factor = read_unit(document, path, entry, si)
     number = _read_scaled(document, path, entry, "value", factor, domain)
     sd = _read_scaled(document, path, entry, "sd", factor, NOT_NEGATIVE) if "sd" in entry else 0.0
+    if si in WEIGHED and domain is POSITIVE and sd > 0.5 * number:
+        rule = f"sd of {path[-1]} must be at most half of its value"
+        raise document.error((*path, "sd"), rule, shown(entry["sd"]), "weigh or measure it, or leave it out")
     return Quantity(number, sd)
 
 

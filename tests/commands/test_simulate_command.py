@@ -67,6 +67,10 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     assert (values["k1"], values["k2"], values["c"], values["m1"]) == (1500.0, 2e4, 5.0, 0.11)
     with pytest.raises(InputError, match="choose from L60"):
         options.capsule_values(parser.parse_args([*drive, "--spring", "L70"]))
+    # Before: no contact, and not a word.
+    for words in ([*drive, "--G", "inf"], [word for word in drive if word not in ("--result", str(tmp_path))]):
+        with pytest.raises(InputError, match="--spring needs the result that it is of, and a gap"):
+            options.capsule_values(parser.parse_args([*words, "--k2", "2e4", "--spring", "L60"]))
     other = {"parameters": rows, "provenance": {"friction": "mine.Law"}}
     (tmp_path / "parameters.json").write_text(json.dumps(other), encoding="utf-8")
     with pytest.raises(InputError, match=r"compute with eq. \(1\).*mine.Law"):
@@ -74,6 +78,16 @@ def test_parameters_of_a_result(tmp_path: Path) -> None:
     (tmp_path / "parameters.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="takes a result"):
         options.capsule_values(parser.parse_args(drive))
+
+
+def test_a_gap_far_beyond_the_motion_is_a_warning_in_mm(tmp_path: Path) -> None:
+    """1 mm is meant. Before: 0 contacts, and not a word."""
+    out = ["--periods", "1", "--samples", "50", "--out", str(tmp_path / "run.csv")]
+    with pytest.warns(UserWarning, match=r"the gap is 1000 mm and the largest \|x_rel\| 3\.\d+ mm: no contact"):
+        _run(*DRIVE, "--G", "1", *out)
+    # Negative controls: filterwarnings makes a warning an error.
+    assert _run(*DRIVE, "--G", "inf", *out) == 0
+    assert _run(*DRIVE, "--G", "0.05", *out) == 0
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,9 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.families.friction_model import FrictionModel
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.registry import Registry, default_registry
+from capsule_id.experiments.static_friction.experiment import StaticFriction
 from capsule_id.inference.fit.point_stage import fit_points
 from capsule_id.inference.sampling.chain_store import ChainStore
 from capsule_id.inference.target.log_posterior import LogPosterior
@@ -218,6 +219,22 @@ def test_a_law_that_cannot_be_fitted_is_refused(law: Any, m2: Quantity | None, t
     with pytest.raises(InputError) as caught:
         cid.fit(own, budget=None, friction=law)
     assert text in str(caught.value)
+
+
+def test_a_kind_that_reads_mu_is_refused_beside_a_law() -> None:
+    """A kind of another package that ignores the law. Before: mu and F_s, two unrelated frictions in one fit."""
+    kinds = default_registry()
+    own = replace(
+        kinds["static_friction"], name="spin", make=lambda table, rig, law: (StaticFriction(table, rig, EQUATION_1),)
+    )
+    registry = Registry((*kinds.kinds, own))
+    spin = replace(tilts(np.random.default_rng(0)), kind="spin", label="spin")
+    own_rig = bench.rig(spin, pushes(np.random.default_rng(1)))
+    with pytest.raises(InputError, match=r"the kind spin reads mu of eq. \(1\), which the friction law Lorentzian"):
+        make_experiments(own_rig, registry=registry, friction=Lorentzian)
+    # Negative control: eq. (1) by default, and by name.
+    for law in (None, CoulombStribeck):
+        assert len(make_experiments(own_rig, registry=registry, friction=law)) == 2
 
 
 def test_the_prior_of_its_parameters_can_be_stated(tmp_path: Path) -> None:

@@ -117,8 +117,12 @@ def run(args: argparse.Namespace) -> int:
     set_xla_options()
     if not args.no_cache:
         keep_programs()
+    from capsule_id.physics.contacts import warn_of_far_gap
+
     with Progress(not args.quiet, unit="point") as progress, client_of(args.scheduler) as client:
         data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
+        if "x_rel" in data and all(axis.name != "G" for axis in axes):
+            warn_of_far_gap(values["G"], data["x_rel"])
         data.attrs["rig"] = rig.name if rig is not None else ""
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
         publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))

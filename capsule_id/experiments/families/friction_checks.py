@@ -42,7 +42,7 @@ def check_variants(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> 
         "name": in_use.name,
         "labels": ", ".join(e.label for e in experiments),
         "count": len(variants),
-        "factor": float(np.exp(highest - used.evidence)),
+        "factor": float(np.exp(min(highest - used.evidence, 700.0))),
         "simplest": simplest.model.name,
         "line": simplest.line,
         "p": used.lack_of_fit,

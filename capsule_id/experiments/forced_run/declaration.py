@@ -306,7 +306,8 @@ KIND = Kind(
     columns={
         "time": ColumnRule("s", increasing=True),
         "x_rel": ColumnRule("m", varies=True),
-        "x_capsule": ColumnRule("m"),  # may be constant: a capsule that never moves is a valid result
+        # A capsule that never moves is a valid result, so its displacement has no smallest size.
+        "x_capsule": ColumnRule("m", usual=(0.0, 0.9)),
         "acceleration_rod": ColumnRule("m/s^2", varies=True),
         "current": ColumnRule("A", varies=True),
         "x_base": ColumnRule("m", varies=True),

@@ -1,6 +1,7 @@
 """Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any record."""
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,20 +20,29 @@ from capsule_id.experiments.free_vibration.settings import (
     release_time,
     window_of,
 )
+from capsule_id.experiments.lint_magnitudes import (
+    ACCELERATIONS,
+    PERIODS,
+    WRONG_PREFIX,
+    Number,
+    frequency_of,
+    lint_rig_quantities,
+)
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
-from capsule_id.parameters import TABLE, parameter
+from capsule_id.parameters import parameter
 from capsule_id.records.faults.aliasing import aliases
-from capsule_id.records.faults.magnitudes import USUAL, unit_meant
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import dominant_frequency, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
-from capsule_id.views import Facts, Finding, Message, counted
+from capsule_id.views import Facts, Finding, Message, counted, filled_in
 
+#: Median, N/m, and factor of the k1 that rods usually have; another k1 may be an alias.
+USUAL_K1 = (1500.0, 1000.0)
 #: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
-#: From so many samples per period on, an alias is less probable than a k1 outside its default prior: 1 in 50 aliased
+#: From so many samples per period on, an alias is less probable than an unusual k1: 1 in 50 aliased
 #: records has as many.
 SAMPLES_WITHOUT_ALIAS = 100
 #: Factor of the prior that a finding proposes for k1: it holds no alias of 20 samples per period or more.
@@ -43,6 +53,8 @@ FEWEST_PERIODS = 2
 FEWEST_MEANS = 4
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
+#: Time derivatives that lead from a channel to the acceleration.
+DERIVATIVES = {"x_rel": 2, "velocity": 1, "acceleration": 0}
 #: Ratios of units that are mistaken for each other.
 RATIOS = (("1000 (s and ms)", 1000.0), ("60 (min and s)", 60.0), ("2 pi (rad and cycles)", 2.0 * np.pi))
 
@@ -52,6 +64,7 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     used = window_of(table)
     yield from lint_times(table, used)
     if table.settings.samples == "turning_points":
+        yield from _scales(table, rig, 0.5 / median_step(table["time"][used]), table["x_rel"][used])
         return
     channels = [name for name in table.columns if name != "time"]
     time = table["time"]
@@ -76,13 +89,6 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
         yield from _frequency(table, rig, *window)
 
 
-def _dominant(time: np.ndarray, values: np.ndarray) -> float:
-    """Dominant frequency of a record that may be sampled unevenly, Hz."""
-    part = loudest_part(values)
-    even = np.linspace(time[part][0], time[part][-1], len(time[part]))
-    return dominant_frequency(even, np.interp(even, time[part], values[part]))
-
-
 def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[Finding]:
     """Report a frequency that differs from that of the first decay of the rig, whose k1 and m1 are the same."""
     first = next((other for other in rig.tables if other.kind == table.kind), table)
@@ -90,7 +96,7 @@ def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[
     if first.label == table.label or channel not in table.columns:
         return
     used = window_of(first)
-    ratio = frequency / _dominant(first["time"][used], first[channel][used])
+    ratio = frequency / frequency_of(first["time"][used], first[channel][used])
     if not 1.0 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         near = next(
             (f" The ratio is near {words}." for words, r in RATIOS if abs(abs(np.log(ratio)) - np.log(r)) < 0.1), ""
@@ -99,21 +105,28 @@ def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[
         yield Finding("decays.frequency", "fail", facts, table.label)
 
 
+def _scales(table: Table[Any], rig: Rig, frequency: float, values: np.ndarray) -> Iterable[Finding]:
+    """Report an unusual period, and an unusual acceleration of the rod at its start."""
+    column, label, period = table.columns["time"], table.label, f"the period of {table.file}"
+    channel = next(name for name in table.columns if name != "time")
+    scales, written = (
+        (f"{label}.time", f"{label}.{channel}"),
+        (label, column.unit, column.to_display, "decays.magnitude"),
+    )
+    yield from Number(period, 1.0 / frequency, "s", PERIODS, scales[:1], *written).unusual(rig)
+    size = 0.5 * float(np.ptp(values)) * (2.0 * np.pi * frequency) ** DERIVATIVES[channel]
+    yield from Number(f"the acceleration in {table.file}", size, "m/s^2", ACCELERATIONS, scales, label).unusual(rig)
+
+
 def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
     """Report an unusual frequency, and frequencies that the sampling cannot tell from that of the record."""
-    frequency = _dominant(time, values)
-    low, high = USUAL["Hz"]
-    if not low <= frequency <= high:
-        facts = {"name": f"the frequency of {table.file}", "value": frequency, "unit": "Hz", "low": low, "high": high}
-        meant = unit_meant(1.0 / frequency, table.columns["time"].to_display, "s", (1.0 / high, 1.0 / low))
-        remedy = f" If the times are in {meant}, write that unit." if meant else ""
-        yield Finding("decays.magnitude", "warn", {**facts, "remedy": remedy}, table.label)
+    frequency = frequency_of(time, values)
+    unusual = [*_scales(table, rig, frequency, values)]
+    yield from unusual
     yield from _other_frequency(table, rig, frequency)
     if rig.m1 is None:
         return
-    stated, default = rig.priors.get("k1"), TABLE["k1"].prior
-    assert default is not None, "k1 has a default prior"
-    median, factor = default.location, default.spread
+    stated, (median, factor) = rig.priors.get("k1"), USUAL_K1
     if stated is not None and stated.median is not None and stated.factor is not None:
         median, factor = stated.median, stated.factor
     k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
@@ -122,7 +135,7 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
     coarse = per_period < SAMPLES_PER_PERIOD
     inside = median / factor <= k1 <= median * factor
     # A sampling that cannot show the usual frequency shows another one instead.
-    blind = 0.5 / median_step(time) < np.sqrt(default.location / rig.m1.value) / (2.0 * np.pi)
+    blind = 0.5 / median_step(time) < np.sqrt(USUAL_K1[0] / rig.m1.value) / (2.0 * np.pi)
     if not coarse and (inside or (stated is None and per_period >= SAMPLES_WITHOUT_ALIAS and not blind)):
         return
     part = loudest_part(values)
@@ -138,8 +151,12 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
             "k1s": ", ".join(dict.fromkeys(f"{k:.4g}" for k in stiffnesses[possible][:3])),
             "range": (median / factor, median * factor),
             "factor": PROPOSED_FACTOR,
+            # A prior would hide a wrong unit.
+            "unit": bool(unusual)
+            or any(f.facts["scales"] == ("m1",) for f in lint_rig_quantities(rig))
+            or (stated is not None and abs(abs(np.log10(k1 / median)) - 3.0) < WRONG_PREFIX),
         }
-        # The default prior is no measurement: small rigs and pendulums have a k1 outside it.
+        # The usual range is no measurement: small rigs and pendulums have a k1 outside it.
         certain = coarse or stated is not None
         yield Finding("decays.alias", "fail" if certain else "warn", facts, table.label, () if certain else ("k1",))
 
@@ -211,16 +228,23 @@ def line_of(key: str) -> str:
     return f'{key} = {{{{ value = {{{key}:.10g}}, unit = "s" }}}}'
 
 
+_UNIT = " Check first the unit of the times and of m1. If they are right, sample faster."
 _ALIAS = (
-    "{file}: the sampling cannot tell {frequency:.4g} Hz (k1 = {k1:.4g} N/m) from {others} Hz (k1 = {k1s} N/m). Sample "
-    "faster. If {frequency:.4g} Hz is right, state a prior that holds it alone, such as "
-    'k1 = {{ median = {k1:.4g}, factor = 1.2, unit = "N/m" }} in [prior].'
+    "{file}: the sampling cannot tell {frequency:.4g} Hz (k1 = {k1:.4g} N/m) from {others} Hz (k1 = {k1s} N/m).",
+    " Sample faster. If {frequency:.4g} Hz is right, state a prior that holds it alone, such as "
+    'k1 = {{ median = {k1:.4g}, factor = 1.2, unit = "N/m" }} in [prior].',
 )
-_DEFAULT_PRIOR = (
-    "{file}: k1 = {k1:.4g} N/m lies outside the range of its default prior, {range[0]:.3g} to {range[1]:.3g} N/m. An "
-    "oscillation of {others} Hz (k1 = {k1s} N/m) has the same samples. If k1 is near {k1:.2g} N/m, state that: "
-    'k1 = {{ median = {k1:.2g}, factor = {factor}, unit = "N/m" }} in [prior]. Else sample faster.'
+_OUTSIDE = (
+    "{file}: k1 = {k1:.4g} N/m lies outside its usual range, {range[0]:.3g} to {range[1]:.3g} N/m. An "
+    "oscillation of {others} Hz (k1 = {k1s} N/m) has the same samples.",
+    " If k1 is near {k1:.2g} N/m, state that: "
+    'k1 = {{ median = {k1:.2g}, factor = {factor}, unit = "N/m" }} in [prior]. Else sample faster.',
 )
+
+
+def _alias(texts: tuple[str, str], facts: Facts) -> str:
+    """The frequencies of the same samples, and the remedy: no prior where a unit is in doubt."""
+    return filled_in(texts[0] + (_UNIT if facts["unit"] else texts[1]), facts)
 
 
 def _hidden(facts: Facts) -> str:
@@ -290,10 +314,6 @@ MESSAGES = {
             "rig.toml: " + line_of("stop")
         ),
     ),
-    "decays.magnitude": Message(
-        "magnitudes",
-        warn="{name} is {value:.4g} {unit}; {low:g} to {high:g} {unit} is usual. Check the unit of the times.{remedy}",
-    ),
     "decays.frequency": Message(
         "magnitudes",
         fail=(
@@ -301,7 +321,7 @@ MESSAGES = {
             "{near} Check the unit of the times, the sampling rate, and that both records show the same rig."
         ),
     ),
-    "decays.alias": Message("aliasing", fail=_ALIAS, warn=_DEFAULT_PRIOR),
+    "decays.alias": Message("aliasing", fail=partial(_alias, _ALIAS), warn=partial(_alias, _OUTSIDE)),
     "decays.uneven": Message(
         "sampling of a decay",
         warn=(

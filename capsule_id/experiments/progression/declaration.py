@@ -173,14 +173,14 @@ MESSAGES = {
 KIND = Kind(
     name="progression",
     columns={
-        "period": ColumnRule("s", POSITIVE),
+        "period": ColumnRule("s", POSITIVE, usual=(2e-3, 20.0)),
         "f": ColumnRule("Hz", POSITIVE),
         "duty": ColumnRule("1", SHARE),
         "P_on": ColumnRule("N"),
         "P_d": ColumnRule("N"),
         "current": ColumnRule("A"),
         "periods": ColumnRule("1", PERIODS, usual=(1.0, 1e4)),
-        "distance": ColumnRule("m"),
+        "distance": ColumnRule("m", usual=(1e-3, 20.0)),
         "session": ColumnRule("1", usual=(1.0, 1e9)),
     },
     sets=(("period", "periods", "distance"), ("f", "periods", "distance")),

@@ -5,12 +5,14 @@ c + (x - c)/(1 - S/w²) with variance S/(1 - S/w²). Its distance from the prior
 normal where prior and data agree (Evans & Moshonov 2006). x is the logarithm where the prior is log-normal.
 """
 
+import math
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy import stats
 
 from capsule_id.experiments.checks.series import LEVEL
+from capsule_id.experiments.lint_magnitudes import WRONG_PREFIX
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.target.priors import prior_of
 from capsule_id.parameters import Parameter, is_stated
@@ -67,6 +69,11 @@ def default_scatter(s: SampledFit, row: Parameter) -> bool:
     return row.scatter and row.name not in s.rig.priors
 
 
+def in_doubt(s: SampledFit) -> set[str]:
+    """Names of the parameters with an unusual scale: a wrong unit explains them, so no other prior is proposed."""
+    return {name for finding in s.findings if "scales" in finding.facts for name in finding.parameters}
+
+
 def check_priors(s: SampledFit) -> list[Finding]:
     """Check every stated prior, weighing and default prior of a physical parameter against the rest of the data."""
     findings = []
@@ -94,11 +101,18 @@ def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
     """The conflict of parameter ``name``; it concerns all parameters of the experiments that read it."""
     (row,) = [row for row in s.target.parameters if row.name == name]
     readers = [e for e in s.experiments if name in e.masses or name in {own.name for own in e.parameters}]
+    prior = prior_of(row)
+    unit = (
+        name in s.rig.priors
+        and prior.kind == "lognormal"
+        and abs(abs(math.log10(conflict.value / prior.median)) - 3.0) < WRONG_PREFIX
+    )
     facts = {
         "name": name,
-        "key": "" if is_stated(name) else row.prior_key,
+        "key": "" if is_stated(name) or unit or name in in_doubt(s) else row.prior_key,
+        "is_unit": unit,
         "unit": "" if row.unit == "1" else f" {row.unit}",
-        "prior": prior_of(row).describe(),
+        "prior": prior.describe(),
         "stated": "rig" if is_stated(name) else "prior" if name in s.rig.priors else "scatter" if row.scatter else "",
         "experiments": ", ".join(dict.fromkeys(e.table.label for e in readers)),
         "fitted": s.values[name],

@@ -6,6 +6,7 @@ scatter, its number is not judged: no check can tell.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,6 +22,16 @@ def concerned(finding: Finding, experiments: Sequence[Experiment]) -> frozenset[
         return frozenset(finding.parameters)
     named = [e for e in experiments if finding.experiment in (e.label, e.table.label)]
     return frozenset(row.name for e in named for row in e.parameters) if named else None
+
+
+def with_scaled(finding: Finding, experiments: Sequence[Experiment]) -> Finding:
+    """``finding`` with the parameters that its scales multiply: those of the tables and masses that it names."""
+    scales = finding.facts.get("scales", ())
+    masses, labels = {"m1", "m2"}.intersection(scales), {name.rpartition(".")[0] for name in scales} - {""}
+    others = {"g", "slope", "N0"}.intersection(scales)  # all friction depends on them
+    read = [e for e in experiments if others or masses & {*e.masses} or labels & {e.label, e.table.label}]
+    names = dict.fromkeys([*sorted(masses), *(row.name for e in read for row in e.parameters)])
+    return replace(finding, parameters=tuple(names)) if scales else finding
 
 
 def trust_words(sampled: SampledFit, informed: np.ndarray) -> dict[str, Trust]:

@@ -15,7 +15,7 @@ from capsule_id.inference.checks.experiment_checks import check_outliers, check_
 from capsule_id.inference.checks.modes import check_maximum, check_starts
 from capsule_id.inference.checks.order import check_trials
 from capsule_id.inference.checks.predictive import check_statistics
-from capsule_id.inference.checks.priors import PRIOR_PULL, check_priors, default_scatter
+from capsule_id.inference.checks.priors import PRIOR_PULL, check_priors, default_scatter, in_doubt
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import LENGTH_IN_TAU, MAX_RHAT
@@ -123,6 +123,7 @@ def _boundary(s: SampledFit) -> list[Finding]:
     z = np.abs(s.target.prior_residuals(s.fit.u))
     judged = [(row.name, pull) for row, pull in zip(s.target.parameters, z, strict=True) if not default_scatter(s, row)]
     names = [name for name, pull in judged if pull > PRIOR_PULL]
-    keys = [row.prior_key for row in s.target.parameters if row.name in names and not is_stated(row.name)]
+    out = {name for name in names if not is_stated(name)} - in_doubt(s)
+    keys = [row.prior_key for row in s.target.parameters if row.name in out]
     facts = {"names": ", ".join(names), "keys": ", ".join(filter(None, keys))}
-    return [Finding("priors.tails", "warn" if names else "ok", facts)]
+    return [Finding("priors.tails", "warn" if names else "ok", facts, parameters=tuple(names))]

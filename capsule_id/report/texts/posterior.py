@@ -47,7 +47,8 @@ def _conflict(facts: Facts) -> str:
         ),
         "prior": (
             f"[prior] {name}",
-            f"Check value and unit of [prior] {name} in rig.toml and the units in {experiments}; remove a guessed prior.",
+            f"Check value and unit of [prior] {name} in rig.toml and the units in {experiments}"
+            + ("; remove a guessed prior." if key else "."),
         ),
         "": (
             f"the default prior of {name}",
@@ -64,6 +65,7 @@ def _conflict(facts: Facts) -> str:
         found = f"{experiments} and the other priors give {facts['value']:.5g} ± {facts['sd']:.2g}{unit}"
     else:
         found = f"{experiments} and the other priors pull it to {facts['fitted']:.5g}{unit}"
+    remedy = f"They differ about 1000 times, as units do. {remedy}" if facts.get("is_unit") else remedy
     return (
         f"{source} ({facts['prior']}, SI) contradicts the rest of the data: {found}, {abs(facts['z']):.1f} sd away "
         f"({stated_p(facts['p'])}). {remedy}"

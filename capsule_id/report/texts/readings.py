@@ -6,11 +6,14 @@ from capsule_id.views import Facts, Message
 
 
 def _unusual(facts: Facts) -> str:
-    """The number, the usual interval, and the unit that was probably meant."""
-    meant = f" If the number is in {facts['meant']}, write that unit." if facts["meant"] else ""
+    """The number, the usual interval, the unit that was probably meant, and the line that confirms the number."""
+    of, unit = "times are" if "period" in facts["name"] else "number is", "" if facts["unit"] == "1" else facts["unit"]
+    meant = f" If the {of} in {facts['meant']}, write that unit." if facts["meant"] else ""
+    scales = " and ".join(facts.get("scales", [facts["name"]]))
+    line = f" If it is right, write this line in [rig] of rig.toml: {facts['line']}" if "line" in facts else ""
     return (
-        f"{facts['name']} is {facts['value']:.4g} {facts['unit']}; {facts['low']:.3g} to {facts['high']:.3g} {facts['unit']} "
-        f"is usual. Check the unit.{meant}"
+        f"{facts['name']} is {facts['value']:.4g} {unit}; {facts['low']:.3g} to {facts['high']:.3g} {unit} is usual. Check "
+        f"the unit of {scales}.{meant} What it scales is not judged.{line}"
     )
 
 
@@ -71,6 +74,11 @@ DATA_MESSAGES: Mapping[str, Message] = {
         fail=_repeated,
     ),
     "readings.magnitude": Message("magnitudes", warn=_unusual, on_console=True),
+    "decays.magnitude": Message("magnitudes", warn=_unusual, on_console=True),
+    "settings.sd": Message(
+        "stated sd",
+        warn="{name} is {value:.4g} ± {sd:.4g} in SI units: its prior reaches below 0. State the sd of a measurement.",
+    ),
     "readings.gaps": Message(
         "gaps in a record",
         warn=(

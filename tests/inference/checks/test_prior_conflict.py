@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -144,7 +145,13 @@ def test_readings_that_the_default_prior_excludes_fail(
     result, texts = fit(make, tmp_path / "default")
     assert result.trust == "not trusted"
     (text,) = [text for text in texts if "the default prior of mu" in text]
-    if rows is pushes:  # the prior that the text proposes is accepted and ends the conflict
+    if rows is pushes:
+        # A wrong unit explains them: no prior is proposed before rig.toml confirms the units.
+        assert "Check the units in" in text
+        assert "[prior]" not in text
+        confirmed = replace(make(tmp_path / "again"), confirmed=("push.speed", "push.distance"))
+        (text,) = [text for text in fit(lambda folder: confirmed, tmp_path)[1] if "the default prior of mu" in text]
+        # The prior that the text proposes is accepted and ends the conflict.
         proposed = re.findall(r"write in \[prior\] (mu = \{.*?\})", text)[0]
         # Speeds of km/s scatter more than usual ones, too.
         assert not any("prior of mu " in text for text in fit(pushes(proposed), tmp_path / "stated")[1])
