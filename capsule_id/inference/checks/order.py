@@ -198,7 +198,7 @@ def added_effect(residuals: np.ndarray, columns: np.ndarray, effect: np.ndarray)
     shift = np.abs(np.linalg.solve(r, q.T @ effect)) / np.linalg.norm(np.linalg.inv(r), axis=1)
     rest, residuals = (x - q @ (q.T @ x) for x in (effect, residuals))
     length, freedom = float(np.linalg.norm(rest)), float(np.sum(used) - np.sum(q[used] ** 2)) - 1.0
-    if freedom < 1.0 or length < SMALLEST_SCATTER * np.linalg.norm(effect):
+    if not (freedom >= 1.0 and length >= SMALLEST_SCATTER * np.linalg.norm(effect)):
         return 1.0, np.where(shift > LEAST_SHIFT * np.max(shift), np.inf, 0.0)
     size = float(rest @ residuals) / length
     left = max(float(np.sum((residuals - size / length * rest)[used] ** 2)) / freedom, SMALLEST_SCATTER**2)
