@@ -159,6 +159,11 @@ class Experiment(eqx.Module):
         """Normal force of every trial, N, and its friction coefficient, (n,) each, where the force is stated row by row."""
         return None
 
+    def alternatives(self, theta: ValuesBySymbol) -> dict[str, np.ndarray]:
+        """Effect (n,) on the readings, SI, of what a setting that varies can show beside the law, by name of the setting."""
+        del theta
+        return {}
+
     @property
     def has_joint_scatters(self) -> bool:
         """Whether readings have several scatters at once; then a point fit takes them from ``profile`` together."""
@@ -235,8 +240,6 @@ class Experiment(eqx.Module):
         """Return all panels of the experiment."""
         return (self.comparison(theta, draws),)
 
-    # -- likelihood -------------------------------------------------------------------------------------------------
-
     def log_likelihood(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings, linear nuisances integrated out; scalar."""
         pairs = zip(self.summaries(theta, xp), self.scatters, strict=True)
@@ -286,8 +289,6 @@ class Experiment(eqx.Module):
         """
         del readings
         return list(records), []
-
-    # -- optional methods of a kind ---------------------------------------------------------------------------------
 
     @property
     def cycles(self) -> np.ndarray | None:

@@ -120,7 +120,7 @@ def _matrix(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def lint_rows(table: Table[Any], rig: Rig, fewest: int) -> Iterable[Finding]:
-    """Warn where a table has fewer than ``fewest`` rows: the number of unknowns of its law plus three."""
+    """Warn where a table has fewer than ``fewest`` rows: three for one unknown, five for two."""
     del rig
     if len(table.rows) < fewest:
         yield Finding("readings.few", "warn", {"rows": len(table.rows), "wanted": fewest}, table.label)

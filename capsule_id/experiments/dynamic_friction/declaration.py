@@ -1,7 +1,6 @@
 """Pushes: columns, settings, template and twin."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -16,9 +15,10 @@ from capsule_id.experiments.families.friction import (
     check_scatter,
     friction_estimates,
     friction_panels,
+    lint_slides,
 )
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
-from capsule_id.experiments.lint import lint_reading_errors, lint_rows
+from capsule_id.experiments.lint import lint_reading_errors
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.entry import Entry
@@ -115,7 +115,7 @@ KIND = Kind(
     informs="mu, v_s",
     captions=CAPTIONS,
     messages={**MESSAGES, **LINT_MESSAGES},
-    lint=(partial(lint_rows, fewest=5), lint_reading_errors, lint_pushes),
+    lint=(lint_slides, lint_reading_errors, lint_pushes),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

@@ -1,6 +1,6 @@
 """Shared declarations of friction experiments: eq. (1), the paper's fit, one panel, one rule on readings."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -8,11 +8,12 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Values
+from capsule_id.experiments.lint import lint_rows
 from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings
-from capsule_id.views import Message, counted
+from capsule_id.views import Finding, Message, counted
 
 if TYPE_CHECKING:
     from capsule_id.experiments.families.friction_experiment import FrictionExperiment
@@ -84,6 +85,11 @@ def check_load(entry: Entry[Any]) -> None:
         raise entry.error("", rule, "none", remedy)
     if table.settings.load_is is not None and not needed:
         raise entry.error("load_is", "load_is needs a slope and a stated normal force", "no such", "remove it", True)
+
+
+def lint_slides(table: Table[Any], rig: Rig) -> Iterable[Finding]:
+    """Warn where slides have few rows: constant friction has one unknown, another law mu and v_s."""
+    return lint_rows(table, rig, 3 if rig.model.friction == "constant" else 5)
 
 
 CAPTIONS = {

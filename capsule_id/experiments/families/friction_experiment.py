@@ -3,6 +3,7 @@
 import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -25,6 +26,13 @@ from capsule_id.views import Comparison, Curve, Finding, Points
 LOWEST_V_S = 1e-6
 #: Largest v_s that readings tell, in units of their largest speed: far above it eq. (1) is level.
 LARGEST_V_S = 100.0
+#: Ratio of the largest to the smallest value of a setting from which it varies; another ratio of kinetic to static friction.
+VARIED, OTHER_RATIO = 1.2, 0.6
+
+
+def varies(setting: np.ndarray) -> bool:
+    """Whether positive values (n,) of a setting are not those of one setting."""
+    return bool(np.max(setting) > VARIED * np.min(setting) > 0.0)
 
 
 def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
@@ -122,6 +130,18 @@ class FrictionExperiment(GroundExperiment):
         stated = {name: self.rig.mass(name) for name in ("m1", "m2") if name in self.masses}
         return np.asarray(self.along({**stated, **self.stated_ground, "g": self.rig.g.value}))
 
+    def alternatives(self, theta: ValuesBySymbol) -> dict[str, np.ndarray]:
+        """The speed shows another ratio of eq. (1), which acts as a constant force does; constant friction: a fall."""
+        speed, friction = self.paper_points()[0], self.friction
+        if friction.law is not CoulombStribeck or "ratio" in friction.free:
+            return {}
+        if not varies(speed):
+            return {"speeds": np.zeros(self.n)}
+        other = {"v_s": float(np.median(speed))} if friction.constant else {"ratio": OTHER_RATIO}
+        free = () if friction.constant else ("ratio",)
+        changed = self.with_friction(replace(friction, constant=False, free=(*friction.free, *free)))
+        return {"speeds": self.misfit(theta).raw - changed.misfit({**theta, **other}).raw}
+
     @abstractmethod
     def point_errors(self) -> tuple[Any, Any]:
         """Relative sd of the paper's points from the reading errors, and per unit of the scatter; () or (n,) each."""
@@ -162,6 +182,11 @@ class LoadedExperiment(FrictionExperiment):
     def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
         several = self.normal_force is not None and np.size(self.normal_force) > 1
         return (np.asarray(self.normal_force), self.paper_points()[1]) if several else None
+
+    def alternatives(self, theta: ValuesBySymbol) -> dict[str, np.ndarray]:
+        """The load shows a constant force beside the friction, 1 N."""
+        loads = {"loads": np.ones(self.n)} if self.loads is not None and np.ptp(self.loads[0]) > 0.0 else {}
+        return {**super().alternatives(theta), **loads}
 
     def along(self, theta: ValuesBySymbol) -> Any:
         """Weight along the slope, N, () or (n,)."""

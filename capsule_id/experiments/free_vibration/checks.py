@@ -18,6 +18,7 @@ from capsule_id.experiments.free_vibration.second_fit.fits import Screening
 from capsule_id.experiments.free_vibration.second_fit.sensitivities import sensitivities, whitened
 from capsule_id.experiments.free_vibration.settings import EFFECTS, decay_window
 from capsule_id.parameters import parameter
+from capsule_id.records.faults.aliasing import sampling
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.noise import length_of_motion
 from capsule_id.rig.filters import median_step
@@ -107,6 +108,17 @@ def check_halves(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Findin
     if compared and not findings:
         findings.append(Finding("decays.halves", "ok", {"labels": ", ".join(compared)}))
     return findings
+
+
+def check_aliases(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+    """State the lowest alias of the records with even samples, which cannot exclude it."""
+    found = ((e.label, *sampling(decay_window(e.table)[0])) for e in records)
+    rates = {label: rate for label, rate, even in found if even}
+    if not rates or "m1" not in fit.values:
+        return []
+    k1 = (2.0 * np.pi * min(rates.values()) * np.sqrt(fit.values["m1"]) - np.sqrt(fit.values["k1"])) ** 2
+    facts = {"labels": ", ".join(rates), "other": float(np.sqrt(k1 / fit.values["m1"])) / (2.0 * np.pi), "k1": k1}
+    return [Finding("decays.alias", "ok", facts)]
 
 
 def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
@@ -321,6 +333,7 @@ CHECKS = (
     check_stiffness,
     check_free_decay,
     check_halves,
+    check_aliases,
     check_positions,
     check_size_of_residuals,
     check_found_forces,

@@ -10,8 +10,6 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.kinematics import lint_kinematics
 from capsule_id.experiments.free_vibration.readings.blocks import block_size, default_block_size
 from capsule_id.experiments.free_vibration.settings import (
-    DAMPING,
-    EFFECTS,
     MOST_PERIODS,
     DecayModel,
     DecaySettings,
@@ -29,22 +27,22 @@ from capsule_id.experiments.lint_magnitudes import (
     lint_rig_quantities,
 )
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
-from capsule_id.parameters import parameter
-from capsule_id.records.faults.aliasing import aliases
+from capsule_id.parameters import TABLE
+from capsule_id.records.faults.aliasing import aliases, sampling
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
+from capsule_id.records.noise import length_of_motion
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.filters import dominant_frequency, loudest_part, median_step, sampling_step
+from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
 from capsule_id.views import Facts, Finding, Message, counted, filled_in
 
-#: Median, N/m, and factor of the k1 that rods usually have; another k1 may be an alias.
-USUAL_K1 = (1500.0, 1000.0)
 #: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
-#: From so many samples per period on, an alias is less probable than an unusual k1: 1 in 50 aliased
-#: records has as many.
-SAMPLES_WITHOUT_ALIAS = 100
+#: From so many samples per period on, an alias is less probable than a k1 outside its default prior: 1 in 50 aliased
+#: records has as many. With so many samples of motion too it is excluded: an alias has a period or more per sample, and
+#: one that lasts for 1000 periods has a damping ratio below 5e-4.
+SAMPLES_WITHOUT_ALIAS, SAMPLES_OF_MOTION = 100, 1000
 #: Factor of the prior that a finding proposes for k1: it holds no alias of 20 samples per period or more.
 PROPOSED_FACTOR = 10
 #: Smallest number of periods; with fewer, one peak determines the damping.
@@ -126,39 +124,52 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
     yield from _other_frequency(table, rig, frequency)
     if rig.m1 is None:
         return
-    stated, (median, factor) = rig.priors.get("k1"), USUAL_K1
-    if stated is not None and stated.median is not None and stated.factor is not None:
-        median, factor = stated.median, stated.factor
+    stated = rig.priors.get("k1")
+    prior = TABLE["k1"].prior if stated is None else stated.prior
+    assert prior is not None, "k1 has a default prior"
+    low, high = prior.location / prior.spread, prior.location * prior.spread
     k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
     # Of aliased records one in ten seems to have more samples per period: 18 Hz sampled at 17 Hz shows sixteen.
     per_period = 1.0 / (median_step(time) * frequency)
     coarse = per_period < SAMPLES_PER_PERIOD
-    inside = median / factor <= k1 <= median * factor
     # A sampling that cannot show the usual frequency shows another one instead.
-    blind = 0.5 / median_step(time) < np.sqrt(USUAL_K1[0] / rig.m1.value) / (2.0 * np.pi)
-    if not coarse and (inside or (stated is None and per_period >= SAMPLES_WITHOUT_ALIAS and not blind)):
+    blind = np.pi / median_step(time) < np.sqrt(prior.location / rig.m1.value)
+    known = low <= k1 <= high or (stated is None and per_period >= SAMPLES_WITHOUT_ALIAS and not blind)
+    part, highest = loudest_part(values), float(np.sqrt(high / rig.m1.value)) / (2.0 * np.pi)
+    others = aliases(time[part], values[part], frequency, highest)
+    if not len(others):
         return
-    part = loudest_part(values)
-    others = aliases(time[part], values[part], frequency)
+    # Uneven times may fit another frequency better: then this one does not fit as well as that.
+    back = aliases(time[part], values[part], float(others[0]), highest)
+    refuted = not np.any(np.abs(back - frequency) < 1.0 / np.ptp(time[part]))
     stiffnesses = rig.m1.value * (2.0 * np.pi * others) ** 2
-    possible = (stiffnesses >= median / factor) & (stiffnesses <= median * factor)
-    if possible.any():
+    possible = (stiffnesses >= low) & (stiffnesses <= high)
+    if refuted or (coarse and (stated is None or possible.any())) or (possible.any() and not known):
+        shown = possible if possible.any() else np.ones(len(others), dtype=bool)
         facts = {
             "file": table.file,
             "frequency": frequency,
-            "others": ", ".join(dict.fromkeys(f"{f:.4g}" for f in others[possible][:3])),
+            "others": ", ".join(dict.fromkeys(f"{f:.4g}" for f in others[shown][:3])),
             "k1": k1,
-            "k1s": ", ".join(dict.fromkeys(f"{k:.4g}" for k in stiffnesses[possible][:3])),
-            "range": (median / factor, median * factor),
+            "k1s": ", ".join(dict.fromkeys(f"{k:.4g}" for k in stiffnesses[shown][:3])),
+            "range": (low, high),
             "factor": PROPOSED_FACTOR,
+            "refuted": refuted,
             # A prior would hide a wrong unit.
             "unit": bool(unusual)
             or any(f.facts["scales"] == ("m1",) for f in lint_rig_quantities(rig))
-            or (stated is not None and abs(abs(np.log10(k1 / median)) - 3.0) < WRONG_PREFIX),
+            or (stated is not None and abs(abs(np.log10(k1 / prior.location)) - 3.0) < WRONG_PREFIX),
         }
-        # The usual range is no measurement: small rigs and pendulums have a k1 outside it.
-        certain = coarse or stated is not None
+        # The default prior is no measurement: small rigs and pendulums have a k1 outside it.
+        certain = coarse or refuted or stated is not None
         yield Finding("decays.alias", "fail" if certain else "warn", facts, table.label, () if certain else ("k1",))
+    elif possible.any() and (per_period < SAMPLES_WITHOUT_ALIAS or length_of_motion(values) < SAMPLES_OF_MOTION):
+        other = (
+            ": even samples have aliases, and the prior of k1 holds one. Or state what is known of k1, such as "
+            f'k1 = {{ median = {k1:.2g}, factor = {PROPOSED_FACTOR}, unit = "N/m" }} in [prior]'
+        )
+        facts = {"samples": per_period, "wanted": 1.0 + np.sqrt(high / k1), "other": other}
+        yield Finding("decays.sampling", "warn", facts, table.label, ("k1",))
 
 
 def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Finding]:
@@ -209,17 +220,18 @@ def _thinned(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterabl
 
 def _sampling(table: Table[Any], time: np.ndarray, values: np.ndarray) -> Iterable[Finding]:
     """Report uneven sampling, and too few samples per period or periods."""
+    frequency, (rate, even) = frequency_of(time, values), sampling(time)
     try:
-        period = 1.0 / dominant_frequency(time, values)
-        step = sampling_step(time)
+        sampling_step(time)
     except InputError as error:
         yield Finding("decays.uneven", "warn", {"rule": error.rule, "value": error.value}, table.label)
-        return
-    if period / step < SAMPLES_PER_PERIOD:
-        facts = {"samples": period / step, "wanted": SAMPLES_PER_PERIOD}
-        yield Finding("decays.sampling", "warn", facts, table.label)
-    if (time[-1] - time[0]) / period < FEWEST_PERIODS:
-        facts = {"periods": (time[-1] - time[0]) / period, "wanted": FEWEST_PERIODS}
+        if not even:
+            return
+    if rate / frequency < SAMPLES_PER_PERIOD:
+        facts = {"samples": rate / frequency, "wanted": SAMPLES_PER_PERIOD, "other": ""}
+        yield Finding("decays.sampling", "warn", facts, table.label, ("k1",) if even else ())
+    if (time[-1] - time[0]) * frequency < FEWEST_PERIODS:
+        facts = {"periods": (time[-1] - time[0]) * frequency, "wanted": FEWEST_PERIODS}
         yield Finding("decays.length", "warn", facts, table.label)
 
 
@@ -229,6 +241,10 @@ def line_of(key: str) -> str:
 
 
 _UNIT = " Check first the unit of the times and of m1. If they are right, sample faster."
+_REFUTED = (
+    "{file}: the uneven times contradict {frequency:.4g} Hz (k1 = {k1:.4g} N/m); they fit {others} Hz (k1 = {k1s} N/m) "
+    "better."
+)
 _ALIAS = (
     "{file}: the sampling cannot tell {frequency:.4g} Hz (k1 = {k1:.4g} N/m) from {others} Hz (k1 = {k1s} N/m).",
     " Sample faster. If {frequency:.4g} Hz is right, state a prior that holds it alone, such as "
@@ -244,35 +260,8 @@ _OUTSIDE = (
 
 def _alias(texts: tuple[str, str], facts: Facts) -> str:
     """The frequencies of the same samples, and the remedy: no prior where a unit is in doubt."""
-    return filled_in(texts[0] + (_UNIT if facts["unit"] else texts[1]), facts)
-
-
-def _hidden(facts: Facts) -> str:
-    """The forces that the records allow, the limits of the parameter beside them, and remedies."""
-    name, unit, words = facts["name"], facts["unit"], [word for word, own in DAMPING.items() if own in facts["symbols"]]
-    effects = " or ".join(EFFECTS[symbol] for symbol in facts["symbols"])
-    allowed = ", ".join(
-        f"{symbol} up to {size:.2g} {parameter(symbol).unit}"
-        for symbol, size in zip(facts["symbols"], facts["largest"], strict=True)
-    )
-    found = (
-        f"With {allowed} they fit as well, and {name} lies between {facts['low']:.3g} and {facts['high']:.3g} {unit}"
-    )
-    all_words = ", ".join(f'"{word}"' for word in ("viscous", *words))
-    lines = [(f"damping = [{all_words}]", 'damping = ["viscous"]')] if words else []
-    lines += [('stiffness = "cubic"', 'stiffness = "linear"')] if "k_cubic" in facts["symbols"] else []
-    free, known = ([line[i] for line in lines] for i in (0, 1))
-    remedies = ["Record more periods with less noise"] if facts["swings"] else ["Release from smaller deflections"]
-    if "k_cubic" in facts["symbols"] and not facts["offers_cubic"]:
-        free.remove('stiffness = "cubic"')
-        remedies.append("release from smaller deflections")
-    if free:
-        remedies.append(f"write {' and '.join(free)} in the experiment for an interval that includes this")
-    return (
-        f"{', '.join(facts['labels'])}: expected records that exclude {effects}; they do not. {found} (the fit without: "
-        f"{facts['value']:.3g}). {', or '.join(remedies)}. If another measurement excludes {effects}, write "
-        f"{' and '.join(known)}."
-    )
+    remedy = " Sample faster." if facts["refuted"] else texts[1]
+    return filled_in((_REFUTED if facts["refuted"] else texts[0]) + (_UNIT if facts["unit"] else remedy), facts)
 
 
 MESSAGES = {
@@ -286,12 +275,6 @@ MESSAGES = {
             "a free decay must begin with its release; found {rest:.4g} s of {before} after the stated start. "
             "Write this line in the experiment in rig.toml: " + line_of("start")
         ),
-    ),
-    "decays.hidden": Message(
-        "further forces of a decay",
-        ok="{labels}: no further force that the records allow changes c or k1 by much",
-        warn=_hidden,
-        fail=_hidden,
     ),
     "decays.thinned": Message(
         "length of a decay",
@@ -321,7 +304,15 @@ MESSAGES = {
             "{near} Check the unit of the times, the sampling rate, and that both records show the same rig."
         ),
     ),
-    "decays.alias": Message("aliasing", fail=partial(_alias, _ALIAS), warn=partial(_alias, _OUTSIDE)),
+    "decays.alias": Message(
+        "aliasing",
+        ok=(
+            "{labels}: even samples cannot exclude an alias. {other:.4g} Hz (k1 = {k1:.4g} N/m) has the same samples; it "
+            "must lie outside what is known of k1"
+        ),
+        warn=partial(_alias, _OUTSIDE),
+        fail=partial(_alias, _ALIAS),
+    ),
     "decays.uneven": Message(
         "sampling of a decay",
         warn=(
@@ -330,7 +321,8 @@ MESSAGES = {
         ),
     ),
     "decays.sampling": Message(
-        "sampling of a decay", warn="{samples:.1f} samples per period; {wanted} or more are wanted. Sample faster."
+        "sampling of a decay",
+        warn="{samples:.1f} samples per period; {wanted:.0f} or more are wanted. Sample faster{other}.",
     ),
     "decays.length": Message(
         "length of a decay", warn="{periods:.1f} periods; {wanted} or more are wanted. Record for longer."

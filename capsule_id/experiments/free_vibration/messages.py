@@ -3,7 +3,8 @@
 from capsule_id.experiments.free_vibration.kinematics import MESSAGES as KINEMATICS_MESSAGES
 from capsule_id.experiments.free_vibration.lint import MESSAGES as LINT_MESSAGES
 from capsule_id.experiments.free_vibration.lint import line_of
-from capsule_id.experiments.free_vibration.settings import DAMPING
+from capsule_id.experiments.free_vibration.settings import DAMPING, EFFECTS
+from capsule_id.parameters import parameter
 from capsule_id.views import Facts, Message, filled_in
 
 
@@ -80,9 +81,43 @@ def _drift(facts: Facts) -> str:
     return filled_in(seen, facts) + f"{_smaller(facts)}."
 
 
+def _hidden(facts: Facts) -> str:
+    """The forces that the records allow, the limits of the parameter beside them, and remedies."""
+    name, unit, words = facts["name"], facts["unit"], [word for word, own in DAMPING.items() if own in facts["symbols"]]
+    effects = " or ".join(EFFECTS[symbol] for symbol in facts["symbols"])
+    allowed = ", ".join(
+        f"{symbol} up to {size:.2g} {parameter(symbol).unit}"
+        for symbol, size in zip(facts["symbols"], facts["largest"], strict=True)
+    )
+    found = (
+        f"With {allowed} they fit as well, and {name} lies between {facts['low']:.3g} and {facts['high']:.3g} {unit}"
+    )
+    all_words = ", ".join(f'"{word}"' for word in ("viscous", *words))
+    lines = [(f"damping = [{all_words}]", 'damping = ["viscous"]')] if words else []
+    lines += [('stiffness = "cubic"', 'stiffness = "linear"')] if "k_cubic" in facts["symbols"] else []
+    free, known = ([line[i] for line in lines] for i in (0, 1))
+    remedies = ["Record more periods with less noise"] if facts["swings"] else ["Release from smaller deflections"]
+    if "k_cubic" in facts["symbols"] and not facts["offers_cubic"]:
+        free.remove('stiffness = "cubic"')
+        remedies.append("release from smaller deflections")
+    if free:
+        remedies.append(f"write {' and '.join(free)} in the experiment for an interval that includes this")
+    return (
+        f"{', '.join(facts['labels'])}: expected records that exclude {effects}; they do not. {found} (the fit without: "
+        f"{facts['value']:.3g}). {', or '.join(remedies)}. If another measurement excludes {effects}, write "
+        f"{' and '.join(known)}."
+    )
+
+
 MESSAGES = {
     **LINT_MESSAGES,
     **KINEMATICS_MESSAGES,
+    "decays.hidden": Message(
+        "further forces of a decay",
+        ok="{labels}: no further force that the records allow changes c or k1 by much",
+        warn=_hidden,
+        fail=_hidden,
+    ),
     "decays.stiffness": Message(
         "stiffness against amplitude",
         ok="k1 is the same in all {records} records ({p:p})",

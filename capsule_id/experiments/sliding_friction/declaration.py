@@ -1,7 +1,6 @@
 """Steady sliding: columns and template."""
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 from capsule_id.experiments.families.friction import (
@@ -15,9 +14,9 @@ from capsule_id.experiments.families.friction import (
     check_scatter,
     friction_estimates,
     friction_panels,
+    lint_slides,
 )
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.experiments.lint import lint_rows
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.entry import Entry
@@ -102,7 +101,7 @@ KIND = Kind(
     informs="mu, v_s",
     captions=CAPTIONS,
     messages=MESSAGES,
-    lint=(partial(lint_rows, fewest=5),),
+    lint=(lint_slides,),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

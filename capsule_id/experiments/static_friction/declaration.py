@@ -137,7 +137,7 @@ KIND = Kind(
     informs="mu",
     captions=CAPTIONS,
     messages=MESSAGES,
-    lint=(partial(lint_rows, fewest=4),),
+    lint=(partial(lint_rows, fewest=3),),
     check=check_scatter,
     paper=friction_estimates,
     panels=friction_panels,

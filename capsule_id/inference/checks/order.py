@@ -3,15 +3,17 @@
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks.refit import estimate, refit
 from capsule_id.experiments.checks.series import autocorrelation
+from capsule_id.experiments.families.friction_experiment import varies
 from capsule_id.inference.checks.regression import design
 from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.inference.fit.point_fit import residual_jacobian
 from capsule_id.parameters import is_stated
-from capsule_id.views import Finding
+from capsule_id.views import Facts, Finding
 
 #: Family-wise false-alarm rate over the tables, and smallest correlation that counts: it widens the sd by a fifth.
 ORDER_LEVEL, SMALLEST_CORRELATION = 0.005, 0.2
@@ -19,6 +21,10 @@ ORDER_LEVEL, SMALLEST_CORRELATION = 0.005, 0.2
 PERMUTATIONS, MANY_ROWS = 10_000, 200
 #: Fewest rows that can be judged: 6 rows have 720 orders.
 FEWEST_ROWS = 6
+#: Share of cases in which a check of a setting sees an error, and the largest error, in sd, that it may need for that: a
+#: constant force beside pulls at loads from 1 to 4 needs 32 of four rows and 11 of eight, another ratio of friction beside
+#: 4 tilts and 5 pushes up to 33. Smaller errors than ``LEAST_SHIFT`` are none. Level from which a load leaves doubt.
+POWER, LARGEST_UNSEEN, LEAST_SHIFT, DOUBTFUL_LEVEL = 0.8, 40.0, 1e-3, 0.05
 #: Residuals below this share of the noise, rms, are rounding, and their order means nothing.
 SMALLEST_SCATTER = 0.02
 #: Smallest factor of the sd by which tables of one kind disagree that counts, and fewest rows of a table.
@@ -29,8 +35,8 @@ ROWS_OF_A_LOAD = 3
 
 def check_trials(s: SampledFit) -> list[Finding]:
     """Check that residuals of trials depend neither on the load, nor on the order, nor on the table."""
-    loads = check_loads(s)
-    return [*check_order(s, {f.experiment for f in loads if f.level == "fail"}), *check_tables(s), *loads]
+    settings = check_settings(s)
+    return [*check_order(s, {f.experiment for f in settings if f.level == "fail"}), *check_tables(s), *settings]
 
 
 def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
@@ -147,21 +153,72 @@ def tables_by_mean(s: SampledFit) -> tuple[list[Finding], int]:
     return findings, sum(len(members) for members, _ in groups)
 
 
-def check_loads(s: SampledFit) -> list[Finding]:
-    """Check that friction is in proportion to the normal force: residuals of trials do not depend on it.
+def check_settings(s: SampledFit) -> list[Finding]:
+    """Check what settings that vary can show beside the law: the loads of a table, the speeds of all friction tables.
 
-    Permutation tests of the scatter between loads, and of the correlation with the logarithm of the load.
+    A parameter is not judged where an error of more than ``LARGEST_UNSEEN`` sd may go unseen.
     """
-    tables = [(e, _unflagged(s, e)[0], *_loads(s, e)) for e in s.experiments if e.loads is not None]
-    tables = [one for one in tables if len(one[1]) >= FEWEST_ROWS and len(np.unique(one[2])) > 1]
-    findings = []
-    for e, residuals, load, coefficient in tables:
-        groups = [residuals[load == one] for one in np.unique(load)]
-        p = 2.0 * min(trend(_standardised(residuals, load), load), _of_levels(groups))
-        if p * len(tables) < ORDER_LEVEL:
-            means = [(float(one), float(np.mean(coefficient[load == one]))) for one in np.unique(load)]
-            findings.append(Finding("trials.loads", "fail", {"means": means, "p": p}, e.label))
-    return findings or [Finding("trials.loads", "ok", {"number": len(tables)})] * bool(tables)
+    residuals, end, findings = s.target.plain_residuals(s.fit.u), 0, []
+    keep, effects = np.ones(len(residuals), dtype=bool), dict[tuple[str, str], np.ndarray]()
+    for e in s.experiments:
+        theta = e.local(s.values)
+        rows, end = np.arange(end, end + e.n), end + len(e.residuals(theta, np))
+        keep[rows[list(s.flagged.get(e.label, []))]] = False
+        for setting, raw in e.alternatives(theta).items():
+            effect = effects.setdefault((setting, e.label * (setting == "loads")), np.full(len(keep), np.nan))
+            effect[rows] = raw / e.misfit(theta).sd
+    varied = {key: effect[keep] for key, effect in effects.items() if np.nansum(np.abs(effect)) > 0.0}
+    jacobian = residual_jacobian(s.target, s.fit.u)[keep][:, s.target.located] if varied else np.zeros((0, 0))
+    physical = {row.name for row in s.target.parameters if row.physical and not is_stated(row.name)}
+    for (setting, label), effect in varied.items():
+        p, errors = added_effect(residuals[keep], jacobian, effect)
+        pairs = zip(np.array(s.target.names)[s.target.located].tolist(), errors.tolist(), strict=True)
+        unseen = {name: error for name, error in pairs if name in physical and error > LEAST_SHIFT}
+        facts = {"rows": int(np.sum(~np.isnan(effect))), "unseen": unseen, "p": p}
+        if setting == "loads":
+            facts |= _of_loads(s, next(e for e in s.experiments if e.label == label), p)
+        p = facts["p"] * len(varied)
+        found = p < (DOUBTFUL_LEVEL if setting == "loads" else ORDER_LEVEL)
+        # Loads that hardly differ are one load, and mu is the coefficient there.
+        wide = setting == "speeds" or varies(np.abs(effect[~np.isnan(effect)]))
+        doubtful = tuple(name for name, error in unseen.items() if found or (wide and error > LARGEST_UNSEEN))
+        level = "fail" if setting == "loads" and p < ORDER_LEVEL else "warn" if doubtful else "ok"
+        findings.append(Finding(f"trials.{setting}", level, facts, label, doubtful * (level == "warn")))
+    return findings
+
+
+def added_effect(residuals: np.ndarray, columns: np.ndarray, effect: np.ndarray) -> tuple[float, np.ndarray]:
+    """t test of an ``effect`` (n,) on residuals beside ``columns`` (n, p) of the parameters; NaN: rows of other tables.
+
+    Return its p-value, and the shift of every parameter, in sd, by the smallest effect that the test finds in ``POWER``
+    of all cases; 1 and inf where too few rows are free.
+    """
+    q, r = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))
+    used, effect = ~np.isnan(effect), np.nan_to_num(effect)
+    shift = np.abs(np.linalg.solve(r, q.T @ effect)) / np.linalg.norm(np.linalg.inv(r), axis=1)
+    rest, residuals = (x - q @ (q.T @ x) for x in (effect, residuals))
+    length, freedom = float(np.linalg.norm(rest)), float(np.sum(used) - np.sum(q[used] ** 2)) - 1.0
+    if not (freedom >= 1.0 and length >= SMALLEST_SCATTER * np.linalg.norm(effect)):
+        return 1.0, np.where(shift > LEAST_SHIFT * np.max(shift), np.inf, 0.0)
+    size = float(rest @ residuals) / length
+    left = max(float(np.sum((residuals - size / length * rest)[used] ** 2)) / freedom, SMALLEST_SCATTER**2)
+    p = 2.0 * float(stats.t.sf(abs(size) / np.sqrt(left), freedom))
+    critical = float(stats.t.isf(ORDER_LEVEL / 2.0, freedom))
+    seen = optimize.brentq(lambda x: float(stats.nct.sf(critical, freedom, x)) - POWER, 0.0, 60.0 * critical)
+    return p, shift * seen / length
+
+
+def _of_loads(s: SampledFit, e: Experiment, p: float) -> Facts:
+    """Coefficient at every load, and the probability of what three tests find, one of them with this ``p``.
+
+    The others are permutation tests of the scatter between loads, and of the correlation with the logarithm of the load.
+    """
+    residuals, (load, coefficient) = _unflagged(s, e)[0], _loads(s, e)
+    means = [(float(one), float(np.mean(coefficient[load == one]))) for one in np.unique(load)]
+    if len(residuals) >= FEWEST_ROWS:
+        levels = _of_levels([residuals[load == one] for one in np.unique(load)])
+        p = 3.0 * min(p, levels, trend(_standardised(residuals, load), load))
+    return {"means": means, "p": p}
 
 
 def _of_levels(groups: Sequence[np.ndarray]) -> float:

@@ -12,7 +12,10 @@ from capsule_id.inference.checks.model_error.widening import Widening
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.trust import trust_words
 from capsule_id.inference.checks.verdict import informed
-from capsule_id.inference.result import Posterior
+from capsule_id.inference.fit.covariance import covariance
+from capsule_id.inference.fit.point_fit import residual_jacobian
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import Parameter, parameter
 
 SUMMARY_COLUMNS = (
@@ -23,12 +26,16 @@ SUMMARY_COLUMNS = (
 #: Ratio of the arms of a 95 % interval about the median above which value ± sd does not describe it. A log-normal
 #: distribution has it at a relative sd of 0.35.
 LARGEST_SKEW = 2.0
+#: Nodes of the average over a scatter: the inverse hyperbolic sine of their distance from the fit, in u, is even. Tables
+#: with more rows show their scatter.
+NODES, REACH = 400, 4.0
 
 
 def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the tables of physical parameters and of nuisances; see ``Result``."""
     target, point, posterior = sampled.target, sampled.fit, sampled.posterior
     masses = {"m1": sampled.rig.m1, "m2": sampled.rig.m2}
+    at_point = errors_over_scatters(target, point) if posterior is None else point.standard_errors
     paper = paper_estimates(target.experiments, registry)
     paper |= {name: mass.value for name, mass in masses.items() if mass is not None}
     known = informed(target, posterior, point)
@@ -40,11 +47,11 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
             "meaning": row.meaning,
             "paper": paper.get(row.name, np.nan),
             "value": point.values[row.name],
-            "sd": point.standard_errors[row.name],
+            "sd": at_point[row.name],
             "basis": "point",
             "trust": words[row.name],
             "map": point.values[row.name],
-            "standard_error": point.standard_errors[row.name],
+            "standard_error": at_point[row.name],
             "informed": bool(known[i]),
         }
         entry |= {} if posterior is None else _sample_columns(posterior, i)
@@ -68,6 +75,34 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
         for chosen in (True, False)
     )
     return physical, nuisances
+
+
+def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, float]:
+    """Standard errors of ``fit``, with the variance of the rows of every table averaged over the posterior of its scatter.
+
+    The most probable scatter of a few rows is too small: one row alone has none. Beside the likelihood at the fit, its
+    posterior counts the degrees of freedom that the located parameters take: the trace of the table's hat matrix.
+    """
+    located, theta, end = target.located, target.theta(fit.u), 0
+    jacobian, x = residual_jacobian(target, fit.u)[:, located], np.linspace(-REACH, REACH, NODES)
+    hat = np.sum(np.linalg.qr(jacobian)[0] ** 2, axis=1)
+    for e in target.experiments:
+        own = e.local(target.mapping(theta))
+        rows, end = slice(end, end + e.n), end + np.size(e.residuals(own, np))
+        symbol, *further = e.scatters
+        if e.time_series or further or symbol is None or e.n > NODES:
+            continue
+        (misfit,) = e.misfits(own, np)
+        index = target.names.index(next(row.name for row in e.parameters if row.symbol == symbol))
+        u = fit.u[index] + np.sinh(x)
+        variance = misfit.fixed_variance + (misfit.scale * np.exp(u)[:, None]) ** 2 * np.ones(e.n)
+        density = misfit.log_density(np.exp(u), np) + target.priors.at(index, np).terms(u, np.exp(u), np)
+        density += np.log(np.cosh(x)) + np.mean(0.5 * np.log(variance), axis=1) * np.sum(hat[rows])
+        weight = np.exp(density - np.max(density))
+        jacobian[rows] *= (misfit.at(own[symbol], np).sd / np.sqrt(weight @ variance / np.sum(weight)))[:, None]
+    matrix = covariance(jacobian, np.zeros(len(jacobian)), residual_sd=1.0)
+    errors = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    return {**fit.standard_errors, **{target.names[i]: float(sd) for i, sd in zip(located, errors, strict=True)}}
 
 
 def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool) -> dict[str, object]:

@@ -173,6 +173,12 @@ def _loads_differ(facts: Facts) -> str:
     )
 
 
+def _unseen(facts: Facts) -> str:
+    """The smallest error that a check of a setting sees in 8 of 10 cases, by parameter."""
+    errors = ", ".join(f"{name} by {sd:.3g} sd" for name, sd in facts["unseen"].items() if sd < float("inf"))
+    return f"the check sees it in 8 of 10 cases where it shifts {errors}" if errors else "too few rows to see it"
+
+
 #: What a statistic of the residuals that is too large means.
 _STATISTICS: Mapping[str, str] = {
     "sign runs": "too many neighbours have the same sign",
@@ -230,8 +236,22 @@ FIT_MESSAGES: Mapping[str, Message] = {
     ),
     "trials.loads": Message(
         "friction against load",
-        ok="friction is in proportion to the normal force in {number:# table}",
+        ok=lambda facts: f"no constant force beside the friction; {_unseen(facts)}",
+        warn=lambda facts: (
+            f"{counted(facts['rows'], 'row')} cannot show whether friction is in proportion to the normal force: a constant "
+            f"force beside it may be there, and {_unseen(facts)}. Repeat the trials, at loads further apart, or fit the rows "
+            "of one load in a folder of their own."
+        ),
         fail=_loads_differ,
+    ),
+    "trials.speeds": Message(
+        "friction against speed",
+        ok=lambda facts: f"no other fall of the friction with the speed; {_unseen(facts)}",
+        warn=lambda facts: (
+            f"expected friction that falls with the speed as the law says; another fall, as with a constant force, has "
+            f"{stated_p(facts['p'])} in {counted(facts['rows'], 'row')}, and {_unseen(facts)}. Repeat the trials, at speeds "
+            "further apart, or compare the friction laws in the report."
+        ),
     ),
     "residuals.statistics": Message(
         "residuals like noise",

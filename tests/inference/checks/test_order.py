@@ -9,7 +9,7 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments.families.line_replicates import lack_of_fit
-from capsule_id.inference.checks.order import between, heterogeneity, lag_1
+from capsule_id.inference.checks.order import ORDER_LEVEL, POWER, added_effect, between, heterogeneity, lag_1
 from tests.measured.folders import Entry, make_rig, quantity
 
 
@@ -192,3 +192,24 @@ def test_readings_that_repeat_off_the_line_fail(tmp_path: Path) -> None:
     again = {"current [A]": anew, "force [N]": 2.0 * anew + off}
     clean = cid.fit(make_rig(tmp_path / "anew", Entry("motor_current", "motor", again)), budget=None)
     assert clean.clean
+
+
+@pytest.mark.parametrize("rows", [4, 8])
+def test_the_error_that_a_check_of_loads_states_is_seen_in_8_of_10_cases(rows: int) -> None:
+    """Pulls in proportion to loads from 1 to 4, and a constant force beside them, in units of the scatter."""
+    rng, load = np.random.default_rng(rows), np.linspace(1.0, 4.0, rows)
+    columns, effect = np.ones((rows, 1)), 1.0 / load
+    _, (unseen,) = added_effect(rng.standard_normal(rows), columns, effect)
+    force = unseen / (np.mean(effect) * np.sqrt(rows))
+
+    def p(size: float) -> float:
+        return added_effect(rng.standard_normal(rows) + size * effect, columns, effect)[0]
+
+    assert np.mean([p(force) < ORDER_LEVEL for _ in range(400)]) == pytest.approx(POWER, abs=0.07)
+    # Without the force, p is uniform.
+    assert np.mean([p(0.0) < 0.1 for _ in range(400)]) == pytest.approx(0.1, abs=0.05)
+
+
+def test_too_few_rows_see_no_error() -> None:
+    p, unseen = added_effect(np.array([0.3, -0.3]), np.ones((2, 1)), np.array([1.0, 0.5]))
+    assert (p, unseen[0]) == (1.0, np.inf)
