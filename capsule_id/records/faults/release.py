@@ -40,21 +40,19 @@ OSCILLATES = 0.3
 MARGIN = 0.04
 #: An earlier part of the same oscillation, this many periods long, is no motion before the release.
 EARLIER = 1.5
-#: Largest logarithm of the ratio of the frequencies of one oscillation.
-SAME = 0.15
+#: Largest error of an earlier part of the same oscillation relative to its amplitude.
+SAME = 0.2
 #: A release changes the motion by this part of the sum of squares by which a hold would change it.
 CHANGE = 0.1
-#: Legs that last as long, and a damping ratio as large, up to these differences belong to one decay; legs from its first
+#: Legs that last as long, and poles that are as large, up to these differences belong to one decay; legs from its first
 #: one to where the search for the release begins.
-REGULAR, ALIKE, LEGS = 0.3, 0.1, 3
+REGULAR, ALIKE, LEGS = 0.3, 0.15, 3
 #: A second excitation makes the amplitude this many times as large.
 GROWTH = 1.15
 #: A push moves the rod by this fraction of the range, and takes this many times as long as the free rod takes back.
 SMALLEST_PUSH, PUSHED = 0.05, 1.3
 #: Time constants after which a decay has died out.
 DIED_OUT = 4.0
-#: A step is a jump where it is this many times the largest one beside it.
-FASTEST = 3.0
 
 Poles = tuple[float, float]
 
@@ -113,8 +111,8 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
         while first and sizes[first - 1] > 0.95 * sizes[first] and abs(lengths[first - 1] / lengths[first] - 1.0) < REGULAR:
             first -= 1
         record, anchor = _Record.of(time, values, period, past)
-        early = record.at(float(time[turns[first + LEGS]])) if first + LEGS < last else anchor
-        begin, fit, stop = _release(record, anchor, early, displacement)
+        early = min(record.at(float(time[turns[min(first + LEGS, len(turns) - 1)]])), anchor) if first + LEGS < last else anchor
+        begin, fit, stop = _release(record, anchor, early)
         over = float(record.time[begin]) + DIED_OUT / max(fit.poles[0] * fit.poles[1], 1e-9)
         start, pushed = float(time[0]), False
         if begin > 0:
@@ -123,10 +121,10 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
             start, pushed = _push(time, values, free, period) if displacement else (free, False)
             start = start if start < free else max(start, float(time[min(cut, len(time) - 1)]))
         after = turns[time[turns] > start + 0.15 * period]  # the first leg of a record is not whole
-        stop = _growth(time, values, after) if stop is None else stop
-        own = 2.0 * np.pi / (fit.poles[0] * np.sqrt(max(1.0 - fit.poles[1] ** 2, 0.1)))
+        stop = _growth(time, values, after) if stop is None and len(after) > 4 else stop
+        own, halves = 2.0 * np.pi / (fit.poles[0] * np.sqrt(max(1.0 - fit.poles[1] ** 2, 0.1))), np.diff(time[after])
         if len(after) > 4:
-            own = 2.0 * float(time[after[-1]] - time[after[0]]) / (len(after) - 1)
+            own = 2.0 * float(np.mean(halves[np.abs(halves / np.median(halves) - 1.0) < REGULAR]))
         decay = FreeDecay(start, stop, start - float(time[0]), own, pushed)
     slow = int(np.searchsorted(time, over, "right"))
     later = time[slow + _turning_points(values[slow:])] if len(time) - slow > WINDOW else time[:0]
@@ -192,22 +190,24 @@ def _scale(time: np.ndarray, values: np.ndarray, begin: int, end: int) -> tuple[
 
 
 def _growth(time: np.ndarray, values: np.ndarray, turns: np.ndarray) -> float | None:
-    """Time before legs between ``turns`` that grow; None where none does. One disturbed reading makes no two of them."""
+    """Time before legs between ``turns`` that grow; None where none does. Two of them grow, and three were lower."""
     sizes = np.abs(np.diff(values[turns]))
-    grown = sizes[1:] > GROWTH * np.minimum.accumulate(sizes)[:-1] + SMALLEST_PUSH * np.max(sizes, initial=0.0)
-    twice = np.flatnonzero(grown[1:] & grown[:-1])
-    return float(time[turns[twice[0] + 1]]) if len(twice) else None
+    highest = np.max(np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (2, 0), mode="edge"), 3), axis=1)
+    grown = sizes > GROWTH * np.minimum.accumulate(np.concatenate([highest[:1], highest[:-1]])) + SMALLEST_PUSH * np.max(sizes)
+    twice = 1 + np.flatnonzero(grown[1:-1] & grown[2:])
+    return float(time[turns[twice[0]]]) if len(twice) else None
 
 
 @dataclass(frozen=True)
 class _Fit:
     """A free decay fitted to a window: ``poles`` (angular frequency, damping ratio), the sum of squares, the sd of the
-    residuals, and that of the errors of the model."""
+    residuals, that of the errors of the model, and the rest position."""
 
     poles: Poles
     cost: float
     sd: float
     model: float
+    level: float
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ class _Record:
     @classmethod
     def of(cls, time: np.ndarray, values: np.ndarray, period: float, past: float) -> tuple["_Record", int]:
         """The record of block means without the rest after the motion, and the index of the time ``past``."""
-        size = max(int(period / np.median(np.diff(time)) / SAMPLES), 1)
+        size = max(min(int(period / np.median(np.diff(time)) / SAMPLES), len(time) // WINDOW), 1)
         time, values = (a[: len(a) // size * size].reshape(-1, size).mean(axis=1) for a in (time, values))
         noise, last = noise_level(values), np.median(values[-max(5, len(values) // 20) :])
         far = np.flatnonzero(np.abs(values - last) > max(STILL_SDS * noise, STILL * float(np.ptp(values))))
@@ -251,15 +251,15 @@ class _Record:
             found = [min((_fit(time, values, poles, noise, 4) for poles in found), key=lambda fit: fit[0])[1]]
         best = _fit(time, values, found[0], noise, steps)
         model = max((MODEL + MODEL_FURTHER * min(best[2], LARGEST_FURTHER)) * size, 1e-15)
-        return _Fit(best[1], best[0], max(np.sqrt(best[0] / max(len(time) - 5, 1)), self.noise, model), model)
+        return _Fit(best[1], best[0], max(np.sqrt(best[0] / max(len(time) - 5, 1)), self.noise, model), model, best[3])
 
 
-def _fit(time: np.ndarray, values: np.ndarray, poles: Poles, sd: float, steps: int) -> tuple[float, Poles, float]:
-    """Sum of squares, poles, and sum of the further forces of a decay fitted to ``values``; ``sd`` of the readings."""
+def _fit(time: np.ndarray, values: np.ndarray, poles: Poles, sd: float, steps: int) -> tuple[float, Poles, float, float]:
+    """Sum of squares, poles, sum of the further forces, and rest position of a decay; ``sd`` of the readings."""
     prior = np.zeros((3, 8))
     prior[[0, 1, 2], [5, 6, 7]] = sd / FURTHER
     wanted, step = np.concatenate([values, np.zeros(3)]), np.zeros(2)
-    best = np.inf, poles, 0.0
+    best = np.inf, poles, 0.0, 0.0
     for _ in range(steps + 1):
         columns = np.vstack([_columns(poles[0] * time, poles[1], values, sd), prior])
         linear = np.delete(columns, [3, 4], axis=1)
@@ -267,7 +267,7 @@ def _fit(time: np.ndarray, values: np.ndarray, poles: Poles, sd: float, steps: i
         cost = float(np.sum((wanted - linear @ found) ** 2))
         if cost < best[0]:
             converged = best[0] - cost < 1e-3 * cost
-            best = cost, poles, float(np.sum(np.abs(found[3:])))
+            best = cost, poles, float(np.sum(np.abs(found[3:]))), float(found[0])
             if converged:
                 break
             step = np.clip(np.linalg.lstsq(columns, wanted, rcond=1e-10)[0][3:5], -0.4, 0.4)
@@ -275,6 +275,18 @@ def _fit(time: np.ndarray, values: np.ndarray, poles: Poles, sd: float, steps: i
             step = step / 3.0
         poles = best[1][0] * float(np.exp(step[0])), float(np.clip(best[1][1] + step[1], 0.0, 2.5))
     return best
+
+
+def _motions(phase: np.ndarray, zeta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Offset and two free motions, their rates, (n, 3) each, the poles (2,) and the waves (n, 2) of a linear decay."""
+    root = np.sqrt(complex(zeta**2 - 1.0))
+    root = root if abs(root) > 1e-3 else 1e-3
+    poles = np.array([-zeta + root, -zeta - root])
+    waves = np.exp(np.clip((poles * phase[:, None]).real, -60.0, 60.0) + 1j * (poles * phase[:, None]).imag)
+    first = ((poles[0] * waves[:, 1] - poles[1] * waves[:, 0]) / (poles[0] - poles[1])).real
+    second = ((waves[:, 0] - waves[:, 1]) / (poles[0] - poles[1])).real
+    motions = np.column_stack([np.ones_like(phase), first, second])
+    return motions, np.column_stack([np.zeros_like(phase), -second, first - 2.0 * zeta * second]), poles, waves
 
 
 def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> np.ndarray:
@@ -289,10 +301,7 @@ def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> n
     zeta : damping ratio
     values : (n,) readings; ``sd`` of their errors
     """
-    root = np.sqrt(complex(zeta**2 - 1.0))
-    root = root if abs(root) > 1e-3 else 1e-3
-    poles = np.array([-zeta + root, -zeta - root])
-    waves = np.exp(np.clip((poles * phase[:, None]).real, -60.0, 60.0) + 1j * (poles * phase[:, None]).imag)
+    motions, rates, poles, waves = _motions(phase, zeta)
     half = 0.5 * np.diff(phase)[:, None, None]
 
     def response(forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -302,10 +311,6 @@ def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> n
         parts = sums * waves[:, :, None] * np.array([1.0, -1.0])[:, None] / (poles[0] - poles[1])
         return parts.sum(axis=1).real, (parts * poles[:, None]).sum(axis=1).real
 
-    first = ((poles[0] * waves[:, 1] - poles[1] * waves[:, 0]) / (poles[0] - poles[1])).real
-    second = ((waves[:, 0] - waves[:, 1]) / (poles[0] - poles[1])).real
-    motions = np.column_stack([np.ones_like(phase), first, second])
-    rates = np.column_stack([np.zeros_like(phase), -second, first - 2.0 * zeta * second])
     found = np.linalg.lstsq(motions, values, rcond=1e-9)[0]
     x, v = motions[:, 1:] @ found[1:], rates @ found
     size = float(np.max(np.abs(x))) + 1e-300
@@ -320,18 +325,18 @@ def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> n
     return np.column_stack([motions, phase * v, response(-2.0 * v[:, None])[0], further])
 
 
-def _release(record: _Record, begin: int, early: int, displacement: bool) -> tuple[int, _Fit, float | None]:
+def _release(record: _Record, begin: int, early: int) -> tuple[int, _Fit, float | None]:
     """First sample of the free decay around sample ``begin``, its fit, and the end of an earlier decay, s.
 
     The search begins at the sample ``early`` where the same oscillation is there already.
     """
-    time, fit = record.time, record.fit(begin, record.end(begin), record.starts(), 15)
+    fit = record.fit(begin, record.end(begin), record.starts(), 15)
     one = record.fit(early, record.end(early), [fit.poles], 8) if early < begin else fit
-    if abs(np.log(one.poles[0] / fit.poles[0])) < SAME and abs(one.poles[1] - fit.poles[1]) < ALIKE:
+    if abs(np.log(one.poles[0] / fit.poles[0])) < ALIKE and abs(one.poles[1] - fit.poles[1]) < ALIKE:
         begin, fit = early, one
     seen = [(begin, fit.sd)]
     while begin > 0:
-        span = record.period * (0.5 if fit.poles[1] < OSCILLATES else 0.125)
+        time, span = record.time, record.period * (0.5 if fit.poles[1] < OSCILLATES else 0.125)
         low = max(min(record.at(time[begin] - span), begin - 2), 0)
         sd = max(min((sd for i, sd in seen if time[i] <= time[begin] + record.period), default=fit.sd), fit.model)
         wider = record.fit(low, record.end(begin), [fit.poles], 4)
@@ -343,10 +348,13 @@ def _release(record: _Record, begin: int, early: int, displacement: bool) -> tup
             found, evidence = _border(record, low, inside, replace(inner, sd=max(min(inner.sd, sd), inner.model)))
             if found > low and evidence > EVIDENCE:
                 inner = record.fit(found, record.end(found), [inner.poles, *record.starts()], 10)
-                if _changes(record, found, inner) and not (displacement and _jumps(record, found)):
+                if _changes(record, found, inner):
                     growth, stop = _earlier(record, found, inner)
                     if growth > GROWTH:
                         return found, inner, stop
+                    # Samples are lost or wrong here: the search goes on in front of them.
+                    last = max(record.at(time[found] - 0.125 * record.period), min(WINDOW, found))
+                    record, low = replace(record, time=time[:last], values=record.values[:last]), max(last - WINDOW, 0)
                 seen = []
             later = record.fit(low, record.end(low), [fit.poles, *record.starts()], 10) if low else fit
         begin, fit = low, later
@@ -360,7 +368,8 @@ def _changes(record: _Record, row: int, fit: _Fit) -> bool:
     held = record.values.copy()
     held[first:row] = np.mean(held[row : row + 2])
     costs = [one.fit(first, end, [fit.poles], 4).cost - fit.cost for one in (record, replace(record, values=held))]
-    return costs[0] > CHANGE * costs[1]
+    noise = noise_level(record.values[first:row]) ** 2 * (row - first) if row - first > 8 else 0.0
+    return costs[0] - noise > CHANGE * costs[1]
 
 
 def _border(record: _Record, low: int, inside: int, fit: _Fit) -> tuple[int, float]:
@@ -385,31 +394,28 @@ def _border(record: _Record, low: int, inside: int, fit: _Fit) -> tuple[int, flo
         best = again
 
 
-def _jumps(record: _Record, row: int) -> bool:
-    """Whether a moving rod jumps near a sample: samples are lost or wrong there, for a release changes its rate alone."""
-    steps, place = np.abs(np.diff(record.values[max(row - 8, 0) : row + 8])), min(row, 8) - 1
-    near = slice(max(place - 1, 0), place + 2)
-    others = np.max(np.delete(steps, near), initial=0.0)
-    return bool(np.max(steps[near]) > FASTEST * others + 6.0 * record.noise and others > 3.0 * record.noise)
-
-
 def _earlier(record: _Record, row: int, fit: _Fit) -> tuple[float, float | None]:
-    """Growth of the amplitude at a sample before which the same oscillation goes on, and the end of an earlier one, s.
+    """Growth of the amplitude at a sample before which the same oscillation goes on, and the end of an earlier decay, s.
 
-    Infinite without an oscillation that ends at this sample; None without any before it.
+    Infinite where no such oscillation ends at this sample; None where none before it lasts ``EARLIER`` periods.
     """
     time, period = record.time, record.period
-    for end in np.arange(time[row] - period / 16.0, time[0] + EARLIER * period, -period):
-        first, middle, last = (record.at(end - part * period) for part in (2.0, 1.0, 0.0))
-        before = float(np.ptp(record.values[middle:last])) if last > middle else 0.0
-        falls = middle > first and np.ptp(record.values[first:middle]) > 0.9 * before > 7.0 * record.noise
-        if not falls or last - first < WINDOW // 2 or len(_turning_points(record.values[first:last])) < 4:
+    if fit.poles[1] > 2.0 * OSCILLATES:
+        return np.inf, None
+    for end in np.arange(time[row] - period / 16.0, time[0] + 0.25 * period, -period):
+        part = slice(record.at(end - 2.0 * period), record.at(end))
+        values, stays = record.values[part], end - time[part.start] > EARLIER * period
+        ends_here = end > time[row] - period
+        if len(values) < 6 or np.ptp(values) < 2.0 * STILL_SDS * record.noise or not (stays or ends_here):
             continue
-        own = record.fit(first, last, [fit.poles], 4)
-        swings = np.sqrt(max(own.sd**2 - record.noise**2, 0.0)) < 0.15 * before
-        if swings and abs(np.log(own.poles[0] / fit.poles[0])) < SAME:
-            grown = float(np.ptp(record.values[row : record.end(row)])) / before
-            return (grown, float(time[row])) if end > time[row] - period else (np.inf, float(end))
+        poles = record.fit(part.start, part.stop, [fit.poles], 4).poles if stays else fit.poles
+        columns = _motions(poles[0] * (time[part] - end), poles[1])[0]
+        found = np.linalg.lstsq(columns, values, rcond=1e-9)[0]
+        size, error = float(np.hypot(found[1], found[2])), np.mean((values - columns @ found) ** 2) - record.noise**2
+        same = error < (SAME * max(size, 0.5 * float(np.ptp(values)))) ** 2 and abs(found[0] - fit.level) < LEG * size
+        if same and abs(np.log(poles[0] / fit.poles[0])) < ALIKE:
+            grown = 0.5 * float(np.ptp(record.values[row : record.end(row)])) / size if ends_here else np.inf
+            return grown, (float(time[row]) if ends_here else float(end)) if stays else None
     return np.inf, None
 
 
