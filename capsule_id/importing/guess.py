@@ -338,4 +338,6 @@ def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None
         decay = find_free_decay(time, values)
     except InputError:
         return None
-    return None if decay is None or (decay.rest == 0.0 and decay.stop is None) else (decay.start, decay.stop)
+    if decay is None or (decay.rest == 0.0 and decay.stop is None):
+        return None
+    return decay.start, decay.stop if decay.stop is not None and decay.stop > decay.start else None

@@ -72,7 +72,8 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if decay is not None:
         yield from _release(table, decay, bool(faults))
         inside = time[used]
-        last = len(inside) if decay.stop is None else int(np.searchsorted(inside, decay.stop, side="right"))
+        ends = decay.stop is not None and decay.stop > decay.start
+        last = int(np.searchsorted(inside, decay.stop, side="right")) if ends else len(inside)
         used = slice(used.start + int(np.searchsorted(inside, decay.start)), used.start + last)
         # Dry friction makes an acceleration jump wherever the rod turns; lost samples make one jump that stands alone.
         faults = faults or [
