@@ -340,4 +340,4 @@ def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None
         return None
     if decay is None or (decay.rest == 0.0 and decay.stop is None):
         return None
-    return decay.start, decay.stop if decay.stop is not None and decay.stop > decay.start else None
+    return decay.start, decay.end

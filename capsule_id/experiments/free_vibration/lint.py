@@ -72,8 +72,7 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if decay is not None:
         yield from _release(table, decay, bool(faults))
         inside = time[used]
-        ends = decay.stop is not None and decay.stop > decay.start
-        last = int(np.searchsorted(inside, decay.stop, side="right")) if ends else len(inside)
+        last = len(inside) if decay.end is None else int(np.searchsorted(inside, decay.end, side="right"))
         used = slice(used.start + int(np.searchsorted(inside, decay.start)), used.start + last)
         # Dry friction makes an acceleration jump wherever the rod turns; lost samples make one jump that stands alone.
         faults = faults or [
@@ -176,7 +175,8 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
 def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Finding]:
     """Report rest before the release, and a second excitation; a ``faulty`` record may feign the latter."""
     start, stop = release_time(decay), decay.stop
-    if decay.rest > 0.0:
+    earlier = stop is not None and decay.end is None
+    if decay.rest > 0.0 and not earlier:
         before = "slow approach to the first turning point" if decay.pushed else "rest or excitation"
         longer = "" if decay.pushed else ". To keep a longer part, state an earlier start."
         facts = {"file": table.file, "rest": decay.rest, "start": start, "found": decay.start, "before": before}
@@ -184,7 +184,8 @@ def _release(table: Table[Any], decay: FreeDecay, faulty: bool) -> Iterable[Find
         yield Finding("decays.release", "warn" if table.settings.start is None else "fail", facts, table.label)
     if stop is not None and not faulty:
         digits = max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
-        facts = {"file": table.file, "stop": round(stop, digits), "found": stop}
+        other = " For the part after that, add instead: " + line_of("start").format(start=start) if earlier else ""
+        facts = {"file": table.file, "stop": round(stop, digits), "found": stop, "other": other}
         yield Finding("decays.second", "fail", facts, table.label)
 
 
@@ -295,7 +296,7 @@ MESSAGES = {
         "end of a decay",
         fail=(
             "the energy of a free decay must not grow; it grows after {found:.5g} s. Add this line to the experiment in "
-            "rig.toml: " + line_of("stop")
+            "rig.toml: " + line_of("stop") + "{other}"
         ),
     ),
     "decays.frequency": Message(

@@ -209,8 +209,9 @@ def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:
 
 
 def release_time(decay: FreeDecay) -> float:
-    """Start of a free decay, s, rounded to a hundredth of its period."""
-    return round(decay.start, max(0, int(np.ceil(-np.log10(0.01 * decay.period)))))
+    """Start of a free decay, s, in hundredths of its period; none of what comes before it is left in."""
+    size = 10.0 ** max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
+    return float(np.ceil(decay.start * size - 1e-6)) / size
 
 
 def cut_at_release(table: Table[DecaySettings]) -> Table[DecaySettings]:

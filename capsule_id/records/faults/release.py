@@ -4,7 +4,7 @@ A decay is fitted to a part of the record that lies behind the release, and that
 samples before it cost more than the noise explains: before the release any motion is possible.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -76,6 +76,11 @@ class FreeDecay:
     period: float
     pushed: bool = False
 
+    @property
+    def end(self) -> float | None:
+        """Time at which another excitation ends the free decay, s; None: none does."""
+        return self.stop if self.stop is not None and self.stop > self.start else None
+
 
 def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = False) -> FreeDecay | None:
     """Return the free decay inside a record; None where no motion exceeds the noise, or it is sampled too slowly.
@@ -108,10 +113,18 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
     decay, over = None, float(time[turns[last + 1]])
     if period >= FEWEST * np.median(np.diff(time)):
         lengths, first = np.diff(time[turns]), last
-        while first and sizes[first - 1] > 0.95 * sizes[first] and abs(lengths[first - 1] / lengths[first] - 1.0) < REGULAR:
+        while (
+            first
+            and sizes[first - 1] > 0.95 * sizes[first]
+            and abs(lengths[first - 1] / lengths[first] - 1.0) < REGULAR
+        ):
             first -= 1
         record, anchor = _Record.of(time, values, period, past)
-        early = min(record.at(float(time[turns[min(first + LEGS, len(turns) - 1)]])), anchor) if first + LEGS < last else anchor
+        early = (
+            min(record.at(float(time[turns[min(first + LEGS, len(turns) - 1)]])), anchor)
+            if first + LEGS < last
+            else anchor
+        )
         begin, fit, stop = _release(record, anchor, early)
         over = float(record.time[begin]) + DIED_OUT / max(fit.poles[0] * fit.poles[1], 1e-9)
         start, pushed = float(time[0]), False
@@ -193,7 +206,9 @@ def _growth(time: np.ndarray, values: np.ndarray, turns: np.ndarray) -> float | 
     """Time before legs between ``turns`` that grow; None where none does. Two of them grow, and three were lower."""
     sizes = np.abs(np.diff(values[turns]))
     highest = np.max(np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (2, 0), mode="edge"), 3), axis=1)
-    grown = sizes > GROWTH * np.minimum.accumulate(np.concatenate([highest[:1], highest[:-1]])) + SMALLEST_PUSH * np.max(sizes)
+    grown = sizes > GROWTH * np.minimum.accumulate(
+        np.concatenate([highest[:1], highest[:-1]])
+    ) + SMALLEST_PUSH * np.max(sizes)
     twice = 1 + np.flatnonzero(grown[1:-1] & grown[2:])
     return float(time[turns[twice[0]]]) if len(twice) else None
 
@@ -254,7 +269,9 @@ class _Record:
         return _Fit(best[1], best[0], max(np.sqrt(best[0] / max(len(time) - 5, 1)), self.noise, model), model, best[3])
 
 
-def _fit(time: np.ndarray, values: np.ndarray, poles: Poles, sd: float, steps: int) -> tuple[float, Poles, float, float]:
+def _fit(
+    time: np.ndarray, values: np.ndarray, poles: Poles, sd: float, steps: int
+) -> tuple[float, Poles, float, float]:
     """Sum of squares, poles, sum of the further forces, and rest position of a decay; ``sd`` of the readings."""
     prior = np.zeros((3, 8))
     prior[[0, 1, 2], [5, 6, 7]] = sd / FURTHER
@@ -282,7 +299,8 @@ def _motions(phase: np.ndarray, zeta: float) -> tuple[np.ndarray, np.ndarray, np
     root = np.sqrt(complex(zeta**2 - 1.0))
     root = root if abs(root) > 1e-3 else 1e-3
     poles = np.array([-zeta + root, -zeta - root])
-    waves = np.exp(np.clip((poles * phase[:, None]).real, -60.0, 60.0) + 1j * (poles * phase[:, None]).imag)
+    exponents = poles * phase[:, None]
+    waves = np.exp(np.clip(np.real(exponents), -60.0, 60.0) + 1j * np.imag(exponents))
     first = ((poles[0] * waves[:, 1] - poles[1] * waves[:, 0]) / (poles[0] - poles[1])).real
     second = ((waves[:, 0] - waves[:, 1]) / (poles[0] - poles[1])).real
     motions = np.column_stack([np.ones_like(phase), first, second])
@@ -341,7 +359,9 @@ def _release(record: _Record, begin: int, early: int) -> tuple[int, _Fit, float 
         sd = max(min((sd for i, sd in seen if time[i] <= time[begin] + record.period), default=fit.sd), fit.model)
         wider = record.fit(low, record.end(begin), [fit.poles], 4)
         later = record.fit(low, record.end(low), [wider.poles], 3)
-        doubtful = wider.cost - fit.cost > sd**2 * (2.0 * (begin - low) + EVIDENCE) or later.sd > MISFIT * max(sd, later.model)
+        doubtful = wider.cost - fit.cost > sd**2 * (2.0 * (begin - low) + EVIDENCE) or later.sd > MISFIT * max(
+            sd, later.model
+        )
         if doubtful or low == 0:
             inside = max(min(record.at(time[begin] + max(span, 0.25 * record.period)), len(time) - 10), begin)
             inner = record.fit(inside, record.end(inside), [fit.poles, *record.starts()], 10)
