@@ -14,7 +14,6 @@ from capsule_id.experiments.lint_magnitudes import (
     with_line,
 )
 from capsule_id.records.faults.duplicates import Readings, repeated_blocks
-from capsule_id.rig.formats.columns import release
 from capsule_id.rig.formats.text.blocks import WINDOWS
 from capsule_id.rig.model import Rig, Table
 from capsule_id.views import Finding
@@ -35,7 +34,6 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     findings += (*lint_rig_quantities(rig), *lint_magnitudes(tables, kinds, rig))
     for table in tables:
         findings += lint_stated_sd(table, kinds[table.kind])
-        _release(table)
         windows = {file: encoding for file, encoding in table.encodings.items() if encoding == WINDOWS}
         findings += [
             Finding("readings.encoding", "ok", {"file": file, "encoding": encoding}, table.label)
@@ -49,13 +47,7 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
             findings.append(Finding("readings.rejected", "warn", facts, table.label))
         for lint_table in kinds[table.kind].lint:
             findings += lint_table(table, rig)
-            _release(table)
     return (*with_line(findings, rig), *_same_files(rig, tables), *_repeated_blocks(rig, tables))
-
-
-def _release(table: Table[Any]) -> None:
-    """Give back the memory of a long table that lies in files."""
-    release(*(column.values for column in table.columns.values()))
 
 
 def lint_settings(rig: Rig, kinds: Mapping[str, Kind], estimate: Estimate) -> tuple[Finding, ...]:
@@ -80,7 +72,6 @@ def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
     readings = []
     for name, column in table.columns.items():
         readings.append((name, hashlib.sha256(np.ascontiguousarray(column.values).data).digest()))
-        _release(table)
     return rig.files.get(table.file, table.label), *readings
 
 

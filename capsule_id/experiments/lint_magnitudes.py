@@ -9,7 +9,6 @@ import numpy as np
 
 from capsule_id.experiments.kind import Kind
 from capsule_id.rig.filters import dominant_frequency, loudest_part
-from capsule_id.rig.formats.columns import release
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, ColumnRule, GroundSettings, QuantityRule
 from capsule_id.rig.units import factor_to_si
@@ -159,7 +158,6 @@ def _numbers(table: Table[Any], kind: Kind, rig: Rig) -> Iterable[Number]:
             value, scales = float(relation(*(table[name] for name in pair))), tuple(f"{label}.{name}" for name in pair)
             yield Number(f"{words} of {table.file}", value, si, usual, scales, label)
     yield from _against_k1(table, rig)
-    release(*(column.values for column in table.columns.values()))
 
 
 def _usual(rule: ColumnRule | QuantityRule, rig: Rig) -> tuple[tuple[float, float] | None, tuple[str, ...]]:

@@ -10,7 +10,6 @@ from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.phase import jump_or_noise, single_spike
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
 from capsule_id.rig.filters import TIMING_TOLERANCE, largest_offset, median_step
-from capsule_id.rig.formats.columns import in_blocks
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 
@@ -58,7 +57,7 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
     values, unit = column.values[used], column.to_display
     if len(time[used]) < 2 or np.ptp(values) == 0.0:
         return
-    values = in_blocks(lambda part: part * unit, values) if unit != 1.0 else values
+    values = values * unit if unit != 1.0 else values
     step = median_step(time[used])
     where = {"file": table.file, "column": name, "unit": column.unit}
     for clipped in clipped_samples(values, period / step):

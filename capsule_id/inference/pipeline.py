@@ -42,7 +42,6 @@ from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenan
 from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS, sample
 from capsule_id.inference.tables.notes import make_notes
 from capsule_id.inference.tables.parameter_table import parameter_tables
-from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.interruption import stop_if_interrupted
@@ -111,7 +110,6 @@ def sample_posterior(
     store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
     progress, ess : see ``capsule_id.inference.sampling.ensembles.sample``
     """
-    release_memory()
     target, posterior = point.target, None
     if budget is not None:
         posterior = sample(MarginalPosterior(target, point.fit), seed, budget, store, progress, ess)
@@ -138,7 +136,6 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     The findings include those of the point fit and ``before``, those on the readings.
     """
     stop_if_interrupted()
-    release_memory()
     before = [with_scaled(finding, sampled.experiments) for finding in before]
     checked = run_checks(replace(sampled, findings=before))
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
@@ -179,7 +176,6 @@ def make_result(
     panels : False leaves out panels, notes and records, which take most of the time
     """
     stop_if_interrupted()
-    release_memory()
     target, posterior = checked.target, checked.posterior
     rng = np.random.default_rng(seed)
     predictive = {e.label: e.predictive_p([e.local(d) for d in checked.draws], rng) for e in target.experiments}

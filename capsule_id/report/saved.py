@@ -18,7 +18,6 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.result import Result
 from capsule_id.report.netcdf import read_sample
-from capsule_id.rig.formats.columns import release
 
 #: The file in the directory of a result, and the sample beside it.
 SAVED, SAMPLE = Path("figures") / "data.npz", "posterior.nc"
@@ -38,7 +37,6 @@ def save(result: Result, directory: Path) -> None:
         for name, values in arrays.items():
             with file.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, values, allow_pickle=False)
-            release(values)
 
 
 def load(directory: Path, registry: Registry) -> dict[str, Any]:

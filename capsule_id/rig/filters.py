@@ -8,14 +8,11 @@ Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. S
 111 (2011).
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 from jaxtyping import Float, Num
 from numpy.polynomial import legendre
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.columns import release
 from capsule_id.views import counted
 
 #: Samples of one channel, or their times.
@@ -75,15 +72,7 @@ def loudest_part(values: Record) -> slice:
     if last <= 0:
         return slice(0, len(values))
     first = max((*range(0, last, PIECE), last), key=lambda k: float(np.var(values[k : k + PIECE])))
-    release(values)
     return slice(first, first + PIECE)
-
-
-def pieces(samples: int, overlap: int = 0) -> Iterator[slice]:
-    """Parts of a record, one after the other, each with ``overlap`` samples of the next; one for a short record."""
-    size = samples if samples < 2 * PIECE else PIECE
-    for first in range(0, max(samples, 1), max(size, 1)):
-        yield slice(first, min(first + size + overlap, samples))
 
 
 def thinned(values: Record) -> Num[np.ndarray, " m"]:
@@ -96,17 +85,12 @@ def median_step(time: Record) -> float:
     if len(time) < 2 * PIECE:
         return float(np.median(np.diff(time)))
     first = np.arange(0, len(time) - 1, len(time) // PIECE)
-    steps = time[first + 1] - time[first]
-    release(time)
-    return float(np.median(steps))
+    return float(np.median(time[first + 1] - time[first]))
 
 
 def largest_offset(time: Record, step: float) -> float:
     """Largest distance of the times from an even grid with ``step`` that begins at the first one, s."""
-    grid = ((part, np.arange(part.start, part.stop)) for part in pieces(len(time)))
-    largest = float(np.max([np.max(np.abs(time[part] - time[0] - step * index)) for part, index in grid]))
-    release(time)
-    return largest
+    return float(np.max(np.abs(time - time[0] - step * np.arange(len(time)))))
 
 
 def sampling_step(time: Record) -> float:

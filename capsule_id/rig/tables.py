@@ -13,7 +13,6 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.columns import IN_MEMORY, in_blocks, release
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.maps.clock import on_reference, read_clock
@@ -279,7 +278,7 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
         raise table.error(None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
     written = table.raw.columns[index]
     with np.errstate(over="ignore"):
-        values = written if factor == 1.0 else in_blocks(lambda part: scale(part, factor), written)
+        values = written if factor == 1.0 else scale(written, factor)
     _check_values(table, index, rule, values)
     if rule.varies and len(values) > 1 and np.ptp(values) == 0.0:
         value = f"{written[0]:g} {unit} in every row"
@@ -287,12 +286,11 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
     if rule.varies and len(values) == 1:
         raise table.error(0, name, f"{name} must vary over the rows", "one row", "add rows")
     values.flags.writeable = False
-    release(values, written)
     return Column(name, unit, 1.0 / factor, values)
 
 
 def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.ndarray) -> None:
-    """Refuse a value of column ``index`` outside its domain, (n,) SI; in blocks, so that no copy of it is made."""
+    """Refuse a value of column ``index`` outside its domain, (n,) SI."""
     name = table.raw.names[index]
     magnitude = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
     checks: list[tuple[Callable[[np.ndarray], np.ndarray], str, str]] = [
@@ -304,16 +302,14 @@ def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.nda
         (is_plausible, magnitude, "correct the value or the unit of the column"),
     ]
     for holds, text, remedy in checks:
-        for first in range(0, len(values), IN_MEMORY):
-            _raise_at_first_false(table, index, holds(values[first : first + IN_MEMORY]), (text, remedy), first)
+        _raise_at_first_false(table, index, holds(values), (text, remedy), 0)
     if rule.increasing:
         text, remedy = f"{name} must increase from row to row", "sort the rows and delete repeated ones"
-        for first in range(0, len(values) - 1, IN_MEMORY):
-            rises = np.diff(values[first : first + IN_MEMORY + 1]) > 0.0
-            fall = first + int(np.argmin(rises))
-            if table.file_of(fall + 1, index) != table.file_of(fall, index):
-                remedy = "name the files in the order of time, or make an experiment of each"
-            _raise_at_first_false(table, index, rises, (text, remedy), first + 1)
+        rises = np.diff(values) > 0.0
+        fall = int(np.argmin(rises)) if len(rises) else 0
+        if len(rises) and table.file_of(fall + 1, index) != table.file_of(fall, index):
+            remedy = "name the files in the order of time, or make an experiment of each"
+        _raise_at_first_false(table, index, rises, (text, remedy), 1)
 
 
 def _raise_at_first_false(table: TableFile, index: int, good: np.ndarray, message: tuple[str, str], first: int) -> None:

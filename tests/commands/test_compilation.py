@@ -1,16 +1,12 @@
 """Options of XLA, the cache of compiled programs and freed memory: a faster second run, no effect on any number."""
 
-import ctypes
 import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from capsule_id.commands import compilation
-from capsule_id.inference.target import compiling
 from tests.cli_tools import environment, run
 
 MOTION = ("simulate", "--k2", "18960", "--P_d", "4", "--Omega", "34.56", "--G", "1e-3", "--periods", "1")
@@ -98,34 +94,3 @@ def test_the_users_own_cache_is_left_alone(variables: dict[str, str], tmp_path: 
     assert variables[compilation.DIRECTORY] == str(own)
     assert compilation.discard_damaged(f"{compilation.DAMAGED} for x: error").startswith(compilation.DAMAGED)
     assert own.exists()
-
-
-@pytest.mark.skipif(sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "mallopt"), reason="glibc only")
-def test_freed_memory_is_given_back() -> None:
-    """Half of many small blocks are freed: the heap keeps them, and ``release_memory`` gives them back."""
-    code = (
-        "import re\n"
-        "from pathlib import Path\n"
-        "from capsule_id.inference.target.compiling import release_memory, use_one_heap\n"
-        "def resident():\n"
-        "    return int(re.search(r'VmRSS:\\s+(\\d+)', Path('/proc/self/status').read_text(encoding='utf-8'))[1])\n"
-        "use_one_heap()\n"
-        "blocks = [bytes(3000) for _ in range(20_000)]\n"
-        "held = blocks[::4000]\n"
-        "full = resident()\n"
-        "del blocks\n"
-        "before = resident()\n"
-        "release_memory()\n"
-        "print(full, before, resident())\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=True)
-    full, before, after = map(int, done.stdout.split())
-    assert full - before < 20_000  # kB: the heap ends with a block that is held
-    assert before - after > 30_000
-
-
-def test_other_c_libraries_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    for fault in (AttributeError, OSError, TypeError):
-        monkeypatch.setattr(compiling.ctypes, "CDLL", lambda _, fault=fault: (_ for _ in ()).throw(fault))
-        compiling.use_one_heap()
-        compiling.release_memory()

@@ -11,7 +11,6 @@ from capsule_id.console import OnProgress, Progress, say
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.registry import Registry
-from capsule_id.inference.target.compiling import use_one_heap
 from capsule_id.output import CHAINS, check_directory, publish, work_in_progress
 from capsule_id.rig.model import Rig
 
@@ -54,7 +53,6 @@ def check_output(directory: Path, options: Options) -> None:
 
 def prepare_jax(options: Options, has_runs: bool) -> None:
     """Set the options of XLA, before JAX loads, the heap, and the cache of programs."""
-    use_one_heap()
     set_xla_options(loop=options.experiments != "bench" and has_runs)
     if options.cached:
         keep_programs()

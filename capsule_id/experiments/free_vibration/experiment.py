@@ -49,7 +49,6 @@ from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.faults.release import shortened
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import choose_window, savitzky_golay
-from capsule_id.rig.formats.columns import in_blocks
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Facts, Finding
 
@@ -124,7 +123,7 @@ class FreeVibration(SurfaceExperiment):
         self.model = model or stated_model(table)
         self.order = CHANNELS[channel_of(table)].order
         time, values = decay_window(table)
-        elapsed = in_blocks(lambda part: part - float(time[0]), time)
+        elapsed = time - float(time[0])
         blocks = block_means(elapsed, values, self.model.thin, by_sample=channel_of(table) != "x_rel")
         self.time, self.values, self.nodes, self.weights = blocks.time, blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)

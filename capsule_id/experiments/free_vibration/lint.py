@@ -68,12 +68,13 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     time = table["time"]
     decay = find_free_decay(time[used], table[channels[0]][used], displacement=channels[0] == "x_rel")
     period = np.inf if decay is None else decay.period
+    if decay is not None:  # a hold is neither clipped nor frozen
+        used = slice(used.start + int(np.searchsorted(time[used], decay.start)), used.stop)
     faults = [found for name in channels for found in lint_channel(table, name, used, period)]
     if decay is not None:
         yield from _release(table, decay, bool(faults))
-        inside = time[used]
-        last = len(inside) if decay.end is None else int(np.searchsorted(inside, decay.end, side="right"))
-        used = slice(used.start + int(np.searchsorted(inside, decay.start)), used.start + last)
+        if decay.end is not None:
+            used = slice(used.start, used.start + int(np.searchsorted(time[used], decay.end, side="right")))
         # Dry friction makes an acceleration jump wherever the rod turns; lost samples make one jump that stands alone.
         faults = faults or [
             found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")

@@ -27,7 +27,6 @@ from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, leas
 from capsule_id.inference.fit.point_fit import AGREEMENT, dispersed_starts
 from capsule_id.inference.fit.variance_shares import variance_shares
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
 from capsule_id.interruption import stop_if_interrupted, threads
 from capsule_id.views import counted
@@ -127,7 +126,6 @@ def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
     ends: list[_End] = []
     with threads(TOGETHER) as workers:
         while len(ends) < len(starts):
-            release_memory()
             best = max(ends, key=lambda end: end.value, default=None)
             if best is None or not np.isfinite(best.value):
                 ends.append(_search(target, starts[len(ends)], np.inf))

@@ -15,7 +15,6 @@ from capsule_id.inference.fit.point_fit import point_fit
 from capsule_id.inference.fit.second_fits import compare_laws, fit_coloured
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.sampling.ensembles import sample
-from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.inference.target.marginal import MarginalPosterior
 from capsule_id.interruption import threads
@@ -64,9 +63,7 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
     alone = LogPosterior(target.rig, closed) if closed else None
     bench = None if alone is None else point_fit(alone, seed)
     known = _paper_values(target, registry) if bench is None else dict(bench.values)
-    release_memory()
     target, findings = cut_unpredictable(target, known)
-    release_memory()
     # The joint fit takes one core most of the time: the bench is sampled on another one.
     with threads(1) as beside:
         own = beside.submit(_bench_sample, alone, bench, seed) if alone and bench and sampled else None

@@ -18,7 +18,6 @@ from capsule_id.experiments.families.friction_model import FrictionModel, Surfac
 from capsule_id.experiments.families.friction_variants import model_lines
 from capsule_id.inference.fit.joint_fit import joint_fit
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.compiling import release_memory
 from capsule_id.inference.target.log_posterior import LogPosterior
 from capsule_id.parameters import is_stated
 from capsule_id.physics.friction import CoulombStribeck
@@ -46,13 +45,11 @@ class _Fit:
         cls, other: LogPosterior, experiments: Sequence[Experiment], known: Mapping[str, float], seed: int
     ) -> "_Fit":
         """Fit other models of the same readings, from many starts about values by name."""
-        release_memory()
         target = LogPosterior(other.rig, experiments)
         return cls(target, joint_fit(target, known, seed))
 
     def with_law(self, law: FrictionModel, seed: int) -> "_Fit":
         """Fit another friction law from this fit alone: the motion is known, and only a comparison needs the result."""
-        release_memory()
         experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in self.target.experiments]
         target = LogPosterior(self.target.rig, experiments)
         values = {**{name: start.centre for name, start in target.starts().items()}, **self.values}

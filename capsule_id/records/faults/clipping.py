@@ -1,13 +1,12 @@
 """Finds clipped records: flat tops, samples that share exactly the largest or smallest value."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from capsule_id.records.faults.duplicates import reading_step
-from capsule_id.rig.filters import pieces, thinned
+from capsule_id.rig.filters import thinned
 
 #: Fewest samples at the limit; how many times as many as at the neighbouring values.
 FEWEST_CLIPPED, EXCESS = 3, 5.0
@@ -65,17 +64,9 @@ def _at_limit(
     """
     (level, sign), (tolerance, step) = limit, resolution
 
-    def within(closest: float, farthest: float) -> Iterator[np.ndarray]:
-        """Indices of the samples at a distance from the limit above ``closest`` and up to ``farthest``."""
-        for part in pieces(len(values)):
-            depth = sign * (level - values[part])
-            yield part.start + np.flatnonzero((depth > closest) & (depth <= farthest))
-
-    rows = np.concatenate(list(within(-np.inf, tolerance)))
-    beside = tolerance, (NEIGHBOURS + 0.25) * step
-    if len(rows) < FEWEST_CLIPPED + EXCESS * sum(len(near) for near in within(*beside)) / NEIGHBOURS:
-        return rows[:0]
-    near = np.concatenate(list(within(*beside)))
+    depth = sign * (level - values)
+    rows = np.flatnonzero(depth <= tolerance)
+    near = np.flatnonzero((depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step))
     if len(rows) < FEWEST_CLIPPED + EXCESS * (len(near) + _one_sided(near, rows)) / NEIGHBOURS:
         return rows[:0]
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)

@@ -11,7 +11,6 @@ import numpy as np
 
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import PIECE, thinned
-from capsule_id.rig.formats.columns import release
 
 #: Expected number of blocks that agree by chance, below which a block counts as repeated.
 CHANCE = 1e-6
@@ -213,7 +212,6 @@ def _hashes(values: np.ndarray, length: int) -> Iterable[tuple[int, np.ndarray]]
     factors = np.random.default_rng(0).integers(1, 1 << 62, (length, values.shape[1]), dtype=np.uint64)
     for begin in range(0, len(values) - length + 1, PIECE):
         rows = (values[begin : begin + PIECE + length - 1] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
-        release(values)
         rows ^= rows >> np.uint64(29)
         total = np.zeros(len(rows) - length + 1, np.uint64)
         for offset, factor in enumerate(factors):

@@ -1,6 +1,6 @@
 """Finds samples lost without a gap in the time column: jumps of an evenly sampled smooth oscillation."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -8,8 +8,6 @@ from scipy import ndimage, signal
 
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.noise import noise_level
-from capsule_id.rig.filters import pieces
-from capsule_id.rig.formats.columns import release
 
 #: Order of the polynomials on both sides of a sample; their length, periods, with the smallest jump, rad, that they show
 #: beyond their own error. Long ones see through noise, short ones show small jumps of quiet records. A jump above LARGE
@@ -61,15 +59,10 @@ def jump_or_noise(values: np.ndarray, period: float, alone: bool = False) -> Jum
     noisy: list[Jump] = []
     for share, smallest in SIDES:
         side = round(share * period)
-        jumps = []
-        for part in pieces(len(values), 2 * side):
-            jump = _jump(values[part], period, side, smallest, noise, alone)
-            jumps += [] if jump is None else [replace(jump, row=part.start + jump.row)]
-            release(values)
-        noisy += [jump for jump in jumps if jump.noisy]
-        jumps = [jump for jump in jumps if not jump.noisy]
-        if jumps:
-            return max(jumps, key=lambda jump: jump.size)
+        jump = _jump(values, period, side, smallest, noise, alone)
+        if jump is not None and not jump.noisy:
+            return jump
+        noisy += [] if jump is None else [jump]
     return max(noisy, key=lambda jump: jump.size, default=None)
 
 

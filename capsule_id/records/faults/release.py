@@ -12,7 +12,6 @@ import numpy as np
 
 from capsule_id.records.noise import noise_level
 from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part
-from capsule_id.rig.formats.columns import release
 
 #: Turning points differ by this fraction of the record's range, and by so many standard deviations of the noise.
 TURN, TURN_SDS = 0.12, 5.0
@@ -128,7 +127,7 @@ def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bo
         begin, fit, stop = _release(record, anchor, early)
         over = float(record.time[begin]) + DIED_OUT / max(fit.poles[0] * fit.poles[1], 1e-9)
         start, pushed = float(time[0]), False
-        if begin > 0:
+        if begin > 0 and np.sum(time >= record.time[begin]) > WINDOW // 4:
             free = float(record.time[begin])
             cut = max(int(np.searchsorted(time, free + MARGIN * period)), int(np.searchsorted(time, free, "right")))
             start, pushed = _push(time, values, free, period) if displacement else (free, False)
@@ -456,5 +455,4 @@ def shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     means = []
     for column in (time, values):
         means.append(column[: count * size].reshape(count, size).mean(axis=1))
-        release(column)
     return means[0], means[1]

@@ -6,7 +6,7 @@ import numpy as np
 
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.noise import noise_level
-from capsule_id.rig.filters import largest_offset, median_step, pieces, thinned
+from capsule_id.rig.filters import largest_offset, median_step, thinned
 
 #: Share of steps that must equal the sampling step before a longer one counts as a gap.
 REGULAR_SHARE = 0.9
@@ -46,16 +46,11 @@ def find_gaps(time: np.ndarray) -> Gaps | None:
     if len(time) < 9:
         return None
     step = median_step(time)
-    rows, lost, regular = [], [], 0
-    for part in pieces(len(time) - 1):
-        steps = np.diff(time[part.start : part.stop + 1]) / step
-        multiple = np.round(steps)
-        long = np.flatnonzero((multiple >= 2) & (np.abs(steps - multiple) <= STEP_TOLERANCE * np.sqrt(multiple)))
-        regular += int(np.sum(np.abs(steps - 1.0) <= STEP_TOLERANCE))
-        rows.append(part.start + long)
-        lost.append(multiple[long].astype(int) - 1)
-    gaps = Gaps(np.concatenate(rows), np.concatenate(lost), step)
-    return gaps if len(gaps.rows) and regular / (len(time) - 1) >= REGULAR_SHARE else None
+    steps = np.diff(time) / step
+    multiple = np.round(steps)
+    rows = np.flatnonzero((multiple >= 2) & (np.abs(steps - multiple) <= STEP_TOLERANCE * np.sqrt(multiple)))
+    regular = float(np.mean(np.abs(steps - 1.0) <= STEP_TOLERANCE))
+    return Gaps(rows, multiple[rows].astype(int) - 1, step) if len(rows) and regular >= REGULAR_SHARE else None
 
 
 def time_rounding(time: np.ndarray) -> float | None:
@@ -85,12 +80,7 @@ def dropouts(values: np.ndarray) -> np.ndarray:
     low, high = np.quantile(thinned(values), [0.05, 0.95])
     noise = DROPOUT_NOISE * noise_level(values) if len(values) > FEWEST_OF_NOISE else 0.0
     spread = max(high - low, min(noise, LARGEST_SHARE * float(np.ptp(values))))
-    runs = [np.empty((0, 2), int)]
-    for part in pieces(len(values)):
-        first = max(part.start - LONGEST_DROPOUT - 1, 0)
-        found = first + _far_runs(values[first : part.stop + LONGEST_DROPOUT + 1], spread)
-        runs.append(found[(found[:, 0] >= part.start) & (found[:, 0] < part.stop)])
-    starts, ends = np.concatenate(runs).T
+    starts, ends = _far_runs(values, spread).T
     own = values[starts]
     # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
     levels, counts = np.unique(own, return_counts=True)

@@ -1,13 +1,11 @@
 """Applies a column map: selects, combines and scales the columns of one file or several."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from capsule_id.rig.filters import pieces
-from capsule_id.rig.formats.columns import in_blocks, joined, release, whole_numbers
 from capsule_id.rig.formats.export import Export
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.maps.declared import ColumnMap, Header, Range, Source, Wanted
@@ -100,10 +98,10 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     keep, missing, other = _kept(document, path, values, where, column_map.where)
     for name, source in column_map.sources.items():
         if (rate := source.rate) is not None:
-            values[name] = in_blocks(lambda part, rate=rate: part / rate, whole_numbers(0, int(first_rows[-1])))
+            values[name] = np.arange(first_rows[-1]) / rate
     names = tuple(column_map.sources)
     columns = tuple(_selected(values.pop(name), keep) for name in names)
-    origin = None if keep is None else _selected(whole_numbers(0, len(keep)), keep)
+    origin = None if keep is None else np.flatnonzero(keep)
 
     def cell(row: int | None, column: int) -> tuple[_Cell, int | None]:
         index = 0 if row is None else row if origin is None else int(origin[row])
@@ -118,28 +116,19 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     units = tuple(column_map.sources[name].unit for name in names)
     # Arrays of a file may have other lengths than those that the map names.
     lines = exports[0].lines[: int(first_rows[-1])]
-    rows = _selected(lines, keep) if len(parts) == 1 else whole_numbers(1, len(columns[0]))
+    rows = _selected(lines, keep) if len(parts) == 1 else np.arange(1, 1 + len(columns[0]))
     raw = RawTable(names, units, columns, rows, place_of)
     return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)
 
 
 def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
     """Columns put one below the other; a single one is not copied."""
-    return parts[0] if len(parts) == 1 else joined(parts)
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _selected(values: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
     """The rows ``keep`` of a column; None: all, without a copy."""
-    if keep is None:
-        return values
-    return joined(_selected_pieces(values, keep), values.dtype.type)
-
-
-def _selected_pieces(values: np.ndarray, keep: np.ndarray) -> Iterable[np.ndarray]:
-    """The rows ``keep`` of each piece of a column."""
-    for part in pieces(len(values)):
-        yield values[part][keep[part]]
-        release(values)
+    return values if keep is None else values[keep]
 
 
 class _Part:
@@ -272,11 +261,11 @@ def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.nd
     """The values of a column in its stated unit."""
     values = found.values
     if source.minus is not None:
-        values = in_blocks(np.subtract, values, part.find((*place, "minus"), source.minus).values)
+        values = values - part.find((*place, "minus"), source.minus).values
     if source.scale == 1.0 and source.offset == 0.0:
         return values
     with np.errstate(over="ignore"):
-        return in_blocks(lambda own: own * source.scale + source.offset, values)
+        return values * source.scale + source.offset
 
 
 def _kept(
@@ -287,7 +276,7 @@ def _kept(
     wanted: Mapping[str, Wanted],
 ) -> tuple[np.ndarray | None, int, int]:
     """Which rows are used (None: all), and how many are dropped: for a missing cell, and outside ``where``."""
-    if not where and not any(_blank(column).any() for column in values.values()):
+    if not where and not any(np.isnan(column).any() for column in values.values()):
         return None, 0, 0
     unknown = np.any([selected.unknown for selected in where.values()], axis=0) if where else np.array(False)
     inside = np.ones(next(iter(values.values())).size, bool)
@@ -303,7 +292,7 @@ def _kept(
         inside &= selected.rows
     empty = np.zeros_like(inside)
     for column in values.values():
-        empty |= _blank(column)
+        empty |= np.isnan(column)
     keep = inside & ~empty
     if not keep.any():
         remedy = "correct where, or map another column"
@@ -312,10 +301,3 @@ def _kept(
         return None, 0, 0
     missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
     return keep, missing, inside.size - int(np.sum(keep)) - missing
-
-
-def _blank(column: np.ndarray) -> np.ndarray:
-    """Whether each cell holds a missing marker, (n,)."""
-    blank = joined((np.isnan(column[part]) for part in pieces(len(column))), np.bool_)
-    release(column)
-    return blank

@@ -14,7 +14,6 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part, median_step, sampling_step
-from capsule_id.rig.formats.columns import release
 
 #: Block means per period that replace a long record; with more, a decay's parameters gain less than 0.5 % in precision.
 READINGS_PER_PERIOD = 32
@@ -66,7 +65,6 @@ def block_means(time: np.ndarray, values: np.ndarray, size: int, by_sample: bool
     for first in range(0, samples, step):
         part = slice(first, min(first + step, samples))
         parts.append(_means(time[part], values[part], np.arange(part.stop - first) // size, by_sample))
-        release(time, values)
     return Blocks(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Blocks)))
 
 

@@ -98,7 +98,8 @@ def steps_of_parts(
     """Gauss-Newton step of parameter k and its sd from every part that informs it.
 
     A part meets the other parameters as the rest of the data gives them: the fit to all of the data has adapted them
-    to the misfit of the part itself. A part without which the fit has no solution gives no step.
+    to the misfit of the part itself. A part without which the fit has no solution, or one less certain than the part, gives
+    no step: the first period of a strong decay holds most of what the record tells.
     """
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     jacobian = jacobian / scale
@@ -109,6 +110,11 @@ def steps_of_parts(
         rows, rest = part == number, part != number
         information = float(np.sum(own[rows] ** 2))
         if information == 0.0 or np.linalg.matrix_rank(jacobian[rest]) < jacobian.shape[1]:
+            continue
+        effect = -own[rows] @ jacobian[rows] / information
+        effect[k] += 1.0
+        triangle = np.linalg.qr(jacobian[rest], mode="r")
+        if np.sum(np.linalg.solve(triangle.T, effect) ** 2) > 1.0 / information:
             continue
         step = np.linalg.lstsq(jacobian[rest], -residuals[rest], rcond=None)[0]
         beyond = residuals[rows] + jacobian[rows] @ step

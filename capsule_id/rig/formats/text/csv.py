@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.columns import Growing, whole_numbers
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.formats.text.blocks import Content, TextFile
 from capsule_id.rig.formats.text.cells import BLANKS, cells_of, read_number, shown_cell
@@ -52,7 +51,7 @@ def read_csv(content: Content, path: Path) -> RawTable:
         line = 0 if row is None else row + 1
         return line + 1, cells_of(file.line(line), delimiter)[column][1]
 
-    return RawTable(names, units, columns, whole_numbers(2, len(columns[0])), place, file.encoding)
+    return RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
 
 
 def _refuse_blank(file: TextFile) -> None:
@@ -66,7 +65,7 @@ def _refuse_blank(file: TextFile) -> None:
 
 def _plain_columns(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...] | None:
     """The columns of a table of numbers alone, with blank lines at its end or none; None for any other table."""
-    columns, ended = tuple(Growing() for _ in range(shape.width)), False
+    blocks, ended = [], False
     for _, text in file.blocks(shape.first):
         size = len(text.rstrip(f"{BLANKS}\n".encode()))
         # Blanks behind the last row may be cells.
@@ -79,9 +78,8 @@ def _plain_columns(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...] | Non
         values = plain_block(rows + b"\n", shape, range(shape.width))
         if values is None:
             return None
-        for column, more in zip(columns, values.T, strict=True):
-            column.extend(more)
-    return tuple(column.values for column in columns) if len(columns[0].values) else None
+        blocks.append(values)
+    return tuple(np.concatenate(blocks).T.copy()) if blocks else None
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.columns import Growing
 from capsule_id.rig.formats.text.blocks import TextFile, lines_of, occurrences
 from capsule_id.rig.formats.text.cells import bare, cells_of, decimal_mark, place_of_cell, read_column
 from capsule_id.views import counted
@@ -48,15 +47,15 @@ class Rows:
     """
 
     def __init__(self, columns: Sequence[int], words: Sequence[int] = ()) -> None:
-        self._codes = {column: Growing(np.int32) for column in words}
+        self._codes: dict[int, list[np.ndarray]] = {column: [] for column in words}
         self._texts: dict[int, dict[str, int]] = {column: {} for column in words}
-        self._lines = Growing(np.int32)
-        self._columns: dict[int, Growing | InputError] = {column: Growing() for column in columns}
+        self._lines: list[np.ndarray] = []
+        self._columns: dict[int, list[np.ndarray] | InputError] = {column: [] for column in columns}
 
     @property
     def lines(self) -> np.ndarray:
         """(rows,) 1-based line of every row."""
-        return self._lines.values
+        return np.concatenate([np.empty(0, int), *self._lines])
 
     def column(self, index: int) -> np.ndarray:
         """The numbers of a column, (rows,).
@@ -69,20 +68,20 @@ class Rows:
         column = self._columns[index]
         if isinstance(column, InputError):
             raise column
-        return column.values
+        return np.concatenate([np.empty(0), *column])
 
     def words(self, index: int) -> tuple[np.ndarray, tuple[str, ...]]:
         """Numbers of the texts of a column, (rows,), and the texts."""
-        return self._codes[index].values, tuple(self._texts[index])
+        return np.concatenate([np.empty(0, int), *self._codes[index]]), tuple(self._texts[index])
 
     def add_words(self, index: int, texts: Sequence[str]) -> None:
         """Append texts to a column."""
         known = self._texts[index]
-        self._codes[index].extend(np.array([known.setdefault(text, len(known)) for text in texts], np.int32))
+        self._codes[index].append(np.array([known.setdefault(text, len(known)) for text in texts], int))
 
     def add_lines(self, numbers: np.ndarray | Sequence[int]) -> None:
         """Append rows by their 0-based lines."""
-        self._lines.extend(np.asarray(numbers) + 1)
+        self._lines.append(np.asarray(numbers, int) + 1)
 
     def add(self, index: int, values: np.ndarray | InputError) -> None:
         """Append numbers to a column; the first error of a column stays."""
@@ -92,7 +91,7 @@ class Rows:
         if isinstance(values, InputError):
             self._columns[index] = values
         else:
-            column.extend(values)
+            column.append(values)
 
 
 def is_comment(line: str) -> bool:
