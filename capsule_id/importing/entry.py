@@ -17,6 +17,7 @@ from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
 from capsule_id.rig.formats.text.blocks import TextFile
+from capsule_id.rig.schema import QuantityRule
 from capsule_id.rig.units import factor_to_si, scale
 from capsule_id.views import counted
 
@@ -171,7 +172,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)
         return
-    if "start" in kind.setting_rules and (part := free_part(time, values)) is not None:
+    if isinstance(kind.setting_rules.get("start"), QuantityRule) and (part := free_part(time, values)) is not None:
         start, stop = part
         yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")
         if stop is not None:

@@ -13,6 +13,7 @@ from capsule_id.experiments.kind import Kind
 from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
 from capsule_id.importing.layout import FoundLayout
 from capsule_id.records.faults.release import find_free_decay
+from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.units import factor_to_si
 
 Confidence = Literal["sure", "likely", "unsure"]
@@ -232,8 +233,9 @@ def _times(found: FoundLayout) -> list[int]:
 
 
 def _increases(values: np.ndarray) -> bool:
+    """Whether times increase; a clock may start anew."""
     values = values[np.isfinite(values)]
-    return bool(np.all(np.diff(values) > 0.0))
+    return int(np.sum(np.diff(values) <= 0.0)) == len(clock_starts(values))
 
 
 def _is_record(found: FoundLayout, time: int | None) -> bool:
@@ -251,7 +253,8 @@ def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidat
         return None
     sample = next(iter(records))
     index = next(column.index for name, column in sample.columns.items() if name != TIME)
-    values = found.columns[index]
+    starts = clock_starts(found.columns[sample.columns[TIME].index]) if TIME in sample.columns else []
+    values = found.columns[index][: starts[0] if len(starts) else None]
     parts = [np.ptp(part) for part in np.array_split(values[np.isfinite(values)], _PARTS)]
     ratio = float(parts[-1] / max(*parts, 1e-300))
     bench = ratio < 0.5 * (DECAYS + DRIVEN)
@@ -338,6 +341,6 @@ def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None
         decay = find_free_decay(time, values)
     except InputError:
         return None
-    if decay is None or (decay.rest == 0.0 and decay.stop is None):
+    if decay is None or np.any(np.diff(time) <= 0.0) or (decay.rest == 0.0 and decay.stop is None):
         return None
     return decay.start, decay.end

@@ -9,7 +9,7 @@ Sources: A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627 (1964); gain: R. W. S
 """
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float, Int, Num
 from numpy.polynomial import legendre
 
 from capsule_id.errors import InputError
@@ -24,6 +24,8 @@ _HAMPEL_BLOCK = 2_000_000  # readings that are sorted at a time
 PIECE = 1 << 18  # samples that are looked at together of a record with twice as many or more
 #: Fewest periods in the loudest part of a record from which its frequency is read.
 FEWEST_PERIODS = 8.0
+#: Largest time at which a clock starts anew, relative to the longest record.
+CLOCK_START = 0.02
 _ZERO_PADDING = 8  # the frequency grid of the spectrum is 8 times finer than 1 / duration
 
 
@@ -78,6 +80,13 @@ def loudest_part(values: Record) -> slice:
 def thinned(values: Record) -> Num[np.ndarray, " m"]:
     """Samples at equal distances of a long record, one to two pieces; a short record itself."""
     return values if len(values) < 2 * PIECE else values[:: len(values) // PIECE]
+
+
+def clock_starts(time: Record) -> Int[np.ndarray, " k"]:
+    """Rows at which the clock of successive records starts anew; () where times are out of order instead."""
+    falls = 1 + np.flatnonzero(np.diff(time) <= 0.0)
+    anew = time[falls] <= time[0] + CLOCK_START * np.ptp(time)
+    return falls if len(falls) * FEWEST_PERIODS < len(time) and anew.all() else falls[:0]
 
 
 def median_step(time: Record) -> float:

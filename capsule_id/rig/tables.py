@@ -12,6 +12,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
+from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
@@ -26,6 +27,7 @@ from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_string, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
+from capsule_id.views import counted
 
 
 @dataclass(frozen=True)
@@ -305,6 +307,9 @@ def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.nda
         _raise_at_first_false(table, index, holds(values), (text, remedy), 0)
     if rule.increasing:
         text, remedy = f"{name} must increase from row to row", "sort the rows and delete repeated ones"
+        if len(anew := clock_starts(values)):
+            lines = " ".join(str(table.raw.rows[row]) for row in anew[:5])
+            remedy = f"the clock starts anew at {counted(len(anew), 'row')} (line {lines}): write a file of each record"
         rises = np.diff(values) > 0.0
         fall = int(np.argmin(rises)) if len(rises) else 0
         if len(rises) and table.file_of(fall + 1, index) != table.file_of(fall, index):

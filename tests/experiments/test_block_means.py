@@ -9,6 +9,7 @@ import pytest
 
 import capsule_id
 from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.decay_models import half_cycles, interpolate
 from capsule_id.experiments.free_vibration.decrement import Decrement
@@ -165,18 +166,22 @@ def test_long_records_are_thinned_and_the_finding_says_so() -> None:
 
 
 def test_a_very_long_record_is_named_and_the_remedy_works() -> None:
-    """250 periods of 600 samples are fitted by 8000 means, with the remedy by 2000."""
-    rate, n = np.sqrt(bench.K1 / bench.M1), 150_000
-    time = np.arange(n) * (2.0 * np.pi / rate / 600.0)
-    x = RELEASE * np.exp(-0.01 * rate * time) * np.cos(rate * time) + NOISE * noise("white", n)
+    """400 periods of a model that takes dry friction are fitted by the first 250; a stated stop confirms another part."""
+    rate, n = np.sqrt(bench.K1 / bench.M1), 24_000
+    time = np.arange(n) * (2.0 * np.pi / rate / 60.0)
+    x = RELEASE * np.exp(-0.001 * rate * time) * np.cos(rate * time) + NOISE * noise("white", n)
     columns = [bench.column("time", time), bench.column("x_rel", x)]
-    table = bench.table("free_vibration", columns, "decay")
+    free = {"damping": ("viscous", "dry"), "stiffness": "linear", "drift": "none", "noise": "white"}
+    table = bench.table("free_vibration", columns, "decay", **free)
     (found,) = [f for f in lint_decay(table, bench.rig(table)) if f.code == "decays.long"]
-    assert found.facts["readings"] == pytest.approx(8000, rel=0.05)
-    assert found.facts["late"] == ""
-    coarse = bench.table("free_vibration", columns, "decay", thin=found.facts["thin"])
-    assert [f for f in lint_decay(coarse, bench.rig(coarse)) if f.code == "decays.long"] == []
-    assert FreeVibration(coarse, bench.rig(coarse)).n == pytest.approx(2000, rel=0.05)
+    assert found.facts["stop"] == pytest.approx(250 * 2.0 * np.pi / rate, rel=0.02)  # whole samples in a period
+    record = make_experiments(bench.rig(table))[0]
+    assert isinstance(record, FreeVibration)
+    assert record.time[-1] == pytest.approx(found.facts["stop"], abs=0.02)
+    stated = bench.table("free_vibration", columns, "decay", stop=found.facts["stop"], **free)
+    assert [f for f in lint_decay(stated, bench.rig(stated)) if f.code == "decays.long"] == []
+    light = bench.table("free_vibration", columns, "decay", **{**free, "damping": ("viscous",)})
+    assert [f for f in lint_decay(light, bench.rig(light)) if f.code == "decays.long"] == []
 
 
 def test_the_estimate_of_a_long_record_is_that_of_its_means(monkeypatch: pytest.MonkeyPatch) -> None:

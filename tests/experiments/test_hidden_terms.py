@@ -18,7 +18,7 @@ from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks.refit import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.lint import MESSAGES
+from capsule_id.experiments.free_vibration.messages import MESSAGES
 from capsule_id.experiments.free_vibration.second_fit.fits import Screened
 from capsule_id.experiments.free_vibration.second_fit.hidden_terms import Hidden, check_hidden_terms, hidden_terms
 from capsule_id.experiments.free_vibration.second_fit.screening import open_models, second_models
@@ -137,7 +137,7 @@ def test_on_a_slope_no_cubic_spring_is_proposed() -> None:
     for settings, offered in ({}, True), ({"slope": slope}, False):
         record = cast(FreeVibration, make_experiments(bench.rig(decay_table(SHORT, DRY, **settings)))[0])
         assert any(model.cubic for model in open_models(record)[0]) is offered
-    facts = {"name": "k1", "unit": "N/m", "value": 1.0, "low": 0.5, "high": 1.5, "labels": ["decay"]}
+    facts = {"name": "k1", "unit": "N/m", "value": 1.0, "low": 0.5, "high": 1.5, "labels": ["decay"], "swings": True}
     both = {"symbols": ["F_dry", "k_cubic"], "largest": [1.0, 2.0]}
     alone = {"symbols": ["k_cubic"], "largest": [2.0]}
     write = MESSAGES["decays.hidden"].fail

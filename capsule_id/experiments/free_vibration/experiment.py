@@ -24,6 +24,7 @@ from capsule_id.experiments.free_vibration.decay_models import (
 )
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, TURNING_TIME
 from capsule_id.experiments.free_vibration.decrement import (
+    UNKNOWNS,
     Decrement,
     damping_of_peaks,
     equilibrium,
@@ -61,6 +62,8 @@ NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
 UNIFORM = 0.6
 #: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
 SMOOTHING_ORDER = 3
+#: A rough viscous fit whose residuals are this many times the noise misses a force.
+MISFIT = 3.0
 
 
 @dataclass(frozen=True)
@@ -322,7 +325,15 @@ class FreeVibration(SurfaceExperiment):
         decrement = self.decrement()
         if decrement is not None and decrement.delta > 0.0:
             return decrement
-        return viscous_fit(self.time, self.values).decrement(self.mass)
+        found = viscous_fit(self.time, self.values)
+        if self.order == 0 and np.std(found.left) > MISFIT * noise_level(self.values):
+            # Dry friction is a constant force up to the first turning point, where the rest of the record misleads.
+            period = int(np.sum(self.time - self.time[0] < 2.0 * np.pi / found.omega))
+            turn = int(np.argmax(np.abs(self.values[:period] - self.values[0])))
+            if turn >= 2 * UNKNOWNS:
+                found = viscous_fit(self.time[:turn], self.values[:turn])
+                found = found._replace(gamma=max(found.gamma, 0.01 * found.omega))  # a stroke tells little of it
+        return found.decrement(self.mass)
 
     def rough_damping(self, symbols: Sequence[str]) -> dict[str, float]:
         """Rough c, and those of F_dry and c_q in ``symbols``, SI, from the peaks; {} with too few of them."""

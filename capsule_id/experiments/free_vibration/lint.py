@@ -74,7 +74,8 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if decay is not None:
         yield from _release(table, decay, bool(faults))
         if decay.end is not None:
-            used = slice(used.start, used.start + int(np.searchsorted(time[used], decay.end, side="right")))
+            kept = max(int(np.searchsorted(time[used], decay.end, side="right")), SHORTEST_RECORD)
+            used = slice(used.start, min(used.start + kept, used.stop))
         # Dry friction makes an acceleration jump wherever the rod turns; lost samples make one jump that stands alone.
         faults = faults or [
             found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")

@@ -407,6 +407,8 @@ def _border(record: _Record, low: int, inside: int, fit: _Fit) -> tuple[int, flo
                 cost[i - low] = min(cost[i - low], one.cost / fit.sd**2 + SAMPLE_COST * (i - low))
                 if cost[i - low] > np.min(cost) + 500.0:
                     break
+        # What follows the release may be one exponential, whose poles lead to no fit of the whole.
+        cost[0] = min(cost[0], record.fit(low, end, [poles, *record.starts()], 12).cost / fit.sd**2)
         again = low + int(np.argmin(cost))
         if again >= best:
             return again, float(cost[np.isfinite(cost)][0] - np.min(cost))

@@ -119,7 +119,7 @@ def test_the_rows_of_the_priors_are_no_part(known: SampledFit) -> None:
 
 
 def test_a_parameter_that_only_its_prior_determines_does_not_widen_another() -> None:
-    """As the damping of a run on a shaken table does. Negative control: the priors as one more part."""
+    """As the damping of a run on a shaken table does: a part without which the rest is less certain gives no step."""
     rng = np.random.default_rng(0)
     jacobian = np.concatenate([rng.standard_normal((60, 2)) * [1.0, 1e-6], np.eye(2)])
     jacobian[:60, 1] += 1e-6 * jacobian[:60, 0]
@@ -128,7 +128,9 @@ def test_a_parameter_that_only_its_prior_determines_does_not_widen_another() -> 
     part = np.append(np.repeat(np.arange(6), 10), [PRIORS, PRIORS])
     assert widening(steps_of_parts(jacobian, residuals, 0, part)).factor < 2.0
     shared = np.where(part == PRIORS, -1, part)
-    assert widening(steps_of_parts(jacobian, residuals, 0, shared)).factor > 4.0
+    assert len(steps_of_parts(jacobian, residuals, 0, shared)) == 6
+    jacobian[:60, 1] *= 1e8  # the data determine it
+    assert len(steps_of_parts(jacobian, residuals, 0, shared)) == 7
 
 
 @cache

@@ -90,13 +90,14 @@ def response_p(record: "FreeVibration", theta: Mapping[str, float]) -> float:
     moved = [record.unwhitened({**theta, name: 1.001 * theta[name]}, np)[1] @ parts for name in ("k1", "c")]
     known = np.column_stack([design, *(column - design @ parts for column in moved)])
     both = np.concatenate([known, extra], axis=1)
-    own, further = (
-        float(np.sum((raw - a @ np.linalg.lstsq(a, raw, rcond=None)[0]) ** 2))
-        for a in (known / np.linalg.norm(known, axis=0), both / np.linalg.norm(both, axis=0))
-    )
     freedom = record.n - both.shape[1]
     if freedom < 1:
         return 1.0
+    own, further = (
+        # A column of zeros is no effect: quadratic damping of a record that stays where it is.
+        float(np.sum((raw - a @ np.linalg.lstsq(a, raw, rcond=None)[0]) ** 2))
+        for a in (x / np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny) for x in (known, both))
+    )
     return float(stats.f.sf((own - further) / extra.shape[1] * freedom / further, extra.shape[1], freedom))
 
 

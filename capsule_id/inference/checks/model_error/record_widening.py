@@ -113,8 +113,7 @@ def steps_of_parts(
             continue
         effect = -own[rows] @ jacobian[rows] / information
         effect[k] += 1.0
-        triangle = np.linalg.qr(jacobian[rest], mode="r")
-        if np.sum(np.linalg.solve(triangle.T, effect) ** 2) > 1.0 / information:
+        if effect @ np.linalg.solve(jacobian[rest].T @ jacobian[rest], effect) > 1.0 / information:
             continue
         step = np.linalg.lstsq(jacobian[rest], -residuals[rest], rcond=None)[0]
         beyond = residuals[rows] + jacobian[rows] @ step
