@@ -1,7 +1,6 @@
 """Entry points of the two commands ``fit-params`` and ``capsule-id``: parse, call, exit code."""
 
 import argparse
-import gc
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,8 +16,6 @@ from capsule_id.interruption import INTERRUPTED, end_interrupted, interruptible
 
 BAD_INPUT, INTERNAL = 2, 1
 _RESUME = "; --resume continues the fit of one rig from the saved state"
-#: Objects until a collection of garbage: imports and traces make large trees, and each collection walks them all.
-_GARBAGE = (50_000, 20, 20)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -90,7 +87,6 @@ def _run(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         print(f"{program}: {error}", file=sys.stderr)
         code = INTERNAL
     if arguments is None:  # the process ends with this command
-        gc.freeze()  # Python's last collection of garbage would take half a second, and the memory is free anyway
         end_interrupted(code)
     return code
 
@@ -104,7 +100,6 @@ def _act(program: str, make_parser: Callable[[str], argparse.ArgumentParser], ar
         If standard output takes no more text.
     """
     console.prepare()
-    gc.set_threshold(*_GARBAGE)
     use_one_blas_thread()
     interrupted = f"{program}: interrupted{_RESUME if program == 'fit-params' else ''}"
     try:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import Kind, TwinTable
+from capsule_id.experiments.kind import Kind
 from capsule_id.experiments.registry import Registry, default_registry
 from capsule_id.parameters import TABLE_1
 from capsule_id.rig.model import Rig
@@ -114,7 +114,11 @@ def synthesize(
     on_bench = {name: value for name, value in values.items() if name not in of_runs}
     twins = [(k, k.twin(on_bench if k.bench else values, rng, seed)) for k in kinds if k.twin is not None]
     masses = {symbol: getattr(truth, symbol) + sd * rng.standard_normal() for symbol, sd in MASS_SD.items()}
-    entries = [_entry(kind, table) for kind, twin in twins for table in twin.tables]
+    entries = [
+        "\n".join(["[[experiment]]", f'kind = "{kind.name}"', f'file = "{table.file}"', *table.settings, ""])
+        for kind, twin in twins
+        for table in twin.tables
+    ]
     priors = [line for _, twin in twins for line in twin.priors]
     behind = {label: known for _, twin in twins for label, known in twin.truth.items()}
     folder.mkdir(parents=True, exist_ok=True)
@@ -142,11 +146,6 @@ def truth_beside(rig: Rig) -> dict[str, float]:
 
 def _truth_file(folder: Path) -> Path:
     return folder.resolve().with_name(folder.resolve().name + ".truth.json")
-
-
-def _entry(kind: Kind, table: TwinTable) -> str:
-    """The ``[[experiment]]`` of ``rig.toml`` that names ``table``."""
-    return "\n".join(["[[experiment]]", f'kind = "{kind.name}"', f'file = "{table.file}"', *table.settings, ""])
 
 
 def _write_csv(path: Path, columns: Mapping[str, np.ndarray]) -> None:

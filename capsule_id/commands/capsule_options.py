@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1, Parameter
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1
 
 if TYPE_CHECKING:
     from capsule_id.physics.drives.pulses import Pulses
@@ -28,7 +28,8 @@ def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str
     group = parser.add_argument_group("parameters", "plain numbers in SI units")
     group.add_argument("--drive", choices=tuple(DRIVES), default="harmonic", help="force on the rod (default harmonic)")
     for name, leaf in LEAVES.items():
-        text = f"default {defaults[name]:g}" if name in defaults else _without_default(leaf)
+        text = f"default {defaults[name]:g}" if name in defaults else f"default {leaf.describe_default()}"
+        text = "required" if name not in defaults and leaf.default is None else text
         drives = [drive for drive, names in DRIVES.items() if name in names]
         only = f"; {drives[0]} drive" if len(drives) == 1 else ""
         group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text}{only})")
@@ -59,7 +60,9 @@ def capsule_values(
             if text is not None:
                 raise InputError(f"the {args.drive} drive has no {name}", f"--{name}", "remove it, or change --drive")
             continue
-        value = _number(name, text) if text is not None else fitted.get(name, defaults.get(name))
+        value = fitted.get(name, defaults.get(name)) if text is None else math.inf
+        if text is not None and not (text == "inf" and leaf.may_be_infinite):
+            value = number(name, text)
         if value is None and name in free:
             value = 1.0
         if value is None and isinstance(leaf.default, str):
@@ -75,11 +78,6 @@ def capsule_values(
         remedy = "give --result DIR and --G X, in m, or remove --spring"
         raise InputError("--spring needs the result that it is of, and a gap", "none", remedy)
     return values
-
-
-def _without_default(leaf: Parameter) -> str:
-    """The default of a parameter without a default value, in words."""
-    return "required" if leaf.default is None else f"default {leaf.describe_default()}"
 
 
 def _check_sign(name: str, value: float, place: str) -> None:
@@ -105,11 +103,6 @@ def capsule_and_drive(values: Mapping[str, Any], drive: str) -> "tuple[CapsulePa
     p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
     own = {name: values[name] for name in DRIVES[drive]}
     return p, Excitation(**own) if drive == "harmonic" else Pulses(**own)
-
-
-def _number(name: str, text: str) -> float:
-    """A number from the option of a parameter; infinity where it is a value."""
-    return math.inf if LEAVES[name].may_be_infinite and text == "inf" else number(name, text)
 
 
 def number(name: str, text: str) -> float:

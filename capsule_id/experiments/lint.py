@@ -85,7 +85,7 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
         readings = [
             Readings(
                 table.label,
-                _matrix([table[name] for name in names]),
+                np.stack([table[name] for name in names], axis=1),
                 "time" in table.columns,
                 tuple(table.columns[name].to_display for name in names),
             )
@@ -103,11 +103,6 @@ def _repeated_blocks(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding
                 "rows": list(range(block.row, block.row + block.count)),
             }
             yield Finding("readings.repeated", "fail", facts, block.label)
-
-
-def _matrix(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Columns side by side, (n, columns); a single one is not copied."""
-    return columns[0][:, None] if len(columns) == 1 else np.stack(columns, axis=1)
 
 
 def lint_rows(table: Table[Any], rig: Rig, fewest: int) -> Iterable[Finding]:

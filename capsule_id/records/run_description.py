@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 from capsule_id.errors import InputError
 from capsule_id.records.label import UNDECIDED, Evidence, MeasuredMotion, measured_motion
-from capsule_id.records.tone import Harmonic
 from capsule_id.records.view import FILTER_ORDER, view_record
 from capsule_id.rig.model import Table
 
@@ -17,8 +16,11 @@ def describe_run(table: Table) -> list[str]:
     if motion.evidence.reasons:
         part = "undecided" if motion.label == UNDECIDED else "the rest of the label is undecided"
         lines.append(f"{part}: {'; '.join(motion.evidence.reasons)}")
-    if motion.evidence.drive:
-        lines.append(_drive(motion.evidence.drive))
+    if drive := motion.evidence.drive:
+        lines.append(
+            f"drive Omega {drive.Omega:.6g} ± {drive.Omega_sd:.2g} rad/s (stated {drive.stated_Omega:g}), current "
+            f"{drive.amplitude:.5g} ± {drive.amplitude_sd:.2g} A, phase {drive.phase:.4f} ± {drive.phase_sd:.2g} rad"
+        )
     try:
         view = view_record(table, motion)
     except InputError:
@@ -50,10 +52,3 @@ def _evidence(motion: MeasuredMotion) -> Iterator[str]:
             f"contacts by spikes {spikes}, by crossings {crossings}, "
             f"same count in {contacts.agreeing} of {contacts.cycles} single periods"
         )
-
-
-def _drive(drive: Harmonic) -> str:
-    return (
-        f"drive Omega {drive.Omega:.6g} ± {drive.Omega_sd:.2g} rad/s (stated {drive.stated_Omega:g}), "
-        f"current {drive.amplitude:.5g} ± {drive.amplitude_sd:.2g} A, phase {drive.phase:.4f} ± {drive.phase_sd:.2g} rad"
-    )

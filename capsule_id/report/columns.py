@@ -109,10 +109,6 @@ def _row(name: str, values: Mapping[Hashable, Any], magnitude: float) -> Row:
     return Row(name, values, scale, unit, decimals, decimals if point is None else point)
 
 
-def _interval(row: Row) -> str:
-    return MISSING if MISSING in row.ends else " to ".join(row.ends)
-
-
 def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | None:
     ends = [float(values[f"lower{suffix}"]), float(values[f"upper{suffix}"])]
     return ends if np.all(np.isfinite(ends)) else None
@@ -168,7 +164,14 @@ COLUMNS = (
     OutputColumn("quote", outputs=FILES),
     OutputColumn("basis", outputs=FILES),
     OutputColumn("trust", "trust", lambda row: str(row.values["trust"]), numeric=False),
-    OutputColumn("ci95", "95 % interval", _interval, _ends, EVERYWHERE - {"csv"}, sampled=True),
+    OutputColumn(
+        "ci95",
+        "95 % interval",
+        lambda row: MISSING if MISSING in row.ends else " to ".join(row.ends),
+        _ends,
+        EVERYWHERE - {"csv"},
+        sampled=True,
+    ),
     OutputColumn("paper", "paper", lambda row: row.number("paper")),
     OutputColumn("map", "MAP ± s.e.", lambda row: row.plus_minus("map", "standard_error", row.point_decimals), sampled=True),
     OutputColumn("standard_error", outputs=frozenset({"csv"})),

@@ -135,7 +135,12 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"symbol_parts": symbol_parts, "number": _number, "embed": _embed, "counted": counted}
+    environment.filters |= {
+        "symbol_parts": symbol_parts,
+        "number": _number,
+        "embed": lambda picture: "data:image/png;base64," + base64.b64encode(picture.png).decode("ascii"),
+        "counted": counted,
+    }
     return environment
 
 
@@ -192,7 +197,3 @@ def _number(value: object, form: str = ".5g") -> str:
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
         return MISSING if math.isnan(value) else format(float(value), form).replace("-", "−")
     return str(value)
-
-
-def _embed(picture: Picture) -> str:
-    return "data:image/png;base64," + base64.b64encode(picture.png).decode("ascii")

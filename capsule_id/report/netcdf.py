@@ -47,7 +47,12 @@ def data_tree(result: Result) -> xr.DataTree:
     groups = {
         "posterior": _posterior(result.posterior, result.fixed, units),
         "sample_stats": _sample_stats(result.posterior),
-        "observed_data": _observed(result.observed),
+        "observed_data": xr.Dataset(
+            {
+                label: (f"{label}_row", np.asarray(y, np.float64), {"units": "SI"})
+                for label, y in result.observed.items()
+            }
+        ),
         "prior": _families({name: draws[np.newaxis] for name, draws in result.prior.items()}, units),
     }
     if result.pointwise is not None:
@@ -122,12 +127,6 @@ def _sample_stats(posterior: Posterior) -> xr.Dataset:
         }
     )
     return dataset.assign_coords(chain=np.arange(chains), draw=np.arange(draws), ensemble=_ensemble_of(posterior))
-
-
-def _observed(observed: Mapping[str, np.ndarray]) -> xr.Dataset:
-    return xr.Dataset(
-        {label: (f"{label}_row", np.asarray(y, np.float64), {"units": "SI"}) for label, y in observed.items()}
-    )
 
 
 def _log_likelihood(pointwise: Pointwise) -> xr.Dataset:

@@ -22,7 +22,6 @@ from capsule_id.experiments.lint import lint_reading_errors
 from capsule_id.parameters import Prior, scatter
 from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.model import Table
 from capsule_id.rig.schema import ColumnRule
 
 PUSH_SCATTER = scatter(
@@ -81,10 +80,6 @@ def _check_ground(entry: Entry[PushSettings]) -> None:
         entry.refuse_ground("slope", 'pushes with forward = "capsule" must be on level ground')
 
 
-def _masses(table: Table[PushSettings]) -> tuple[str, ...]:
-    return ("m1", "m2") if table.settings.forward == "capsule" or "N0" in table.settings.ground else ()
-
-
 TEMPLATE = """\
 #: Pushes, a row each, the rod locked to the capsule: mu and v_s. Columns: speed [m/s], distance [mm].
 # [[experiment]]
@@ -103,7 +98,7 @@ KIND = Kind(
     columns={"speed": ColumnRule("m/s", POSITIVE), "distance": ColumnRule("m", POSITIVE)},
     sets=(("speed", "distance"),),
     settings=PushSettings,
-    masses=_masses,
+    masses=lambda table: ("m1", "m2") if table.settings.forward == "capsule" or "N0" in table.settings.ground else (),
     rules=(_check_ground,),
     masses_of_free=MASSES_OF_FREE,
     parameters=(PUSH_SCATTER,),

@@ -9,7 +9,7 @@ most 1/FACTOR (Markov's inequality, for parameters drawn from the prior).
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from scipy import special
@@ -119,7 +119,10 @@ class Points:
         ):
             axes = (1, 2) if isinstance(e, Slide) else (1,)
             own = {**known, "viscous": 0.0 if viscous is None else viscous / N}
-            law = CoulombStribeck(N=1.0, **{name: _expanded(value, axes) for name, value in own.items()})
+            law = CoulombStribeck(
+                N=1.0,
+                **{name: value if np.ndim(value) == 0 else np.expand_dims(value, axes) for name, value in own.items()},
+            )
             law = Reversed(law) if e.friction.direction == "backward" else law
             speed = e.paper_points()[0]
             if isinstance(e, Slide):
@@ -243,7 +246,3 @@ def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:
     if prior.kind == "halfnormal":
         return prior.spread * special.ndtri(0.5 * (1.0 + special.ndtr(z)))
     return prior.location * np.exp(np.log(prior.spread) / QUANTILE_975 * z)
-
-
-def _expanded(value: Any, axes: tuple[int, ...]) -> Any:
-    return value if np.ndim(value) == 0 else np.expand_dims(value, axes)

@@ -127,11 +127,6 @@ def _make(table: Table[RunSettings], rig: Rig, friction: "FrictionModel") -> tup
     return made_by(f"capsule_id.experiments.forced_run.{reference}")(table, rig, friction)
 
 
-def _masses(table: Table[RunSettings]) -> tuple[str, ...]:
-    # A prescribed rod needs no mass.
-    return ("m2",) if table.settings.drive == "base" else ("m1", "m2")
-
-
 def _second_fit(facts: Facts) -> str:
     """The records whose noise is coloured, and how to state either noise."""
     return (
@@ -317,7 +312,7 @@ KIND = Kind(
     channels=tuple(NOISE),
     settings=RunSettings,
     rules=(Entry.check_spring_with_gap, Entry.check_length, check_base, check_drive),
-    masses=_masses,
+    masses=lambda table: ("m2",) if table.settings.drive == "base" else ("m1", "m2"),  # a prescribed rod needs no mass
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
     make=_make,
     template=TEMPLATE,

@@ -132,7 +132,7 @@ def agreement(
     the parameters correlated with it (v_s with mu). Heavy tails make z a poor measure of its origin.
     ``tests`` are the labels of the bench tests that inform each parameter; those of the largest disagreement are named.
     """
-    p = {name: _family_wise(one.z, len(found)) for name, one in found.items()}
+    p = {name: _sidak(stats.norm.sf(abs(one.z)), len(found)) for name, one in found.items()}
     lost = [name for name, one in found.items() if not (np.isfinite(one.sd) and np.isfinite(one.z))]
     far = [name for name in found if p[name] < LEVEL and name not in lost]
     far.sort(key=lambda name: -abs(found[name].sd))
@@ -148,11 +148,6 @@ def agreement(
         "tests": ", ".join((tests or {}).get(named[0], ())),
     }
     return Finding("bench_and_runs.agree", level, facts)
-
-
-def _family_wise(z: float, number: int) -> float:
-    """p-value of the largest of ``number`` scores (two-sided, Šidák)."""
-    return _sidak(stats.norm.sf(abs(z)), number)
 
 
 def _sidak(tail: Any, number: int) -> float:

@@ -144,7 +144,10 @@ def tables_by_mean(s: SampledFit) -> tuple[list[Finding], int]:
             name = next(row for row in members[0].parameters if row.physical)
             facts = {
                 "name": name.name,
-                "estimates": [(e.label, _estimate(s, e, name.symbol)) for e in members],
+                "estimates": [
+                    (e.label, refit(e, e.local(s.values), list(s.flagged.get(e.label, [])))[name.symbol][0])
+                    for e in members
+                ],
                 "unit": name.unit,
                 "p": p,
                 "factor": factor,
@@ -280,11 +283,6 @@ def _unflagged(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
     flagged = list(s.flagged.get(e.label, []))
     residuals, columns = design(e, e.local(s.values))
     return np.delete(residuals, flagged), np.delete(columns, flagged, axis=0)
-
-
-def _estimate(s: SampledFit, e: Experiment, symbol: str) -> float:
-    """A parameter by one table alone, SI."""
-    return refit(e, e.local(s.values), list(s.flagged.get(e.label, [])))[symbol][0]
 
 
 def between(residuals: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float]:

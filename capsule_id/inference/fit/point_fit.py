@@ -169,11 +169,6 @@ def _polish(
     )
 
 
-def _steps(target: LogPosterior) -> np.ndarray:
-    """(d,) steps of difference quotients: relative, or fractions of the prior's sd where u is not a logarithm."""
-    return DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd)
-
-
 def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """R (d, d) with R R' the inverse Hessian of -log-posterior at u (d,), from the ``jacobian`` (n, d) of the residuals.
 
@@ -198,7 +193,8 @@ def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarra
 
 def residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
     """(n, d) Jacobian of the standardised residuals, scatters in the denominator included."""
-    return jacobian(target.plain_residuals, u, _steps(target))
+    # Steps are relative, or fractions of the prior's sd where u is not a logarithm.
+    return jacobian(target.plain_residuals, u, DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd))
 
 
 def _owners(target: LogPosterior, theta: np.ndarray) -> list[Experiment | None]:

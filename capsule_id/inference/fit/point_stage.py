@@ -66,17 +66,14 @@ def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: boo
     target, findings = cut_unpredictable(target, known)
     # The joint fit takes one core most of the time: the bench is sampled on another one.
     with threads(1) as beside:
-        own = beside.submit(_bench_sample, alone, bench, seed) if alone and bench and sampled else None
+        own = None
+        if alone and bench and sampled:
+            own = beside.submit(sample, MarginalPosterior(alone, bench), seed, BENCH_BUDGET)
         target, joint, wavering = _fit_with_right_starts(target, known, seed)
         target, joint, second = fit_coloured(target, joint, seed)
         second += compare_laws(target, joint, seed)
         bench_fit = BenchFit(bench, None if own is None else own.result())
     return PointStage(target, joint, bench_fit, seed, (*findings, *wavering, *second))
-
-
-def _bench_sample(alone: LogPosterior, fit: PointFit, seed: int) -> Posterior:
-    """Sample the bench tests ``alone`` about their ``fit``."""
-    return sample(MarginalPosterior(alone, fit), seed, BENCH_BUDGET)
 
 
 def _fit_with_right_starts(

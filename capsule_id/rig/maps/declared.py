@@ -112,15 +112,15 @@ def read_map(
     sources = {name: _source(document, (*place, name), stated[name], rules[name]) for name in stated}
     where = _where(document, path, entry)
     named = [header for source in sources.values() for header in (source.header, source.minus) if header is not None]
-    keys = [(form, value) for key, value in where.items() for form in _forms(key)]
+    # A key of ``where`` is a header, or the number of a column.
+    keys = [
+        (form, value)
+        for key, value in where.items()
+        for form in (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))
+    ]
     words = tuple(form for form, value in keys if isinstance(value, str))
     layout = replace(layout, columns=(*named, *(form for form, _ in keys)), words=words)
     return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(where))
-
-
-def _forms(key: str) -> tuple[Header, ...]:
-    """What a key of ``where`` may be: a header, or also the number of a column."""
-    return (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))
 
 
 def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRule) -> Source:

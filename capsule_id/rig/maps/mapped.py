@@ -90,7 +90,7 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     ]
     values: dict[str, np.ndarray] = {}
     for name, source in sources.items():
-        values[name] = _joined(
+        values[name] = np.concatenate(
             [_scaled(part, here.pop(name), (*place, name), source) for part, here in zip(parts, found, strict=True)]
         )
     where = {key: _selected_by(parts, (*path, "where", key), value) for key, value in column_map.where.items()}
@@ -119,11 +119,6 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     rows = _selected(lines, keep) if len(parts) == 1 else np.arange(1, 1 + len(columns[0]))
     raw = RawTable(names, units, columns, rows, place_of)
     return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)
-
-
-def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Columns put one below the other; a single one is not copied."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _selected(values: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
@@ -230,12 +225,12 @@ def _selected_by(parts: Sequence[_Part], place: KeyPath, wanted: Wanted) -> _Sel
     """The rows whose column, named by the last key of ``place``, has what is ``wanted``."""
     key = str(place[-1])
     if isinstance(wanted, str):
-        texts = _joined([part.words(place, _where_header(part, key)) for part in parts])
+        texts = np.concatenate([part.words(place, _where_header(part, key)) for part in parts])
         rows = texts == wanted
         return _Selected(
             rows, texts == "", "" if rows.any() else _some([shown(str(text)) for text in np.unique(texts)])
         )
-    column = _joined([part.find(place, _where_header(part, key)).values for part in parts])
+    column = np.concatenate([part.find(place, _where_header(part, key)).values for part in parts])
     if isinstance(wanted, Range):
         # 0.1 + 0.2 is 0.3; times since 1970 in microseconds keep their digits.
         own = [np.spacing(end) if np.isfinite(end) else 0.0 for end in np.abs([wanted.min, wanted.max])]

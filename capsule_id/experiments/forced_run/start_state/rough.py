@@ -86,7 +86,7 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
     elif "x_rel" in channels:
         ratio = Omega / ROD_FREQUENCY
         lag = np.arctan2(2.0 * ROD_DAMPING * ratio, 1.0 - ratio**2)
-        phase = _wrap(tone_at(time, channels["x_rel"], Omega)[1] + lag)
+        phase = float(np.angle(np.exp(1j * (tone_at(time, channels["x_rel"], Omega)[1] + lag))))
     x_rel = rate = 0.0
     if "x_rel" in channels:
         x_rel, rate = _polynomial(time, channels["x_rel"], PARABOLA_SAMPLES, 2)[0]
@@ -113,7 +113,3 @@ def _polynomial(time: np.ndarray, values: np.ndarray, samples: int, order: int) 
     inverse = np.linalg.pinv(design)
     coefficients = inverse @ values[:samples]
     return (float(coefficients[0]), float(coefficients[1])), float(np.linalg.norm(inverse[1]))
-
-
-def _wrap(angle: float) -> float:
-    return float(np.arctan2(np.sin(angle), np.cos(angle)))

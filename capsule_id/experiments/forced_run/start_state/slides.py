@@ -45,7 +45,8 @@ def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: f
     direction = np.where(np.abs(rate) > SLIDING * np.max(np.abs(rate)), np.sign(rate), 0.0)
     edges = np.flatnonzero(np.diff(direction)) + 1
     pieces = np.split(np.arange(len(time)), edges.tolist())
-    own = [_slide(time[i], r[i], m2 * X2[i], float(direction[i[0]])) for i in pieces if _is_slide(direction, i)]
+    slides = [i for i in pieces if direction[i[0]] != 0.0 and len(i) >= SHORTEST_SLIDE]
+    own = [_slide(time[i], r[i], m2 * X2[i], float(direction[i[0]])) for i in slides]
     if not own:
         return None
     rows = np.concatenate(own)
@@ -60,10 +61,6 @@ def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: f
         return None
     speed = float(np.mean(np.abs(rate[direction != 0.0])))
     return Slides(k1, max(c, 2.0 * LEAST_DAMPING * float(np.sqrt(k1 * m2))), friction, force / k1, speed)
-
-
-def _is_slide(direction: np.ndarray, piece: np.ndarray) -> bool:
-    return bool(direction[piece[0]] != 0.0 and len(piece) >= SHORTEST_SLIDE)
 
 
 def _slide(time: np.ndarray, r: np.ndarray, momentum: np.ndarray, direction: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.export import Export, Layout
-from capsule_id.rig.formats.text.blocks import Content, TextFile, lines_of, occurrences
+from capsule_id.rig.formats.text.blocks import Content, TextFile, occurrences
 from capsule_id.rig.formats.text.cells import BLANKS, bare, cells_of, number_in, place_of_cell, shown_cell
 from capsule_id.rig.formats.text.rows import COMMENTS, Shape, any_rows, is_comment, is_row, plain_rows
 
@@ -46,7 +46,7 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     _refuse_separator_in_quotes(file, first, row, delimiter)
     *cells, last = (cell for cell, _ in cells_of(row, delimiter))
     blank = bool(cells) and not last
-    trailing = blank and all(_ends_blank(text, delimiter) for _, text in file.blocks(first))
+    trailing = blank and all(not cells_of(line, delimiter)[-1][0] for line in file.lines(first) if is_row(line))
     width = len(cells) + (not trailing)
     above = range((layout.data_from_line or first + 1) - 2, -1, -1)
     found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width, layout))]
@@ -88,11 +88,6 @@ def _file(content: Content, path: Path, layout: Layout) -> TextFile:
 def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:
     """Whether a column is named by its number or by a header."""
     return column + 1 in wanted or any(names[column] in wanted for names in headers)
-
-
-def _ends_blank(text: bytes, delimiter: str | None) -> bool:
-    """Whether the last cell of every row in ``text`` is blank."""
-    return all(not cells_of(line, delimiter)[-1][0] for line in lines_of(text) if is_row(line))
 
 
 def _head(file: TextFile, layout: Layout) -> list[str]:
