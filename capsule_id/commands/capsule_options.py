@@ -28,8 +28,8 @@ def add_capsule_arguments(parser: argparse.ArgumentParser, defaults: Mapping[str
     group = parser.add_argument_group("parameters", "plain numbers in SI units")
     group.add_argument("--drive", choices=tuple(DRIVES), default="harmonic", help="force on the rod (default harmonic)")
     for name, leaf in LEAVES.items():
-        text = f"default {defaults[name]:g}" if name in defaults else f"default {leaf.describe_default()}"
-        text = "required" if name not in defaults and leaf.default is None else text
+        text = "required" if leaf.default is None else f"default {leaf.describe_default()}"
+        text = f"default {defaults[name]:g}" if name in defaults else text
         drives = [drive for drive, names in DRIVES.items() if name in names]
         only = f"; {drives[0]} drive" if len(drives) == 1 else ""
         group.add_argument(f"--{name}", metavar="X", help=f"{leaf.meaning}, {leaf.unit} ({text}{only})")
