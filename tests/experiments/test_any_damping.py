@@ -216,3 +216,19 @@ def test_m1_is_not_the_mass_of_the_record(tmp_path: Path) -> None:
     time, x, k1, _, m1 = twin(0.6, 1)
     summary = cid.fit(cid.read_rig(folder(tmp_path, time, x, 1.1 * m1)), budget=None).summary
     assert abs(summary.loc["k1", "value"] - k1) > 5.0 * summary.loc["k1", "sd"]
+
+
+def test_a_step_after_rest_is_no_clipped_record_and_its_rounding_no_wrong_model(tmp_path: Path) -> None:
+    """Readings in steps of 10 um of rest, then of a decay that comes to rest. Before: clipped, or an sd times 167."""
+    time, k1, c, m1 = np.arange(600) / 1000.0, 245.062, 5.192, 0.11
+    step = np.where(time < 0.1, 0.0, 1.0 - viscous(np.maximum(time - 0.1, 0.0), k1, c, m1))
+    noise = 0.7e-6 * np.random.default_rng(1).standard_normal(len(time))
+    x = 1e-5 * np.round((8e-3 * step + noise) / 1e-5)
+    result = cid.fit(cid.read_rig(folder(tmp_path / "a", time, x, m1)), budget=None)
+    assert [f.code for f in result.findings if f.level == "fail"] == []
+    assert result.summary.at["k1", "value"] == pytest.approx(k1, abs=3.0 * float(result.summary.at["k1", "sd"]))
+    assert float(result.summary.at["k1", "sd"]) < 0.01 * k1
+    # Negative control: peaks that end at a limit are clipped.
+    clipped = folder(tmp_path / "b", time, np.minimum(x, 8.5e-3), m1)
+    again = cid.fit(cid.read_rig(clipped), budget=None)
+    assert "readings.clipped" in [f.code for f in again.findings if f.level == "fail"]

@@ -268,3 +268,32 @@ def test_a_decay_that_is_pushed_near_its_end_is_not_sure_to_be_driven(
     # A decay that loses a tenth in the record: before, sure to be driven.
     assert 'kind = "forced_run"  # unsure' in texts["light"]
     assert 'kind = "forced_run"  # sure' in texts["driven"]
+
+
+def test_decays_with_a_clock_of_their_own_each_are_decays_and_are_not_sorted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before: "static_friction # sure", and "sort the rows", which interleaves the decays."""
+    time = np.arange(300) / 50.0
+    one = 0.1 * np.exp(-0.3 * time) * np.cos(3.0 * time)
+    rows = [f"{t:.2f},{x:.5f}" for _ in range(3) for t, x in zip(time, one, strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join(["Time/s,Displacement/mm", *rows, ""]), encoding="utf-8")
+    assert cli.capsule_id(["import", str(tmp_path / "run.csv")]) == 0
+    said = capsys.readouterr().out
+    assert 'kind = "free_vibration"' in said
+    assert "start =" not in said
+    columns = 'columns = { time = { from = "Time/s", unit = "s" }, x_rel = { from = 2, unit = "mm" } }'
+    entry = f'[[experiment]]\nkind = "free_vibration"\nfile = "run.csv"\n{columns}\n'
+    (tmp_path / "rig.toml").write_text(
+        f'[rig]\nname = "a"\nm1 = {{ value = 1, unit = "kg" }}\n{entry}', encoding="utf-8"
+    )
+    with pytest.raises(
+        capsule_id.InputError, match=r"302:1: .*starts anew at 2 rows \(line 302 602\): write a file of each"
+    ):
+        capsule_id.read_rig(tmp_path)
+    # Negative control: a row out of order is no new clock.
+    (tmp_path / "run.csv").write_text(
+        "\n".join(["Time/s,Displacement/mm", *rows[:300], rows[200], ""]), encoding="utf-8"
+    )
+    with pytest.raises(capsule_id.InputError, match="sort the rows"):
+        capsule_id.read_rig(tmp_path)
