@@ -41,9 +41,9 @@ def test_what_was_found_is_drawn() -> None:
     noise = 1e-5 * np.random.default_rng(0).standard_normal(2000)
     values = bench.released(TIME, 2e-3) + noise[:1000]
     assert list(drawn(decay(values, TIME))) == ["readings"]
-    limit = 0.9 * np.max(values)
-    clipped = drawn(decay(np.minimum(values, limit), TIME))
-    assert clipped["clipped"] == np.sum(values >= limit)
+    limit = 0.9 * np.min(values)  # a flat first top is a hold
+    clipped = drawn(decay(np.maximum(values, limit), TIME))
+    assert clipped["clipped"] == np.sum(values <= limit)
     kept = np.delete(np.arange(1000), slice(300, 320))
     assert "gap" in drawn(decay(values[kept], TIME[kept]))
     rested = np.concatenate([noise[:1000], values])
