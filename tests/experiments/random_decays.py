@@ -1,9 +1,10 @@
 """Random free decays of any damping, length and noise, damaged as records of benches are; SciPy makes the motion."""
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import OdeSolution, solve_ivp
 
 #: Ways to damage a record, and their share.
 DAMAGES = (
@@ -28,8 +29,7 @@ def motion(rng: np.random.Generator, time: np.ndarray, ratio: float, omega: floa
     solution = solve_ivp(
         rate, (0.0, time[-1] + 1e-9), [1.0, velocity], "LSODA", rtol=1e-7, atol=1e-10, dense_output=True
     )
-    assert solution.sol is not None
-    return np.asarray(solution.sol(time)[0])
+    return np.asarray(cast(OdeSolution, solution.sol)(time)[0])
 
 
 def record(seed: int) -> tuple[np.ndarray, np.ndarray, str]:

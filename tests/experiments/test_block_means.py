@@ -175,8 +175,7 @@ def test_a_very_long_record_is_named_and_the_remedy_works() -> None:
     table = bench.table("free_vibration", columns, "decay", **free)
     (found,) = [f for f in lint_decay(table, bench.rig(table)) if f.code == "decays.long"]
     assert found.facts["stop"] == pytest.approx(250 * 2.0 * np.pi / rate, rel=0.02)  # whole samples in a period
-    record = make_experiments(bench.rig(table))[0]
-    assert isinstance(record, FreeVibration)
+    record = cast(FreeVibration, make_experiments(bench.rig(table))[0])
     assert record.time[-1] == pytest.approx(found.facts["stop"], abs=0.02)
     stated = bench.table("free_vibration", columns, "decay", stop=found.facts["stop"], **free)
     assert [f for f in lint_decay(stated, bench.rig(stated)) if f.code == "decays.long"] == []

@@ -150,10 +150,11 @@ def error_of(form: str, seed: int, coarse: bool) -> float:
 def test_the_release_is_found_whatever_comes_before_it(form: str, coarse: bool, number: int) -> None:
     """Holds from two samples on, wobbles, blows, bounces, second grips, also with further forces; damping ratios to 2.
 
-    Of 20 records each, 18 to 20 have the cut near the release, of coarse ones 17 to 20.
+    Of 20 records each, 19 or 20 have the cut near the release (18 of "stop"), of coarse ones 18 to 20.
     """
+    least = 0.8 if coarse else 0.9 if form == "stop" else 0.95
     near = [abs(error_of(form, seed, coarse)) <= 1.0 for seed in range(number)]
-    assert sum(near) >= (0.8 if coarse else 0.9) * number
+    assert sum(near) >= least * number
 
 
 @pytest.mark.parametrize("number", [1, pytest.param(4, marks=pytest.mark.slow)])

@@ -40,10 +40,9 @@ AGREEMENT = 0.05
 FLATTEST = 1e-4
 #: An end of least squares this near to a maximum, in posterior standard deviations, belongs to it.
 SAME_BASIN = 0.3
-#: Gradients per posterior standard deviation: quasi-Newton stops below the first, and its end counts as a maximum below the
-#: second, where it lies a hundredth of an sd away. Rounding of the log-posterior may stop it in between: it is 1e-16 of the
-#: sum of squared readings over their variance, so 1e-6 of 500 readings of 4000 sds, and the gradient's is 500 times that.
-TOLERANCE, MAXIMUM = 5e-4, 1e-2
+#: Gradients per posterior standard deviation: quasi-Newton stops below the first, and its end counts as a maximum
+#: below the second. Rounding of the log-posterior may stop it in between.
+TOLERANCE, MAXIMUM = 1e-4, 1e-3
 #: Largest number of quasi-Newton steps.
 MAX_STEPS = 400
 #: Replaces a log-posterior that is not finite, because line searches need a finite number.
