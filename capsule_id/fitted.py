@@ -93,12 +93,12 @@ class Fit(Result):
         """
         tree = data_tree(self)
         try:
-            arviz = import_module("arviz")  # an optional package
+            kind: Any = getattr(import_module("arviz"), "InferenceData", type(tree))  # an optional package
         except ImportError:
             return tree
-        if not hasattr(arviz, "InferenceData"):
+        if isinstance(tree, kind):  # ArviZ 1
             return tree
-        return arviz.InferenceData(**{str(name): group.to_dataset() for name, group in tree.children.items()})
+        return kind(**{str(name): group.to_dataset() for name, group in tree.children.items()})
 
     def simulate(
         self,

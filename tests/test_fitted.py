@@ -3,6 +3,7 @@
 import dataclasses
 import re
 import shutil
+import subprocess
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from matplotlib.figure import Figure
 
 import capsule_id as cid
 from capsule_id.errors import InputError
+from capsule_id.experiments.base import BLOCKS
 from capsule_id.fitted import Fit, compare
 from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.synthetic import truth_beside
@@ -227,20 +229,46 @@ def test_compare_finds_two_equal_rigs_equal(fitted: Fit) -> None:
 
 
 def test_arviz_needs_no_arguments(capsule: Fit, tmp_path: Path) -> None:
+    """ArviZ 0.2x and 1: ``loo`` of a fit, with 1,000 draws where it has them; only rows of a small table decide a parameter."""
     capsule.write(tmp_path / "out")
-    readings = sum(len(values) for values in capsule.observed.values())
-    for data in (arviz.from_netcdf(str(tmp_path / "out" / "posterior.nc")), capsule.to_arviz()):
-        shown: Any = data
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of ArviZ about matplotlib, and about this short chain
-            loo = arviz.loo(shown)
-        assert (loo.n_data_points, np.isfinite(loo.elpd_loo)) == (readings, True)
+    pointwise = cast(Pointwise, capsule.pointwise)
+    ensembles, draws, walkers, _ = cast(Posterior, capsule.posterior).draws.shape
+    assert len(pointwise.chain) * len(pointwise.draw) >= min(1000, ensembles * draws * walkers)
+    terms = {label: values.shape[-1] for label, values in pointwise.log_likelihood.items()}
+    assert all(
+        terms[label] == min(len(y), BLOCKS if "vib" in label else len(y)) for label, y in capsule.observed.items()
+    )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert len(np.ravel(arviz.plot_ppc(capsule.to_arviz()))) == len(capsule.observed)
+        warnings.simplefilter("ignore")  # of ArviZ about matplotlib, and about this short chain
+        for data in (arviz.from_netcdf(str(tmp_path / "out" / "posterior.nc")), capsule.to_arviz()):
+            loo: Any = arviz.loo(data, pointwise=True)
+            assert (loo.n_data_points, np.isfinite(getattr(loo, "elpd_loo", None) or loo.elpd)) == (
+                sum(terms.values()),
+                True,
+            )
+            shapes = np.asarray(loo.pareto_k)
+        (found,) = [finding for finding in capsule.findings if finding.code == "readings.decisive"]
+        assert abs(np.sum(shapes > found.facts["limit"]) - found.facts["far"]) <= 3  # ArviZ counts effective draws
         data = capsule.to_arviz()
-        few = data.log_likelihood["chain"].values[[0, -1]]  # it has fewer chains than the posterior
-        assert arviz.plot_trace(data.sel(chain=few)).shape[1] == 2
+        plot = getattr(arviz, "plot_ppc", None) or arviz.plot_ppc_dist  # pyright: ignore
+        plot(data)
+        assert len(data.posterior_predictive.data_vars) == len(capsule.observed)
+        arviz.plot_trace(data)
+
+
+@pytest.mark.slow
+def test_arviz_1_reads_a_result(tmp_path: Path) -> None:
+    """The tests of ArviZ on Python 3.12 or later, where such an interpreter is at hand: ArviZ 1 needs it."""
+    known = [path for path in map(shutil.which, ("python3.14", "python3.13", "python3.12")) if path]
+    running = [path for path in known if subprocess.run([path, "--version"], capture_output=True).returncode == 0]
+    if not running:
+        pytest.skip("no Python 3.12 or later")
+    python, root = tmp_path / "venv" / "bin" / "python", Path(__file__).parents[1]
+    subprocess.run([running[0], "-m", "venv", str(tmp_path / "venv")], check=True)
+    subprocess.run([str(python), "-m", "pip", "install", "-q", f"{root}[test]", "arviz>=1,<2"], check=True)
+    words = ["tests/test_fitted.py", "tests/report/test_write.py", "tests/inference", "-k", "arviz", "-n", "0"]
+    done = subprocess.run([str(python), "-m", "pytest", "-q", *words], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-4000:]
 
 
 def test_replicates_scatter_as_the_readings(capsule: Fit) -> None:

@@ -21,7 +21,6 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 from capsule_id.experiments.checks.context import Check, RunRecord, TableMaker
-from capsule_id.experiments.linear import LOG_2PI
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter
 from capsule_id.precision import require_float64
@@ -33,6 +32,9 @@ if TYPE_CHECKING:
     from capsule_id.physics.smooth.engine import Smoothing
 
 require_float64()
+
+#: Terms of a record in the leave-one-out density. A stretch of a sixtieth of a record seldom decides a parameter.
+BLOCKS = 60
 
 #: Parameter values and constants of one experiment, SI, by *symbol* (``k1``, ``k2``, ``noise_sd``, ``g``, ``m1``).
 #: ``Experiment.local`` makes it from values by name (``k2[soft]``, ``noise_sd[decay_1]``).
@@ -261,12 +263,20 @@ class Experiment(eqx.Module):
         """(p,) conditional mean of the linear nuisances, in units of their priors."""
         return self.misfit(theta).at_nuisance_mean(np)[1]
 
-    def pointwise(self, theta: ValuesBySymbol, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) log-density and replicate (SI) of each reading, given one draw of the nuisances; coloured: and the past."""
+    @property
+    def blocks(self) -> np.ndarray:
+        """(blocks,) first reading of every term of the leave-one-out density: a row of a table, a stretch of a record."""
+        count = min(self.n, BLOCKS) if self.time_series else self.n
+        return np.unique(np.linspace(0, self.n, count, endpoint=False).astype(int))
+
+    def left_out(self, theta: ValuesBySymbol) -> np.ndarray:
+        """Log-density (blocks,) of each of ``blocks`` given all other readings; coloured noise: as innovations."""
+        return self.misfit(theta).left_out(self.blocks)
+
+    def replicate(self, theta: ValuesBySymbol, rng: np.random.Generator) -> np.ndarray:
+        """Replicate (n,) of the readings, SI, given one draw of the nuisances; coloured noise: and given the past."""
         misfit = self.misfit(theta)
-        scaled = misfit.at_nuisance_draw(rng)
-        density = -0.5 * scaled**2 - np.log(misfit.sd) - 0.5 * LOG_2PI + misfit.log_measure
-        return density, self.observed + misfit.sd * (rng.standard_normal(self.n) - scaled)
+        return self.observed + misfit.sd * (rng.standard_normal(self.n) - misfit.at_nuisance_draw(rng))
 
     def predictive_p(self, draws: list[ValuesBySymbol], rng: np.random.Generator) -> float | None:
         """Posterior predictive p-value of the chi-square discrepancy; None without draws.

@@ -19,7 +19,7 @@ MANY_NUISANCES = 8
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp) -> Any:
+def marginal_log_density(yy: Any, ay: Any, aa: Any, n: Any, xp: ModuleType = jnp) -> Any:
     """log N(y; 0, I + A A') from the moments, (...).
 
     Explicit elimination is efficient for few nuisances and works for any number of leading axes.
@@ -29,7 +29,7 @@ def marginal_log_density(yy: Any, ay: Any, aa: Any, n: int, xp: ModuleType = jnp
     yy : (...) y'y
     ay : (..., p) A'y
     aa : (..., p, p) A'A
-    n : length of y
+    n : length of y, (...) or one for all
     """
     if aa.shape[-1] > MANY_NUISANCES:
         mean, log_det = _solve(ay, aa, xp)

@@ -17,6 +17,7 @@
 
 import platform
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -33,6 +34,7 @@ from capsule_id.experiments.registry import Registry
 from capsule_id.inference.checks.agreement import check_agreement
 from capsule_id.inference.checks.model_error.record_widening import record_widenings
 from capsule_id.inference.checks.model_error.widening import beside_stated, widenings
+from capsule_id.inference.checks.predictive import decisive_readings
 from capsule_id.inference.checks.sampled_fit import SampledFit
 from capsule_id.inference.checks.trust import with_scaled
 from capsule_id.inference.checks.verdict import run_checks
@@ -51,8 +53,8 @@ from capsule_id.views import Comparison, Finding
 
 #: Number of posterior draws for bands and predictive p-values, and of prior draws in the saved sample.
 BAND_DRAWS, PRIOR_DRAWS = 200, 2000
-#: Largest number of stored pointwise log-likelihoods, and the draws at which they are stored.
-POINTWISE_SIZE, FEWEST_POINTWISE, MOST_POINTWISE = 2_000_000, 64, 256
+#: Walkers, and draws of each, at which densities of left-out readings are stored; the largest number of stored replicates.
+POINTWISE, REPLICATES = 32, 2_000_000
 #: Packages whose versions the provenance records.
 PACKAGES = ("capsule-id", "numpy", "scipy", "jax", "optimistix", "emcee", "pandas", "matplotlib", "xarray")
 
@@ -180,6 +182,8 @@ def make_result(
     rng = np.random.default_rng(seed)
     predictive = {e.label: e.predictive_p([e.local(d) for d in checked.draws], rng) for e in target.experiments}
     summary, nuisances = parameter_tables(checked, registry)
+    pointwise = None if posterior is None else _pointwise(target, posterior, rng)
+    findings = (*checked.findings, *([] if pointwise is None else [decisive_readings(pointwise)]))
     views = (e.record_view(e.local(checked.values)) for e in target.experiments if panels)
     return kind(
         rig=target.rig,
@@ -188,14 +192,14 @@ def make_result(
         nuisances=nuisances,
         point_fit=checked.fit,
         posterior=posterior,
-        findings=tuple(checked.findings),
+        findings=findings,
         comparisons=_comparisons(checked, predictive, registry) if panels else (),
         notes=tuple(make_notes(checked, predictive)) if panels else (),
         records=tuple(view for view in views if view is not None),
         fixed={name: value for name, value in target.fixed.items() if name != "g"},
         observed={e.label: e.observed for e in target.experiments},
         prior=target.sample_prior(rng, PRIOR_DRAWS),
-        pointwise=None if posterior is None else _pointwise(target, posterior, rng),
+        pointwise=pointwise,
         provenance=replace(made_from, versions={**made_from.versions, **registry.packages}),
         truth=truth_beside(target.rig),
     )
@@ -237,16 +241,22 @@ def _comparisons(
 
 
 def _pointwise(target: LogPosterior, posterior: Posterior, rng: np.random.Generator) -> Pointwise:
-    """Log-densities and replicates of the readings on an even grid of walkers and stored draws."""
+    """Densities of left-out readings on an even grid of walkers and stored draws, replicates on a coarser one."""
     ensembles, draws, walkers, d = posterior.draws.shape
+    draw = np.unique(np.linspace(0, draws - 1, POINTWISE).astype(int))
+    # A short run has fewer draws, but more walkers.
+    chain = np.unique(np.linspace(0, ensembles * walkers - 1, -(-(POINTWISE**2) // len(draw))).astype(int))
     readings = sum(e.n for e in target.experiments)
-    number = max(FEWEST_POINTWISE, min(MOST_POINTWISE, POINTWISE_SIZE // readings))
-    draw = np.unique(np.linspace(0, draws - 1, round(number**0.5)).astype(int))
-    chain = np.unique(np.linspace(0, ensembles * walkers - 1, number // len(draw)).astype(int))
-    by_chain = posterior.draws.transpose(0, 2, 1, 3).reshape(ensembles * walkers, draws, d)
-    values = [target.mapping(theta) for theta in by_chain[np.ix_(chain, draw)].reshape(-1, d)]
+    thin = max(2, round((len(chain) * len(draw) * readings / REPLICATES) ** 0.5))
+    by_chain = posterior.draws.transpose(0, 2, 1, 3).reshape(ensembles * walkers, draws, d)[np.ix_(chain, draw)]
+    values = [target.mapping(theta) for theta in by_chain.reshape(-1, d)]
+    some = [target.mapping(theta) for theta in by_chain[::thin, ::thin].reshape(-1, d)]
+    coarse = by_chain[::thin, ::thin].shape[:2]
     density, replicates = {}, {}
     for e in target.experiments:
-        pairs = np.stack([e.pointwise(e.local(v), rng) for v in values], axis=1)
-        density[e.label], replicates[e.label] = pairs.reshape(2, len(chain), len(draw), e.n)
-    return Pointwise(density, replicates, chain, draw)
+        stop_if_interrupted()
+        with ThreadPoolExecutor() as pool:  # motions of forced runs take milliseconds
+            terms = list(pool.map(lambda v, e=e: e.left_out(e.local(v)), values))
+        density[e.label] = np.reshape(terms, (len(chain), len(draw), -1))
+        replicates[e.label] = np.reshape([e.replicate(e.local(v), rng) for v in some], (*coarse, e.n))
+    return Pointwise(density, {e.label: e.blocks for e in target.experiments}, replicates, chain, draw, thin)

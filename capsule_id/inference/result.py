@@ -103,18 +103,22 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Pointwise:
-    """Log-density and a replicate of every reading at some draws, evenly spaced over the sample.
+    """Leave-one-out densities and replicates of the readings at some draws, evenly spaced over the sample.
 
     Attributes
     ----------
-    log_likelihood, replicates : (chain, draw, n) by label of the experiment; the replicates in SI
+    log_likelihood : (chain, draw, terms) by label of the experiment, see ``Experiment.left_out``
+    rows : (terms,) first reading of every term, by label
+    replicates : (some chains, some draws, n) by label, SI: at every ``thin``-th of the chains and of the draws
     chain, draw : indices of the walkers and of the stored draws
     """
 
     log_likelihood: Mapping[str, np.ndarray]
+    rows: Mapping[str, np.ndarray]
     replicates: Mapping[str, np.ndarray]
     chain: np.ndarray
     draw: np.ndarray
+    thin: int
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ from capsule_id.report.sampled_parameters import sampled_parameters
 from capsule_id.views import Comparison, counted
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
+# Characters of a file's name from a label, which may be longer than a name.
+_LONGEST = 80
 # Wider than this (CSS pixels) does not go in pairs.
 _HALF_PAGE = 650
 
@@ -70,7 +72,7 @@ def pictures(result: Result) -> tuple[Picture, ...]:
         ).on(result, figures.comparison_figure(item))
         for name, item in zip(names, result.comparisons, strict=True)
     ]
-    labels = _unique(_UNSAFE.sub("_", record.name) for record in result.records)
+    labels = _unique(_safe(record.name) for record in result.records)
     for label, record in zip(labels, result.records, strict=True):
         drawn += _record_pictures(result, label, record)
     if result.posterior is not None:
@@ -191,7 +193,11 @@ class Drawing:
 
 def _comparison_name(item: Comparison) -> str:
     name = item.label if item.label.startswith(item.kind) else f"{item.kind}_{item.label}"
-    return _UNSAFE.sub("_", name)
+    return _safe(name)
+
+
+def _safe(name: str) -> str:
+    return _UNSAFE.sub("_", name)[:_LONGEST]
 
 
 def _unique(names: Iterable[str]) -> list[str]:

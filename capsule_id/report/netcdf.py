@@ -1,5 +1,6 @@
 """``posterior.nc``: the sample in the groups and dimensions that ArviZ knows."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -30,8 +31,9 @@ def data_tree(result: Result) -> xr.DataTree:
 
     ``posterior``, ``sample_stats``: dimensions ``chain`` (every walker of every ensemble, with the coordinate
     ``ensemble``) and ``draw``. ``log_likelihood`` (one variable ``readings``) and ``posterior_predictive``: at every so
-    many of these chains and draws, whose labels they keep. ``observed_data``, ``prior``. A family of names such as
-    ``k2[soft]``, ``k2[stiff]`` is one variable with one dimension more. Groups without variables are left out.
+    many of these chains and draws, whose labels they keep. ``observed_data``, ``prior``. Readings are numbered, and their
+    attribute ``experiment`` is the label. A family of names such as ``k2[soft]``, ``k2[stiff]`` is one variable with one
+    dimension more. Groups without variables are left out.
 
     Raises
     ------
@@ -47,12 +49,7 @@ def data_tree(result: Result) -> xr.DataTree:
     groups = {
         "posterior": _posterior(result.posterior, result.fixed, units),
         "sample_stats": _sample_stats(result.posterior),
-        "observed_data": xr.Dataset(
-            {
-                label: (f"{label}_row", np.asarray(y, np.float64), {"units": "SI"})
-                for label, y in result.observed.items()
-            }
-        ),
+        "observed_data": _readings(result.observed, ()),
         "prior": _families({name: draws[np.newaxis] for name, draws in result.prior.items()}, units),
     }
     if result.pointwise is not None:
@@ -88,15 +85,18 @@ def read_sample(path: Path, saved: Posterior) -> tuple[Posterior, dict[str, np.n
     if "log_likelihood" not in tree:
         return posterior, prior, None
     density, replicates = tree["log_likelihood"]["readings"], tree["posterior_predictive"].to_dataset()
-    label = density["experiment"].to_numpy()
+    of, rows = density["experiment"].to_numpy(), density["row"].to_numpy()
+    by_label = {str(values.attrs["experiment"]): values.to_numpy() for values in replicates.data_vars.values()}
     return (
         posterior,
         prior,
         Pointwise(
-            {str(name): density.to_numpy()[..., label == name] for name in replicates.data_vars},
-            {str(name): values.to_numpy() for name, values in replicates.data_vars.items()},
+            {label: density.to_numpy()[..., of == label] for label in by_label},
+            {label: rows[of == label] for label in by_label},
+            by_label,
             density["chain"].to_numpy(),
             density["draw"].to_numpy(),
+            int(replicates.attrs["thin"]),
         ),
     )
 
@@ -130,10 +130,10 @@ def _sample_stats(posterior: Posterior) -> xr.Dataset:
 
 
 def _log_likelihood(pointwise: Pointwise) -> xr.Dataset:
-    """One variable with all readings, whose experiment and row are coordinates: ``arviz.loo`` needs no argument."""
+    """One variable with all terms, whose experiment and first row are coordinates: ``arviz.loo`` needs no argument."""
     values = pointwise.log_likelihood
     labels = np.repeat(list(values), [part.shape[-1] for part in values.values()])
-    rows = np.concatenate([np.arange(part.shape[-1]) for part in values.values()])
+    rows = np.concatenate([pointwise.rows[label] for label in values])
     together = np.concatenate(list(values.values()), axis=-1)
     dataset = xr.Dataset({"readings": (("chain", "draw", "reading"), together, {"units": "1"})})
     return dataset.assign_coords(
@@ -142,13 +142,23 @@ def _log_likelihood(pointwise: Pointwise) -> xr.Dataset:
 
 
 def _replicates(pointwise: Pointwise) -> xr.Dataset:
-    dataset = xr.Dataset(
+    dataset = _readings(pointwise.replicates, ("chain", "draw"))
+    dataset.attrs["thin"] = pointwise.thin
+    return dataset.assign_coords(chain=pointwise.chain[:: pointwise.thin], draw=pointwise.draw[:: pointwise.thin])
+
+
+def _readings(by_label: Mapping[str, np.ndarray], leading: tuple[str, ...]) -> xr.Dataset:
+    """A variable per experiment. A label may be a name that ArviZ gives, so that its number precedes it."""
+    return xr.Dataset(
         {
-            label: (("chain", "draw", f"{label}_row"), values, {"units": "SI"})
-            for label, values in pointwise.replicates.items()
+            f"y{i}_{re.sub(r'[^0-9A-Za-z_]', '_', label)[:40]}": (
+                (*leading, f"row_{i}"),
+                np.asarray(values, np.float64),
+                {"units": "SI", "experiment": label},
+            )
+            for i, (label, values) in enumerate(by_label.items(), 1)
         }
     )
-    return dataset.assign_coords(chain=pointwise.chain, draw=pointwise.draw)
 
 
 def _ensemble_of(posterior: Posterior) -> tuple[str, np.ndarray]:

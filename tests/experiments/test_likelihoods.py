@@ -1,5 +1,6 @@
 """Every likelihood equals a sum of SciPy densities, with the integrated nuisances in the covariance."""
 
+from dataclasses import replace
 from typing import Any
 
 import bench
@@ -10,7 +11,7 @@ import pytest
 from scipy import integrate, stats
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.base import Experiment, ValuesBySymbol
+from capsule_id.experiments.base import BLOCKS, Experiment, ValuesBySymbol
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.rig.model import Table
 from tests.scipy_decay import scipy_decay
@@ -243,43 +244,46 @@ def test_a_wrong_width_is_seen() -> None:
     assert float(wider.log_likelihood(theta, np)) == pytest.approx(before - 3.0 * np.log(2.0), abs=2e-3)
 
 
-class TestPointwise:
-    """Densities of single readings, conditional on a draw of the linear nuisances."""
+class TestLeftOut:
+    """Densities of readings given all others, and replicates."""
 
     THETA = {"k1": 1430.0, "c": 3.8, "noise_sd": 5e-5, **MASSES}  # noqa: RUF012
 
-    def test_chib_identity(self) -> None:
-        """log p(y) = log p(y|b) + log p(b) - log p(b|y) for whichever b was drawn."""
+    def test_it_is_the_conditional_of_the_dense_normal_density(self) -> None:
+        """log p(block | rest) = log p(y) - log p(rest), with the covariance written out."""
         experiment = record(UNIFORM)
         misfit = experiment.misfit(self.THETA)
-        y, a = misfit.raw / misfit.sd, misfit.design / misfit.sd[:, None]
-        covariance = np.linalg.inv(np.eye(3) + a.T @ a)
-        marginal = float(experiment.log_likelihood(self.THETA, np))
-        for seed in range(5):
-            pointwise, _ = experiment.pointwise(self.THETA, np.random.default_rng(seed))
-            # The same generator gives the same draw b by another route.
-            z = np.random.default_rng(seed).standard_normal(3)
-            b = covariance @ (a.T @ y) + np.linalg.solve(np.linalg.cholesky(np.linalg.inv(covariance)).T, z)
-            np.testing.assert_allclose(
-                pointwise, stats.norm.logpdf(misfit.raw, misfit.design @ b, misfit.sd), rtol=1e-7
-            )
-            prior = stats.norm.logpdf(b).sum()
-            given = -0.5 * (z @ z + 3.0 * np.log(2.0 * np.pi)) - 0.5 * np.linalg.slogdet(covariance)[1]
-            assert pointwise.sum() + prior - given == pytest.approx(marginal, rel=1e-10)
+        # Without the record's wide nuisances, whose dense covariance is nearly singular.
+        narrow = replace(misfit, design=misfit.design / 100.0)
+        covariance = np.diag(narrow.sd**2) + narrow.design @ narrow.design.T
+        joint = stats.multivariate_normal(cov=covariance).logpdf(narrow.raw)
+        found = narrow.left_out(experiment.blocks)
+        assert len(found) == BLOCKS
+        edges = [*experiment.blocks, experiment.n]
+        for k in (0, 1, 30, BLOCKS - 1):
+            rest = np.delete(np.arange(experiment.n), np.arange(edges[k], edges[k + 1]))
+            given = stats.multivariate_normal(cov=covariance[np.ix_(rest, rest)]).logpdf(narrow.raw[rest])
+            assert found[k] == pytest.approx(joint - given, rel=1e-7)
+        # Negative control: the density of the block alone is another.
+        own = np.arange(edges[0], edges[1])
+        alone = stats.multivariate_normal(cov=covariance[np.ix_(own, own)]).logpdf(narrow.raw[own])
+        assert abs(alone - found[0]) > 0.1
 
-    def test_mean_over_draws(self) -> None:
-        """E sum log p(y_i|b) over b|y: the residual sum of squares at the mean, and 3 degrees of freedom less."""
+    def test_a_row_of_a_table_is_a_term(self) -> None:
         experiment = record(UNIFORM)
+        rows = experiment.misfit(self.THETA).left_out(np.arange(experiment.n))
+        whole = experiment.misfit(self.THETA).left_out(np.array([0]))
+        assert whole[0] == pytest.approx(float(experiment.log_likelihood(self.THETA, np)), rel=1e-9)
+        assert rows.shape == (experiment.n,)
+
+    def test_replicates_scatter_by_the_noise(self) -> None:
+        experiment = record(UNIFORM)
+        drawn = np.array([experiment.replicate(self.THETA, np.random.default_rng(seed)) for seed in range(400)])
         misfit = experiment.misfit(self.THETA)
-        a = misfit.design / misfit.sd[:, None]
-        at_mean = np.sum(np.asarray(experiment.residuals(self.THETA, np))[:160] ** 2)
-        spread = np.trace(np.linalg.solve(np.eye(3) + a.T @ a, a.T @ a))
-        expected = -0.5 * (at_mean + spread + 160 * np.log(2.0 * np.pi)) - np.sum(np.log(misfit.sd))
-        rng = np.random.default_rng(8)
-        sums = np.array([experiment.pointwise(self.THETA, rng)[0].sum() for _ in range(4000)])
-        error = np.std(sums) / np.sqrt(4000)
-        assert abs(np.mean(sums) - expected) < 3.5 * error
-        assert abs(np.mean(sums) - (expected + 0.5 * spread)) > 20.0 * error  # negative control: a plug-in mean
+        mean = experiment.observed - misfit.sd * misfit.at_nuisance_mean(np)[0]
+        z = (np.mean(drawn, axis=0) - mean) / misfit.sd * np.sqrt(400)
+        assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.2)
+        assert np.mean(np.std(drawn, axis=0) / misfit.sd) == pytest.approx(1.0, abs=0.03)
 
 
 def test_predictive_p_counts_replicates() -> None:

@@ -1,6 +1,7 @@
 """Choice of the model: variants, densities of settings left out, evidence, predictions."""
 
 from dataclasses import replace
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,7 +13,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.choice import leave_out
-from capsule_id.inference.choice.evidence import _bridge, log_evidence
+from capsule_id.inference.choice.importance import LARGEST_SHAPE, _bridge, log_evidence, smoothed_weights
 from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_out, weighted_draws
 from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
 from capsule_id.inference.choice.variants import variants_of
@@ -110,7 +111,7 @@ def test_readings_left_out_have_their_predictive_density() -> None:
     exact = stats.norm.logpdf(y, others, np.sqrt(1.2))
     found = leave_settings_out(e, draws)
     assert [one.density for one in found] == pytest.approx(exact, abs=0.02)
-    assert max(one.shape for one in found) < leave_out.LARGEST_SHAPE
+    assert max(one.shape for one in found) < LARGEST_SHAPE
     with_it = stats.norm.logpdf(y, np.mean(y), np.sqrt(7.0 / 6.0))
     assert np.max(np.abs(with_it - exact)) > 0.3
 
@@ -137,7 +138,7 @@ def test_draws_without_a_density_have_no_weight(log_weight: float, reliable: boo
     found = leave_out._left_out(weights, np.where(without, np.nan, -1.0), draws, -1.0)
     assert found.density == pytest.approx(-1.0)
     assert np.all(found.log_weight[:5] == -np.inf)
-    assert (found.shape <= leave_out.LARGEST_SHAPE) == reliable
+    assert (found.shape <= LARGEST_SHAPE) == reliable
     nothing = leave_out._left_out(np.zeros(2000), np.full(2000, np.nan), draws, -1.0)
     assert (nothing.density, nothing.shape) == (-np.inf, np.inf)
 
@@ -251,3 +252,18 @@ def test_no_evidence_where_few_draws_are_inside() -> None:
     value, error = log_evidence(np.append(np.zeros(10), np.full(90, -np.inf)), np.random.default_rng(0))
     assert np.isnan(value)
     assert np.isnan(error)
+
+
+def test_weights_are_smoothed_as_by_arviz() -> None:
+    old = getattr(import_module("arviz"), "psislw", None)  # ArviZ 0.2x takes weights, 1 takes their inverses
+    new = None if old else import_module("arviz_stats.base").array_stats.psislw
+    rng = np.random.default_rng(4)
+    for heavy in (0.2, 0.5, 0.9, 3.0):
+        log_weight = heavy * rng.exponential(size=1500)
+        found, shape = smoothed_weights(log_weight)
+        expected, known = map(np.asarray, old(log_weight) if old else new(-log_weight))
+        near = 1e-9 if old else 0.1  # ArviZ 1 takes another size of the tail
+        np.testing.assert_allclose(found, expected, atol=near)
+        assert shape == pytest.approx(float(known), abs=near)
+        assert (shape < LARGEST_SHAPE) == (heavy < 0.6)
+    assert smoothed_weights(np.zeros(100))[1] == np.inf  # no tail

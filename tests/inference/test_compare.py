@@ -85,19 +85,6 @@ def test_the_models_that_the_readings_demand_are_compared(rig: Rig, monkeypatch:
     assert len(compare_models(rig, ["lag"]).predictions) == 2
 
 
-def test_arviz_is_missed_before_any_fit(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise ImportError(name)
-
-    def fitted(*_: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(leave_out, "import_module", missing)
-    monkeypatch.setattr(compare, "joint_fit", fitted)
-    with pytest.raises(InputError, match=r"comparing models needs the package arviz, not installed, pip install"):
-        compare_models(rig, ["lag"])
-
-
 def variant(parameters: int, density: list[float], shape: float = 0.3, refits: int = 0) -> _Variant:
     """A variant of one progression with these densities of its settings."""
     nothing = cast(Any, None)

@@ -139,9 +139,11 @@ def _posterior(rng: np.random.Generator, ensembles: int, draws: int, walkers: in
 
 def _pointwise(rng: np.random.Generator, comparisons: tuple[Comparison, ...]) -> Pointwise:
     chains, draws = np.arange(0, 8, 2), np.arange(0, 20, 4)
-    shapes = {item.label: (len(chains), len(draws), item.points[0].y.size) for item in comparisons}
-    density, replicates = ({label: rng.normal(size=shape) for label, shape in shapes.items()} for _ in range(2))
-    return Pointwise(density, replicates, chains, draws)
+    sizes = {item.label: item.points[0].y.size for item in comparisons}
+    density, replicates = (
+        {label: rng.normal(size=(*grid, n)) for label, n in sizes.items()} for grid in ((4, 5), (2, 3))
+    )
+    return Pointwise(density, {label: np.arange(n) for label, n in sizes.items()}, replicates, chains, draws, 2)
 
 
 #: What a check of an outlier has found, and the same of coloured residuals.

@@ -18,7 +18,7 @@ from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
 from capsule_id.report.console_table import table_text
-from capsule_id.report.netcdf import write_posterior
+from capsule_id.report.netcdf import read_sample, write_posterior
 from capsule_id.report.write import parameters_json, write_result
 from capsule_id.views import Finding
 from tests.report.conftest import COLOURED
@@ -213,10 +213,15 @@ def test_same_result_same_bytes(folder: Path, maker: Callable[..., Result], tmp_
     assert (other / "report.html").read_bytes() != (folder / "report.html").read_bytes()
 
 
+def _groups(data: Any) -> set[str]:
+    """Names of the groups, ArviZ 0.2x or 1."""
+    return set(data.groups() if callable(data.groups) else data.children)
+
+
 def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType) -> None:
     data = arviz.from_netcdf(str(folder / "posterior.nc"))
     read = {"posterior", "sample_stats", "observed_data", "log_likelihood", "posterior_predictive", "prior"}
-    assert set(data.groups()) == read
+    assert _groups(data) == read
     posterior = cast(Posterior, result.posterior)
     ensembles, draws, walkers, _ = posterior.draws.shape
     assert dict(data.posterior.sizes) == {
@@ -226,9 +231,10 @@ def test_arviz_opens_every_group(folder: Path, result: Result, arviz: ModuleType
     assert all(variable.dtype == np.float64 for variable in data.posterior.data_vars.values())
     summary = arviz.summary(data, var_names=["k1", "k2"], kind="stats")
     assert summary.loc["k2[stiff]", "mean"] == pytest.approx(posterior.draws[..., 9].mean(), rel=1e-3)
-    for group in (data.log_likelihood, data.posterior_predictive):
-        assert list(group.chain.values) == [0, 2, 4, 6]
-        assert list(group.draw.values) == [0, 4, 8, 12, 16]
+    assert list(data.log_likelihood.chain.values) == [0, 2, 4, 6]
+    assert list(data.log_likelihood.draw.values) == [0, 4, 8, 12, 16]
+    assert list(data.posterior_predictive.chain.values) == [0, 4]
+    assert list(data.posterior_predictive.draw.values) == [0, 8, 16]
 
 
 def test_every_draw_is_in_its_place(folder: Path, result: Result) -> None:
@@ -268,15 +274,61 @@ def test_the_other_groups_hold_what_was_given(folder: Path, result: Result) -> N
                     np.testing.assert_array_equal(data["readings"][..., data["experiment"] == label], values)
                 continue
             given = result.observed if group == "observed_data" else pointwise.replicates
-            for label, values in given.items():
-                np.testing.assert_array_equal(data[label], values)
-                assert data[label].dims[-1] == f"{label}_row"
+            assert [variable.attrs["experiment"] for variable in data.data_vars.values()] == list(given)
+            for i, (label, values) in enumerate(given.items(), 1):
+                np.testing.assert_array_equal(data[f"y{i}_{label}"], values)
+                assert data[f"y{i}_{label}"].dims[-1] == f"row_{i}"
+
+
+def _labels() -> list[str]:
+    """200 labels: names that ArviZ and this file use, pairs with a suffix, other alphabets, dots, 255 bytes."""
+    rng = np.random.default_rng(0)
+    words = [
+        "chain", "draw", "ensemble", "experiment", "row", "reading", "readings", "lp", "acceptance", "spring", "y1", "row_1",
+        "posterior", "observed_data", "k1", "x", "x_row", "a", "a_row", "Größe", "振动", "полёт", "🙂", "a.b", "a..b", "-",
+        "a b ", " a", "a]b[c", "y1_a", "L" * 300, "é" * 127, "L" * 299 + "M",
+    ]  # fmt: skip
+    letters = [*"abxyAB_.-[]éж振 ", "_row", "draw", "chain"]
+    while len(words) < 200:
+        word = "".join(rng.choice(letters, size=rng.integers(1, 12)))
+        words += [word] if word not in words else []
+    return words
+
+
+def test_every_label_keeps_its_readings(result: Result, tmp_path: Path) -> None:
+    """Before, ``draw`` made a file that no one could load, and ``a_row`` lost its readings beside ``a``."""
+    labels, rng = _labels(), np.random.default_rng(1)
+    sizes = dict(zip(labels, rng.integers(2, 5, size=len(labels)), strict=True))
+    density, replicates = (
+        {label: rng.normal(size=(*grid, n)) for label, n in sizes.items()} for grid in ((4, 5), (2, 3))
+    )
+    rows = {label: np.arange(n) for label, n in sizes.items()}
+    pointwise = Pointwise(density, rows, replicates, np.arange(0, 8, 2), np.arange(0, 20, 4), 2)
+    observed = {label: rng.normal(size=n) for label, n in sizes.items()}
+    prior = {f"noise_sd[{label}]": rng.normal(size=7) for label in labels}
+    write_posterior(dataclasses.replace(result, observed=observed, pointwise=pointwise, prior=prior), tmp_path / "x.nc")
+    _, read_prior, read = read_sample(tmp_path / "x.nc", cast(Posterior, result.posterior))
+    assert read is not None
+    assert list(read.log_likelihood) == list(read.replicates) == labels
+    for label in labels:
+        np.testing.assert_array_equal(read.log_likelihood[label], density[label])
+        np.testing.assert_array_equal(read.rows[label], rows[label])
+        np.testing.assert_array_equal(read.replicates[label], replicates[label])
+        np.testing.assert_array_equal(read_prior[f"noise_sd[{label}]"], prior[f"noise_sd[{label}]"])
+
+
+def test_a_long_label_does_not_make_a_long_file_name(result: Result, tmp_path: Path) -> None:
+    long = [
+        dataclasses.replace(item, label=letter * 300) for item, letter in zip(result.comparisons, "aab", strict=False)
+    ]
+    write_result(dataclasses.replace(result, comparisons=tuple(long)), tmp_path)
+    assert len([path for path in (tmp_path / "figures").glob("*.png") if len(path.stem) >= 80]) == 3
 
 
 def test_without_arrays_only_the_sample_is_written(result: Result, tmp_path: Path, arviz: ModuleType) -> None:
     bare = dataclasses.replace(result, fixed={}, observed={}, prior={}, pointwise=None)
     write_posterior(bare, tmp_path / "x.nc")
-    assert set(arviz.from_netcdf(str(tmp_path / "x.nc")).groups()) == {"posterior", "sample_stats"}
+    assert _groups(arviz.from_netcdf(str(tmp_path / "x.nc"))) == {"posterior", "sample_stats"}
 
 
 def test_exact_members_join_their_family(result: Result, tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.inference.checks.order import SMALLEST_SCATTER
 from capsule_id.inference.checks.regression import DIFFERENCE, moving_symbols
 from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.inference.choice.importance import LARGEST_SHAPE, smoothed_weights
 from capsule_id.inference.fit.curvature import jacobian
+from capsule_id.inference.result import Pointwise
 from capsule_id.views import Finding
 
 #: Numbers of the replicates that are drawn, and of their readings together above the smaller number.
@@ -134,3 +136,16 @@ def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding
             level = "warn" if worst == "largest" else "fail"
             findings.append(Finding("residuals.statistics", level, {"statistic": worst, "p": small[worst]}, e.label))
     return findings or [Finding("residuals.statistics", "ok", {"number": judged})] * bool(judged)
+
+
+def decisive_readings(pointwise: Pointwise) -> Finding:
+    """Name the readings without which the sample cannot predict them, because they decide a parameter."""
+    named, number = [], 0
+    for label, density in pointwise.log_likelihood.items():
+        terms = density.reshape(-1, density.shape[-1]).T
+        shapes = [smoothed_weights(-own)[1] for own in terms]
+        number += len(shapes)
+        named += [(shape, label, int(row) + 1) for shape, row in zip(shapes, pointwise.rows[label], strict=True)]
+    far = sorted((one for one in named if one[0] > LARGEST_SHAPE), reverse=True)
+    rows = ", ".join(f"{label} reading {row} ({shape:.2f})" for shape, label, row in far)
+    return Finding("readings.decisive", "ok", {"number": number, "far": len(far), "rows": rows, "limit": LARGEST_SHAPE})

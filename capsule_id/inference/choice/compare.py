@@ -12,14 +12,12 @@ from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
 from capsule_id.experiments.registry import Registry, default_registry
-from capsule_id.inference.choice.evidence import log_evidence
+from capsule_id.inference.choice.importance import LARGEST_SHAPE, log_evidence
 from capsule_id.inference.choice.leave_out import (
-    LARGEST_SHAPE,
     LeftOut,
     WeightedDraws,
     leave_setting_out,
     leave_settings_out,
-    psislw,
     weighted_draws,
 )
 from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
@@ -196,9 +194,8 @@ def compare_models(
     Raises
     ------
     InputError
-        If a word is unknown, ArviZ is not installed, or a progression has too few settings or there is none.
+        If a word is unknown, or a progression has too few settings or there is none.
     """
-    psislw()
     choices, kinds = _variants(rig, words, registry)
     fitted = {}
     for number, (name, model) in enumerate(choices.items()):

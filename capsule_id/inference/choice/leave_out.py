@@ -7,17 +7,14 @@ parameters and all other readings, leaves the setting out.
 Statistics and Computing 27, 2017, 1413.)
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from capsule_id.errors import InputError
 from capsule_id.experiments.families.trials_experiment import TrialsExperiment
-from capsule_id.inference.choice.evidence import log_evidence
+from capsule_id.inference.choice.importance import LARGEST_SHAPE, log_evidence, smoothed_weights
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, emulation
 from capsule_id.inference.sampling.ensembles import adapted_proposal, laplace_proposal
@@ -27,8 +24,6 @@ from capsule_id.inference.target.marginal import MarginalPosterior, trials_of
 
 #: Draws of a proposal; draws of an emulated posterior, fewer because their weights vary less.
 DRAWS, EMULATED_DRAWS = 4096, 2048
-#: Importance weights with a larger Pareto shape are not reliable.
-LARGEST_SHAPE = 0.7
 #: Largest number of adaptations of the proposal without a setting, each from the one before.
 ADAPTATIONS = 3
 #: Weight that draws without a density may hold.
@@ -80,21 +75,6 @@ class LeftOut:
     shape: float
     log_weight: np.ndarray
     draws: WeightedDraws
-
-
-def psislw() -> Callable[[np.ndarray], tuple[Any, Any]]:
-    """ArviZ' Pareto smoothing of importance weights.
-
-    Raises
-    ------
-    InputError
-        If ArviZ is not installed.
-    """
-    try:
-        return import_module("arviz").psislw
-    except (ImportError, AttributeError):
-        rule, remedy = "comparing models needs the package arviz", "pip install 'capsule-id[compare]'"
-        raise InputError(rule, "not installed", remedy) from None
 
 
 def weighted_draws(
@@ -191,7 +171,7 @@ def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws,
     known, smoothed = np.isfinite(density), np.full(len(density), -np.inf)
     if not np.any(known):
         return LeftOut(-np.inf, np.inf, smoothed, draws)
-    smoothed[known], shape = _smooth(log_weight[known] + power * density[known])
+    smoothed[known], shape = smoothed_weights(log_weight[known] + power * density[known])
     lost = np.logaddexp.reduce(log_weight[~known]) - np.logaddexp.reduce(log_weight) if not np.all(known) else -np.inf
     return LeftOut(
         float(np.logaddexp.reduce(smoothed[known] + density[known])),
@@ -199,9 +179,3 @@ def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws,
         smoothed,
         draws,
     )
-
-
-def _smooth(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
-    """Normalised log-weights (m,) smoothed by ArviZ, and their Pareto shape."""
-    smoothed, shape = map(np.asarray, psislw()(log_weight))
-    return smoothed, float(shape)

@@ -8,6 +8,13 @@ from capsule_id.views import Facts, Message, filled_in, stated_p
 FAR_BELOW = 1000
 
 
+_DECISIVE = (
+    "{far} of {number} readings or stretches decide a parameter almost alone, so that the sample cannot tell how well the "
+    "others predict them (Pareto shape above {limit:g}; a stretch is named by its first reading): {rows}"
+)
+_NOT_DECISIVE = "each of {number} readings or stretches can be left out: the sample predicts it from the others"
+
+
 def _disagreeing_starts(facts: Facts) -> str:
     seen = (
         f"expected {facts['starts']} starts to end at the same maximum; {facts['stalled']} stalled, {facts['elsewhere']} "
@@ -127,6 +134,10 @@ POSTERIOR_MESSAGES: Mapping[str, Message] = {
         "chains converged",
         ok=_CHAINS,
         warn=_chains,
+    ),
+    "readings.decisive": Message(
+        "readings left out",
+        ok=lambda facts: filled_in(_DECISIVE if facts["far"] else _NOT_DECISIVE, facts),
     ),
     "sample.unfinished": Message(
         "sample", warn="the sample is still to be drawn: this is the point fit alone, without intervals and figures"

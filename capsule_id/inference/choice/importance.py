@@ -1,7 +1,13 @@
-"""Evidence of a model by bridge sampling (Meng & Wong 1996) between its posterior and the adapted proposal."""
+"""Importance weights: evidence of a model by bridge sampling (Meng & Wong 1996), and Pareto smoothing.
+
+A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, *Pareto smoothed importance sampling*, J. Machine Learning Research
+25 (72), 2024. J. Zhang, M. A. Stephens, *A new and efficient estimation method for the generalized Pareto distribution*,
+Technometrics 51, 2009, 316.
+"""
 
 import numpy as np
 from jaxtyping import Float
+from scipy import stats
 
 from capsule_id.inference.sampling.refinement import effective_size
 
@@ -9,6 +15,10 @@ from capsule_id.inference.sampling.refinement import effective_size
 PARTS = 4
 #: Steps of the iteration, which converges within a few.
 STEPS = 100
+#: Importance weights with a larger Pareto shape are not reliable.
+LARGEST_SHAPE = 0.7
+#: Fewest weights in a tail to which a shape can be fitted.
+FEWEST_IN_TAIL = 5
 
 
 def log_evidence(log_weight: Float[np.ndarray, " m"], rng: np.random.Generator) -> tuple[float, float]:
@@ -55,3 +65,30 @@ def _bridge(posterior: Float[np.ndarray, " n"], proposal: Float[np.ndarray, " m"
 
 def _log_mean(logarithm: Float[np.ndarray, " m"]) -> float:
     return float(np.logaddexp.reduce(logarithm) - np.log(len(logarithm)))
+
+
+def smoothed_weights(log_weight: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " m"], float]:
+    """Normalised log-weights with a smoothed upper tail, and the Pareto shape of that tail; inf where it has no tail."""
+    x = log_weight - np.max(log_weight)
+    order = np.argsort(x, kind="stable")
+    size = int(np.ceil(min(0.2 * len(x), 3.0 * np.sqrt(len(x)))))
+    cutoff = max(x[order[-size - 1]], np.log(np.finfo(float).tiny))
+    tail = order[x[order] > cutoff]
+    shape = np.inf
+    if len(tail) >= FEWEST_IN_TAIL:
+        shape, scale = _pareto(np.exp(x[tail]) - np.exp(cutoff))
+        places = (np.arange(len(tail)) + 0.5) / len(tail)
+        x[tail] = np.minimum(np.log(np.exp(cutoff) + stats.genpareto.ppf(places, shape, scale=scale)), 0.0)
+    return x - np.logaddexp.reduce(x), float(shape)
+
+
+def _pareto(x: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Shape and scale of a generalised Pareto distribution from its ascending sample, the shape drawn towards 0.5."""
+    n = len(x)
+    count = 30 + int(np.sqrt(n))
+    b = (1.0 - np.sqrt(count / (np.arange(count) + 0.5))) / (3.0 * x[int(n / 4 + 0.5) - 1]) + 1.0 / x[-1]
+    k = np.mean(np.log1p(-b[:, None] * x), axis=1)
+    density = n * (np.log(-b / k) - k - 1.0)
+    mean = float(np.sum(b * np.exp(density - np.logaddexp.reduce(density))))
+    shape = float(np.mean(np.log1p(-mean * x)))
+    return (n * shape + 5.0) / (n + 10.0), -shape / mean
