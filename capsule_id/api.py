@@ -35,7 +35,7 @@ def read_rig(folder: str | Path, registry: Registry | None = None, friction: typ
 
     Parameters
     ----------
-    folder : holds ``rig.toml`` and the tables that it names
+    folder : holds ``rig.toml`` and the tables that it names; or the path of ``rig.toml``
     registry : the kinds of experiments that it may have, by default the built-in ones and those of installed packages
     friction : class of a friction law; ``[prior]`` may then state its parameters
 
@@ -50,7 +50,7 @@ def read_rig(folder: str | Path, registry: Registry | None = None, friction: typ
 
 
 def fit(
-    rig: Rig,
+    rig: Rig | str | Path,
     seed: int = 0,
     experiments: Choice = "all",
     budget: int | None = DEFAULT_BUDGET,
@@ -65,7 +65,7 @@ def fit(
 
     Parameters
     ----------
-    rig : from ``read_rig``
+    rig : from ``read_rig``, or what ``read_rig`` reads
     seed : the same seed gives the same numbers
     experiments : "bench", "runs" or "all"
     budget : emcee steps of an ensemble after burn-in; None for the point fit alone
@@ -80,11 +80,10 @@ def fit(
     Raises
     ------
     InputError
-        If ``rig`` is not from ``read_rig`` or holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or
+        If ``rig`` cannot be read or holds nothing to fit, ``experiments`` is another word, ``seed``, ``budget`` or
         ``ess`` is out of range, or ``friction`` cannot be fitted.
     """
-    if not isinstance(rig, Rig):
-        raise InputError("the rig must be one that read_rig returns", repr(rig), "call fit(read_rig(folder))")
+    rig = rig if isinstance(rig, Rig) else read_rig(rig, registry, friction)
     if not isinstance(seed, int) or seed < 0:
         raise InputError("seed must be a whole number, not negative", repr(seed), "give 0 or more")
     if budget is not None and budget < 1:

@@ -25,6 +25,7 @@ from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
 from capsule_id.report.columns import table_rows
 from capsule_id.report.console_table import table_text, verdict_text, wrapped
 from capsule_id.report.figures import comparisons, corner, runs, traces
+from capsule_id.report.figures.style import figure_of
 from capsule_id.report.html import summary_html
 from capsule_id.report.netcdf import data_tree
 from capsule_id.report.texts.messages import caption_of, finding_text, messages_of, title_of
@@ -191,24 +192,25 @@ class Fit(Result):
         panels = [panel for panel in self.comparisons if panel.autocorrelation is not None]
         return comparisons.autocorrelation(_named(panels, label, _label), ax or _new_axes(6.4, 2.4))
 
-    def plot_record(self, name: str | None = None, ax: Axes | None = None) -> Axes:
-        """Channels of a recorded run and its phase plane, several panels in the place of ``ax``."""
+    def plot_record(self, name: str | None = None, ax: Axes | None = None) -> Figure:
+        """Channels of a recorded run and its phase plane, several panels in the place of ``ax``: the figure."""
         view = _named(self.records, name, lambda record: record.name).view
-        return runs.run_overview(view, ax or _new_axes(*runs.overview_size(view), constrained=False))
+        return figure_of(runs.run_overview(view, ax or _new_axes(*runs.overview_size(view), constrained=False)))
 
     def plot_force(self, name: str | None = None, ax: Axes | None = None) -> Axes:
         """Force on the rod from the recorded current, and the fitted drive."""
         record = _named([r for r in self.records if r.view.force is not None], name, lambda record: record.name)
         return runs.force_on_rod(record.view, ax or _new_axes(6.4, 4.4), (record.view.time, record.force))
 
-    def plot_corner(self, ax: Axes | None = None) -> Axes:
-        """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair."""
+    def plot_corner(self, ax: Axes | None = None) -> Figure:
+        """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair: the figure."""
         width, height = corner.corner_size(self._sampled)[1:]
-        return corner.corner(self, ax or _new_axes(width, height))
+        return figure_of(corner.corner(self, ax or _new_axes(width, height)))
 
-    def plot_traces(self, ax: Axes | None = None) -> Axes:
-        """A few walkers of each ensemble against the step, several panels in the place of ``ax``."""
-        return traces.traces(self, ax or _new_axes(*traces.traces_size(self._sampled), constrained=False))
+    def plot_traces(self, ax: Axes | None = None) -> Figure:
+        """A few walkers of each ensemble against the step, several panels in the place of ``ax``: the figure."""
+        size = traces.traces_size(self._sampled)
+        return figure_of(traces.traces(self, ax or _new_axes(*size, constrained=False)))
 
     def plot_starts(self, ax: Axes | None = None) -> Axes:
         """Where each start of the point fit began and ended, in standard deviations."""

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import capsule_id as cid
@@ -132,11 +133,17 @@ def test_the_table_is_parameters_csv(fitted: Fit, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["plot_comparison", "plot_residuals", "plot_autocorrelation", "plot_corner", "plot_traces", "plot_starts"]
 )
-def test_every_plot_draws_into_given_axes_or_a_pyplot_figure(capsule: Fit, name: str) -> None:
+def test_every_plot_draws_into_given_axes_or_a_pyplot_figure(capsule: Fit, name: str, tmp_path: Path) -> None:
     plot = getattr(capsule, name)
-    ax = plot()
+    drawn = plot()
     assert plt.get_fignums() == [1]
-    assert ax in plt.figure(1).axes
+    several = name in ("plot_corner", "plot_traces")
+    assert isinstance(drawn, Figure if several else Axes)
+    assert drawn.get_figure(root=True) is plt.figure(1)
+    drawn.figure.savefig(tmp_path / "x.png")  # of traces, a part of a figure that cannot be saved
+    if name == "plot_traces":
+        shown = [row for row in capsule.summary.index if row in cast(Posterior, capsule.posterior).names]
+        assert [bool(ax.get_ylabel()) for ax in drawn.axes] == [True] * len(shown)
     figure = Figure()
     given = figure.subplots(1, 2)[1]
     assert plot(ax=given).get_figure(root=True) is figure

@@ -44,7 +44,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
 
     Parameters
     ----------
-    folder : holds ``rig.toml`` and the tables that it names
+    folder : holds ``rig.toml`` and the tables that it names; or the path of ``rig.toml``
     kinds : the kinds of experiments that it may have, by name
     parameters : further rows that ``[prior]`` may state, those of a friction law
 
@@ -60,6 +60,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         [rig] or experiments have faults, at the first one of each (``FolderError``).
     """
     folder = Path(folder)
+    folder = folder.parent if folder.name == "rig.toml" and folder.is_file() else folder
     document, sha256 = _read_document(folder)
     data = document.data
     refuse_unknown_keys(document, (), data, ("rig", "model", "prior", "experiment"))
@@ -106,7 +107,8 @@ def _read_document(folder: Path) -> tuple[TomlDocument, str]:
     path = folder / "rig.toml"
     try:
         if not folder.is_dir():
-            raise InputError("the rig must be a folder", "no such folder", "name a folder with a rig.toml", folder)
+            value = "a file" if folder.is_file() else "no such folder"
+            raise InputError("the rig must be a folder", value, "name a folder with a rig.toml", folder)
         if not path.is_file():
             remedy = "run `capsule-id init DIR` for a commented one"
             raise InputError("a rig folder must contain a file rig.toml", "none", remedy, path, 1, 1)

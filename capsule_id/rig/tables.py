@@ -83,7 +83,11 @@ def table_path(document: TomlDocument, path: KeyPath, name: str) -> Path:
     if not inside:
         raise document.error(path, "file must lie inside the rig folder, links followed", shown(name), remedy)
     if not exists:
-        raise document.error(path, "file must exist", shown(name), "correct the name or add the file")
+        near = closest(
+            name, [p.relative_to(folder).as_posix() for p in file.parent.glob("*") if suffix_of(p) in EXPORTS]
+        )
+        remedy = f'write "{near}"' if near else "correct the name or add the file"
+        raise document.error(path, "file must exist", shown(name), remedy)
     if not regular:
         raise document.error(path, "file must be a regular file", shown(name), "name a table, not a folder or device")
     if suffix_of(file) not in EXPORTS:

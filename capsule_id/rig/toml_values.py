@@ -19,6 +19,12 @@ NOWHERE: Mapping[str, Collection[str]] = MappingProxyType({})
 #: Units of masses and lengths. Positive ones are weighed or measured to better than half of their value.
 WEIGHED = ("kg", "m", "m/s^2")
 _LONGEST_SHOWN = 60  # characters of a faulty value in an error line
+#: Other names of keys and words of ``rig.toml``.
+_ALIASES = {
+    "mass1": "m1", "mass_1": "m1", "rod_mass": "m1", "mass2": "m2", "mass_2": "m2", "capsule_mass": "m2", "gravity": "g",
+    "uncertainty": "sd", "error": "sd", "sigma": "sd", "std": "sd", "stdev": "sd", "val": "value", "units": "unit",
+    "type": "kind", "path": "file", "filename": "file", "title": "name", "na": "missing", "missing_values": "missing",
+}  # fmt: skip
 
 
 def shown(value: object) -> str:
@@ -31,8 +37,21 @@ def shown(value: object) -> str:
 
 
 def closest(word: str, known: Collection[str]) -> str | None:
-    """The word of ``known`` that is most similar to ``word``, None if no word is similar."""
-    return next(iter(get_close_matches(word[:_LONGEST_SHOWN], known, n=1)), None)
+    """The word of ``known`` that ``word`` means: in another case or with hyphens, another name for it, or misspelt.
+
+    None where no word is similar, or where a part of a similar one is another word: ``k2_back`` does not mean ``mu_back``.
+    """
+    parts = re.split(r"[_\W]+", word[:_LONGEST_SHOWN].lower())
+    folded = {tuple(re.split(r"[_\W]+", one.lower())): one for one in reversed([*known])}
+    folded |= {tuple(alias.split("_")): one for alias, one in _ALIASES.items() if one in known and alias not in known}
+    joined = {"".join(each): one for each, one in folded.items()}
+    same = [each for each in folded if len(each) == len(parts) and all(map(_similar, parts, each))]
+    near = get_close_matches("_".join(parts), ["_".join(each) for each in same], n=1)
+    return joined.get("".join(parts)) or (folded[tuple(near[0].split("_"))] if near else None)
+
+
+def _similar(part: str, other: str) -> bool:
+    return part == other or bool(get_close_matches(part, [other], cutoff=0.7))
 
 
 def refuse_unknown_keys(
@@ -46,7 +65,7 @@ def refuse_unknown_keys(
     for key in entry:
         if key not in known:
             close, table = closest(key, known), next((name for name, keys in elsewhere.items() if key in keys), None)
-            remedy = f"move it to {table}" if table else f"write {close}" if close else "remove it"
+            remedy = f"move it to {table}" if table else f"write {close}" if close else "correct or remove it"
             remedy += f"; known: {' '.join(known)}"
             raise document.error((*path, key), "unknown key", shown(key), remedy, of_key=True)
 

@@ -9,6 +9,8 @@ import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.text.csv import read_csv
 from capsule_id.rig.toml_document import DEEPEST_KEY, LARGEST_TEXT, parse_toml
+from capsule_id.rig.toml_values import closest
+from tests.cli_tools import small_rig
 
 TOML, TABLE = Path("rig.toml"), Path("table.csv")
 #: Longest time until an error, s.
@@ -55,10 +57,60 @@ def test_a_rig_is_named_by_a_path(folder: object) -> None:
         capsule_id.read_rig(folder)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("rig", ["data", Path("data"), None])
-def test_what_is_fitted_is_a_rig(rig: object) -> None:
-    with pytest.raises(InputError, match=r"the rig must be one that read_rig returns.*fit\(read_rig\(folder\)\)"):
-        capsule_id.fit(rig)  # type: ignore[arg-type]
+def test_a_fit_takes_a_rig_its_folder_or_its_file(tmp_path: Path) -> None:
+    """Before, only a rig. What is no rig and no path is refused by name; so is a file that is no folder."""
+    folder = small_rig(tmp_path / "rig")
+    for given in (folder, str(folder), folder / "rig.toml"):
+        assert capsule_id.read_rig(given).files == capsule_id.read_rig(folder).files
+    values = [
+        capsule_id.fit(given, budget=None).summary["value"].to_list()
+        for given in (folder / "rig.toml", capsule_id.read_rig(folder))
+    ]
+    assert values[0] == values[1]
+    with pytest.raises(InputError, match=r"the rig must be a path \(str or Path\), NoneType"):
+        capsule_id.fit(None)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    for given, found in ((folder / "rig.csv", "a file"), (folder / "absent", "no such folder")):
+        (folder / "rig.csv").write_text("1", encoding="utf-8")
+        with pytest.raises(InputError, match=f"the rig must be a folder, {found}"):
+            capsule_id.fit(given)
+
+
+def test_a_rig_in_utf_16_is_read(tmp_path: Path) -> None:
+    """As an editor of Windows saves it; before: "a binary file"."""
+    folder = small_rig(tmp_path / "rig")
+    text, expected = (folder / "rig.toml").read_text(encoding="utf-8"), capsule_id.read_rig(folder)
+    for codec in ("utf-16", "utf-16-be"):
+        mark = b"\xfe\xff" if codec == "utf-16-be" else b""
+        (folder / "rig.toml").write_bytes(mark + text.encode(codec))
+        assert capsule_id.read_rig(folder).name == expected.name
+    (folder / "rig.toml").write_bytes(text.encode("utf-16-le"))  # without its mark
+    with pytest.raises(InputError, match=r"the file must be text, a binary file \(NUL byte\), export it as text"):
+        capsule_id.read_rig(folder)
+
+
+def test_the_name_of_a_file_in_another_case_is_proposed(tmp_path: Path) -> None:
+    folder = small_rig(tmp_path / "rig")
+    (file,) = folder.glob("*.csv")
+    file.rename(folder / file.name.upper())
+    with pytest.raises(InputError, match=f'file must exist, .*, write "{file.name.upper()}"'):
+        capsule_id.read_rig(folder)
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        ("spring_back", None), ("k2_back", None), ("m3", None), ("x_rel_noise", None), ("stiffness", None),
+        ("mass1", "m1"), ("M1", "m1"), ("m_1", "m1"), ("uncertaint", "sd"), ("uncertainty", "sd"), ("error", "sd"),
+        ("free-vibration", "free_vibration"), ("normalforce", "normal_force"), ("lenght_is", "length_is"),
+        ("x_rel_sdd", "x_rel_sd"), ("colums", "columns"), ("sprng", "spring"), ("directon", "direction"),
+    ],
+)  # fmt: skip
+def test_a_proposed_word_has_the_meaning_of_the_written_one(written: str, meant: str | None) -> None:
+    known = (
+        "kind", "file", "label", "columns", "missing", "spring", "gap", "mu_back", "k2", "sd", "value", "unit", "m1", "m2",
+        "g", "free_vibration", "normal_force", "direction", "length_is", "x_rel_sd", "x_rel_resolution",
+    )  # fmt: skip
+    assert closest(written, known) == meant
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "1", None])

@@ -104,7 +104,8 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
 
 TEMPLATE = """\
 #: Tilts of the board until the capsule slips: mu. Column: angle [deg]; or height [mm] and length [mm] with
-#: length_is = "board" (the sloping side) or "base" (the side on the floor).
+#: length_is = "board" (the sloping side) or "base" (the side on the floor). Heights of one board of 950 mm:
+#: columns = { height = { from = "height [mm]", unit = "mm" }, length = { from = 1, unit = "mm", scale = 0, offset = 950 } }
 #: Or force [N]: the pull along the track at which the capsule slips. The normal force follows from the weight, slope
 #: and N0, or is stated by normal_force = { value = 6.3, unit = "N" }, or for every row in a column normal_force [N].
 # [[experiment]]

@@ -52,10 +52,10 @@ def figure_of(ax: Axes) -> Figure:
 
 
 def subfigure_at(ax: Axes) -> SubFigure:
-    """A part of the figure of ``ax`` for several panels, in the place of ``ax``, whose own frame is hidden."""
-    ax.set_axis_off()
-    figure = figure_of(ax)
-    return figure.add_subfigure(ax.get_subplotspec() or GridSpec(1, 1, figure=figure)[0])
+    """A part of the figure of ``ax`` for several panels, which take the place of ``ax``."""
+    figure, place = figure_of(ax), ax.get_subplotspec()
+    ax.remove()
+    return figure.add_subfigure(place or GridSpec(1, 1, figure=figure)[0])
 
 
 def set_text(ax: Axes, x_label: str, y_label: str, title: str = "") -> None:

@@ -40,7 +40,7 @@ def traces(result: Result, ax: Axes | None = None) -> Axes:
     step = np.arange(shown.shape[1]) * every * columns.posterior.thin
     for i, panel in enumerate(axes.flat):
         if i >= n:
-            panel.set_axis_off()
+            panel.remove()
             continue
         for e, ensemble in enumerate(shown[..., i]):
             panel.plot(step, ensemble, color=CYCLE[e % len(CYCLE)], lw=0.6, alpha=0.8)

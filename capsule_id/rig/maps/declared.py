@@ -136,15 +136,18 @@ def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRu
     if "from" not in entry:
         raise document.error(path, f"{path[-1]} must have a from", shown(entry), f"write {_EXAMPLE}")
     read_unit(document, path, entry, rule.si)
-    scale = _number(document, (*path, "scale"), entry.get("scale", 1.0))
-    if scale == 0.0:
-        raise document.error((*path, "scale"), "scale must not be 0", "0", "write 1, or -1 for the other sign")
+    scale, offset = (
+        _number(document, (*path, key), entry.get(key, zero)) for key, zero in (("scale", 1.0), ("offset", 0.0))
+    )
+    if scale == offset == 0.0:
+        remedy = "write 1, or -1 for the other sign; for a constant, state it as offset"
+        raise document.error((*path, "scale"), "scale must not be 0", "0", remedy)
     return Source(
         _header(document, (*path, "from"), entry["from"]),
         _header(document, (*path, "minus"), entry["minus"]) if "minus" in entry else None,
         entry["unit"],
         scale,
-        _number(document, (*path, "offset"), entry.get("offset", 0.0)),
+        offset,
     )
 
 

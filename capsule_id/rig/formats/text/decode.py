@@ -1,19 +1,22 @@
 """Decodes a text in UTF-8 and locates the first byte that is not text."""
 
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from pathlib import Path
 
 from capsule_id.errors import InputError
 
 
 def decode(content: bytes, path: Path) -> str:
-    """UTF-8 text with ``\\n`` line ends, without the byte-order mark.
+    """UTF-8 or, with its byte-order mark, UTF-16 text: with ``\\n`` line ends, without the mark.
 
     Raises
     ------
     InputError
         If the content is not UTF-8 or holds a NUL byte, at its line and character.
     """
+    if content.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        content = content.decode("utf-16", "replace").encode()
     nul = content.find(b"\0")
     if nul >= 0:
         place, remedy = place_of_byte(content[:nul]), "export it as text"
