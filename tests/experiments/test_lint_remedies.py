@@ -279,6 +279,11 @@ def test_remedies_name_only_the_words_that_the_entry_states(tmp_path: Path, stat
         assert (word in coloured.partition("or remove ")[2].partition(" from its entry")[0]) == (word in stated)
     assert ("Remove stiffness from its entry, or state start" in apart) == ("stiffness" in stated)
     assert ("State start and stop" in apart) == ("stiffness" not in stated)
+    # Where the model holds a cubic spring, the amplitude is no cause any more: before, it was named, with the time.
+    halves = {**halves, "model": "viscous damping, cubic spring", "stated": ()}
+    in_time = text(Finding("decays.halves", "fail", halves, "a"))
+    assert "The stiffness changes with the time" in in_time
+    assert "State start" not in in_time
 
 
 @pytest.mark.parametrize("constant", [False, True])

@@ -10,7 +10,7 @@ from scipy import stats
 
 from capsule_id.fitted import Fit
 from capsule_id.inference.result import Result
-from capsule_id.inference.tables.parameter_table import quote
+from capsule_id.inference.tables.parameter_table import _limited, quote
 from capsule_id.report.columns import table_rows
 from capsule_id.report.console_table import table_text
 from capsule_id.report.html import render
@@ -42,6 +42,15 @@ def entry(distribution: stats.rv_continuous) -> dict[str, float]:
 )
 def test_the_rule(distribution: stats.rv_continuous, positive: bool, word: str) -> None:
     assert quote(entry(distribution), positive) == word
+
+
+@pytest.mark.parametrize(("sd", "limit"), [(0.8, False), (0.95, True), (1.5, True)])
+def test_an_upper_limit_begins_at_zero(sd: float, limit: bool) -> None:
+    """Before: an undamped record gave c = 0.05 to 6.4 mN s/m, because the prior of its logarithm cannot reach 0."""
+    posterior = entry(stats.lognorm(sd))
+    assert _limited(posterior) == ({"lower": 0.0} if limit else {})
+    assert quote({**posterior, **_limited(posterior)}, positive=True) == "interval"
+    assert _limited({"value": 1.0, "sd": 0.2}) == {}
 
 
 def test_without_a_sample_there_is_no_interval_to_quote() -> None:

@@ -23,10 +23,18 @@ def _halves(facts: Facts) -> str:
     key = "damping" if damping else "stiffness"
     leave = f"Remove {key} from its entry, or state" if key in facts["stated"] else "State"
     values = f"the first half gives {facts['first']:.4g}, the second {facts['second']:.4g} {facts['unit']}"
+    cause = (
+        f"The {key} depends on the amplitude or on the time in a way that the fitted model lacks ({facts['model']}). {leave} "
+        "start and stop for the amplitudes of interest."
+    )
+    if facts["name"] == "k1" and "cubic" in facts["model"]:
+        cause = (
+            f"The stiffness changes with the time: the fitted model ({facts['model']}) holds a dependence on the amplitude "
+            "already. Find what warms up, works loose or moves during the record, and record again."
+        )
     return (
         f"{facts['label']}: expected the same {facts['name']} in both halves of the record; {values} ({facts['z']:.1f} joint "
-        f"sd apart). The {key} depends on the amplitude or on the time in a way that the fitted model lacks "
-        f"({facts['model']}). {leave} start and stop for the amplitudes of interest."
+        f"sd apart). {cause}"
     )
 
 

@@ -26,6 +26,9 @@ SUMMARY_COLUMNS = (
 #: Ratio of the arms of a 95 % interval about the median above which value ± sd does not describe it. A log-normal
 #: distribution has it at a relative sd of 0.35.
 LARGEST_SKEW = 2.0
+#: Of a positive parameter whose 95 % interval ends differ by more than this factor, the readings give an upper limit alone:
+#: the lower end is that of the prior, which cannot reach 0. An undamped record gives c such an interval.
+UPPER_LIMIT = 30.0
 #: Nodes of the average over a scatter: the inverse hyperbolic sine of their distance from the fit, in u, is even. Tables
 #: with more rows show their scatter.
 NODES, REACH = 400, 4.0
@@ -56,6 +59,7 @@ def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFr
         }
         entry |= {} if posterior is None else _sample_columns(posterior, i)
         entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
+        entry |= _limited(entry) if row.positive else {}
         rows.append((row, {**entry, "quote": quote(entry, row.positive)}))
     for symbol in (symbol for symbol in masses if symbol in target.fixed):
         row, value = parameter(symbol), target.fixed[symbol]
@@ -122,6 +126,11 @@ def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool
             moved = value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
             found |= {end: moved, f"{end}_unwidened": limit}
     return found
+
+
+def _limited(entry: Mapping[str, Any]) -> dict[str, object]:
+    """The lower end 0 where the readings give an upper limit alone."""
+    return {"lower": 0.0} if "lower" in entry and entry["lower"] * UPPER_LIMIT < entry["upper"] else {}
 
 
 def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]:
