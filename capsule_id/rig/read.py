@@ -23,6 +23,7 @@ from capsule_id.rig.tables import TableFile, read_experiment_files
 from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
 from capsule_id.rig.toml_values import (
     NAME_PATTERN,
+    closest,
     read_bool,
     read_name,
     read_prior,
@@ -216,7 +217,9 @@ def _read_experiment(
         raise document.error(path, "an experiment must have a kind", "none", 'add kind = "..."')
     word = read_string(document, (*path, "kind"), entry["kind"])
     if word not in kinds:
-        raise document.error((*path, "kind"), "unknown kind", shown(word), f"write one of {' '.join(kinds)}")
+        close = closest(word, kinds)
+        remedy = f'write "{close}"' if close else f"write one of {' '.join(kinds)}"
+        raise document.error((*path, "kind"), "unknown kind", shown(word), remedy)
     kind = kinds[word]
     errors = [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
     known = ("kind", "file", "label", "reject", "clock", *MAP_KEYS, *kind.setting_rules, *errors)

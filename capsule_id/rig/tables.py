@@ -1,6 +1,7 @@
 """Reads the files of one experiment: path check, bytes, hash, column map, columns in SI."""
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -12,10 +13,11 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
-from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.formats.text.blocks import TextFile
+from capsule_id.rig.formats.text.csv import HEADER_CELL, MissingCellsError
 from capsule_id.rig.maps.clock import on_reference, read_clock
 from capsule_id.rig.maps.declared import ColumnMap, read_map
 from capsule_id.rig.maps.mapped import apply_map
@@ -23,11 +25,13 @@ from capsule_id.rig.maps.plateaus import Plateaus, read_plateaus, readings_of_pl
 from capsule_id.rig.maps.proposal import proposal
 from capsule_id.rig.maps.rejection import Rejection, outlying_rows, read_rejection
 from capsule_id.rig.model import NO_DRIFT, Column, Quantity
+from capsule_id.rig.order import remedy_of_order
 from capsule_id.rig.schema import ColumnRule, KindRule
 from capsule_id.rig.toml_document import KeyPath, TomlDocument
 from capsule_id.rig.toml_values import closest, read_string, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
-from capsule_id.views import counted
+
+_A_TRIAL = "a row per trial"
 
 
 @dataclass(frozen=True)
@@ -190,11 +194,34 @@ def _read_plain(
         table = TableFile(hashes, raw, {}, lambda row, column: file, encodings={next(iter(hashes)): raw.encoding})
         _check_names(raw.names, kind, lambda name, *text: table.error(None, name, *text))
     except InputError as error:
-        if error.line != 1:
+        own, remedy = (
+            _own_map(file, kind),
+            f"{error.remedy}; or add {_proposal(file, kind, Layout())} to the experiment",
+        )
+        if isinstance(error, MissingCellsError) and own:
+            missing = json.dumps(error.texts, ensure_ascii=False)
+            remedy = (
+                f"add two lines to the experiment, which drop all rows without a reading: {own} and missing = {missing}"
+            )
+        elif error.line != 1 or _A_TRIAL in error.remedy:
             raise
-        remedy = f"{error.remedy}; or add {_proposal(file, kind, Layout())} to the experiment"
+        elif own:
+            remedy = f"add to the experiment {own}: other columns are then not read"
         raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
     return table
+
+
+def _own_map(file: Path, kind: KindRule) -> str:
+    """The column map of the headers that the kind itself has; "" where they are not those that it needs."""
+    own = [(found[1], found[0], found[2]) for found in HEADER_CELL.finditer(TextFile(file, file).line(0))]
+    own = [(name, *rest) for name, *rest in own if name in kind.columns]
+    names = [name for name, *_ in own]
+    try:
+        _check_names(names, kind, lambda name, *text: InputError(*text))
+    except (InputError, IndexError):
+        return ""
+    texts = [f"{name} = {{ from = {json.dumps(header)}, unit = {json.dumps(unit)} }}" for name, header, unit in own]
+    return f"columns = {{ {', '.join(texts)} }}" if len({*names}) == len(names) else ""
 
 
 def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:
@@ -260,6 +287,12 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
     """
     for name in names:
         if name not in kind.columns:
+            if name == "time":
+                sets = ", or ".join(" and ".join(columns) for columns in kind.sets)
+                remedy = (
+                    f"read {sets} off the record, {_A_TRIAL}, and repeat the trial; plateaus reads steps of one record"
+                )
+                raise error(name, f"{kind.name} must be a table of trials", "a record against time", remedy)
             close = closest(name, kind.columns)
             remedy = f"rename it to {close}" if close else "remove it"
             known = " ".join(kind.columns)
@@ -298,27 +331,35 @@ def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
 def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.ndarray) -> None:
     """Refuse a value of column ``index`` outside its domain, (n,) SI."""
     name = table.raw.names[index]
+    signed = [c for own, c in zip(table.raw.names, table.raw.columns, strict=True) if own != "normal_force"]
+    # Sliding and pulls; a single sign may be a slip of the pen.
+    directed = name in ("speed", "force") and np.sum(values < 0.0) > 1
+    correct = (
+        f"where the sign is the direction, move the rows with {name} < 0 to a file of their own without the minus signs, "
+        'in an experiment of the same kind with direction = "backward"'
+        if directed and all(np.array_equal(np.sign(c), np.sign(values)) for c in signed)
+        else "correct the value or delete the row"
+    )
     magnitude = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
     checks: list[tuple[Callable[[np.ndarray], np.ndarray], str, str]] = [
         (
             lambda part: np.isfinite(part) & rule.domain.holds(part),
             f"{name} must {rule.domain.text}",
-            "correct the value or delete the row",
+            correct,
         ),
         (is_plausible, magnitude, "correct the value or the unit of the column"),
     ]
     for holds, text, remedy in checks:
         _raise_at_first_false(table, index, holds(values), (text, remedy), 0)
     if rule.increasing:
-        text, remedy = f"{name} must increase from row to row", "sort the rows and delete repeated ones"
-        if len(anew := clock_starts(values)):
-            lines = " ".join(str(table.raw.rows[row]) for row in anew[:5])
-            remedy = f"the clock starts anew at {counted(len(anew), 'row')} (line {lines}): write a file of each record"
         rises = np.diff(values) > 0.0
         fall = int(np.argmin(rises)) if len(rises) else 0
-        if len(rises) and table.file_of(fall + 1, index) != table.file_of(fall, index):
-            remedy = "name the files in the order of time, or make an experiment of each"
-        _raise_at_first_false(table, index, rises, (text, remedy), 1)
+        if rises.all():
+            return
+        remedy = "name the files in the order of time, or make an experiment of each"
+        if table.file_of(fall + 1, index) == table.file_of(fall, index):
+            remedy = remedy_of_order(table.raw, index)
+        _raise_at_first_false(table, index, rises, (f"{name} must increase from row to row", remedy), 1)
 
 
 def _raise_at_first_false(table: TableFile, index: int, good: np.ndarray, message: tuple[str, str], first: int) -> None:

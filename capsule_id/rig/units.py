@@ -6,7 +6,7 @@ A pattern admits only products of known symbols: pint alone reads ``m,s`` as ms 
 """
 
 import re
-from difflib import get_close_matches
+from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -29,6 +29,7 @@ _DEFINITIONS = {
     "cm": "1e-2 * m",
     "km": "1e3 * m",
     "in": "0.0254 * m",
+    "ns": "1e-9 * s",
     "us": "1e-6 * s",
     "ms": "1e-3 * s",
     "min": "60 * s",
@@ -57,6 +58,16 @@ _DEFINITIONS = {
 }
 # Other ways to write the same symbol.
 _SPELLINGS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "⋅": "·", "%": "percent"})
+# Other names of symbols, in lower case; an s at their end is left out.
+_NAMES = {
+    "sec": "s", "second": "s", "msec": "ms", "millisecond": "ms", "usec": "us", "microsecond": "us", "nsec": "ns",
+    "nanosecond": "ns", "minute": "min", "meter": "m", "metre": "m", "millimeter": "mm", "millimetre": "mm",
+    "micron": "um", "micrometer": "um", "micrometre": "um", "centimeter": "cm", "centimetre": "cm", "inch": "in",
+    "inche": "in", "gram": "g", "gramme": "g", "kilogram": "kg", "kilo": "kg", "pound": "lb", "lb": "lb",
+    "newton": "N", "amp": "A", "ampere": "A", "degree": "deg", "deg": "deg", "radian": "rad", "rad": "rad",
+    "hertz": "Hz", "volt": "V", "millivolt": "mV",
+}  # fmt: skip
+_SYMBOL = re.compile("g_n|[A-Za-z]+")
 _FACTOR = r"(?:(?:g_n|[A-Za-z]+)(?:\^-?[1-4]|⁻?[¹²³⁴])?|1)"
 _GRAMMAR = re.compile(rf"{_FACTOR}(?:(?: ?[*/·] ?| ){_FACTOR})*")
 _LONGEST = 40  # characters of a unit
@@ -119,13 +130,16 @@ def factor_to_si(unit: str, si: str) -> float:
     written = unit.strip().translate(_SPELLINGS)
     if len(written) > _LONGEST or not _GRAMMAR.fullmatch(written):
         raise UnitError("a unit is a product of symbols, e.g. kN/m, N*s/m or m/s^2 (1: no unit)", remedy)
-    for symbol in re.findall(r"g_n|[A-Za-z]+", written):
+    for symbol in _SYMBOL.findall(written):
         if symbol not in _DEFINITIONS:
-            if symbol in _SIGNALS and si != "1":
+            if _known(symbol) in _SIGNALS and si != "1":
                 remedy += f" and the factor to it: columns = {{ ... = {{ from = 1, unit = ..., scale = ... }} }}, per {symbol}"
                 raise UnitError(f"a reading in {symbol} needs the sensitivity of its sensor", remedy)
-            close = get_close_matches(symbol, _DEFINITIONS, n=1)
-            raise UnitError(f"unknown unit symbol {symbol}", f"{remedy}; did you mean {close[0]}?" if close else remedy)
+            meant = _SYMBOL.sub(lambda found: _known(found[0]), written)
+            with suppress(UnitError):  # a proposal has the dimension wanted
+                if meant != written and factor_to_si(meant, si):
+                    remedy = f"write {meant}"
+            raise UnitError(f"unknown unit symbol {symbol}", remedy)
     (factor, base), (_, wanted) = (_registry().get_base_units(each) for each in (written, si))
     if base != wanted:
         if written == "g" and si == "m/s^2":
@@ -134,6 +148,13 @@ def factor_to_si(unit: str, si: str) -> float:
             f"unit must have the dimension of {si}" if si != "1" else "unit must be 1 (a pure number)", remedy
         )
     return float(factor)  # pyright: ignore[reportArgumentType]  (pint types every number as Number)
+
+
+def _known(symbol: str) -> str:
+    """The symbol that another name, or the other case, means; ``symbol`` itself where it is none. M is the mega of MN."""
+    name = _NAMES.get(symbol.lower().removesuffix("s"), symbol)
+    same = [each for each in _DEFINITIONS if each.lower() == symbol.lower() and symbol[1:] and symbol[0] != "M"]
+    return symbol if symbol in _DEFINITIONS else same[0] if name == symbol and len(same) == 1 else name
 
 
 def scale(values: Values, factor: float) -> Values:

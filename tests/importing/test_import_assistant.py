@@ -293,7 +293,7 @@ def test_decays_with_a_clock_of_their_own_each_are_decays_and_are_not_sorted(
         capsule_id.read_rig(tmp_path)
     # Negative control: a row out of order is no new clock.
     (tmp_path / "run.csv").write_text(
-        "\n".join(["Time/s,Displacement/mm", *rows[:300], rows[200], ""]), encoding="utf-8"
+        "\n".join(["Time/s,Displacement/mm", *rows[:200], *rows[201:300], rows[200], ""]), encoding="utf-8"
     )
     with pytest.raises(capsule_id.InputError, match="sort the rows"):
         capsule_id.read_rig(tmp_path)

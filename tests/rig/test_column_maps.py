@@ -89,7 +89,7 @@ def test_files_in_another_order_than_time_are_named(tmp_path: Path) -> None:
     assert_read(rig_of(tmp_path, {}, f'files = ["a.csv", "b.csv"]\n{MAP}'))
     # Within one file the rows are at fault.
     fault = fault_of(tmp_path, {"c.csv": "".join([*text, text[3]])}, f'file = "c.csv"\n{MAP}')
-    assert fault.remedy == "sort the rows and delete repeated ones"
+    assert fault.remedy == "delete the repeated rows: line 14"
 
 
 def test_a_reading_in_volts_needs_a_scale(tmp_path: Path) -> None:

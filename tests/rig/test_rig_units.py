@@ -17,6 +17,7 @@ BY_HAND = {
     "s": ("s", 1.0),
     "ms": ("s", 0.001),
     "us": ("s", 0.000001),
+    "ns": ("s", 0.000000001),
     "min": ("s", 60.0),
     "kg": ("kg", 1.0),
     "g": ("kg", 0.001),
@@ -88,7 +89,6 @@ def test_products_and_spellings(unit: str, si: str, factor: float) -> None:
         ("deg", "m", "dimension of m"),
         ("kg", "N", "dimension of N"),
         ("mms", "m", "unknown unit symbol mms"),  # a plural of mm to pint
-        ("newtons", "N", "unknown unit symbol newtons"),
         ("MM", "m", "unknown unit symbol MM"),
         ("", "m", "a unit is a product"),
         ("3", "1", "a unit is a product"),
@@ -104,6 +104,34 @@ def test_refused(unit: str, si: str, rule: str) -> None:
         factor_to_si(unit, si)
     assert rule in caught.value.rule
     assert caught.value.remedy.startswith("write a unit such as")
+
+
+@pytest.mark.parametrize(
+    ("unit", "si", "remedy"),
+    [
+        ("sec", "s", "write s"),  # before: "write a unit such as ms"
+        ("msec", "s", "write ms"),
+        ("inch", "m", "write in"),
+        ("grams", "kg", "write g"),
+        ("newtons", "N", "write N"),
+        ("Newton/millimeter", "N/m", "write N/mm"),
+        ("hz", "Hz", "write Hz"),
+        ("KG", "kg", "write kg"),
+        # Negative controls: no proposal of another dimension, nor across the prefixes m and M.
+        ("sec", "m", "write a unit such as mm"),
+        ("MN", "N", "write a unit such as N"),
+        ("stone", "kg", "write a unit such as g"),
+    ],
+)
+def test_another_name_of_a_unit_is_proposed_where_its_dimension_fits(unit: str, si: str, remedy: str) -> None:
+    with pytest.raises(UnitError, match="unknown unit symbol") as caught:
+        factor_to_si(unit, si)
+    assert caught.value.remedy == remedy
+
+
+def test_a_voltage_by_its_name_needs_a_sensitivity() -> None:
+    with pytest.raises(UnitError, match="a reading in Volt needs the sensitivity"):
+        factor_to_si("Volt", "m")
 
 
 def test_the_same_length_in_two_units_is_the_same_float() -> None:

@@ -110,7 +110,7 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
             continue
         cells = _split(line, delimiter_of(line, layout))
         if begun is None and any(is_number(cell) for cell in cells):
-            begun = i
+            begun, cells = i, _mapped(cells, lines, layout)
         if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
             if i == begun:
                 return lines
@@ -128,6 +128,15 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
     remedy = f"state data_from_line = {begun + 1}, or the line of the first reading"
     rule = "data_from_line must be stated where no row has numbers only"
     raise InputError(rule, shown_cell(lines[begun].strip()), remedy, file.path, begun + 1, 1)
+
+
+def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
+    """The cells of the first row with a number, the last of ``lines``, that are read as numbers; all without a map."""
+    *above, row = lines
+    found = (_headers(line, delimiter_of(row, layout), len(cells), layout) for line in above)
+    headers = tuple(names for names in found if names)
+    wanted = [k for k in range(len(cells)) if is_wanted(k, headers, layout.columns or ())]
+    return [cells[k] for k in wanted if not is_wanted(k, headers, layout.words)] or cells
 
 
 def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:

@@ -18,7 +18,17 @@ from capsule_id.rig.formats.text.cells import BLANKS, cells_of, read_number, sho
 from capsule_id.rig.formats.text.rows import Shape, plain_block
 from capsule_id.views import counted
 
-_HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
+#: What exports write where there is no reading, in small letters, without signs.
+_NO_READING = ("", "nan", "inf", "infinity", "na", "n/a", "#n/a", "null", "none")
+HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
+
+
+class MissingCellsError(InputError):
+    """Cells without a reading: the error of the first one, with the ``texts`` of all."""
+
+    def __init__(self, first: InputError, texts: tuple[str, ...]) -> None:
+        super().__init__(first.rule, first.value, first.remedy, first.file, first.line, first.column)
+        self.texts = texts
 
 
 def read_csv(content: Content, path: Path) -> RawTable:
@@ -90,7 +100,7 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
         bare = cell[1:-1].strip() if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell
         if not bare:
             raise InputError("every column must have a header", "an empty cell", remedy, path, 1, column)
-        found = _HEADER_CELL.fullmatch(bare)
+        found = HEADER_CELL.fullmatch(bare)
         if found is None or not found[2].strip():
             raise InputError("the first line must be headers `name [unit]`", shown_cell(bare), remedy, path, 1, column)
         if found[1] in units:
@@ -102,8 +112,9 @@ def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tup
 
 
 def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
-    """The columns, read cell by cell; raises at the first fault."""
+    """The columns, read cell by cell; raises at the first fault, and at missing readings where there is no other."""
     path, columns, blank = file.path, shape.width, None
+    missing: dict[str, InputError] = {}
     assert shape.delimiter is not None, "a table has a separator"
     values: list[array[float]] = [array("d") for _ in range(columns)]
     for line, text in enumerate(file.lines(shape.first), shape.first + 1):
@@ -125,7 +136,14 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
             rule = f"a row must have {counted(columns, 'cell')}"
             raise InputError(rule, counted(len(cells), "cell"), remedy, path, line, place)
         for (cell, column), numbers in zip(cells, values, strict=True):
-            numbers.append(read_number(cell, shape.decimal or ".", path, line, column))
+            try:
+                numbers.append(read_number(cell, shape.decimal or ".", path, line, column))
+            except InputError as error:
+                if cell.lower().strip("+-") not in _NO_READING:
+                    raise
+                missing.setdefault(cell, error)
+    if missing:
+        raise MissingCellsError(next(iter(missing.values())), tuple(missing))
     if not values[0]:
         raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
     return tuple(np.array(numbers) for numbers in values)
