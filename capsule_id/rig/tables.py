@@ -14,13 +14,14 @@ from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
 from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.export import Layout
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.maps.clock import on_reference, read_clock
+from capsule_id.rig.maps.columns import proposal
 from capsule_id.rig.maps.declared import ColumnMap, read_map
+from capsule_id.rig.maps.layout import find_layout
 from capsule_id.rig.maps.mapped import apply_map
 from capsule_id.rig.maps.plateaus import Plateaus, read_plateaus, readings_of_plateaus
-from capsule_id.rig.maps.proposal import proposal
 from capsule_id.rig.maps.rejection import Rejection, outlying_rows, read_rejection
 from capsule_id.rig.model import NO_DRIFT, Column, Quantity
 from capsule_id.rig.schema import ColumnRule, KindRule
@@ -199,10 +200,12 @@ def _read_plain(
 
 def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:
     """The column map that reads a file as ``kind``."""
-    export: Export | None = None
+    found, first = None, ""
     with suppress(InputError):
-        export = EXPORTS[suffix_of(file)](file, file, layout)
-    return proposal(kind, export)
+        found = find_layout(file.read_bytes(), file, sorted({rule.si for rule in kind.columns.values()}))
+        if found.layout.data_from_line != layout.data_from_line is None:
+            first = f"data_from_line = {found.layout.data_from_line} and "
+    return first + proposal(kind, found)
 
 
 def _times(table: TableFile) -> np.ndarray:
