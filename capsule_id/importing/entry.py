@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,15 @@ from capsule_id.importing.guess import Guess, are_turning_points, disordered_tim
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
 from capsule_id.rig.formats.text.blocks import TextFile
-from capsule_id.rig.maps.columns import TIME, source_of
+from capsule_id.rig.maps.columns import TIME, is_constant, source_of
 from capsule_id.rig.maps.headers import fits_name, name_and_unit, unit_of
 from capsule_id.rig.maps.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.schema import QuantityRule
 from capsule_id.rig.units import UNKNOWN, factor_to_si, scale
 from capsule_id.views import counted
 
+#: Columns of a tilt, which is its own slope.
+TILT = {"angle", "height"}
 _SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
 
 
@@ -162,6 +165,8 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
     for key in kind.required:
         stem = "".join(mark if mark.isalnum() or mark in "._-" else "_" for mark in Path(file).name.split(".")[0])
         yield _commented(f'{key} = "{stem}"', "unsure", "from the name of the file")
+    constant = _constant_settings(found, guessed, kind)
+    yield from constant.values()
     channel = next((name for name in guessed.columns if name != TIME), None)
     if TIME not in kind.columns or channel is None:
         return
@@ -179,7 +184,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")
         if stop is not None:
             yield _commented(f'stop = {{ value = {stop:.6g}, unit = "s" }}', "likely", "another excitation begins here")
-    if "f" in kind.setting_rules:
+    if "f" in kind.setting_rules and "f" not in constant:
         even = np.linspace(time[0], time[-1], len(time))
         try:
             frequency = dominant_frequency(even, np.interp(even, time, values))
@@ -187,6 +192,24 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
             return
         reason = f"the strongest frequency of {channel}; state the set value"
         yield _commented(f'f = {{ value = {frequency:.4g}, unit = "Hz" }}', "unsure", reason)
+
+
+def _constant_settings(found: FoundLayout, guessed: Guess, kind: Kind) -> dict[str, str]:
+    """A line for each setting that a column outside the map holds, the same in every row."""
+    lines, free = dict[str, str](), set(found.columns) - {column.index for column in guessed.columns.values()}
+    for (key, rule), index in product(kind.setting_rules.items(), sorted(free)):
+        if (
+            isinstance(rule, QuantityRule)
+            and is_constant(found, index)
+            and not (key == "slope" and TILT & set(guessed.columns))
+        ):
+            name, text = name_and_unit(found.names[index], [rule.si])
+            unit = unit_of(text or found.units[index], [rule.si])
+            if unit is not None and fits_name(name, key) > 0:
+                line = f'{key} = {{ value = {np.nanmax(found.columns[index]):.10g}, unit = "{unit}" }}'
+                reason = f"{found.names[index]!r} is the same in every row" + "; + uphill" * (key == "slope")
+                lines[key] = _commented(line, "unsure", reason)
+    return lines
 
 
 def times_of_guess(found: FoundLayout, guessed: Guess) -> np.ndarray:
