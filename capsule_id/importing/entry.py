@@ -177,7 +177,7 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)
         return
-    if TIME in guessed.columns and guessed.columns[TIME].unit == UNKNOWN:
+    if guessed.columns[TIME].unit == UNKNOWN if TIME in guessed.columns else guessed.rate is None:
         return
     if isinstance(kind.setting_rules.get("start"), QuantityRule) and (part := free_part(time, values)) is not None:
         start, stop = part

@@ -87,6 +87,9 @@ def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
         used = {column.index for column in chosen.columns.values()}
         if TIME not in chosen.kind.columns and any(_is_record(found, i) for i in times_of(found) if i not in used):
             return _guess(found, chosen, "unsure", f"the file is a record in time, {names[0]} a table of trials")
+        if any(not used >= {column.index for column in one.columns.values()} for one in leading):
+            sets = " and ".join(" with ".join(one.columns) for one in leading)
+            return _guess(found, chosen, "unsure", f"the columns fit {sets}")
         return _guess(found, chosen, "sure", "the columns fit no other kind as well")
     by_motion = _by_motion(found, leading)
     if by_motion is not None:

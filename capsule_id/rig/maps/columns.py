@@ -68,7 +68,8 @@ class Assignment:
 def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
     """The best assignment of file columns to each set of columns of a kind."""
     for columns in kind.sets:
-        wanted = [*columns, *kind.channels, *kind.optional]
+        optional = [name for name in kind.optional if name != "normal_force" or "force" in columns]
+        wanted = [*columns, *kind.channels, *optional]
         scores = np.full((len(wanted), len(found.columns)), _NO_NAME)
         ranges = np.zeros_like(scores)
         guesses = {}
@@ -91,6 +92,16 @@ def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
             )
             for i, j in pairs
         }
+        for i, k in ((i, k) for i in range(-len(optional), 0) for k in unused):
+            other = guesses.get((i % len(wanted), k))
+            if (
+                other is not None
+                and wanted[i] not in chosen
+                and not meaning(found.names[other.index], "force", kind.name)
+            ):
+                # A normal force under another name would change the number.
+                reason = f"{other.reason}; remove the # if it is the {wanted[i]}"
+                chosen[wanted[i]] = replace(other, confidence="unsure", reason=reason, asked=True)
         missing = tuple(name for name in columns if name not in chosen and name != TIME)
         if kind.channels and not set(kind.channels) & set(chosen):
             missing = (*missing, kind.channels[0])
@@ -100,7 +111,7 @@ def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
 
 def _lead(score: float, chosen: float) -> float:
     """By how much a column fits better than the chosen one; one of another name as well as the end of a word."""
-    return 0.0 if score == _NO_NAME and chosen < 2.0 + UNIT_SCORE else score - chosen
+    return 0.0 if score == _NO_NAME and chosen <= 1.0 + UNIT_SCORE else score - chosen
 
 
 def _si(found: FoundLayout, column: ColumnGuess, si: str, *, finite: bool = False) -> np.ndarray:
@@ -146,7 +157,7 @@ def _with_rivals(
         else f"column {other.index + 1}"
         for other, _ in rivals
     )
-    alike = tuple(other for other, lead in rivals if lead >= 0.0)
+    alike = tuple(other for other, lead in rivals if lead + UNIT_SCORE * (other.unit == UNKNOWN) >= 0.0)
     if alike:
         reason = f"{column.reason}; {named} fits as well"
         return replace(column, confidence="unsure", reason=reason, rivals=alike, asked=True)
@@ -162,12 +173,13 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     unit = unit_of(text, [rule.si]) if text else None
     constant = is_constant(found, index)
     named, meant = fits_name(stem, name), meaning(stem, name, kind.name)
-    if (text and unit is None) or min(named, meant) < 0 or (constant and rule.varies):
+    said = f"the file says {found.names[index]!r}"
+    if (text and unit is None) or named < 0 or (constant and rule.varies):
         return None
     by_name = named + MEANT_SCORE * meant if named or name == "force" else 0.0
-    said = f"the file says {found.names[index]!r}"
-    if by_name == 0:
-        return None if unit is None or constant else (_NO_NAME, ColumnGuess(index, unit, "unsure", said))
+    if by_name <= 0.0 or meant < 0:
+        other = constant or not (unit or named) or rule.si == "1"
+        return None if other else (_NO_NAME, ColumnGuess(index, unit or UNKNOWN, "unsure", said))
     if constant and name not in (*SETTINGS, *kind.optional):
         reason = f"{said}, the same in every row: a setting, or a coarse reading"
         return by_name + CONSTANT, ColumnGuess(index, unit or UNKNOWN, "unsure", reason, asked=True)
@@ -202,6 +214,8 @@ def proposal(kind: KindRule, found: FoundLayout | None) -> str:
     texts, words = [], []
     for name in dict.fromkeys((*best.wanted, *best.columns, *best.missing)):
         column = best.columns.get(name)
+        if column is not None and column.asked and name in kind.optional:
+            continue
         if column is None and name == TIME and found is not None:
             texts.append(f'{name} = {{ rate = {{ value = "{UNKNOWN}", unit = "Hz" }} }}')
             words.append("no column holds times: state the sampling rate")

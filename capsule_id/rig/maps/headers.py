@@ -3,75 +3,76 @@
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 from capsule_id.rig.units import UnitError, factor_to_si
 
 _WORDS = {
-    "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock value",
-    "x_rel": (
-        "relative displacement disp deflection position pos x s weg laser distance abstand "
-        "auslenkung ausschlag verschiebung elongation desplazamiento deplacement spostamento "
-        "posicion posizione elongacion elongazione distancia distanza amplitude amplitudes "
-        "peak"
-    ),
+    "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock value duree instant istante "
+    "instante zeitstempel",
+    "x_rel": "relative displacement disp deflection position pos x s weg laser distance abstand auslenkung "
+    "ausschlag verschiebung elongation desplazamiento deplacement spostamento posicion posizione "
+    "elongacion elongazione distancia distanza amplitude amplitudes peak",
     "x_capsule": "capsule kapsel housing capsula gehause boitier carcasa",
     "x_base": "base shaker basis tisch",
-    "acceleration": ("acceleration acc accel accelerometer beschleunigung aceleracion accelerazione a"),
-    "velocity": "velocity speed v geschwindigkeit vitesse velocidad velocita",
-    "current": ("current strom stromstarke i courant corriente corrente intensite intensidad amps coil"),
-    "force": (
-        "force kraft f load friction weight pull fs fk fr fmax fstat fkin reibung fuerza "
-        "forza frottement friccion rozamiento attrito traction traccion trazione last charge "
-        "carga carico"
-    ),
-    "normal_force": ("normal normalkraft normale fn load weight last auflast gewicht charge poids carga peso carico"),
-    "angle": (
-        "angle tilt winkel inclination incline slope neigung steigung theta alpha angulo "
-        "angolo inclinaison inclinacion inclinazione pente pendiente pendenza"
-    ),
-    "height": "height hoehe hohe h hauteur altura altezza",
+    "acceleration": "acceleration acc accel accelerometer beschleunigung aceleracion accelerazione a beschl",
+    "velocity": "velocity speed v geschwindigkeit vitesse velocidad velocita vel geschw",
+    "current": "current strom stromstarke i courant corriente corrente intensite intensidad amps coil",
+    "force": "force kraft f load friction weight pull fs fk fr fmax fstat fkin reibung fuerza forza "
+    "frottement friccion rozamiento attrito traction traccion trazione last charge carga carico "
+    "thrust tension effort empuje spinta schub",
+    "normal_force": "normal normalkraft normale fn load weight last auflast gewicht charge poids carga peso "
+    "carico anpresskraft",
+    "angle": "angle tilt winkel inclination incline slope neigung steigung theta alpha angulo angolo "
+    "inclinaison inclinacion inclinazione pente pendiente pendenza ang phi θ α φ",
+    "height": "height hoehe hohe h hauteur altura altezza rise elevation",
     "length": "length laenge lange l board longueur longitud lunghezza brett planche tabla tavola",
-    "speed": "speed velocity v v0 geschwindigkeit vitesse velocidad velocita",
-    "distance": (
-        "distance dist travel slide strecke weg x d s displacement disp distanz distancia "
-        "distanza recorrido percorso parcours deplacement desplazamiento spostamento"
-    ),
-    "deflection": (
-        "deflection displacement disp compression extension verformung weg x d s "
-        "federweg auslenkung deplacement fleche allongement desplazamiento deflexion "
-        "alargamiento spostamento deflessione allungamento"
-    ),
-    "coefficient": ("coefficient mu μ cof reibwert reibzahl reibungszahl koeffizient coeficiente coefficiente"),
+    "speed": "speed velocity v v0 geschwindigkeit vitesse velocidad velocita vel geschw",
+    "distance": "distance dist travel slide strecke weg x d s displacement disp distanz distancia distanza "
+    "recorrido percorso parcours deplacement desplazamiento spostamento path spazio espacio",
+    "deflection": "deflection displacement disp compression extension verformung weg x d s federweg auslenkung "
+    "deplacement fleche allongement desplazamiento deflexion alargamiento spostamento deflessione "
+    "allungamento dehnung stauchung einfederung elongation enfoncement compresion compressione "
+    "deformation deformazione deformacion flexion dx δx",
+    "coefficient": "coefficient mu μ cof reibwert reibzahl reibungszahl koeffizient coeficiente coefficiente "
+    "friction frottement rozamiento friccion attrito beiwert reibbeiwert",
     "period": "period t periode periodendauer periodo",
     "f": "frequency freq frequenz frequence frecuencia frequenza",
-    "duty": "duty tau tastgrad",
-    "periods": "periods n cycles perioden periodes periodos periodi zyklen ciclos cicli",
+    "duty": "duty tau tastgrad tastverhaltnis",
+    "periods": "periods n cycles perioden periodes periodos periodi zyklen ciclos cicli pulses impulse "
+    "impulses pulsos impulsi",
     "session": "session day",
-    "uncertainty": "sd std stdev sigma err error unc uncertainty fehler abweichung unsicherheit ecart incertitude "
-    "desviacion incertidumbre errore deviazione incertezza",
-    "break-away": "fs fmax fstat max peak static statique statisch estatic maximum break_away breakaway haftre haftkr "
-    "losbrech losreiss limit adheren arranque distacco demarrage",
-    "sliding": "fk fkin sliding kinetic gleit glissement cinetique cinetic dynamic dynamique dinamic deslizamiento "
-    "scorrimento",
-    "reading": "reading counts adc raw cell messwert ablesung lecture lectura lettura",
-}
+    "uncertainty": "sd std stdev sigma err error unc uncertainty fehler abweichung unsicherheit ecart "
+    "incertitude desviacion incertidumbre errore deviazione incertezza",
+    "break-away": "fs fmax fstat max peak static statique statisch estatic maxim massim break_away breakaway "
+    "haftre haftkr losbrech losreiss limit adheren arranque distacco demarrage",
+    "no pull": "fn normal coefficient koeffizient coeficiente beiwert",
+    "sliding": "fk fkin sliding kinetic gleit glissement cinetique cinetic dynamic dynamique dinamic "
+    "deslizamiento scorrimento",
+    "reading": "reading counts adc raw cell messwert ablesung lecture lectura lettura signal output anzeige "
+    "digits",
+}  # fmt: skip
 #: Words for a column of a kind, without accents, by its name; a column is always known by its own name too. Words for
 #: the uncertainty of any, and parts of the names of frictions.
 WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in _WORDS.items()}
 #: Names of the same quantity.
 SAME = {"acceleration_rod": "acceleration", "slope": "angle"}
 #: Kind of trials -> what it takes of the friction at break-away and while sliding, and what it does not.
-MEANT = {"static_friction": ("break-away", "sliding"), "sliding_friction": ("sliding", "break-away")}
-#: Fewest letters of a word that can end a compound.
-SHORTEST_HEAD = 5
-#: Units of headers that state none: names that programs give to their columns.
-UNITS_OF_NAMES: Mapping[str, str] = {"X_Value": "s"}
+MEANT = {
+    "static_friction": ("break-away", "sliding", "no pull"),
+    "sliding_friction": ("sliding", "break-away", "no pull"),
+}
+#: Fewest letters of a word that can end a compound, and shorter words that can.
+SHORTEST_HEAD, SHORT_HEADS = 5, ("weg", "zeit")
+#: Units of headers that state none: names that programs give to their columns, and a normal force, or one in N.
+UNITS_OF_NAMES: Mapping[str, str | None] = {"X_Value": "s", "F_N": None}
 #: Other ways to write a unit.
 SPELLINGS: Mapping[str, str] = {
     "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s", "sekunden": "s", "msec": "ms", "usec": "us",
     "millimeter": "mm", "millimetre": "mm", "meter": "m", "metre": "m", "m/s2": "m/s^2", "m/s**2": "m/s^2",
     "newton": "N", "amp": "A", "amps": "A", "ampere": "A", "degree": "deg", "degrees": "deg", "grad": "deg",
-    "counts": "1", "count": "1", "-": "1",
+    "seconde": "s", "secondes": "s", "segundos": "s", "secondi": "s", "meters": "m", "metres": "m", "metros": "m",
+    "metri": "m", "newtons": "N", "grados": "deg", "gradi": "deg", "degrés": "deg", "counts": "1", "count": "1", "-": "1",
 }  # fmt: skip
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*")
 _INSIDE = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*(\S.*)")
@@ -137,9 +138,9 @@ def fits_name(name: str, column: str) -> float:
     if bare == column.lower():
         return 3
     known = WORDS.get(SAME.get(column, column), ())
-    if any(word in words for word in known):
-        return 2.5 if set(words) <= set(known) else 2
-    heads = tuple(word for word in known if len(word) >= SHORTEST_HEAD)
+    if any(word in (*words, *map("".join, pairwise(words))) for word in known):  # F_N is FN
+        return 2.5 if set(words) <= set(known) or "".join(words) in known else 2
+    heads = tuple(word for word in known if len(word) >= SHORTEST_HEAD or word in SHORT_HEADS)
     return 1 if any(word.endswith(heads) for word in words) else 0
 
 
@@ -148,11 +149,12 @@ def meaning(name: str, column: str, kind: str) -> int:
     if column == "normal_force":
         return 0
     bare = _bare(name)
+    words = (*bare.split("_"), *map("".join, pairwise(bare.split("_"))))
     told = [
-        any(part in (bare if len(part) >= SHORTEST_HEAD else bare.split("_")) for part in WORDS[which])
-        for which in MEANT.get(kind, ())
+        any(part in (bare if len(part) >= SHORTEST_HEAD else words) for part in WORDS[which])
+        for which in MEANT.get(kind, ())[: 3 if column == "force" else 2]
     ]
-    return told[0] - told[1] if told else 0
+    return told[0] - any(told[1:]) if told else 0
 
 
 def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
