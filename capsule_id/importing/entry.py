@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +12,20 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
 from capsule_id.experiments.registry import default_registry
-from capsule_id.importing.guess import TIME, ColumnGuess, Guess, are_turning_points, disordered_times, free_part, guess
-from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
-from capsule_id.importing.layout import FoundLayout, find_layout, used_layout
+from capsule_id.importing.guess import Guess, are_turning_points, disordered_times, free_part, guess
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
 from capsule_id.rig.formats.text.blocks import TextFile
+from capsule_id.rig.maps.columns import TIME, is_constant, source_of
+from capsule_id.rig.maps.headers import fits_name, name_and_unit, unit_of
+from capsule_id.rig.maps.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.schema import QuantityRule
-from capsule_id.rig.units import factor_to_si, scale
+from capsule_id.rig.units import UNKNOWN, factor_to_si, scale
 from capsule_id.views import counted
 
+#: Columns of a tilt, which is its own slope.
+TILT = {"angle", "height"}
 _SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
-_LONGEST_HEADER = 40  # characters; a column with a longer header is named by its number
 
 
 def dimensions_of(kinds: Mapping[str, Kind]) -> tuple[str, ...]:
@@ -114,10 +117,10 @@ def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str
     for index, error in found.unread.items():
         name, text = name_and_unit(found.names[index], dimensions)
         text = text or found.units[index]
-        if not fits_name(name, TIME) and (not text or unit_of(text, dimensions) is None):
+        if fits_name(name, TIME) <= 0 and (not text or unit_of(text, dimensions) is None):
             continue
         remedy = "Correct the cell or delete the row, or list its text in missing."
-        if ":" in error.value and fits_name(name, TIME):
+        if ":" in error.value and fits_name(name, TIME) > 0:
             remedy = "Export times as seconds, or state the sampling rate."
         yield f"#: {found.names[index]!r} is not read: line {error.line} has {' '.join(error.value.split())}. {remedy}"
 
@@ -162,22 +165,26 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
     for key in kind.required:
         stem = "".join(mark if mark.isalnum() or mark in "._-" else "_" for mark in Path(file).name.split(".")[0])
         yield _commented(f'{key} = "{stem}"', "unsure", "from the name of the file")
+    constant = _constant_settings(found, guessed, kind)
+    yield from constant.values()
     channel = next((name for name in guessed.columns if name != TIME), None)
     if TIME not in kind.columns or channel is None:
         return
-    time, values = _times(found, guessed), found.columns[guessed.columns[channel].index]
+    time, values = times_of_guess(found, guessed), found.columns[guessed.columns[channel].index]
     here = np.isfinite(values) & np.isfinite(time)
     time, values = time[here], values[here]
     if "samples" in kind.setting_rules and are_turning_points(values):
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)
         return
+    if guessed.columns[TIME].unit == UNKNOWN if TIME in guessed.columns else guessed.rate is None:
+        return
     if isinstance(kind.setting_rules.get("start"), QuantityRule) and (part := free_part(time, values)) is not None:
         start, stop = part
         yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")
         if stop is not None:
             yield _commented(f'stop = {{ value = {stop:.6g}, unit = "s" }}', "likely", "another excitation begins here")
-    if "f" in kind.setting_rules:
+    if "f" in kind.setting_rules and "f" not in constant:
         even = np.linspace(time[0], time[-1], len(time))
         try:
             frequency = dominant_frequency(even, np.interp(even, time, values))
@@ -187,30 +194,45 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         yield _commented(f'f = {{ value = {frequency:.4g}, unit = "Hz" }}', "unsure", reason)
 
 
-def _times(found: FoundLayout, guessed: Guess) -> np.ndarray:
-    """The times of a record, (n,) s; sample numbers where neither times nor a rate are known."""
+def _constant_settings(found: FoundLayout, guessed: Guess, kind: Kind) -> dict[str, str]:
+    """A line for each setting that a column outside the map holds, the same in every row."""
+    lines, free = dict[str, str](), set(found.columns) - {column.index for column in guessed.columns.values()}
+    for (key, rule), index in product(kind.setting_rules.items(), sorted(free)):
+        if (
+            isinstance(rule, QuantityRule)
+            and is_constant(found, index)
+            and not (key == "slope" and TILT & set(guessed.columns))
+        ):
+            name, text = name_and_unit(found.names[index], [rule.si])
+            unit = unit_of(text or found.units[index], [rule.si])
+            if unit is not None and fits_name(name, key) > 0:
+                line = f'{key} = {{ value = {np.nanmax(found.columns[index]):.10g}, unit = "{unit}" }}'
+                reason = f"{found.names[index]!r} is the same in every row" + "; + uphill" * (key == "slope")
+                lines[key] = _commented(line, "unsure", reason)
+    return lines
+
+
+def times_of_guess(found: FoundLayout, guessed: Guess) -> np.ndarray:
+    """The times of a record, (n,) s, or in the unit of the file; sample numbers where times and rate are unknown."""
     if TIME in guessed.columns:
         column = guessed.columns[TIME]
-        return scale(found.columns[column.index], factor_to_si(column.unit, "s"))
+        factor = 1.0 if column.unit == UNKNOWN else factor_to_si(column.unit, "s")
+        return scale(found.columns[column.index], factor)
     return np.arange(len(next(iter(found.columns.values())))) / (guessed.rate or 1.0)
 
 
 def _column_lines(found: FoundLayout, guessed: Guess) -> Iterable[str]:
-    """A line for each column of the map."""
+    """A line for each column of the map; as comments, one for each column of the file, where the user must choose."""
     if TIME not in guessed.columns and guessed.rate is not None:
         line = f'{TIME} = {{ rate = {{ value = {guessed.rate:g}, unit = "Hz" }} }}'
         yield _commented(line, "likely", "the file states this rate and no times")
     elif TIME not in guessed.columns and guessed.confidence == "unsure" and "sampling rate" in guessed.reason:
-        yield _commented(f'{TIME} = {{ rate = {{ value = 1000, unit = "Hz" }} }}', "unsure", "the file states no rate")
+        yield _commented(
+            f'{TIME} = {{ rate = {{ value = "{UNKNOWN}", unit = "Hz" }} }}', "unsure", "the file states no rate"
+        )
     for name, column in guessed.columns.items():
-        factor = "" if column.scale is None else f", scale = {column.scale:.10g}"
-        source = f'{{ from = {_source(found, column)}, unit = "{column.unit}"{factor} }}'
-        yield _commented(f"{name} = {source}", column.confidence, column.reason)
-
-
-def _source(found: FoundLayout, column: ColumnGuess) -> str:
-    """The header of a column, or its number where the header is not unique, long or absent."""
-    header = found.names[column.index]
-    everything = [name for row in found.export.headers for name in row]
-    usable = header and header.isprintable() and len(header) <= _LONGEST_HEADER and everything.count(header) == 1
-    return json.dumps(header, ensure_ascii=False) if usable else str(column.index + 1)
+        for each in (column, *column.rivals):
+            factor = "" if each.scale is None else f", scale = {each.scale:.10g}"
+            source = f'{{ from = {source_of(found, each.index)}, unit = "{each.unit}"{factor} }}'
+            reason = column.reason if each is column else "or this one"
+            yield _commented(f"{'# ' * column.asked}{name} = {source}", column.confidence, reason)

@@ -1,29 +1,30 @@
 """Guesses the kind of experiment of an export, and which of its columns and units are those of the kind."""
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
-from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
-from capsule_id.importing.layout import FoundLayout
 from capsule_id.records.faults.release import find_free_decay
 from capsule_id.rig.filters import clock_starts
-from capsule_id.rig.units import factor_to_si
+from capsule_id.rig.maps.columns import (
+    FEWEST_SAMPLES,
+    TIME,
+    ColumnGuess,
+    Confidence,
+    assignments,
+    increases,
+    score_of,
+    times_of,
+)
+from capsule_id.rig.maps.headers import fits_name, name_and_unit, unit_of
+from capsule_id.rig.maps.layout import FoundLayout
+from capsule_id.rig.units import UNKNOWN, factor_to_si
 
-Confidence = Literal["sure", "likely", "unsure"]
-TIME = "time"
-#: Fewest rows of a record in time.
-FEWEST_SAMPLES = 50
-#: Score of a unit that fits a column, of a column that is left out, and the smallest lead of a kind that is sure.
-UNIT_SCORE, LEFT_OUT, LEAD = 1.0, -0.25, 1.0
-#: Weight of the range of a column, relative to the largest one, which decides between equal scores only.
-TIE = 1e-3
+#: Smallest lead of the score of a kind that is sure.
+LEAD = 1.0
 #: A record whose last fifth has less than this fraction of the amplitude of its largest part decays; above the second
 #: fraction it is driven.
 DECAYS, DRIVEN = 0.5, 0.8
@@ -34,17 +35,6 @@ _PARTS = 5
 ANGULAR = {"m": "rad", "m/s": "rad/s", "m/s^2": "rad/s^2"}
 #: Largest angle of a swing, rad; a larger number is in degrees.
 LARGEST_SWING = 3.2
-
-
-@dataclass(frozen=True)
-class ColumnGuess:
-    """A column of the kind: index in the file, unit, what the guess rests on, and the factor to write beside it."""
-
-    index: int
-    unit: str
-    confidence: Confidence
-    reason: str
-    scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -95,8 +85,11 @@ def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     if len(names) == 1:
         chosen = max(candidates, key=lambda candidate: candidate.score)
         used = {column.index for column in chosen.columns.values()}
-        if TIME not in chosen.kind.columns and any(_is_record(found, i) for i in _times(found) if i not in used):
+        if TIME not in chosen.kind.columns and any(_is_record(found, i) for i in times_of(found) if i not in used):
             return _guess(found, chosen, "unsure", f"the file is a record in time, {names[0]} a table of trials")
+        if any(not used >= {column.index for column in one.columns.values()} for one in leading):
+            sets = " and ".join(" with ".join(one.columns) for one in leading)
+            return _guess(found, chosen, "unsure", f"the columns fit {sets}")
         return _guess(found, chosen, "sure", "the columns fit no other kind as well")
     by_motion = _by_motion(found, leading)
     if by_motion is not None:
@@ -114,88 +107,26 @@ def _guess(found: FoundLayout, candidate: _Candidate, confidence: Confidence, re
 
 
 def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
-    """The assignments of file columns to each set of columns of a kind."""
-    dimensions = sorted({rule.si for rule in kind.columns.values()})
-    for columns in kind.sets:
-        if any(set(columns) < set(larger) for larger in kind.sets):  # it needs a line of [model]
-            continue
-        wanted = [*columns, *kind.channels, *kind.optional]
-        needed = set(columns) - {TIME}
-        scores = np.full((len(wanted), len(found.columns)), -1e3)
-        ranges = np.zeros_like(scores)
-        guesses = {}
-        for (i, name), (j, index) in product(enumerate(wanted), enumerate(found.columns)):
-            scored = _score(found, index, name, kind.columns[name].si, dimensions)
-            values = found.columns[index]
-            span = float(np.nanmax(values) - np.nanmin(values))
-            if scored is not None and (name not in kind.channels or span > 0.0):
-                scores[i, j], guesses[i, j] = scored
-                ranges[i, j] = span * factor_to_si(scored[1].unit, kind.columns[name].si)
-        # Of columns that fit as well, such as the axes of an accelerometer, the one with the largest motion.
-        largest = np.maximum(np.max(ranges, axis=1, keepdims=True), np.finfo(float).tiny)
-        rows, places = linear_sum_assignment(scores + TIE * ranges / largest, maximize=True)
-        pairs = [(i, j) for i, j in zip(rows, places, strict=True) if (i, j) in guesses]
-        used = {j for _, j in pairs}
-        chosen = {
-            wanted[i]: (_with_rival(guesses[i, j], _rival(found, scores[i], float(scores[i, j]), used)), scores[i, j])
-            for i, j in pairs
-        }
-        if not needed <= set(chosen) or (kind.channels and not set(kind.channels) & set(chosen)):
-            continue
-        if TIME in columns and not _is_record(found, chosen[TIME][0].index if TIME in chosen else None):
-            continue
-        score = sum(score for _, score in chosen.values()) + LEFT_OUT * (len(columns) - len(set(columns) & set(chosen)))
-        yield _Candidate(kind, {name: column for name, (column, _) in chosen.items()}, float(score))
-
-
-def _rival(found: FoundLayout, scores: np.ndarray, score: float, used: Container[int]) -> str | None:
-    """A column of the file that is not ``used`` but fits as well as the chosen one, in words; None where there is none.
-
-    ``scores`` (columns,) for one wanted column, ``score`` that of the chosen one.
-    """
-    better = [j for j in np.flatnonzero(scores >= score).tolist() if j not in used]
-    if not better:
-        return None
-    index = list(found.columns)[better[0]]
-    return f"column {index + 1}, {found.names[index]!r}," if found.names[index] else f"column {index + 1}"
-
-
-def _with_rival(column: ColumnGuess, rival: str | None) -> ColumnGuess:
-    """The guess, unsure where another column fits as well."""
-    if rival is None:
-        return column
-    return replace(column, confidence="unsure", reason=f"{column.reason}; {rival} fits as well")
-
-
-def _score(
-    found: FoundLayout, index: int, name: str, si: str, dimensions: list[str]
-) -> tuple[float, ColumnGuess] | None:
-    """How well a column of the file fits the column ``name`` of a kind; None where it cannot be."""
-    stem, text = name_and_unit(found.names[index], dimensions)
-    text = text if text is not None else found.units[index] or None
-    by_name = fits_name(stem, name)
-    unit = None if text is None else unit_of(text, [si])
-    if text is not None and unit is None and text.strip():
-        return None
-    if by_name == 0:
-        return None
-    if unit is None:
-        if si == "1":
-            return float(by_name), ColumnGuess(index, "1", "likely", "a number without unit")
-        return float(by_name), ColumnGuess(index, si, "unsure", "the file states no unit")
-    exact = unit == (text or "").strip()
-    reason = f"the file says {found.names[index]!r}" + ("" if exact else f", read as {unit}")
-    return by_name + UNIT_SCORE, ColumnGuess(index, unit, "sure" if exact else "likely", reason)
+    """The assignments of file columns to each set of columns of a kind that needs no line of [model]."""
+    for one in assignments(found, kind):
+        needs_line = any(set(one.wanted) < set(larger) for larger in kind.sets)
+        time = one.columns.get(TIME)
+        if (
+            not one.missing
+            and not needs_line
+            and (TIME not in one.wanted or _is_record(found, None if time is None else time.index))
+        ):
+            yield _Candidate(kind, one.columns, one.score)
 
 
 def _by_angle(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     """A guess for a record of an angle, its rate or its acceleration, as arm times angle; None for another file."""
-    times = [index for index in _times(found) if len(found.columns[index]) >= FEWEST_SAMPLES]
+    times = [index for index in times_of(found) if len(found.columns[index]) >= FEWEST_SAMPLES]
     candidates = []
     for kind in kinds.values():
         channel = next(filter(None, (_angle(found, kind, name) for name in kind.channels)), None)
         if times and channel is not None and TIME in kind.columns:
-            time = _score(found, times[0], TIME, "s", ["s"])
+            time = score_of(found, times[0], TIME, kind)
             columns = {} if time is None else {TIME: time[1]}
             candidates.append(_Candidate(kind, {**columns, channel[0]: channel[1]}, 0.0))
     if not candidates:
@@ -214,11 +145,11 @@ def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess]
         stem, text = name_and_unit(found.names[index], [*ANGULAR, *ANGULAR.values()])
         text = (text if text is not None else found.units[index]).strip()
         unit = unit_of(text, [ANGULAR[si]])
-        known = fits_name(stem, name) or (name == "x_rel" and fits_name(stem, "angle"))
+        known = max(fits_name(stem, name), fits_name(stem, "angle") if name == "x_rel" else 0) > 0
         if known and unit is not None:
             scale, reason = factor_to_si(unit, ANGULAR[si]), f"{found.names[index]!r} times an arm of 1 m"
             return name, ColumnGuess(index, si, "unsure", f"{reason}; {remedy}", scale)
-        if name == "x_rel" and not text and fits_name(stem, "angle"):
+        if name == "x_rel" and not text and fits_name(stem, "angle") > 0:
             largest = float(np.nanmax(np.abs(values)))
             scale, taken = (1.0, "rad") if largest <= LARGEST_SWING else (float(np.deg2rad(1.0)), "deg")
             reason = f"an angle without unit, taken as {taken} because it reaches {largest:.3g}"
@@ -226,24 +157,12 @@ def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess]
     return None
 
 
-def _times(found: FoundLayout) -> list[int]:
-    """Columns that are named as times and increase from row to row."""
-    names = {index: name_and_unit(found.names[index], ["s"])[0] for index in found.columns}
-    return [index for index, name in names.items() if fits_name(name, TIME) and _increases(found.columns[index])]
-
-
-def _increases(values: np.ndarray) -> bool:
-    """Whether times increase; a clock may start anew."""
-    values = values[np.isfinite(values)]
-    return int(np.sum(np.diff(values) <= 0.0)) == len(clock_starts(values))
-
-
 def _is_record(found: FoundLayout, time: int | None) -> bool:
     """Whether a file is a record in time: long enough, with increasing times."""
     rows = len(next(iter(found.columns.values())))
     if time is None:
         return rows >= FEWEST_SAMPLES
-    return rows >= 8 and _increases(found.columns[time])
+    return rows >= 8 and increases(found.columns[time])
 
 
 def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidate, Confidence, str] | None:
@@ -291,7 +210,7 @@ def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | Non
             for (index, _), pair in zip(wanted, units, strict=True)
             if pair is not None
         }
-        if times and (named := _score(found, times[0], TIME, "s", dimensions)) is not None:
+        if times and (named := score_of(found, times[0], TIME, kind)) is not None:
             columns[TIME] = named[1]
         if len(columns) == len(wanted):
             candidates.append(_Candidate(kind, columns, 0.0))
@@ -302,10 +221,10 @@ def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | Non
 def _first_with_unit(
     found: FoundLayout, index: int, names: list[str], kind: Kind, dimensions: list[str]
 ) -> tuple[str, str] | None:
-    """The first of the ``names`` that the unit in the file allows, and that unit (SI where the file has none)."""
+    """The first of the ``names`` that the unit in the file allows, and that unit."""
     text = name_and_unit(found.names[index], dimensions)[1] or found.units[index]
     if unit_of(text, dimensions) is None:
-        return next(((name, kind.columns[name].si) for name in names), None)
+        return next(((name, UNKNOWN) for name in names), None)
     units = ((name, unit_of(text, [kind.columns[name].si])) for name in names)
     return next(((name, unit) for name, unit in units if unit is not None), None)
 
@@ -314,7 +233,7 @@ def disordered_times(found: FoundLayout) -> tuple[str, int] | None:
     """Header of a column of times that do not increase, and the first line where they do not; None without one."""
     for index, values in found.columns.items():
         name, text = name_and_unit(found.names[index], ["s"])
-        if fits_name(name, TIME) and unit_of(text or found.units[index], ["s"]) is not None:
+        if fits_name(name, TIME) > 0 and unit_of(text or found.units[index], ["s"]) is not None:
             rows = np.flatnonzero(np.diff(values) <= 0.0)
             if len(rows):
                 return found.names[index], int(found.export.lines[rows[0] + 1])

@@ -7,15 +7,16 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind
-from capsule_id.importing.entry import dimensions_of, entry_of
-from capsule_id.importing.guess import ANGULAR, TIME, guess
-from capsule_id.importing.headers import fits_name, name_and_unit, unit_of
-from capsule_id.importing.layout import FoundLayout, find_layout
+from capsule_id.importing.entry import dimensions_of, entry_of, times_of_guess
+from capsule_id.importing.guess import ANGULAR, guess
 from capsule_id.records.clocks import estimate_clock
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import reading_step
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples
-from capsule_id.rig.units import factor_to_si, scale
+from capsule_id.rig.maps.columns import TIME
+from capsule_id.rig.maps.headers import fits_name, name_and_unit, unit_of
+from capsule_id.rig.maps.layout import FoundLayout, find_layout
+from capsule_id.rig.units import UNKNOWN
 from capsule_id.views import counted
 
 _SHOWN_ROWS = 3
@@ -38,9 +39,9 @@ def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list
     guessed = guess(found, kinds)
     time = None
     if guessed is not None and TIME in guessed.columns:
-        column = guessed.columns[TIME]
-        time = scale(found.columns[column.index], factor_to_si(column.unit, "s"))
-        lines += _sampling(time[np.isfinite(time)])
+        time = times_of_guess(found, guessed)
+        known = guessed.columns[TIME].unit != UNKNOWN
+        lines += _sampling(time[np.isfinite(time)]) if known else ["sampling: the file states no unit of its times"]
     elif found.rate is not None:
         lines.append(f"sampling: {found.rate:g} Hz, as the file states; it holds no times")
     for index in list(found.columns)[:_SHOWN_COLUMNS]:
@@ -72,14 +73,13 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
     for path, content in files.items():
         found = find_layout(content, path, dimensions_of(kinds))
         guessed = guess(found, kinds)
-        if guessed is None or TIME not in guessed.columns:
+        if guessed is None or TIME not in guessed.columns or guessed.columns[TIME].unit == UNKNOWN:
             raise InputError("a file must hold times with their unit", "none", "head them `time [s]`", path)
         index = next((index for index in found.columns if found.names[index] == common), None)
         if index is None:
             known = ", ".join(found.names[index] for index in found.columns)
             raise InputError(f"a file must have the column {common}", known, "name a column of both files", path)
-        column = guessed.columns[TIME]
-        records += [scale(found.columns[column.index], factor_to_si(column.unit, "s")), found.columns[index]]
+        records += [times_of_guess(found, guessed), found.columns[index]]
     clock = estimate_clock(*records)
     offset = f'{{ value = {clock.offset:.9g}, sd = {clock.offset_sd:.2g}, unit = "s" }}'
     drift = f'{{ value = {1e6 * clock.drift:.6g}, sd = {1e6 * clock.drift_sd:.2g}, unit = "ppm" }}'
@@ -107,7 +107,7 @@ def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record
     missing, values = int(np.sum(np.isnan(values))), values[np.isfinite(values)]
     name, text = name_and_unit(found.names[index], dimensions)
     # A lone g is a mass, unless the header says acceleration.
-    masses = () if fits_name(name, "acceleration") else ("kg",)
+    masses = () if fits_name(name, "acceleration") > 0 else ("kg",)
     unit = unit_of(text or found.units[index], (*masses, *dimensions, *ANGULAR.values())) or "unit unknown"
     step = reading_step(values)
     line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"

@@ -14,15 +14,16 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.export import Export, Layout
+from capsule_id.rig.formats.export import Layout
 from capsule_id.rig.formats.raw import RawTable
 from capsule_id.rig.formats.text.blocks import TextFile
 from capsule_id.rig.formats.text.csv import HEADER_CELL, MissingCellsError
 from capsule_id.rig.maps.clock import on_reference, read_clock
+from capsule_id.rig.maps.columns import proposal
 from capsule_id.rig.maps.declared import ColumnMap, read_map
+from capsule_id.rig.maps.layout import find_layout
 from capsule_id.rig.maps.mapped import apply_map
 from capsule_id.rig.maps.plateaus import Plateaus, read_plateaus, readings_of_plateaus
-from capsule_id.rig.maps.proposal import proposal
 from capsule_id.rig.maps.rejection import Rejection, outlying_rows, read_rejection
 from capsule_id.rig.model import NO_DRIFT, Column, Quantity
 from capsule_id.rig.order import remedy_of_order
@@ -226,10 +227,12 @@ def _own_map(file: Path, kind: KindRule) -> str:
 
 def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:
     """The column map that reads a file as ``kind``."""
-    export: Export | None = None
+    found, first = None, ""
     with suppress(InputError):
-        export = EXPORTS[suffix_of(file)](file, file, layout)
-    return proposal(kind, export)
+        found = find_layout(file.read_bytes(), file, sorted({rule.si for rule in kind.columns.values()}))
+        if found.layout.data_from_line != layout.data_from_line is None:
+            first = f"data_from_line = {found.layout.data_from_line} and "
+    return first + proposal(kind, found)
 
 
 def _times(table: TableFile) -> np.ndarray:

@@ -108,6 +108,8 @@ def _registry() -> "pint.UnitRegistry":
     return registry
 
 
+#: Written for a unit that a file does not state.
+UNKNOWN = "?"
 #: Units of the output of a sensor.
 _SIGNALS = ("V", "mV")
 
@@ -127,6 +129,8 @@ def factor_to_si(unit: str, si: str) -> float:
         If the unit is unknown or has another dimension.
     """
     remedy = f"write a unit such as {_EXAMPLES.get(si, si)}"
+    if unit.strip() == UNKNOWN:
+        raise UnitError("state the unit of the column, which the file does not say", remedy)
     written = unit.strip().translate(_SPELLINGS)
     if len(written) > _LONGEST or not _GRAMMAR.fullmatch(written):
         raise UnitError("a unit is a product of symbols, e.g. kN/m, N*s/m or m/s^2 (1: no unit)", remedy)

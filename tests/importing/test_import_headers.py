@@ -220,5 +220,5 @@ def test_only_the_column_without_a_name_is_called_so(tmp_path: Path) -> None:
     rows = "".join(f"{t:.2f},{20.0 * np.exp(-0.3 * t) * np.cos(5.0 * t):.5f}\n" for t in time)
     (tmp_path / "a.csv").write_text(f"Time,Channel 1\n{rows}", encoding="utf-8")
     entry = capsule_id.propose_entry(tmp_path / "a.csv")
-    assert 'time = { from = "Time", unit = "s" }  # unsure: the file states no unit' in entry
-    assert 'x_rel = { from = "Channel 1", unit = "m" }  # unsure: no header names the column' in entry
+    assert 'time = { from = "Time", unit = "?" }  # unsure: the file states no unit' in entry
+    assert 'x_rel = { from = "Channel 1", unit = "?" }  # unsure: no header names the column' in entry

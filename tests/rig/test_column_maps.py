@@ -216,7 +216,9 @@ def test_matlab_files_are_merged_by_name(tmp_path: Path) -> None:
     assert {"s_x.mat", "s_y.mat"} < set(rig.files)
     fault = fault_of(tmp_path, {}, 'file = "s_x.mat"')
     (proposed,) = re.findall(r"columns = \{.*\} \}", fault.remedy)
-    rig_of(tmp_path, {}, f'file = "s_x.mat"\n{proposed}')
+    refused = fault_of(tmp_path, {}, f'file = "s_x.mat"\n{proposed}')
+    assert (refused.rule, refused.value) == ("state the unit of the column, which the file does not say", "'?'")
+    rig_of(tmp_path, {}, f'file = "s_x.mat"\n{proposed}'.replace("?", "s", 1).replace("?", "mm"))
     savemat(tmp_path / "s_y.mat", {"t": TIME + 1e-6, "y": y})
     fault = fault_of(tmp_path, {}, f'files = ["s_x.mat", "s_y.mat"]\n{source}')
     assert "must be the same" in fault.rule

@@ -19,6 +19,7 @@ from capsule_id.rig.toml_values import (
     refuse_unknown_keys,
     shown,
 )
+from capsule_id.rig.units import UNKNOWN
 
 #: Keys of an experiment that go with ``columns``.
 MAP_KEYS = ("columns", "files", "data_from_line", "data_to_line", "missing", "decimal", "where", "plateaus")
@@ -135,6 +136,7 @@ def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRu
     refuse_unknown_keys(document, path, entry, ("from", "minus", "unit", "scale", "offset"))
     if "from" not in entry:
         raise document.error(path, f"{path[-1]} must have a from", shown(entry), f"write {_EXAMPLE}")
+    header = _header(document, (*path, "from"), entry["from"])
     read_unit(document, path, entry, rule.si)
     scale, offset = (
         _number(document, (*path, key), entry.get(key, zero)) for key, zero in (("scale", 1.0), ("offset", 0.0))
@@ -143,7 +145,7 @@ def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRu
         remedy = "write 1, or -1 for the other sign; for a constant, state it as offset"
         raise document.error((*path, "scale"), "scale must not be 0", "0", remedy)
     return Source(
-        _header(document, (*path, "from"), entry["from"]),
+        header,
         _header(document, (*path, "minus"), entry["minus"]) if "minus" in entry else None,
         entry["unit"],
         scale,
@@ -160,6 +162,9 @@ def _header(document: TomlDocument, path: KeyPath, value: object) -> Header:
     if not isinstance(value, str):
         rule = f"{path[-1]} must be a header or the number of a column"
         raise document.error(path, rule, shown(value), f'write {path[-1]} = 1 or {path[-1]} = "<header>"')
+    if value == UNKNOWN:
+        remedy = "write its header, or its number counted from 1"
+        raise document.error(path, f"{path[-1]} must name the column that holds {path[-2]}", shown(value), remedy)
     return " ".join(read_string(document, path, value).split())
 
 

@@ -141,7 +141,7 @@ def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
 
 def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:
     """The headers in a line above the numbers; () if it holds none."""
-    bare = line.lstrip(BLANKS).lstrip("".join(COMMENTS))
+    bare = line.lstrip(" " if delimiter == "\t" else BLANKS).lstrip("".join(COMMENTS))  # a first cell may be empty
     for cells in _header_cells(bare, delimiter):
         if len(cells) == width + 1 and not cells[-1]:
             cells.pop()

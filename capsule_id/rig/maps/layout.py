@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.importing.headers import is_units_row
 from capsule_id.rig.formats import EXPORTS, suffix_of
 from capsule_id.rig.formats.export import Export, Layout
 from capsule_id.rig.formats.text.any_layout import delimiter_of, is_number
 from capsule_id.rig.formats.text.blocks import COMPRESSED, TextFile
 from capsule_id.rig.formats.text.cells import bare, cells_of
 from capsule_id.rig.formats.text.rows import is_row
+from capsule_id.rig.maps.headers import is_units_row
 
 #: Texts that loggers and spreadsheets write where a reading is missing.
 MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
@@ -90,7 +90,12 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
         layout = replace(layout, data_from_line=first, data_to_line=last)
         export = EXPORTS[suffix](content, path, layout)
     columns, singles, unread = _readings(export)
+    if not columns:
+        rule, remedy = "a file must have a column of numbers", "export the readings as numbers"
+        raise next(iter(unread.values()), InputError(rule, "none", remedy, path))
     names, units = _headers(export, dimensions)
+    # Headers are printed: no character of them may command the terminal.
+    names = tuple("".join(mark if mark.isprintable() else " " for mark in name) for name in names)
     return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
 
 

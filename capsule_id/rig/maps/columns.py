@@ -1,0 +1,229 @@
+"""Guesses which columns of a file are those of one kind, and their units; proposes a column map for error lines."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from capsule_id.rig.filters import clock_starts
+from capsule_id.rig.maps.headers import fits_name, meaning, name_and_unit, unit_of
+from capsule_id.rig.maps.layout import FoundLayout
+from capsule_id.rig.schema import KindRule
+from capsule_id.rig.units import UNKNOWN, factor_to_si, scale
+
+Confidence = Literal["sure", "likely", "unsure"]
+TIME = "time"
+#: Fewest rows of a record in time.
+FEWEST_SAMPLES = 50
+#: Score of a unit that fits a column, of a column that is left out, and of one that is the same in every row.
+UNIT_SCORE, LEFT_OUT, CONSTANT = 1.0, -0.25, -2.0
+#: Score of the word for the friction that a kind takes.
+MEANT_SCORE = 0.5
+#: Weight of the range of a column, relative to the largest one, which decides between equal scores only.
+TIE = 1e-3
+_NO_NAME = -1e3  # score of a column whose name does not fit
+_LONGEST_HEADER = 40  # characters; a column with a longer header is named by its number
+#: Columns that may be the same in every row, beside those that a kind calls optional.
+SETTINGS = ("length", "speed", "period", "f", "periods")
+
+
+@dataclass(frozen=True)
+class ColumnGuess:
+    """A column of the kind: index in the file, unit, what the guess rests on, and the factor to write beside it.
+
+    ``rivals`` fit too and hold other numbers. ``asked``: which of them is meant, the user must say.
+    """
+
+    index: int
+    unit: str
+    confidence: Confidence
+    reason: str
+    scale: float | None = None
+    rivals: tuple["ColumnGuess", ...] = ()
+    asked: bool = False
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """Columns of a file as those of a kind.
+
+    Attributes
+    ----------
+    wanted : the set of columns of the kind
+    columns : by name of the kind's column
+    missing : columns that the kind needs and the file does not have; a time may be stated as a rate
+    score : how well all fit
+    """
+
+    wanted: tuple[str, ...]
+    columns: Mapping[str, ColumnGuess]
+    missing: tuple[str, ...]
+    score: float
+
+
+def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
+    """The best assignment of file columns to each set of columns of a kind."""
+    for columns in kind.sets:
+        optional = [name for name in kind.optional if name != "normal_force" or "force" in columns]
+        wanted = [*columns, *kind.channels, *optional]
+        scores = np.full((len(wanted), len(found.columns)), _NO_NAME)
+        ranges = np.zeros_like(scores)
+        guesses = {}
+        for (i, name), (j, index) in product(enumerate(wanted), enumerate(found.columns)):
+            scored = score_of(found, index, name, kind)
+            if scored is not None:
+                scores[i, j], guesses[i, j] = scored
+                ranges[i, j] = np.ptp(_si(found, scored[1], kind.columns[name].si, finite=True))
+        # Of columns that fit as well, such as the axes of an accelerometer, the one with the largest motion.
+        largest = np.maximum(np.max(ranges, axis=1, keepdims=True, initial=0.0), np.finfo(float).tiny)
+        rows, places = linear_sum_assignment(scores + TIE * ranges / largest, maximize=True)
+        pairs = [(i, j) for i, j in zip(rows.tolist(), places.tolist(), strict=True) if scores[i, j] > _NO_NAME]
+        unused = [j for j in range(len(found.columns)) if j not in {j for _, j in pairs}]
+        chosen = {
+            wanted[i]: _with_rivals(
+                found,
+                guesses[i, j],
+                [(guesses[i, k], _lead(float(scores[i, k]), float(scores[i, j]))) for k in unused if (i, k) in guesses],
+                kind.columns[wanted[i]].si,
+            )
+            for i, j in pairs
+        }
+        for i, k in ((i, k) for i in range(-len(optional), 0) for k in unused):
+            other = guesses.get((i % len(wanted), k))
+            if (
+                other is not None
+                and wanted[i] not in chosen
+                and not meaning(found.names[other.index], "force", kind.name)
+            ):
+                # A normal force under another name would change the number.
+                reason = f"{other.reason}; remove the # if it is the {wanted[i]}"
+                chosen[wanted[i]] = replace(other, confidence="unsure", reason=reason, asked=True)
+        missing = tuple(name for name in columns if name not in chosen and name != TIME)
+        if kind.channels and not set(kind.channels) & set(chosen):
+            missing = (*missing, kind.channels[0])
+        left_out = sum(name not in chosen for name in columns)
+        yield Assignment(columns, chosen, missing, sum(float(scores[pair]) for pair in pairs) + LEFT_OUT * left_out)
+
+
+def _lead(score: float, chosen: float) -> float:
+    """By how much a column fits better than the chosen one; one of another name as well as the end of a word."""
+    return 0.0 if score == _NO_NAME and chosen <= 1.0 + UNIT_SCORE else score - chosen
+
+
+def _si(found: FoundLayout, column: ColumnGuess, si: str, *, finite: bool = False) -> np.ndarray:
+    """The readings of a column in SI, (n,); as they are where their unit is unknown."""
+    values = found.columns[column.index]
+    values = values[np.isfinite(values)] if finite else values
+    return values if column.unit == UNKNOWN else scale(values, factor_to_si(column.unit, si))
+
+
+def increases(values: np.ndarray) -> bool:
+    """Whether times increase; a clock may start anew."""
+    values = values[np.isfinite(values)]
+    return int(np.sum(np.diff(values) <= 0.0)) == len(clock_starts(values))
+
+
+def times_of(found: FoundLayout) -> list[int]:
+    """Columns that are named as times and increase from row to row."""
+    names = {index: name_and_unit(found.names[index], ["s"])[0] for index in found.columns}
+    return [index for index, name in names.items() if fits_name(name, TIME) > 0 and increases(found.columns[index])]
+
+
+def is_constant(found: FoundLayout, index: int) -> bool:
+    """Whether a column of several rows is the same in all of them."""
+    values = found.columns[index]
+    return len(values) > 1 and float(np.nanmax(values)) == float(np.nanmin(values))
+
+
+def _with_rivals(
+    found: FoundLayout, column: ColumnGuess, others: Sequence[tuple[ColumnGuess, float]], si: str
+) -> ColumnGuess:
+    """The guess beside the ``others`` that may be meant, each with the lead of its score; equal numbers are no rivals."""
+    own = _si(found, column, si)
+    rivals = [
+        (other, lead)
+        for other, lead in others
+        if not np.allclose(_si(found, other, si), own, rtol=1e-9, atol=0.0, equal_nan=True)
+    ]
+    if not rivals:
+        return column
+    named = " ".join(
+        f"column {other.index + 1}, {found.names[other.index]!r},"
+        if found.names[other.index]
+        else f"column {other.index + 1}"
+        for other, _ in rivals
+    )
+    alike = tuple(other for other, lead in rivals if lead + UNIT_SCORE * (other.unit == UNKNOWN) >= 0.0)
+    if alike:
+        reason = f"{column.reason}; {named} fits as well"
+        return replace(column, confidence="unsure", reason=reason, rivals=alike, asked=True)
+    confidence = "likely" if column.confidence == "sure" else column.confidence
+    return replace(column, confidence=confidence, reason=f"{column.reason}; {named} fits less well")
+
+
+def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple[float, ColumnGuess] | None:
+    """How well a column of the file fits the column ``name`` of a kind; None where it cannot be."""
+    rule = kind.columns[name]
+    stem, text = name_and_unit(found.names[index], sorted({each.si for each in kind.columns.values()}))
+    text = (text if text is not None else found.units[index]).strip()
+    unit = unit_of(text, [rule.si]) if text else None
+    constant = is_constant(found, index)
+    named, meant = fits_name(stem, name), meaning(stem, name, kind.name)
+    said = f"the file says {found.names[index]!r}"
+    if (text and unit is None) or named < 0 or (constant and rule.varies):
+        return None
+    by_name = named + MEANT_SCORE * meant if named or name == "force" else 0.0
+    if by_name <= 0.0 or meant < 0:
+        other = constant or not (unit or named) or rule.si == "1"
+        return None if other else (_NO_NAME, ColumnGuess(index, unit or UNKNOWN, "unsure", said))
+    if constant and name not in (*SETTINGS, *kind.optional):
+        reason = f"{said}, the same in every row: a setting, or a coarse reading"
+        return by_name + CONSTANT, ColumnGuess(index, unit or UNKNOWN, "unsure", reason, asked=True)
+    if unit is None:
+        if rule.si == "1":
+            return float(by_name), ColumnGuess(index, "1", "likely", "a number without unit")
+        return float(by_name), ColumnGuess(index, UNKNOWN, "unsure", "the file states no unit")
+    exact = unit == text
+    reason = said if exact else f"{said}, read as {unit}"
+    return by_name + UNIT_SCORE, ColumnGuess(index, unit, "sure" if exact else "likely", reason)
+
+
+def source_of(found: FoundLayout, index: int) -> str:
+    """The header of a column, or its number where the header is not unique, long or absent."""
+    header = found.names[index]
+    everything = [name for row in found.export.headers for name in row]
+    usable = header and header.isprintable() and len(header) <= _LONGEST_HEADER and everything.count(header) == 1
+    return json.dumps(header, ensure_ascii=False) if usable else str(index + 1)
+
+
+def proposal(kind: KindRule, found: FoundLayout | None) -> str:
+    """The text ``columns = { ... }`` that reads a file as a table of ``kind``; ``?`` is what the file does not say.
+
+    ``found`` is the file (None: unknown).
+    """
+    best, record = Assignment(kind.sets[0], {}, (*kind.sets[0], *kind.channels[:1]), 0.0), False
+    if found is not None:
+        best = max(assignments(found, kind), key=lambda one: (-len(one.missing), one.score))
+        # A reading of a calibration is a row of a record; a trial is not.
+        trials = not any(rule.varies for rule in kind.columns.values())
+        record = trials and any(len(found.columns[index]) >= FEWEST_SAMPLES for index in times_of(found))
+    texts, words = [], []
+    for name in dict.fromkeys((*best.wanted, *best.columns, *best.missing)):
+        column = best.columns.get(name)
+        if column is not None and column.asked and name in kind.optional:
+            continue
+        if column is None and name == TIME and found is not None:
+            texts.append(f'{name} = {{ rate = {{ value = "{UNKNOWN}", unit = "Hz" }} }}')
+            words.append("no column holds times: state the sampling rate")
+            continue
+        source = f'"{UNKNOWN}"'
+        if found is not None and column is not None and not record and not column.asked:
+            source = source_of(found, column.index)
+        elif column is not None:
+            words.append(f"{name}: {column.reason}; {'the file is a record in time' if record else 'name the column'}")
+        texts.append(f'{name} = {{ from = {source}, unit = "{UNKNOWN if column is None else column.unit}" }}')
+    return f"columns = {{ {', '.join(texts)} }}" + (f" ({'; '.join(words)})" if words else "")
