@@ -2,6 +2,7 @@
 
 import errno
 import io
+import logging
 import os
 import shutil
 import sys
@@ -23,7 +24,7 @@ NOTEBOOK_WIDTH = 100
 
 
 def prepare() -> None:
-    """Open missing standard streams, and make standard output accept any character."""
+    """Open missing standard streams, make standard output accept any character, and keep it free of libraries' remarks."""
     # The null device takes the number of a closed stream, so no data file gets this number.
     if sys.stdin is None:
         sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
@@ -33,6 +34,9 @@ def prepare() -> None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
+    if not logging.getLogger().handlers:  # else a library's log goes to standard error, as on a matplotlibrc
+        logging.getLogger().addHandler(logging.NullHandler())
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's, as on a slow compilation
 
 
 def say(text: str) -> None:

@@ -55,6 +55,11 @@ class Fit(Result):
         return sorted({title_of(finding.code, messages) for finding in self.findings if finding.level == "fail"})
 
     @property
+    def verdict(self) -> str:
+        """The verdict in one line: trust, failed checks, number of warnings."""
+        return verdict_text(self.trust, self.failed, sum(finding.level == "warn" for finding in self.findings))
+
+    @property
     def remarks(self) -> list[str]:
         """Texts that the console shows under the table: a quoted model that is not the stated one, and unusual magnitudes."""
         messages = messages_of(self.registry)
@@ -75,10 +80,10 @@ class Fit(Result):
 
     def __str__(self) -> str:
         table = table_text(self.summary, synthetic=self.rig.synthetic)
-        return "\n".join([table, *wrapped(self.remarks), verdict_text(self.trust, self.failed)])
+        return "\n".join([table, *wrapped(self.remarks), self.verdict])
 
     def _repr_html_(self) -> str:
-        return summary_html(self, self.failed, self.remarks)
+        return summary_html(self, self.verdict, self.remarks)
 
     def to_dataframe(self) -> pd.DataFrame:
         """The content of parameters.csv: a row per parameter, noise levels included (``role``), SI."""

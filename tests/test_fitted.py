@@ -18,11 +18,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import capsule_id as cid
+from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import BLOCKS
 from capsule_id.fitted import Fit, compare
 from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.synthetic import truth_beside
+from capsule_id.views import Finding, Level
 from tests.cli_tools import DATA, listing, small_rig
 
 TABLES = ("free_vibration_1", "static_friction", "dynamic_friction", "support_spring_soft")
@@ -119,6 +121,24 @@ def test_it_shows_itself_in_short(fitted: Fit) -> None:
     assert html.count("<tr>") == 1 + len(fitted.summary)
     assert f"verdict: {fitted.trust}" in html
     assert str(fitted).splitlines()[-1].startswith(f"verdict: {fitted.trust}")
+
+
+@pytest.mark.parametrize("level", ["ok", "warn", "fail"])
+def test_console_report_and_notebook_have_one_verdict(
+    fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str], level: Level
+) -> None:
+    """(Before: the console said "no check failed" where the report said "2 warnings below".)"""
+    findings = tuple(Finding("linearity", "warn" if level != "ok" else "ok", {}, label) for label in ("a", "b"))
+    one = dataclasses.replace(fitted, findings=(*findings, Finding("outliers", level, {})))
+    warned = {"ok": 0, "warn": 3, "fail": 2}[level]
+    said = str(one).splitlines()[-1]
+    assert said.endswith(f"; {warned} warnings") == (warned > 0)
+    assert ("warning" in said) == (warned > 0)
+    one.write(tmp_path / "one")
+    assert capsule_id(["report", str(tmp_path / "one")]) == (3 if level == "fail" else 0)
+    assert capsys.readouterr().out.splitlines()[-1] == said
+    assert f">V{said[1:]}." in (tmp_path / "one" / "report.html").read_text(encoding="utf-8")
+    assert said in one._repr_html_()
 
 
 def test_the_table_is_parameters_csv(fitted: Fit, tmp_path: Path) -> None:

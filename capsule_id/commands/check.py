@@ -53,15 +53,16 @@ def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
         If the folder cannot be written.
     """
     from capsule_id.report.figures.readings import readings_figure
-    from capsule_id.report.figures.style import mark, png
+    from capsule_id.report.figures.style import mark, own_style, png
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for table in rig.tables:
-            figure = readings_figure(table, [found for found in findings if found.experiment == table.label])
-            if rig.synthetic:
-                mark(figure, "SYNTHETIC")
-            (folder / f"{table.label}.png").write_bytes(png(figure))
+        with own_style():
+            for table in rig.tables:
+                figure = readings_figure(table, [found for found in findings if found.experiment == table.label])
+                if rig.synthetic:
+                    mark(figure, "SYNTHETIC")
+                (folder / f"{table.label}.png").write_bytes(png(figure))
     except OSError as error:
         raise InputError("--figures DIR must be writable", str(error.strerror), "name another one", folder) from None
     return [f"figures: {len(rig.tables)} in {folder}"]

@@ -42,13 +42,14 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.api import load
     from capsule_id.inference.prediction import predict
     from capsule_id.report.figures.comparisons import side_by_side
-    from capsule_id.report.figures.style import png
+    from capsule_id.report.figures.style import own_style, png
 
     made = predict(load(args.result), args.settings, seed=args.seed)
     table = made.table.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode()
     written = [("--out", args.out, table)]
     if args.figure is not None:
-        written.append(("--figure", args.figure, png(side_by_side(made.panels))))
+        with own_style():
+            written.append(("--figure", args.figure, png(side_by_side(made.panels))))
     for option, file, content in written:
         try:
             file.write_bytes(content)

@@ -43,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
     failed = sorted({finding["check"] for finding in findings if finding["level"] == "fail"})
     texts = (f"{finding['level']:4} {finding['check']}: {finding['text']}" for finding in findings)
-    say("\n".join([table_text(frame, synthetic=bool(saved["synthetic"])), *texts, verdict_text(trust, failed)]))
+    verdict = verdict_text(trust, failed, sum(finding["level"] == "warn" for finding in findings))
+    say("\n".join([table_text(frame, synthetic=bool(saved["synthetic"])), *texts, verdict]))
     return 0 if clean else 3
 
 

@@ -143,11 +143,12 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     import numpy as np
 
     from capsule_id.report.figures.capsule import MotionView, motion
-    from capsule_id.report.figures.style import png
+    from capsule_id.report.figures.style import own_style, png
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
     view = MotionView(np.asarray(t.times), x_rel, np.asarray(t.X2), rate, x_rel[section], rate[section], G)
-    path.write_bytes(png(motion(view)))
+    with own_style():
+        path.write_bytes(png(motion(view)))
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:

@@ -25,14 +25,17 @@ MOTION_COLUMNS = {
     "x_rel": ("m", "X1 - X2 at the drive's phase at the start of a period"),
     "rate": ("m/s", "Y1 - Y2 at the drive's phase at the start of a period"),
     "Y2": ("m/s", "velocity of the capsule at the drive's phase at the start of a period"),
-    "label": ("1", "P-<period>-<direction>-<contacts per excitation period>, aperiodic, or failed (see status)"),
-    "period": ("1", "period of the motion in excitation periods, 0 if aperiodic or failed"),
+    "label": (
+        "1",
+        "P-<period>-<direction>-<contacts per excitation period>, aperiodic, not settled, or failed (see status)",
+    ),
+    "period": ("1", "period of the motion in excitation periods, 0 if there is none"),
     "direction": ("1", "F forward, B backward, S standing, empty if failed"),
     "contacts_per_period": ("1", "closings of the gap per excitation period"),
     "mean_velocity": ("m/s", "mean velocity of the capsule"),
     "work_per_period": ("J", "work of the drive per excitation period"),
     "efficiency": ("m/J", "advance of the capsule per work of the drive"),
-    "lyapunov": ("1/s", "largest Lyapunov exponent of an aperiodic motion, undefined for all others"),
+    "lyapunov": ("1/s", "largest Lyapunov exponent of a motion without a period, undefined for all others"),
     "status": ("1", "how the run ended: 0 complete, 1 complete with grazing, 2 and more given up"),
 }
 SECTION = ("x_rel", "rate", "Y2")  # one value a period, all others one value a point

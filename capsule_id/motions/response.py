@@ -71,14 +71,15 @@ SETTLING = Settling()
 class Response:
     """The settled motion; with a batch every field is an array (batch,).
 
-    label : "P-<period>-<direction>-<contacts>", "aperiodic", or "failed" where the run was given up (see status)
-    period : in excitation periods, 1..16; 0 where the motion is aperiodic or the run failed
+    label : "P-<period>-<direction>-<contacts>"; "aperiodic"; "not settled" where a motion without a period has a negative
+        Lyapunov exponent: it approaches a period, and more periods must be dropped; "failed" where the run was given up
+    period : in excitation periods, 1..16; 0 for the other labels
     direction : "F" forward, "B" backward, "S" standing (|advance| < 1e-7 m per excitation period), "" where failed
     contacts_per_period : closings of the gap per excitation period
     mean_velocity : of the capsule over the observed periods, m/s
     status : a ``Status`` code
     work_per_period : work of the drive per excitation period, J
-    lyapunov : largest Lyapunov exponent of an aperiodic motion, 1/s; NaN for all others, see ``largest_exponent``
+    lyapunov : largest Lyapunov exponent of a motion without a period, 1/s; NaN for all others, see ``largest_exponent``
     """
 
     label: str | np.ndarray
@@ -188,7 +189,7 @@ def settle(
     velocity = (X2[:, -1] - X2[:, 0]) / (settling.observed * T)
     work = np.where(np.isfinite(velocity), seen.work[:, before:].mean(axis=1), np.nan)
     exponent = exponents(p, e, tuple(states[:, :, -1]), label == "aperiodic", settling, friction)
-    columns = (label, period, direction, per_period, velocity, status, work, exponent)
+    columns = (settled_label(label, exponent), period, direction, per_period, velocity, status, work, exponent)
     return Settled(*columns, x_rel=X1 - X2, rate=Y1 - Y2, Y2=Y2)
 
 
@@ -225,6 +226,11 @@ def exponents(
         rates = largest_exponent(p, e, (X1, Y1, X2, Y2), settling.exponent_periods, settling.max_steps, friction)
         found[chosen] = rates.exponent
     return found
+
+
+def settled_label(label: np.ndarray, exponent: np.ndarray) -> np.ndarray:
+    """Labels (lanes,), "not settled" in the place of "aperiodic" where the exponent (lanes,) is negative."""
+    return np.where((label == "aperiodic") & (exponent < 0.0), "not settled", label)
 
 
 def _describe(state: np.ndarray, Omega: float, contacts: np.ndarray, status: int) -> tuple[str, int, str, float]:

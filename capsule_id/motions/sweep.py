@@ -42,7 +42,7 @@ from capsule_id.motions.points import (
     motion_columns,
     sweep_points,
 )
-from capsule_id.motions.response import SETTLING, Settling, exponents, settle
+from capsule_id.motions.response import SETTLING, Settling, exponents, settle, settled_label
 from capsule_id.physics.batches import CHUNK
 from capsule_id.physics.drive import PeriodicDrive
 from capsule_id.physics.model import CapsuleParameters, Initial
@@ -251,3 +251,4 @@ def _add_exponents(seen: MotionColumns, points: SweepPoints, settling: Settling)
     x_rel, rate, Y2 = (seen[name][:, -1] for name in SECTION)
     ends = (x_rel, rate + Y2, np.zeros_like(x_rel), Y2)
     seen["lyapunov"] = exponents(points.p, points.e, ends, seen["label"] == "aperiodic", settling)
+    seen["label"] = settled_label(seen["label"], seen["lyapunov"])

@@ -154,8 +154,8 @@ class _Shortfall:
 
 
 def _shortfall(cycle: Cycle) -> _Shortfall | None:
-    """Linear law minus acceleration; None without an acceleration or without enough samples clear of contact."""
-    if cycle.acceleration is None:
+    """Linear law minus acceleration; None without one that varies or without enough samples clear of contact."""
+    if cycle.acceleration is None or np.ptp(cycle.acceleration) == 0.0:
         return None
     wide = local_polynomials(
         cycle.phase,
@@ -176,7 +176,9 @@ def _shortfall(cycle: Cycle) -> _Shortfall | None:
     near = local_polynomials(cycle.phase, cycle.x_rel, cycle.period, cycle.phase, half, 3)
     terms = _linear_law_terms(cycle, near.value, near.rate)
     shortfall = terms @ law - cycle.acceleration
-    sd = float(np.std(shortfall[clear]))
+    # A step that exceeds the motion clear of contact hides the noise: what is left is the rounding.
+    rounding = float(np.min(np.diff(np.unique(cycle.acceleration)))) / np.sqrt(12.0)
+    sd = max(float(np.std(shortfall[clear])), rounding)
     of_law = sd * np.linalg.norm(np.linalg.solve(triangle.T, (terms / scale).T), axis=0)
     of_terms = cycle.noise_sd * np.hypot(law[1] * near.sd, law[2] * near.rate_sd)
     return _Shortfall(shortfall, sd, np.hypot(of_law, of_terms))

@@ -92,9 +92,17 @@ def table_rows(frame: pd.DataFrame) -> list[Row]:
     rows = {str(name): values for name, values in frame.to_dict("index").items()}
     largest: dict[str, float] = {}
     for name, values in rows.items():
-        symbol, size = symbol_of(name), abs(float(values["map"]))
-        largest[symbol] = max(largest.get(symbol, 0.0), size if np.isfinite(size) else 0.0)
+        symbol = symbol_of(name)
+        largest[symbol] = max(largest.get(symbol, 0.0), magnitude(values))
     return [_row(name, values, largest[symbol_of(name)]) for name, values in rows.items()]
+
+
+def magnitude(values: Mapping[Hashable, Any]) -> float:
+    """Largest of the quoted numbers, SI: value and sd, or ends. The maximum, often far from them, counts without a value."""
+    columns = ("value", "lower", "upper") if values["quote"] == "interval" else ("value", "sd")
+    quoted = np.abs([float(values[column]) for column in columns])
+    largest = max(quoted[np.isfinite(quoted)], default=abs(float(values["map"])))
+    return float(largest) if np.isfinite(largest) else 0.0
 
 
 def skewed_names(frame: pd.DataFrame) -> list[str]:
@@ -102,8 +110,8 @@ def skewed_names(frame: pd.DataFrame) -> list[str]:
     return [row.name for row in table_rows(frame) if row.skewed]
 
 
-def _row(name: str, values: Mapping[Hashable, Any], magnitude: float) -> Row:
-    scale, unit = prefix_for(str(values["unit"]), magnitude)
+def _row(name: str, values: Mapping[Hashable, Any], largest: float) -> Row:
+    scale, unit = prefix_for(str(values["unit"]), largest)
     sample, point = (decimals_for(float(values[column]) * scale) for column in ("sd", "standard_error"))
     decimals = point if sample is None else sample
     return Row(name, values, scale, unit, decimals, decimals if point is None else point)

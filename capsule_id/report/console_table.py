@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from capsule_id.report.columns import columns_of, skewed_names, table_rows
-from capsule_id.views import Trust
+from capsule_id.views import Trust, counted
 
 #: Width of the table where standard output is no terminal.
 WIDTH = 110
@@ -53,13 +53,12 @@ def wrapped(texts: Sequence[str], width: int | None = None) -> list[str]:
     return [line for text in texts for line in textwrap.wrap(text, max(width, 20), break_on_hyphens=False)]
 
 
-def verdict_text(trust: Trust, failed: Sequence[str]) -> str:
-    """The verdict in one line; ``failed`` are the titles of the failed checks."""
-    if failed:
-        return f"verdict: {trust}; failed: {', '.join(failed)}"
-    return f"verdict: {trust}; no check failed" + (
-        ", but not every number could be checked" if trust == "not judged" else ""
-    )
+def verdict_text(trust: Trust, failed: Sequence[str], warned: int) -> str:
+    """The verdict in one line: titles of the ``failed`` checks, number of warnings. Console and report have these words."""
+    found = f"failed: {', '.join(failed)}" if failed else "no check failed"
+    if trust == "not judged" and not failed:
+        found += ", but not every number could be checked"
+    return f"verdict: {trust}; {found}" + (f"; {counted(warned, 'warning')}" if warned else "")
 
 
 def _line(cells: list[str], widths: list[int]) -> str:

@@ -48,7 +48,11 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             checks=_checks(result.findings, titles),
             findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
             words=_WORDS,
-            failed=list(dict.fromkeys(titles[finding.code] for finding in result.findings if finding.level == "fail")),
+            verdict=verdict_text(
+                result.trust,
+                sorted({titles[finding.code] for finding in result.findings if finding.level == "fail"}),
+                sum(finding.level == "warn" for finding in result.findings),
+            ),
             starts=_starts(result),
             notes=[_note(note, messages) for note in result.notes],
             terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
@@ -111,14 +115,8 @@ def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, 
     return entries
 
 
-def summary_html(result: Result, failed: Sequence[str], changes: Sequence[str]) -> str:
-    """Verdict, changes of the model and parameter table, for a notebook.
-
-    Parameters
-    ----------
-    failed, changes : titles of the failed checks; texts of the findings that change the model
-    """
-    verdict = verdict_text(result.trust, failed)
+def summary_html(result: Result, verdict: str, changes: Sequence[str]) -> str:
+    """Verdict, changes of the model (texts of the findings that make them) and parameter table, for a notebook."""
     table = _parameters(result.summary, "console")
     return (
         _environment()

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capsule_id.inference.result import Posterior, Result
+from capsule_id.report.columns import magnitude
 from capsule_id.report.typography import plain_symbol, prefix_for
 
 
@@ -42,15 +43,14 @@ def sampled_parameters(result: Result) -> SampledParameters:
     place = {name: i for i, name in enumerate(result.posterior.names)}
     summary = result.summary.loc[[name in place for name in result.summary.index]]
     names = tuple(str(name) for name in summary.index)
-    centre = summary["map"].to_numpy(float)
-    display = [prefix_for(str(unit), float(value)) for unit, value in zip(summary["unit"], centre, strict=True)]
+    display = [prefix_for(str(row["unit"]), magnitude(row)) for row in summary.to_dict("records")]
     scale = np.array([factor for factor, _ in display])
     return SampledParameters(
         names=names,
         symbols=tuple(plain_symbol(name) for name in names),
         units=tuple(unit for _, unit in display),
         draws=result.posterior.draws[..., [place[name] for name in names]] * scale,
-        map=centre * scale,
+        map=summary["map"].to_numpy(float) * scale,
         paper=summary["paper"].to_numpy(float) * scale,
         posterior=result.posterior,
     )

@@ -13,6 +13,7 @@ import pandas as pd
 
 from capsule_id.inference.result import Result
 from capsule_id.report.columns import columns_of
+from capsule_id.report.figures.style import own_style
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
 from capsule_id.report.netcdf import write_posterior
@@ -31,7 +32,8 @@ def write_result(result: Result, directory: Path) -> None:
     """
     figures = directory / "figures"
     figures.mkdir(exist_ok=True)
-    drawn = pictures(result)
+    with own_style():
+        drawn = pictures(result)
     for picture in drawn:
         (figures / f"{picture.name}.png").write_bytes(picture.png)
     save(result, directory)

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import bench
 import numpy as np
@@ -15,6 +16,7 @@ from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.lint import lint
 from capsule_id.experiments.registry import default_registry
+from capsule_id.parameters import TABLE, Parameter, Prior
 from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 from capsule_id.rig.read import read_rig
@@ -148,6 +150,17 @@ def test_a_pendulum_whose_k1_lies_outside_its_default_prior_is_not_called_aliase
     # Negative control: a stated prior that the record contradicts.
     (against,) = found(bench.rig(slow(150.0), priors={"k1": PriorOverride(bench.K1, 10.0)}), "decays.alias")
     assert against.level == "fail"
+
+
+def test_another_default_prior_moves_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Before: the default prior of k1 was read as a bound of physics.)"""
+    rigs = [bench.rig(table) for table in (coarse(25.0), coarse(40.0), coarse(1000.0), slow(40.0), slow(150.0))]
+    before = [found(rig, "decays.alias", "decays.sampling") for rig in rigs]
+    assert [bool(findings) for findings in before] == [True, True, False, True, False]
+    for median in (1e-2, 1e7):
+        other = replace(TABLE["k1"], prior=Prior("lognormal", median, 1.5))
+        monkeypatch.setitem(cast(dict[str, Parameter], TABLE), "k1", other)
+        assert [found(rig, "decays.alias", "decays.sampling") for rig in rigs] == before
 
 
 def test_uneven_sampling_and_fast_sampling_have_no_aliases() -> None:

@@ -1,5 +1,7 @@
 """The table on standard output: aligned, narrow enough, loud where it must be."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -42,9 +44,12 @@ def test_loud_line(result: Result, synthetic: bool) -> None:
 
 
 def test_the_verdict_is_one_line_with_the_word_and_the_failed_checks() -> None:
-    assert verdict_text("trusted", []) == "verdict: trusted; no check failed"
-    assert verdict_text("not trusted", ["linearity", "outliers"]) == "verdict: not trusted; failed: linearity, outliers"
-    assert verdict_text("not judged", []).startswith("verdict: not judged; no check failed, but ")
+    assert verdict_text("trusted", [], 0) == "verdict: trusted; no check failed"
+    assert verdict_text("trusted", [], 8) == "verdict: trusted; no check failed; 8 warnings"
+    failed = ["linearity", "outliers"]
+    assert verdict_text("not trusted", failed, 0) == "verdict: not trusted; failed: linearity, outliers"
+    assert verdict_text("not trusted", failed, 1) == "verdict: not trusted; failed: linearity, outliers; 1 warning"
+    assert verdict_text("not judged", [], 0).startswith("verdict: not judged; no check failed, but ")
 
 
 @pytest.mark.parametrize("width", [200, 110, 80, 60])
@@ -79,6 +84,33 @@ def test_one_unit_for_all_rows_of_a_symbol(result: Result) -> None:
     gaps = gaps.assign(unit="m", value=[9.9926e-4, 1.50037e-3], map=[9.9926e-4, 1.50037e-3], sd=5e-6)
     assert [row.unit for row in table_rows(gaps)] == ["mm", "mm"]
     assert [row.number("value") for row in table_rows(gaps)] == ["0.9993", "1.5004"]
+
+
+@pytest.mark.parametrize(
+    ("quote", "value", "sd", "ends", "maximum", "unit", "expected"),
+    [
+        ("sd", 1.01, 0.12, (0.8, 1.2), 1e-6, "N", "1.01 ± 0.12 N"),  # before: 1010000 ± 120000 µN
+        ("interval", 0.8, 0.5, (0.21, 2.05), 1e-6, "N", "0.80 (0.21 to 2.05) N"),
+        ("interval", 2e-6, 0.5, (1e-7, 2.05), 1e-6, "N", "0.0000020 (0.00000010 to 2.0500000) N"),
+        ("sd", 1e-9, 0.12, (-0.2, 0.2), 1e-9, "N", "0.00 ± 0.12 N"),
+        ("sd", 2e-5, 4e-7, (1.9e-5, 2.1e-5), 2e-5, "N", "20.00 ± 0.40 µN"),
+        ("sd", math.nan, math.nan, (math.nan, math.nan), 2e-5, "N", "– µN"),
+    ],
+)
+def test_the_prefix_follows_the_quoted_numbers(
+    result: Result,
+    quote: str,
+    value: float,
+    sd: float,
+    ends: tuple[float, float],
+    maximum: float,
+    unit: str,
+    expected: str,
+) -> None:
+    """The maximum of the joint posterior may be a million times smaller, as of dry friction that a decay hardly shows."""
+    row = result.summary.loc[["k1"]].assign(quote=quote, value=value, sd=sd, standard_error=sd, unit=unit, map=maximum)
+    (printed,) = table_rows(row.assign(lower=ends[0], upper=ends[1]))
+    assert f"{printed.quoted} {printed.unit}" == expected
 
 
 @pytest.mark.parametrize(

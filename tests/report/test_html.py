@@ -14,12 +14,13 @@ from capsule_id.api import read_rig
 from capsule_id.experiments.registry import Registry
 from capsule_id.inference.result import Provenance, Result
 from capsule_id.report.columns import table_rows
+from capsule_id.report.console_table import verdict_text
 from capsule_id.report.gallery import Picture, pictures
 from capsule_id.report.html import render
 from capsule_id.report.texts.citation import methods_paragraph
 from capsule_id.report.texts.messages import finding_text, messages_of
 from capsule_id.report.texts.terms import TERMS
-from capsule_id.views import Finding, Message, ResultTable, Text, counted
+from capsule_id.views import Finding, Message, ResultTable, Text
 from tests.cli_tools import DATA
 from tests.report.conftest import OUTLIER
 
@@ -125,7 +126,7 @@ def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean:
     """Before the contents list: the verdict, a row per parameter, what to do."""
     text = render(unclean, ())
     first = Page(text.partition("<nav")[0] + "</body></html>").text
-    assert "Verdict: not trusted. Failed: stated errors, residuals white." in first
+    assert "Verdict: not trusted; failed: residuals white, stated errors; 2 warnings." in first
     assert 'class="untrusted"' in text
     for row in table_rows(unclean.summary):
         assert row.plus_minus("value", "sd", row.decimals) in first
@@ -134,8 +135,7 @@ def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean:
     assert "Quote trusted numbers only." in first
     clean = Page(page.partition("<nav")[0] + "</body></html>").text
     warned = sum(finding.level == "warn" for finding in result.findings)
-    below = f"; {counted(warned, 'warning')} below" if warned else ""
-    assert f"Verdict: trusted. No check failed{below}." in clean
+    assert f"V{verdict_text('trusted', [], warned)[1:]}." in clean
     assert 'class="untrusted"' not in page
 
 

@@ -111,7 +111,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
         If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
     """
     prepare_jax(options, rig.has_runs)
-    from capsule_id.report.console_table import verdict_text, wrapped
+    from capsule_id.report.console_table import wrapped
 
     kinds = kinds or default_registry()
     with tempfile.TemporaryDirectory() as name:
@@ -126,7 +126,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
             if path.is_file() and path.name not in WORK_FILES
         }
     changes = "".join(f"\n{line}" for line in wrapped(result.remarks))
-    return FittedRig(files, changes, verdict_text(result.trust, result.failed), result.clean)
+    return FittedRig(files, changes, result.verdict, result.clean)
 
 
 def _in_process(rigs: Sequence[Rig], options: Options, kinds: Registry) -> Iterator[tuple[Rig, FittedRig | Exception]]:

@@ -123,7 +123,7 @@ def fit_one(
     check_output(directory, options)
     prepare_jax(options, rig.has_runs)
     # JAX loads only now, so that a faulty folder is reported at once.
-    from capsule_id.report.console_table import table_text, verdict_text, wrapped
+    from capsule_id.report.console_table import table_text, wrapped
     from capsule_id.report.texts.messages import messages_of
     from capsule_id.report.write import write_report
 
@@ -140,14 +140,14 @@ def fit_one(
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
         result = write_fit(rig, options, partial, kinds, progress, preliminary)
         publish(partial, directory)
-    report, failed = directory / "report.html", result.failed
+    report = directory / "report.html"
     if as_json:
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
     else:
         table = table_text(result.summary, synthetic=rig.synthetic)
         changes = wrapped(result.remarks)
-        say("\n".join([table, *changes, f"report: {report}", verdict_text(result.trust, failed)]))
+        say("\n".join([table, *changes, f"report: {report}", result.verdict]))
     if result.clean:
         return 0
-    print(f"fit-params: verdict not clean: {', '.join(failed)}; see {report}", file=sys.stderr)
+    print(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}", file=sys.stderr)
     return 3

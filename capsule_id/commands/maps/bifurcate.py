@@ -118,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_cache:
         keep_programs()
     from capsule_id.physics.contacts import warn_of_far_gap
+    from capsule_id.report.figures.style import own_style
 
     with Progress(not args.quiet, unit="point") as progress, client_of(args.scheduler) as client:
         data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
@@ -125,7 +126,8 @@ def run(args: argparse.Namespace) -> int:
             warn_of_far_gap(values["G"], data["x_rel"])
         data.attrs["rig"] = rig.name if rig is not None else ""
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
-        publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+        with own_style():
+            publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
     remove_store(store)
     say(_summary_text(data, axes, out))
     return 0

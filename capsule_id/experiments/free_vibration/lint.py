@@ -27,7 +27,6 @@ from capsule_id.experiments.lint_magnitudes import (
     lint_rig_quantities,
 )
 from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_times
-from capsule_id.parameters import TABLE
 from capsule_id.records.faults.aliasing import aliases, sampling
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.records.noise import length_of_motion
@@ -39,10 +38,12 @@ from capsule_id.views import Facts, Finding, Message, counted, filled_in
 
 #: Smallest number of samples per period; the highest sample is then at most 1 - cos(pi/20) = 1.2 % below the peak.
 SAMPLES_PER_PERIOD = 20
-#: From so many samples per period on, an alias is less probable than a k1 outside its default prior: 1 in 50 aliased
+#: From so many samples per period on, an alias is less probable than an unusual k1: 1 in 50 aliased
 #: records has as many. With so many samples of motion too it is excluded: an alias has a period or more per sample, and
 #: one that lasts for 1000 periods has a damping ratio below 5e-4.
 SAMPLES_WITHOUT_ALIAS, SAMPLES_OF_MOTION = 100, 1000
+#: Usual k1: its middle, N/m, and factor. It is no prior: another default of the fit must not move a check.
+USUAL_K1 = (1500.0, 1000.0)
 #: Factor of the prior that a finding proposes for k1: it holds no alias of 20 samples per period or more.
 PROPOSED_FACTOR = 10
 #: Smallest number of periods; with fewer, one peak determines the damping.
@@ -127,15 +128,14 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
     if rig.m1 is None:
         return
     stated = rig.priors.get("k1")
-    prior = TABLE["k1"].prior if stated is None else stated.prior
-    assert prior is not None, "k1 has a default prior"
-    low, high = prior.location / prior.spread, prior.location * prior.spread
+    middle, factor = USUAL_K1 if stated is None else (stated.prior.location, stated.prior.spread)
+    low, high = middle / factor, middle * factor
     k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
     # Of aliased records one in ten seems to have more samples per period: 18 Hz sampled at 17 Hz shows sixteen.
     per_period = 1.0 / (median_step(time) * frequency)
     coarse = per_period < SAMPLES_PER_PERIOD
     # A sampling that cannot show the usual frequency shows another one instead.
-    blind = np.pi / median_step(time) < np.sqrt(prior.location / rig.m1.value)
+    blind = np.pi / median_step(time) < np.sqrt(middle / rig.m1.value)
     known = low <= k1 <= high or (stated is None and per_period >= SAMPLES_WITHOUT_ALIAS and not blind)
     part, highest = loudest_part(values), float(np.sqrt(high / rig.m1.value)) / (2.0 * np.pi)
     others = aliases(time[part], values[part], frequency, highest)
@@ -160,9 +160,9 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
             # A prior would hide a wrong unit.
             "unit": bool(unusual)
             or any(f.facts["scales"] == ("m1",) for f in lint_rig_quantities(rig))
-            or (stated is not None and abs(abs(np.log10(k1 / prior.location)) - 3.0) < WRONG_PREFIX),
+            or (stated is not None and abs(abs(np.log10(k1 / middle)) - 3.0) < WRONG_PREFIX),
         }
-        # The default prior is no measurement: small rigs and pendulums have a k1 outside it.
+        # What is usual is no measurement: small rigs and pendulums have another k1.
         certain = coarse or refuted or stated is not None
         yield Finding("decays.alias", "fail" if certain else "warn", facts, table.label, () if certain else ("k1",))
     elif possible.any() and (per_period < SAMPLES_WITHOUT_ALIAS or length_of_motion(values) < SAMPLES_OF_MOTION):

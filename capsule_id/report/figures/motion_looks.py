@@ -25,7 +25,7 @@ def shown(names: list[str], heights: np.ndarray) -> tuple[list[str], np.ndarray]
         (family if len(family) < len(_SHADES.get(direction, " ")) else rest).append(int(i))
     order = [
         i
-        for direction in ("F", "S", "B", "aperiodic", "failed")
+        for direction in ("F", "S", "B", "aperiodic", "not settled", "failed")
         for i in sorted(kept.get(direction, []), key=lambda i: names[i])
     ]
     own = heights[order]
@@ -51,7 +51,7 @@ def label_looks(names: Sequence[str]) -> tuple[list[str], list[str]]:
             colours.append(_SHADES[direction][shade])
         else:
             colours.append({"other": _OTHER, "aperiodic": _APERIODIC}.get(name, _FAILED))
-        hatches.append("xx" if name == "failed" else "")
+        hatches.append({"failed": "xx", "not settled": "//"}.get(name, ""))
     return colours, hatches
 
 

@@ -5,9 +5,11 @@ Nothing here touches pyplot: figures are plain ``matplotlib.figure.Figure`` obje
 
 import io
 import warnings
+from contextlib import AbstractContextManager
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib import rc_context, rcParamsDefault
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
@@ -25,6 +27,11 @@ _PALETTE, _NEARLY_WHITE = 128, 253
 TEXT, SMALL = 11.0, 9.5
 #: Heights of an entry of a legend and of its margins, and the largest part of the panel for both.
 _ENTRY, _MARGINS, _MOST_ROOM = 1.5 * SMALL, 2.0 * SMALL, 0.5
+
+
+def own_style() -> AbstractContextManager[None]:
+    """Matplotlib's defaults in place of the user's matplotlibrc, which may ask for LaTeX or for fonts that are missing."""
+    return rc_context(dict(rcParamsDefault))
 
 
 def new_figure(width: float, height: float) -> Figure:
