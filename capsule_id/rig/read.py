@@ -15,7 +15,7 @@ from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
 from capsule_id.rig.choices import check_masses_of_free, check_normal_forces, read_confirmed, read_model
 from capsule_id.rig.entry import Entry
-from capsule_id.rig.formats.text.decode import decode
+from capsule_id.rig.formats.text.blocks import TextFile
 from capsule_id.rig.maps.declared import MAP_KEYS
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, TABLE_KEYS, KindRule, parameter_rows
@@ -120,7 +120,7 @@ def _read_document(folder: Path) -> tuple[TomlDocument, str]:
         content = path.read_bytes()
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links
         raise InputError("rig.toml must be readable", str(error), "check path and permissions", path, 1, 1) from None
-    return parse_toml(decode(content, path), path), hashlib.sha256(content).hexdigest()
+    return parse_toml("\n".join(TextFile(content, path).lines()), path), hashlib.sha256(content).hexdigest()
 
 
 def _check_masses(

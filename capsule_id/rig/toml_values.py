@@ -51,7 +51,7 @@ def closest(word: str, known: Collection[str]) -> str | None:
 
 
 def _similar(part: str, other: str) -> bool:
-    return part == other or bool(get_close_matches(part, [other], cutoff=0.7))
+    return part == other or bool(get_close_matches(part, [other], cutoff=0.65))
 
 
 def refuse_unknown_keys(
@@ -65,7 +65,7 @@ def refuse_unknown_keys(
     for key in entry:
         if key not in known:
             close, table = closest(key, known), next((name for name, keys in elsewhere.items() if key in keys), None)
-            remedy = f"move it to {table}" if table else f"write {close}" if close else "correct or remove it"
+            remedy = f"move it to {table}" if table else f"write {close}" if close else "remove it"
             remedy += f"; known: {' '.join(known)}"
             raise document.error((*path, key), "unknown key", shown(key), remedy, of_key=True)
 

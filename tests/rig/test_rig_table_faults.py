@@ -97,5 +97,5 @@ def test_fault_in_a_table(tmp_path: Path, table: str, marked: str, rule: str) ->
 def test_bytes_that_are_no_text(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "rig", tables={"static_friction.csv": "angle [deg]\n33\nµ".encode() + b"\xff\n"})
     assert_fault(fault_of(folder), folder / "static_friction.csv", (3, 2), "the file must be UTF-8 text, byte 0xff")
-    (folder / "rig.toml").write_bytes(b"[rig]\n# \xe4\n")
-    assert_fault(fault_of(folder), folder / "rig.toml", (2, 3), "the file must be UTF-8 text, byte 0xe4")
+    (folder / "rig.toml").write_bytes("[rig]\n# µ".encode() + b"\xe4\n")
+    assert_fault(fault_of(folder), folder / "rig.toml", (2, 4), "the file must be UTF-8 text, byte 0xe4")

@@ -11,7 +11,6 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.rig.formats.limits import complete, refuse_large
-from capsule_id.rig.formats.text.decode import place_of_byte
 
 #: The bytes of a file, or where they lie.
 Content = bytes | Path
@@ -134,3 +133,9 @@ def occurrences(mark: str, text: bytes) -> int:
 def lines_of(text: bytes) -> list[str]:
     """The lines of a block, without line feeds."""
     return text[:-1].decode().split("\n")
+
+
+def place_of_byte(before: bytes, codec: str = "utf-8") -> tuple[int, int]:
+    """1-based line and character of a byte; the bytes ``before`` it may be invalid too."""
+    lines = re.split(r"\r\n?|\n", before.decode(codec, "replace"))
+    return len(lines), len(lines[-1]) + 1
