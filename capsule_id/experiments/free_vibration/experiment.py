@@ -49,6 +49,7 @@ from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.faults.release import shortened
 from capsule_id.records.noise import noise_level
+from capsule_id.records.tone import other_tone
 from capsule_id.rig.filters import choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Facts, Finding
@@ -377,6 +378,7 @@ class FreeVibration(SurfaceExperiment):
 
     def noise_facts(self) -> Facts:
         facts = {"present": self.model.additions, "second": self.replaced, "lines": self.model.lines}
+        facts |= {"tone": other_tone(self.time, self.values)}
         return {"model": "decay", "stated": self.stated_words, **facts, **self.damping_trend(), **later_start(self)}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:

@@ -1,6 +1,6 @@
 """Findings on the readings of a free decay: release, aliasing, sampling, length, position, and those of any record."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -30,6 +30,7 @@ from capsule_id.experiments.lint_records import lint_channel, lint_smooth, lint_
 from capsule_id.records.faults.aliasing import aliases, sampling
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.records.noise import length_of_motion
+from capsule_id.records.tone import other_tone
 from capsule_id.rig.entry import Entry
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
@@ -72,8 +73,9 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if decay is not None:  # a hold is neither clipped nor frozen
         used = slice(used.start + int(np.searchsorted(time[used], decay.start)), used.stop)
     faults = [found for name in channels for found in lint_channel(table, name, used, period)]
+    release = list[Finding]()
     if decay is not None:
-        yield from _release(table, decay, bool(faults))
+        release = [*_release(table, decay, bool(faults))]
         if decay.end is not None:
             kept = max(int(np.searchsorted(time[used], decay.end, side="right")), SHORTEST_RECORD)
             used = slice(used.start, min(used.start + kept, used.stop))
@@ -82,12 +84,24 @@ def lint_decay(table: Table[Any], rig: Rig) -> Iterable[Finding]:
             found for name in channels for found in lint_smooth(table, name, used, period, name == "acceleration")
         ]
         faults = faults or [*lint_kinematics(table, used, period)]
-    yield from faults
+    yield from _named(table, release, faults)
     window = time[used], table[channels[0]][used]
     yield from _thinned(table, *window)
     yield from _sampling(table, *window)
     if not faults:
         yield from _frequency(table, rig, *window)
+
+
+def _named(table: Table[Any], release: Sequence[Finding], faults: Sequence[Finding]) -> Iterable[Finding]:
+    """The faults of a record; where another oscillation or wrong samples feign a release or a jump, those alone."""
+    blamed = [found for found in (*release, *faults) if found.code not in ("readings.clipped", "readings.frozen")]
+    channel, used = next(name for name in table.columns if name != "time"), window_of(table)
+    tone = other_tone(table["time"][used], table[channel][used]) if blamed else None
+    if tone is not None:
+        yield Finding("decays.tone", "fail", {"file": table.file, "column": channel, "tone": tone}, table.label)
+        return
+    feigned = any(found.code in ("readings.spike", "readings.dropouts", "readings.clipped") for found in faults)
+    yield from (*(() if feigned else release), *faults)
 
 
 def _other_frequency(table: Table[Any], rig: Rig, frequency: float) -> Iterable[Finding]:
@@ -268,7 +282,14 @@ def _alias(texts: tuple[str, str], facts: Facts) -> str:
     return filled_in((_REFUTED if facts["refuted"] else texts[0]) + (_UNIT if facts["unit"] else remedy), facts)
 
 
+#: Remedy of an oscillation that no key describes; a later start or stop does not remove it.
+TONE = (
+    "An oscillation of {tone:.4g} Hz lies beside that of the rod, as hum of the mains (50 or 60 Hz) or another mode of the "
+    "structure does. Remove its source, and record again."
+)
+
 MESSAGES = {
+    "decays.tone": Message("further oscillations", fail="{file}: {column} must show one decaying oscillation. " + TONE),
     "decays.release": Message(
         "release of a decay",
         warn=(

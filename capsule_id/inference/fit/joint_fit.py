@@ -91,11 +91,7 @@ def joint_fit(
     u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
     best = int(np.argmax(value))
     if not np.isfinite(value[best]):
-        raise InputError(
-            "bench and runs are fitted from a start at which every motion is finite",
-            f"none in {counted(len(starts), 'start')}",
-            "check masses, gaps and settings of the runs, and fit the bench alone (--experiments bench)",
-        )
+        raise _not_finite(target, ends[best].fit, len(starts))
     fit, located = ends[best].fit, target.located
     matrix = np.zeros((target.dimension, target.dimension))
     located_covariance = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0)
@@ -118,6 +114,23 @@ def joint_fit(
         at_other_maximum=_at_another_maximum(u, value, spread),
         stalled=np.array([not end.converged for end in ends]),
         shares=variance_shares(target, fit.jacobian[0], target.residual_owners(u[best])),
+    )
+
+
+def _not_finite(target: LogPosterior, fit: LeastSquaresFit, starts: int) -> InputError:
+    """The error where no start leads to a finite fit: the derivatives that are not finite where the motion is."""
+    columns = np.isfinite(fit.jacobian[0]).all(axis=0)
+    names = [target.names[i] for i, finite in zip(target.located, columns, strict=True) if not finite]
+    alone = "fit the bench alone (--experiments bench)"
+    if names and np.isfinite(fit.residuals).all():
+        rule, value = (
+            "every motion must have finite derivatives",
+            f"the motion is finite, its derivative is not: {', '.join(names)}",
+        )
+        return InputError(rule, value, f"state a prior of {' and '.join(names)} with another median, or {alone}")
+    rule = "bench and runs are fitted from a start at which every motion is finite"
+    return InputError(
+        rule, f"none in {counted(starts, 'start')}", f"check masses, gaps and settings of the runs, or {alone}"
     )
 
 

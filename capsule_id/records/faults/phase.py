@@ -66,26 +66,6 @@ def jump_or_noise(values: np.ndarray, period: float, alone: bool = False) -> Jum
     return max(noisy, key=lambda jump: jump.size, default=None)
 
 
-def single_spike(values: np.ndarray, jump: Jump, period: float, alone: bool = False) -> int | None:
-    """Row of the one sample without which there is no ``jump``; None where several samples are wrong, or some lost.
-
-    Parameters are those of ``phase_jump``.
-    """
-    near = max(1, round(SIDES[0][0] * period))
-    rows = np.arange(max(1, jump.row - near), min(len(values) - 2, jump.row + near) + 1)
-    row = int(rows[np.argmax(np.abs(values[rows - 1] - 2.0 * values[rows] + values[rows + 1]))])
-    steps = np.diff(values[max(row - 2, 0) : row + 3])
-    off = abs(steps[len(steps) // 2 - 1] - steps[len(steps) // 2])
-    # Beside a gap a sample is half the jump away from its neighbours, which differ by all of it.
-    if len(steps) == 4 and 2.0 * abs(steps[1] + steps[2] - steps[0] - steps[3]) > off:
-        return None
-    part = slice(max(0, row - round(2.0 * period)), row + round(2.0 * period))
-    mended = values[part].copy()
-    place = row - part.start
-    mended[place] = 0.5 * (mended[place - 1] + mended[place + 1])
-    return row if phase_jump(mended, period, alone) is None else None
-
-
 def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float, alone: bool) -> Jump | None:
     """The most significant jump by polynomials over ``side`` samples."""
     if side < ORDER + 3 or len(values) < 2 * side:

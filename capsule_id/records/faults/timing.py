@@ -16,6 +16,9 @@ STEP_TOLERANCE = 0.1
 ROUNDING = (0.02, 1.01)
 #: A drop-out departs from both neighbours by this fraction of the range of the other samples.
 DROPOUT_RANGE = 0.5
+#: In coarse steps a smooth top is a short run too. A drop-out departs by more than this many reading steps, and than this
+#: many times the change of the readings beside it.
+DROPOUT_STEPS, DROPOUT_CHANGES = 3.0, 2.0
 #: Noise levels that count as that range where the motion is a small part of the record, and their largest share of the
 #: whole range: of coarse samples the noise level shows the motion.
 DROPOUT_NOISE, LARGEST_SHARE = 20.0, 0.5
@@ -101,6 +104,12 @@ def _far_runs(values: np.ndarray, spread: float) -> np.ndarray:
     jump = np.minimum(np.abs(own - before), np.abs(own - after))
     far = (jump > DROPOUT_RANGE * spread) & (np.abs(after - before) < 0.5 * jump)
     far &= np.sign(own - before) == np.sign(own - after)
+    ends = starts + lengths
+    change = [
+        np.abs(values[np.maximum(starts - 2, 0)] - before),
+        np.abs(values[np.minimum(ends + 1, len(values) - 1)] - after),
+    ]
+    far &= jump > np.maximum(DROPOUT_CHANGES * np.minimum(*change), DROPOUT_STEPS * reading_step(values))
     return np.stack([starts, starts + lengths], axis=1)[far]
 
 

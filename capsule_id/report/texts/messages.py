@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from typing import Literal
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.lint import TONE
 from capsule_id.experiments.registry import Registry
 from capsule_id.report.texts.posterior import POSTERIOR_MESSAGES
 from capsule_id.report.texts.readings import DATA_MESSAGES
-from capsule_id.views import Facts, Finding, Level, Message, ResultTable, counted, stated_p
+from capsule_id.views import Facts, Finding, Level, Message, ResultTable, counted, filled_in, stated_p
 
 #: Errors of a text that does not match its facts.
 TEXT_ERRORS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
@@ -99,6 +100,8 @@ def _decay_remedy(facts: Facts) -> str:
     if facts.get("model") != "decay":
         return ""
     present = f"Present in the fitted model: {', '.join(facts['present'])}. " if facts["present"] else ""
+    if facts.get("tone"):
+        return present + filled_in(TONE, facts)
     cut = "Cut the record to free decay with start and stop"
     if (start := facts.get("start")) is not None:
         cut = f'Leave out the larger half of the amplitudes: write start = {{ value = {start:.10g}, unit = "s" }} in its entry'

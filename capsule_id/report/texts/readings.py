@@ -34,6 +34,18 @@ def _repeated(facts: Facts) -> str:
     )
 
 
+def _spikes(facts: Facts) -> str:
+    """The samples that stand off, and what drops them."""
+    number, place = len(facts["rows"]), f"{facts['file']}:{facts['line']}: {facts['column']} must be smooth;"
+    if number == 1:
+        size = f"at {facts['time']:.5g} s stands off by {facts['size']:.2g} of the amplitude"
+        return f"{place} one sample {size}. Delete its row."
+    return (
+        f"{place} {number} single samples stand off (lines {facts['lines']}). Add this line to the experiment in rig.toml, "
+        f"which drops them: reject = {facts['rule']}"
+    )
+
+
 DATA_MESSAGES: Mapping[str, Message] = {
     "masses.exact": Message(
         "masses", warn="{name}: no sd stated, so its value counts as exact. State the weighing error."
@@ -94,45 +106,41 @@ DATA_MESSAGES: Mapping[str, Message] = {
         "clipped samples",
         fail=(
             "{file}:{line}: {column} is clipped at its {side} limit {level:.5g} {unit}: {samples:# sample} "
-            "({share:.2g} of the record), the last at {time:.5g} s. Repeat with a wider range of the sensor, or use the "
-            "record after the clipped part only."
+            "({share:.2g} of the record), the last at {time:.5g} s. Use the record after the clipped part only, or "
+            "repeat with a wider range of the sensor. {cut}"
         ),
     ),
     "readings.dropouts": Message(
         "drop-outs",
         fail=(
             "{file}:{line}: {column} drops out: {samples:# sample} far from both neighbours, the first "
-            "{value:.6g} {unit} at {time:.5g} s. Delete these rows."
+            "{value:.6g} {unit} at {time:.5g} s. Delete these rows: lines {lines}."
         ),
     ),
     "readings.frozen": Message(
         "frozen channel",
         fail=(
             "{file}:{line}: {column} freezes: {samples:# sample} with the value before, the first {value:.6g} {unit} at "
-            "{time:.5g} s. Delete these rows."
+            "{time:.5g} s. Delete these rows: lines {lines}."
         ),
     ),
     "readings.jump": Message(
         "lost samples",
         fail=(
             "{file}:{line}: {column} must be smooth; it jumps at {time:.5g} s by {size:.2g} of its amplitude, and the times "
-            "are even: samples were lost, or the rig was struck or moved. Use the record on one side of the jump only, "
-            "or repeat it."
+            "are even. Samples may be lost, or the rig was struck or moved. Use the record on one side of the jump only, "
+            "or repeat it. {cut}"
         ),
     ),
     "readings.burst": Message(
         "bursts of noise",
         fail=(
             "{file}:{line}: {column} must have the same noise throughout; from {begin:.5g} to {end:.5g} s it has more than "
-            "three times the usual noise. Add this line to the experiment in rig.toml: "
-            '{key} = {{ value = {value:.10g}, unit = "s" }}'
+            "three times the usual noise. {cut}"
         ),
     ),
     "readings.spike": Message(
         "spikes",
-        fail=(
-            "{file}:{line}: {column} must be smooth; one sample at {time:.5g} s stands off by {size:.2g} of the amplitude. "
-            "Delete its row."
-        ),
+        fail=_spikes,
     ),
 }
