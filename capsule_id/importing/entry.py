@@ -177,14 +177,17 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
         reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
         yield _commented('samples = "turning_points"', "unsure", reason)
         return
+    driven = "f" in kind.setting_rules and "f" not in constant
     if guessed.columns[TIME].unit == UNKNOWN if TIME in guessed.columns else guessed.rate is None:
+        if driven:
+            yield _commented(f'f = {{ value = "{UNKNOWN}", unit = "Hz" }}', "unsure", "state the set value")
         return
     if isinstance(kind.setting_rules.get("start"), QuantityRule) and (part := free_part(time, values)) is not None:
         start, stop = part
         yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")
         if stop is not None:
             yield _commented(f'stop = {{ value = {stop:.6g}, unit = "s" }}', "likely", "another excitation begins here")
-    if "f" in kind.setting_rules and "f" not in constant:
+    if driven:
         even = np.linspace(time[0], time[-1], len(time))
         try:
             frequency = dominant_frequency(even, np.interp(even, time, values))

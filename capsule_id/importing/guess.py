@@ -16,15 +16,17 @@ from capsule_id.rig.maps.columns import (
     Confidence,
     assignments,
     increases,
+    is_constant,
     score_of,
     times_of,
 )
 from capsule_id.rig.maps.headers import fits_name, name_and_unit, unit_of
 from capsule_id.rig.maps.layout import FoundLayout
+from capsule_id.rig.schema import QuantityRule
 from capsule_id.rig.units import UNKNOWN, factor_to_si
 
-#: Smallest lead of the score of a kind that is sure.
-LEAD = 1.0
+#: Smallest lead of the score of a kind that is sure, and number of columns that make it so whatever others there are.
+LEAD, MANY = 1.0, 3
 #: A record whose last fifth has less than this fraction of the amplitude of its largest part decays; above the second
 #: fraction it is driven.
 DECAYS, DRIVEN = 0.5, 0.8
@@ -82,20 +84,39 @@ def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     best = max(candidate.score for candidate in candidates)
     leading = [candidate for candidate in candidates if candidate.score > best - LEAD]
     names = sorted({candidate.kind.name for candidate in leading})
+    chosen = max(leading, key=lambda candidate: candidate.score)
+    confidence, reason = _doubt(found, chosen, leading, kinds)
     if len(names) == 1:
-        chosen = max(candidates, key=lambda candidate: candidate.score)
-        used = {column.index for column in chosen.columns.values()}
-        if TIME not in chosen.kind.columns and any(_is_record(found, i) for i in times_of(found) if i not in used):
-            return _guess(found, chosen, "unsure", f"the file is a record in time, {names[0]} a table of trials")
-        if any(not used >= {column.index for column in one.columns.values()} for one in leading):
-            sets = " and ".join(" with ".join(one.columns) for one in leading)
-            return _guess(found, chosen, "unsure", f"the columns fit {sets}")
-        return _guess(found, chosen, "sure", "the columns fit no other kind as well")
+        return _guess(found, chosen, confidence, reason)
     by_motion = _by_motion(found, leading)
     if by_motion is not None:
-        return _guess(found, *by_motion)
-    chosen = max(leading, key=lambda candidate: candidate.score)
+        return _guess(found, *(by_motion if confidence == "sure" else (by_motion[0], confidence, reason)))
     return _guess(found, chosen, "unsure", f"the columns fit {' and '.join(names)}")
+
+
+def _doubt(
+    found: FoundLayout, chosen: _Candidate, leading: list[_Candidate], kinds: Mapping[str, Kind]
+) -> tuple[Confidence, str]:
+    """Whether other columns leave the kind of the chosen candidate sure, and why."""
+    used, kind = {column.index for column in chosen.columns.values()}, chosen.kind
+    if TIME not in kind.columns and any(_is_record(found, i) for i in times_of(found) if i not in used):
+        return "unsure", f"the file is a record in time, {kind.name} a table of trials"
+    own = [one for one in leading if one.kind is kind]
+    if any(not used >= {column.index for column in one.columns.values()} for one in own):
+        return "unsure", f"the columns fit {' and '.join(' with '.join(one.columns) for one in own)}"
+    # A column under an unknown name may make it another kind: a force and a current are no list of pulls.
+    known = {kind.columns[name].si for name in (kind.columns if TIME in kind.columns else chosen.columns)}
+    stated = {rule.si for rule in kind.setting_rules.values() if isinstance(rule, QuantityRule)}
+    dimensions = {rule.si for each in kinds.values() for rule in each.columns.values()} - known
+    for index in sorted(set(found.columns) - used) if len(chosen.columns) < MANY else ():
+        text = name_and_unit(found.names[index], sorted(dimensions))[1] or found.units[index]
+        others = sorted(dimensions - stated if is_constant(found, index) else dimensions)
+        # A number of a trial is no reading, nor is a mass, or a percentage.
+        label = found.columns[index] == np.clip(np.rint(found.columns[index]), 0, len(found.columns[index]))
+        bare = not text and len(chosen.columns) == 1 and not label.all()
+        if bare or (unit_of(text, others) not in (None, "%") and unit_of(text, ["kg"]) is None):
+            return "unsure", f"column {index + 1}, {found.names[index]!r}, is not used"
+    return "sure", "the columns fit no other kind as well"
 
 
 def _guess(found: FoundLayout, candidate: _Candidate, confidence: Confidence, reason: str) -> Guess:

@@ -136,8 +136,8 @@ def _header(name: str, unit: str, way: str) -> str:
     return f"{name}{way}{unit}"
 
 
-def layout(kind: str, seed: int) -> Layouted:
-    """A random layout of a kind."""
+def layout(kind: str, seed: int, unknown: bool = False) -> Layouted:
+    """A random layout of a kind; ``unknown``: one of its columns has a name that says nothing."""
     rng = np.random.default_rng([seed, sorted(SETS).index(kind)])
     pick = lambda options: options[int(rng.integers(len(options)))]  # noqa: E731
     rows = 400 if kind in ("free_vibration", "forced_run") else int(rng.integers(5, 13))
@@ -145,13 +145,14 @@ def layout(kind: str, seed: int) -> Layouted:
     columns, headers, units = dict[str, np.ndarray](), list[str](), list[str]()
     written = list[np.ndarray]()
     named = bool(way)
-    for wanted in pick(SETS[kind]).split():
+    for number, wanted in enumerate(wanteds := pick(SETS[kind]).split()):
         quantity, _, column = wanted.partition(":")
         values = _readings(rng, kind, quantity, rows)
         unit = pick(sorted(UNITS[SI[quantity]]))
         cells = np.array([float(f"{value:.8g}") for value in values / UNITS[SI[quantity]][unit]])
         names = NAMES[quantity].split("|")
         name = pick([one for one in names if one not in headers])
+        name = "Sig7" if unknown and number == seed % len(wanteds) else name
         columns[column or quantity] = cells * UNITS[SI[quantity]][unit]
         headers.append(_header(name, unit, way))
         units.append("-" if way == "row" and unit == "1" else unit)  # a row that begins with a number is a reading

@@ -26,7 +26,9 @@ def outcome(export: Layouted, found: FoundLayout, said: Guess | None) -> str:
     """ "right", "wrong" or "asked"."""
     if said is None or said.unsure or any(one.asked or one.unit == UNKNOWN for one in said.columns.values()):
         return "asked"
-    if said.kind != export.kind or set(said.columns) != set(export.columns):
+    # One channel of a record may do without another.
+    left = set(export.columns) - set(said.columns) - {*KINDS[said.kind].channels}
+    if said.kind != export.kind or left or not set(said.columns) <= set(export.columns):
         return "wrong"
     rules = KINDS[said.kind].columns
     right = all(
@@ -36,12 +38,12 @@ def outcome(export: Layouted, found: FoundLayout, said: Guess | None) -> str:
     return "right" if right else "wrong"
 
 
-def study(seeds: range) -> tuple[Counter[str], Counter[str], list[str]]:
+def study(seeds: range, unknown: bool = False) -> tuple[Counter[str], Counter[str], list[str]]:
     """Outcomes of all layouts, of those whose headers name quantity and unit, and the files of the wrong ones."""
     every, named, wrong = Counter[str](), Counter[str](), list[str]()
     for kind in SETS:
         for seed in seeds:
-            export = layout(kind, seed)
+            export = layout(kind, seed, unknown)
             result = outcome(export, *guessed(export))
             every[result] += 1
             named[result] += export.named
@@ -65,6 +67,14 @@ def test_guesses_are_right_or_asked(seeds: range) -> None:
     assert named.total() > 0.4 * every.total()
     assert named["right"] >= 0.8 * named.total()
     assert named["asked"] <= 0.1 * named.total()
+
+
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(2000, 2060), marks=pytest.mark.slow)])
+def test_a_name_that_says_nothing_is_asked(seeds: range) -> None:
+    """Before, at full size: 57 of 540 wrong without a question."""
+    every, _, wrong = study(seeds, unknown=True)
+    assert every["asked"] > 0.5 * every.total()
+    assert not wrong
 
 
 def swapped(export: Layouted) -> Layouted:

@@ -178,7 +178,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
         return None
     by_name = named + MEANT_SCORE * meant if named or name == "force" else 0.0
     if by_name <= 0.0 or meant < 0:
-        other = constant or not (unit or named) or rule.si == "1"
+        other = (constant and name not in kind.optional) or not (unit or named) or rule.si == "1"
         return None if other else (_NO_NAME, ColumnGuess(index, unit or UNKNOWN, "unsure", said))
     if constant and name not in (*SETTINGS, *kind.optional):
         reason = f"{said}, the same in every row: a setting, or a coarse reading"
