@@ -72,7 +72,7 @@ def test_the_channels_follow_from_the_truth(folder: Path) -> None:
         assert run["current_amplitude"] * parameters["K"] == pytest.approx(run["P_d"])
         for name, values in exact.items():
             rest = (table[name] - values - run["offsets"].get(name, 0.0))[1:]
-            # 2649 samples or more: standard errors at most 0.019 and 0.014; contacts cut the numerical derivative by less than 0.1
+            # 2649 samples or more: standard errors at most 0.019 and 0.014; contacts cut the derivative by less than 0.1
             assert abs(rest.mean()) < 0.1 * NOISE_SD[name], (table.label, name)
             assert np.std(rest) == pytest.approx(NOISE_SD[name], rel=0.07), (table.label, name)
         off = np.std(table["x_rel"] - np.roll(exact["x_rel"], round(1e-3 / time[1])))
