@@ -1,11 +1,13 @@
 """The twin's forced runs in memory: tables, experiments, true values, and the channels without noise."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.twin import SyntheticRun, make_runs
+from capsule_id.experiments.forced_run.twin import RUNS, STEP, SyntheticRun, make_runs
+from capsule_id.experiments.forced_run.twin import SAMPLES as RECORDED
 from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.synthetic import Truth
@@ -18,8 +20,8 @@ TRUTH = Truth().with_runs().flat()
 
 @cache
 def recorded() -> tuple[SyntheticRun, ...]:
-    """The twin's four runs; at seed 0 the first starts with the capsule moving, the others with it stuck."""
-    return tuple(make_runs(TRUTH, 0))
+    """The twin's four runs at 1 kHz; at seed 0 the first starts with the capsule moving, the others with it stuck."""
+    return tuple(make_runs(TRUTH, 0, tuple(replace(run, samples=RECORDED, step=STEP) for run in RUNS)))
 
 
 def table(number: int = 0, samples: int = SAMPLES, without: tuple[str, ...] = (), **settings: object) -> Table:

@@ -12,30 +12,34 @@ from capsule_id.parameters import QUANTILE_975
 from capsule_id.physics.forces import rod_acceleration
 from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate, status_message
 
+#: Number of samples of a record, and time between two, s, where a setup states none.
+SAMPLES, STEP = 2000, 1e-3
+
 
 @dataclass(frozen=True)
 class RunSetup:
-    """Settings of one run, SI: the spring by name, the drive and the gap."""
+    """Settings of one run, SI: the spring by name, the drive, the gap, and the sampling."""
 
     spring: str
     Omega: float
     P_d: float
     G: float
+    samples: int = SAMPLES
+    step: float = STEP
 
 
-#: Runs of the synthetic rig: one near the paper's Fig. 6, one of its Fig. 11, two of its Fig. 10.
+#: Runs of the synthetic rig: one near the paper's Fig. 6, one of its Fig. 11, two of its Fig. 10. The shortest contact has
+#: 11 samples, and 8 excitation periods follow the transient.
 RUNS = (
-    RunSetup("medium", 34.56, 4.0, 1.0e-3),
-    RunSetup("stiff", 73.58, 1.2, 1.0e-3),
-    RunSetup("hard", 26.58, 2.5, 1.5e-3),
-    RunSetup("hard", 46.0, 2.5, 1.5e-3),
+    RunSetup("medium", 34.56, 4.0, 1.0e-3, 2850, 0.6e-3),
+    RunSetup("stiff", 73.58, 1.2, 1.0e-3, 2650, 0.35e-3),
+    RunSetup("hard", 26.58, 2.5, 1.5e-3, 6100, 0.35e-3),
+    RunSetup("hard", 46.0, 2.5, 1.5e-3, 3800, 0.35e-3),
 )
 #: Factor of the prior of springs without a static test, dimensionless.
 SPRING_FACTOR = 1.5
 #: Excitation periods from rest before the record starts; the record starts at a random phase.
 SETTLED = 40
-#: Number of samples and sampling rate, Hz, of a record.
-SAMPLES, RATE = 2000, 1000.0
 #: Noise level of each channel, SI (m, m, m/s^2, A).
 NOISE_SD = {"x_rel": 10e-6, "x_capsule": 5e-6, "acceleration_rod": 1.0, "current": 5e-3}
 #: Standard deviation of the channels' zero errors, SI. x_capsule has none, because it is zero at the first sample.
@@ -116,7 +120,7 @@ def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, 
     generators = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(len(runs))]
     cuts = np.array([SETTLED + rng.uniform() for rng in generators])
     T = np.array([2.0 * np.pi / run.Omega for run in runs])
-    time = np.arange(SAMPLES) / RATE
+    time = np.arange(max(run.samples for run in runs)) * np.array([[run.step] for run in runs])
     start = (cuts * T)[:, None]
     k2 = np.array([parameters[f"k2[{run.spring}]"] for run in runs])
     p = _capsule(parameters, k2, np.array([run.G for run in runs]))
@@ -126,8 +130,8 @@ def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, 
         raise InputError("every run must be complete", "a run was given up", status_message(t.status))
     states = np.stack([np.asarray(x)[:, 1:] for x in (t.X1, t.Y1, t.X2, t.Y2)], axis=1)
     return [
-        _measure(rng, parameters, run, time, state, 2.0 * np.pi * (cut % 1.0))
-        for rng, run, state, cut in zip(generators, runs, states, cuts, strict=True)
+        _measure(rng, parameters, run, at[: run.samples], state[:, : run.samples], 2.0 * np.pi * (cut % 1.0))
+        for rng, run, at, state, cut in zip(generators, runs, time, states, cuts, strict=True)
     ]
 
 

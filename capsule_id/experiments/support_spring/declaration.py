@@ -12,8 +12,8 @@ from capsule_id.rig.model import Quantity, Settings
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Message
 
-#: Deflections of the twin, m, and noise of the force relative to full scale.
-DEFLECTIONS = np.linspace(0.0, 1e-3, 11)
+#: Deflections of the twin and their reading error, m, and noise of the force relative to full scale.
+DEFLECTIONS, DEFLECTION_SD = np.linspace(0.0, 1e-3, 11), 1e-6
 SPRING_NOISE = 0.002
 #: Reference length, m, and its k2, N/m, for the cantilever law of the twin; sd of a measured length, m.
 LENGTH, LENGTH_OF, LENGTH_SD = 60e-3, 18960.0, 0.1e-3
@@ -38,15 +38,22 @@ def static_test(
 
 
 def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
-    del seed
     tables = []
+    # A generator of their own: the readings of the other tests do not depend on these errors.
+    errors = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**21,)))
     for name, k2 in values.items():
         if name.startswith("k2["):
             spring = name[len("k2[") : -1]
             length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
             stated = f'length = {{ value = {1e3 * length:.2f}, sd = {1e3 * LENGTH_SD:g}, unit = "mm" }}'
             columns = static_test(rng, k2, DEFLECTIONS, SPRING_NOISE)
-            tables.append(TwinTable(f"support_spring_{spring}.csv", columns, (f'spring = "{spring}"', stated)))
+            columns["deflection [mm]"] += 1e3 * DEFLECTION_SD * errors.standard_normal(DEFLECTIONS.size)
+            known = (
+                f'deflection_sd = {{ value = {1e6 * DEFLECTION_SD:g}, unit = "um" }}',
+                f'force_sd = {{ value = {1e3 * SPRING_NOISE * k2 * DEFLECTIONS[-1]:.3g}, unit = "mN" }}',
+            )
+            settings = (f'spring = "{spring}"', stated, *known)
+            tables.append(TwinTable(f"support_spring_{spring}.csv", columns, settings))
     return Twin(tuple(tables))
 
 
