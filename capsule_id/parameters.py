@@ -131,13 +131,6 @@ class Parameter:
         """The default in one phrase, SI."""
         return f"as {self.default}" if isinstance(self.default, str) else f"{self.default:g}"
 
-    def describe_prior(self) -> str:
-        """The default prior in one phrase, SI; "constant" if it is not sampled."""
-        if not self.sampled:
-            return "constant"
-        described = "by the experiment" if self.prior is None else self.prior.describe()
-        return f"{self.describe_default()}; if free: {described}" if self.optional else described
-
     def admits(self, value: Any) -> Any:
         """Whether ``value`` is finite and has an admissible sign, elementwise; number, NumPy or JAX array."""
         bound = {"positive": value > 0.0, "not negative": value >= 0.0, "any": value == value}[self.sign]

@@ -14,6 +14,7 @@ import pytest
 import capsule_id as cid
 from capsule_id import cli
 from capsule_id.experiments.registry import default_registry
+from capsule_id.parameters import Parameter
 from capsule_id.report.columns import COLUMNS
 from capsule_id.report.texts import citation
 from capsule_id.rig.choices import OPTIONAL
@@ -151,8 +152,16 @@ def test_the_three_words_of_trust_are_the_packages() -> None:
     assert set(rows("| trust | meaning | what to do |", README)) == set(get_args(Trust))
 
 
+def _prior(row: Parameter) -> str:
+    """The default prior in one phrase, SI; "constant" if it is not sampled."""
+    if not row.sampled:
+        return "constant"
+    described = "by the experiment" if row.prior is None else row.prior.describe()
+    return f"{row.describe_default()}; if free: {described}" if row.optional else described
+
+
 def test_the_parameter_table_is_the_packages() -> None:
-    expected = {symbol: [row.unit, row.meaning, row.describe_prior()] for symbol, row in KINDS.parameters.items()}
+    expected = {symbol: [row.unit, row.meaning, _prior(row)] for symbol, row in KINDS.parameters.items()}
     assert rows("| symbol | unit | meaning | default prior |", GUIDE["parameters"]) == expected
 
 

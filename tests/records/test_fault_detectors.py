@@ -9,7 +9,7 @@ from scipy import signal
 
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
-from capsule_id.records.faults.phase import Jump, jump_or_noise, phase_jump
+from capsule_id.records.faults.phase import Jump, jump_or_noise
 from capsule_id.records.faults.timing import Gaps, dropouts, find_gaps, frozen_samples, time_rounding
 from tests.experiments.bench import K1, M1, C, released
 
@@ -17,6 +17,12 @@ RATE = 2000.0
 PERIOD = 2.0 * np.pi / np.sqrt(K1 / M1)
 SAMPLES = PERIOD * RATE
 TIME = np.arange(1200) / RATE
+
+
+def phase_jump(values: np.ndarray, period: float, alone: bool = False) -> Jump | None:
+    """The largest jump of a smooth oscillation that is not noisy."""
+    found = jump_or_noise(values, period, alone)
+    return None if found is None or found.noisy else found
 
 
 def decay(seed: int = 0, noise: float = 0.01, time: np.ndarray = TIME) -> np.ndarray:

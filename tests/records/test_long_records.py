@@ -10,7 +10,7 @@ from capsule_id.records import noise
 from capsule_id.records.faults import duplicates, release
 from capsule_id.records.faults.clipping import clipped_samples
 from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
-from capsule_id.records.faults.phase import Jump, phase_jump
+from capsule_id.records.faults.phase import Jump, jump_or_noise
 from capsule_id.records.faults.release import FreeDecay, find_free_decay
 from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
 from capsule_id.rig import filters
@@ -85,13 +85,13 @@ def test_repeated_blocks(short_pieces: Callable[[pytest.MonkeyPatch], None]) -> 
 
 def test_lost_samples_release_and_frequency(short_pieces: Callable[[pytest.MonkeyPatch], None]) -> None:
     x = np.delete(record(9), np.arange(1500, 1513))
-    whole = cast(Jump, phase_jump(x, PERIOD))
+    whole = cast(Jump, jump_or_noise(x, PERIOD))
     time = np.arange(SAMPLES) * 1e-3
     rest = np.concatenate([np.full(1200, 5.0), record(10)[: SAMPLES - 1200]])
     free = cast(FreeDecay, find_free_decay(time, rest))
     with pytest.MonkeyPatch.context() as patch:
         short_pieces(patch)
-        found, decay = cast(Jump, phase_jump(x, PERIOD)), cast(FreeDecay, find_free_decay(time, rest))
+        found, decay = cast(Jump, jump_or_noise(x, PERIOD)), cast(FreeDecay, find_free_decay(time, rest))
         assert filters.dominant_frequency(time, record(10)) == pytest.approx(1e3 / PERIOD, rel=0.01)
         assert reading_step(record(10)) == pytest.approx(1e-3)
         assert noise.noise_level(record(10)) == pytest.approx(0.01, rel=0.1)

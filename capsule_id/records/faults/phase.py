@@ -37,12 +37,6 @@ class Jump:
     noisy: bool = False
 
 
-def phase_jump(values: np.ndarray, period: float, alone: bool = False) -> Jump | None:
-    """Return the largest jump of a smooth oscillation; None where there is none. See ``jump_or_noise``."""
-    found = jump_or_noise(values, period, alone)
-    return None if found is None or found.noisy else found
-
-
 def jump_or_noise(values: np.ndarray, period: float, alone: bool = False) -> Jump | None:
     """Return the largest jump of a smooth oscillation, else the largest one that is ``noisy``; None without both.
 
