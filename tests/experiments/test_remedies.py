@@ -101,7 +101,7 @@ def test_a_clean_folder_has_no_remedy(kind: object, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_remedies_of_the_whole_list(tmp_path: Path) -> None:
-    """Measured: see CHANGELOG. The table is kept beside the folders."""
+    """Measured: 47 "a", 3 "b", 7 "c"; two of very coarse steps and one of signs are not trusted, none is made worse."""
     table: dict[int, Ending] = {}
     for fault in FAULTS:
         table[fault.seed] = ending(fault, tmp_path / str(fault.seed))
