@@ -16,11 +16,11 @@ from capsule_id.importing.guess import Guess, are_turning_points, disordered_tim
 from capsule_id.rig.filters import dominant_frequency
 from capsule_id.rig.formats.text.any_layout import delimiter_of
 from capsule_id.rig.formats.text.blocks import TextFile
-from capsule_id.rig.maps.columns import TIME, is_constant, source_of
+from capsule_id.rig.maps.columns import TIME, is_constant, readings_of, source_of
 from capsule_id.rig.maps.headers import fits_name, name_and_unit, unit_of
 from capsule_id.rig.maps.layout import FoundLayout, find_layout, used_layout
 from capsule_id.rig.schema import QuantityRule
-from capsule_id.rig.units import UNKNOWN, factor_to_si, scale
+from capsule_id.rig.units import UNKNOWN
 from capsule_id.views import counted
 
 #: Columns of a tilt, which is its own slope.
@@ -193,8 +193,8 @@ def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) ->
             frequency = dominant_frequency(even, np.interp(even, time, values))
         except InputError:
             return
-        reason = f"the strongest frequency of {channel}; state the set value"
-        yield _commented(f'f = {{ value = {frequency:.4g}, unit = "Hz" }}', "unsure", reason)
+        line = f'f = {{ value = {frequency:.4g}, unit = "Hz" }}'
+        yield _commented(line, "unsure", f"the strongest frequency of {channel}; state the set value")
 
 
 def _constant_settings(found: FoundLayout, guessed: Guess, kind: Kind) -> dict[str, str]:
@@ -209,18 +209,18 @@ def _constant_settings(found: FoundLayout, guessed: Guess, kind: Kind) -> dict[s
             name, text = name_and_unit(found.names[index], [rule.si])
             unit = unit_of(text or found.units[index], [rule.si])
             if unit is not None and fits_name(name, key) > 0:
-                line = f'{key} = {{ value = {np.nanmax(found.columns[index]):.10g}, unit = "{unit}" }}'
-                reason = f"{found.names[index]!r} is the same in every row" + "; + uphill" * (key == "slope")
-                lines[key] = _commented(line, "unsure", reason)
+                lines[key] = _commented(
+                    f'{key} = {{ value = {np.nanmax(found.columns[index]):.10g}, unit = "{unit}" }}',
+                    "unsure",
+                    f"{found.names[index]!r} is the same in every row{'; + uphill' * (key == 'slope')}",
+                )
     return lines
 
 
 def times_of_guess(found: FoundLayout, guessed: Guess) -> np.ndarray:
     """The times of a record, (n,) s, or in the unit of the file; sample numbers where times and rate are unknown."""
     if TIME in guessed.columns:
-        column = guessed.columns[TIME]
-        factor = 1.0 if column.unit == UNKNOWN else factor_to_si(column.unit, "s")
-        return scale(found.columns[column.index], factor)
+        return readings_of(found, guessed.columns[TIME], "s")
     return np.arange(len(next(iter(found.columns.values())))) / (guessed.rate or 1.0)
 
 

@@ -1,6 +1,6 @@
 """Guesses the kind of experiment of an export, and which of its columns and units are those of the kind."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from capsule_id.rig.filters import clock_starts
 from capsule_id.rig.maps.columns import (
     FEWEST_SAMPLES,
     TIME,
+    Assignment,
     ColumnGuess,
     Confidence,
     assignments,
@@ -35,8 +36,6 @@ STEADY = 0.97
 _PARTS = 5
 #: SI unit of a displacement, a velocity or an acceleration -> that of the same quantity of an angle.
 ANGULAR = {"m": "rad", "m/s": "rad/s", "m/s^2": "rad/s^2"}
-#: Largest angle of a swing, rad; a larger number is in degrees.
-LARGEST_SWING = 3.2
 
 
 @dataclass(frozen=True)
@@ -63,16 +62,17 @@ class Guess:
         return "unsure" in (self.confidence, *(column.confidence for column in self.columns.values()))
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    kind: Kind
-    columns: Mapping[str, ColumnGuess]
-    score: float
-
-
 def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     """The most probable kind and columns of an export; None where no kind fits."""
-    candidates = [candidate for kind in kinds.values() for candidate in _candidates(found, kind)]
+    # Sets within larger ones need a line of [model].
+    candidates = [
+        one
+        for kind in kinds.values()
+        for one in assignments(found, kind)
+        if not one.missing
+        and not any(set(one.wanted) < set(larger) for larger in kind.sets)
+        and (TIME not in one.wanted or _is_record(found, one.columns[TIME].index if TIME in one.columns else None))
+    ]
     if not any(TIME in candidate.kind.columns for candidate in candidates):
         by_angle = _by_angle(found, kinds)
         if by_angle is not None:
@@ -95,15 +95,15 @@ def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
 
 
 def _doubt(
-    found: FoundLayout, chosen: _Candidate, leading: list[_Candidate], kinds: Mapping[str, Kind]
+    found: FoundLayout, chosen: Assignment, leading: list[Assignment], kinds: Mapping[str, Kind]
 ) -> tuple[Confidence, str]:
     """Whether other columns leave the kind of the chosen candidate sure, and why."""
     used, kind = {column.index for column in chosen.columns.values()}, chosen.kind
     if TIME not in kind.columns and any(_is_record(found, i) for i in times_of(found) if i not in used):
         return "unsure", f"the file is a record in time, {kind.name} a table of trials"
-    own = [one for one in leading if one.kind is kind]
-    if any(not used >= {column.index for column in one.columns.values()} for one in own):
-        return "unsure", f"the columns fit {' and '.join(' with '.join(one.columns) for one in own)}"
+    own = [one.columns for one in leading if one.kind is kind]
+    if any(not used >= {column.index for column in one.values()} for one in own):
+        return "unsure", f"the columns fit {' and '.join(map(' with '.join, own))}"
     # A column under an unknown name may make it another kind: a force and a current are no list of pulls.
     known = {kind.columns[name].si for name in (kind.columns if TIME in kind.columns else chosen.columns)}
     stated = {rule.si for rule in kind.setting_rules.values() if isinstance(rule, QuantityRule)}
@@ -113,13 +113,13 @@ def _doubt(
         others = sorted(dimensions - stated if is_constant(found, index) else dimensions)
         # A number of a trial is no reading, nor is a mass, or a percentage.
         label = found.columns[index] == np.clip(np.rint(found.columns[index]), 0, len(found.columns[index]))
-        bare = not text and len(chosen.columns) == 1 and not label.all()
-        if bare or (unit_of(text, others) not in (None, "%") and unit_of(text, ["kg"]) is None):
+        unnamed = not text and len(chosen.columns) == 1 and not label.all()
+        if unnamed or (unit_of(text, others) not in (None, "%") and unit_of(text, ["kg"]) is None):
             return "unsure", f"column {index + 1}, {found.names[index]!r}, is not used"
     return "sure", "the columns fit no other kind as well"
 
 
-def _guess(found: FoundLayout, candidate: _Candidate, confidence: Confidence, reason: str) -> Guess:
+def _guess(found: FoundLayout, candidate: Assignment, confidence: Confidence, reason: str) -> Guess:
     """The guess of a candidate; a missing time column needs a stated rate."""
     needs_rate = TIME in candidate.kind.columns and TIME not in candidate.columns
     if needs_rate and found.rate is None:
@@ -127,29 +127,15 @@ def _guess(found: FoundLayout, candidate: _Candidate, confidence: Confidence, re
     return Guess(candidate.kind.name, candidate.columns, found.rate if needs_rate else None, confidence, reason)
 
 
-def _candidates(found: FoundLayout, kind: Kind) -> Iterable[_Candidate]:
-    """The assignments of file columns to each set of columns of a kind that needs no line of [model]."""
-    for one in assignments(found, kind):
-        needs_line = any(set(one.wanted) < set(larger) for larger in kind.sets)
-        time = one.columns.get(TIME)
-        if (
-            not one.missing
-            and not needs_line
-            and (TIME not in one.wanted or _is_record(found, None if time is None else time.index))
-        ):
-            yield _Candidate(kind, one.columns, one.score)
-
-
 def _by_angle(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     """A guess for a record of an angle, its rate or its acceleration, as arm times angle; None for another file."""
     times = [index for index in times_of(found) if len(found.columns[index]) >= FEWEST_SAMPLES]
     candidates = []
-    for kind in kinds.values():
+    for kind in (kind for kind in kinds.values() if times and TIME in kind.columns):
         channel = next(filter(None, (_angle(found, kind, name) for name in kind.channels)), None)
-        if times and channel is not None and TIME in kind.columns:
-            time = score_of(found, times[0], TIME, kind)
-            columns = {} if time is None else {TIME: time[1]}
-            candidates.append(_Candidate(kind, {**columns, channel[0]: channel[1]}, 0.0))
+        time = score_of(found, times[0], TIME, kind)
+        columns = {} if time is None else {TIME: time[1]}
+        candidates += [] if channel is None else [Assignment(kind, {**columns, channel[0]: channel[1]})]
     if not candidates:
         return None
     by_motion = _by_motion(found, candidates)
@@ -162,31 +148,27 @@ def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess]
     if si not in ANGULAR:
         return None
     remedy = "multiply scale by the arm in m, or enter the moment of inertia in kg m^2 as the mass in kg"
-    for index, values in found.columns.items():
+    for index in found.columns:
         stem, text = name_and_unit(found.names[index], [*ANGULAR, *ANGULAR.values()])
         text = (text if text is not None else found.units[index]).strip()
         unit = unit_of(text, [ANGULAR[si]])
         known = max(fits_name(stem, name), fits_name(stem, "angle") if name == "x_rel" else 0) > 0
         if known and unit is not None:
-            scale, reason = factor_to_si(unit, ANGULAR[si]), f"{found.names[index]!r} times an arm of 1 m"
-            return name, ColumnGuess(index, si, "unsure", f"{reason}; {remedy}", scale)
+            reason = f"{found.names[index]!r} times an arm of 1 m; {remedy}"
+            return name, ColumnGuess(index, si, "unsure", reason, factor_to_si(unit, ANGULAR[si]))
         if name == "x_rel" and not text and fits_name(stem, "angle") > 0:
-            largest = float(np.nanmax(np.abs(values)))
-            scale, taken = (1.0, "rad") if largest <= LARGEST_SWING else (float(np.deg2rad(1.0)), "deg")
-            reason = f"an angle without unit, taken as {taken} because it reaches {largest:.3g}"
-            return name, ColumnGuess(index, si, "unsure", f"{reason}; {remedy}", scale)
+            reason = f"an angle without unit: write {si} and scale = 1 for rad, 0.01745329252 for degrees"
+            return name, ColumnGuess(index, UNKNOWN, "unsure", f"{reason}; {remedy}")
     return None
 
 
 def _is_record(found: FoundLayout, time: int | None) -> bool:
     """Whether a file is a record in time: long enough, with increasing times."""
     rows = len(next(iter(found.columns.values())))
-    if time is None:
-        return rows >= FEWEST_SAMPLES
-    return rows >= 8 and increases(found.columns[time])
+    return rows >= FEWEST_SAMPLES if time is None else rows >= 8 and increases(found.columns[time])
 
 
-def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidate, Confidence, str] | None:
+def _by_motion(found: FoundLayout, leading: list[Assignment]) -> tuple[Assignment, Confidence, str] | None:
     """Of kinds with the same columns, the bench test where the record decays, the other where it is driven."""
     records = [each for each in leading if TIME in each.kind.columns]
     if {each.kind.bench for each in records} != {True, False} or len(records) < len(leading):
@@ -204,18 +186,15 @@ def _by_motion(found: FoundLayout, leading: list[_Candidate]) -> tuple[_Candidat
     # A lightly damped decay has lost little at its end, but each part is smaller than the one before.
     falls = bool(np.all(np.diff(parts) < 0.0)) and ratio < STEADY
     clear = ratio < DECAYS or (least > DRIVEN and not falls)
-    words = "decays" if bench else "is driven"
-    return (
-        chosen,
-        "sure" if clear else "unsure",
-        f"the motion {words}: its amplitude ends at {ratio:.0%} of its largest",
-    )
+    reason = f"the motion {'decays' if bench else 'is driven'}: its amplitude ends at {ratio:.0%} of its largest"
+    return chosen, "sure" if clear else "unsure", reason
 
 
 def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
     """A guess for a record whose headers say nothing: times that increase evenly, and one channel."""
     rows = len(next(iter(found.columns.values()), ()))
-    times = [index for index in found.columns if _is_even(found.columns[index])]
+    steps = {index: np.diff(values) for index, values in found.columns.items()}
+    times = [index for index, each in steps.items() if np.all(each > 0.0) and np.all(each < 3.0 * np.median(each))]
     channels = [index for index in found.columns if index not in times]
     if rows < FEWEST_SAMPLES or len(times) > 1 or len(channels) != 1:
         return None
@@ -234,7 +213,7 @@ def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | Non
         if times and (named := score_of(found, times[0], TIME, kind)) is not None:
             columns[TIME] = named[1]
         if len(columns) == len(wanted):
-            candidates.append(_Candidate(kind, columns, 0.0))
+            candidates.append(Assignment(kind, columns))
     by_motion = _by_motion(found, candidates)
     return None if by_motion is None else _guess(found, by_motion[0], "unsure", f"{reason}; {by_motion[2]}")
 
@@ -244,9 +223,8 @@ def _first_with_unit(
 ) -> tuple[str, str] | None:
     """The first of the ``names`` that the unit in the file allows, and that unit."""
     text = name_and_unit(found.names[index], dimensions)[1] or found.units[index]
-    if unit_of(text, dimensions) is None:
-        return next(((name, UNKNOWN) for name in names), None)
-    units = ((name, unit_of(text, [kind.columns[name].si])) for name in names)
+    unknown = None if unit_of(text, dimensions) else UNKNOWN
+    units = ((name, unit_of(text, [kind.columns[name].si]) or unknown) for name in names)
     return next(((name, unit) for name, unit in units if unit is not None), None)
 
 
@@ -255,16 +233,9 @@ def disordered_times(found: FoundLayout) -> tuple[str, int] | None:
     for index, values in found.columns.items():
         name, text = name_and_unit(found.names[index], ["s"])
         if fits_name(name, TIME) > 0 and unit_of(text or found.units[index], ["s"]) is not None:
-            rows = np.flatnonzero(np.diff(values) <= 0.0)
-            if len(rows):
-                return found.names[index], int(found.export.lines[rows[0] + 1])
+            for row in np.flatnonzero(np.diff(values) <= 0.0):
+                return found.names[index], int(found.export.lines[row + 1])
     return None
-
-
-def _is_even(values: np.ndarray) -> bool:
-    """Whether values increase by nearly equal steps."""
-    steps = np.diff(values)
-    return bool(len(steps) and np.all(steps > 0.0) and np.max(steps) < 3.0 * np.median(steps))
 
 
 def are_turning_points(values: np.ndarray) -> bool:

@@ -15,7 +15,7 @@ from capsule_id import cli
         ("Time (s),Angle (deg)", 'x_rel = { from = "Angle (deg)", unit = "m", scale = 0.01745329252 }  # unsure: '),
         (
             "Time (s),Angle",
-            'x_rel = { from = "Angle", unit = "m", scale = 0.01745329252 }  # unsure: an angle without unit',
+            'x_rel = { from = "Angle", unit = "?" }  # unsure: an angle without unit: write m and scale = 1 for rad, 0.01745',
         ),
         ("Zeit t / s,Weg b_A1 / rad", 'x_rel = { from = "Weg b_A1 / rad", unit = "m", scale = 1 }  # unsure: '),
         (
@@ -35,6 +35,7 @@ def test_a_record_of_an_angle_is_no_table_of_tilts(tmp_path: Path, header: str, 
     assert f'kind = "free_vibration"  # {"unsure" if "speed" in header else "sure"}' in entry
     assert line in entry
     masses = '[rig]\nname = "a"\nm1 = { value = 0.02, unit = "kg" }\n\n'
+    entry = entry.replace('unit = "?"', 'unit = "m", scale = 0.01745329252')
     (tmp_path / "rig.toml").write_text(masses + entry, encoding="utf-8")
     (table,) = capsule_id.read_rig(tmp_path).tables
     factor = 1e-3 if "mm" in header else 1.0 if "rad" in header else np.radians(1.0)

@@ -19,13 +19,12 @@ Confidence = Literal["sure", "likely", "unsure"]
 TIME = "time"
 #: Fewest rows of a record in time.
 FEWEST_SAMPLES = 50
-#: Score of a unit that fits a column, of a column that is left out, and of one that is the same in every row.
-UNIT_SCORE, LEFT_OUT, CONSTANT = 1.0, -0.25, -2.0
-#: Score of the word for the friction that a kind takes.
-MEANT_SCORE = 0.5
-#: Weight of the range of a column, relative to the largest one, which decides between equal scores only.
-TIE = 1e-3
-_NO_NAME = -1e3  # score of a column whose name does not fit
+#: Score of a unit that fits a column, of the word for the friction that a kind takes, of a column that is left out, and of
+#: one that is the same in every row.
+UNIT_SCORE, MEANT_SCORE, LEFT_OUT, CONSTANT = 1.0, 0.5, -0.25, -2.0
+#: Weight of the range of a column, relative to the largest one, which decides between equal scores only; score of a column
+#: whose name does not fit.
+TIE, _NO_NAME = 1e-3, -1e3
 _LONGEST_HEADER = 40  # characters; a column with a longer header is named by its number
 #: Columns that may be the same in every row, beside those that a kind calls optional.
 SETTINGS = ("length", "speed", "period", "f", "periods")
@@ -53,16 +52,17 @@ class Assignment:
 
     Attributes
     ----------
-    wanted : the set of columns of the kind
     columns : by name of the kind's column
-    missing : columns that the kind needs and the file does not have; a time may be stated as a rate
     score : how well all fit
+    wanted : the set of columns of the kind
+    missing : columns that the kind needs and the file does not have; a time may be stated as a rate
     """
 
-    wanted: tuple[str, ...]
+    kind: KindRule
     columns: Mapping[str, ColumnGuess]
-    missing: tuple[str, ...]
-    score: float
+    score: float = 0.0
+    wanted: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
 
 def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
@@ -77,7 +77,7 @@ def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
             scored = score_of(found, index, name, kind)
             if scored is not None:
                 scores[i, j], guesses[i, j] = scored
-                ranges[i, j] = np.ptp(_si(found, scored[1], kind.columns[name].si, finite=True))
+                ranges[i, j] = np.ptp(readings_of(found, scored[1], kind.columns[name].si, finite=True))
         # Of columns that fit as well, such as the axes of an accelerometer, the one with the largest motion.
         largest = np.maximum(np.max(ranges, axis=1, keepdims=True, initial=0.0), np.finfo(float).tiny)
         rows, places = linear_sum_assignment(scores + TIE * ranges / largest, maximize=True)
@@ -87,34 +87,28 @@ def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
             wanted[i]: _with_rivals(
                 found,
                 guesses[i, j],
-                [(guesses[i, k], _lead(float(scores[i, k]), float(scores[i, j]))) for k in unused if (i, k) in guesses],
+                float(scores[i, j]),
+                [(guesses[i, k], float(scores[i, k])) for k in unused if (i, k) in guesses],
                 kind.columns[wanted[i]].si,
             )
             for i, j in pairs
         }
-        for i, k in ((i, k) for i in range(-len(optional), 0) for k in unused):
-            other = guesses.get((i % len(wanted), k))
-            if (
-                other is not None
-                and wanted[i] not in chosen
-                and not meaning(found.names[other.index], "force", kind.name)
-            ):
-                # A normal force under another name would change the number.
+        for (i, k), other in guesses.items():
+            named = (
+                wanted[i] not in optional
+                or wanted[i] in chosen
+                or meaning(found.names[other.index], "force", kind.name)
+            )
+            if k in unused and not named:  # a normal force under another name would change the number
                 reason = f"{other.reason}; remove the # if it is the {wanted[i]}"
                 chosen[wanted[i]] = replace(other, confidence="unsure", reason=reason, asked=True)
-        missing = tuple(name for name in columns if name not in chosen and name != TIME)
-        if kind.channels and not set(kind.channels) & set(chosen):
-            missing = (*missing, kind.channels[0])
-        left_out = sum(name not in chosen for name in columns)
-        yield Assignment(columns, chosen, missing, sum(float(scores[pair]) for pair in pairs) + LEFT_OUT * left_out)
+        channel = () if not kind.channels or set(kind.channels) & set(chosen) else kind.channels[:1]
+        missing = (*(name for name in columns if name not in chosen and name != TIME), *channel)
+        score = sum(float(scores[pair]) for pair in pairs) + LEFT_OUT * len(set(columns) - set(chosen))
+        yield Assignment(kind, chosen, score, columns, missing)
 
 
-def _lead(score: float, chosen: float) -> float:
-    """By how much a column fits better than the chosen one; one of another name as well as the end of a word."""
-    return 0.0 if score == _NO_NAME and chosen <= 1.0 + UNIT_SCORE else score - chosen
-
-
-def _si(found: FoundLayout, column: ColumnGuess, si: str, *, finite: bool = False) -> np.ndarray:
+def readings_of(found: FoundLayout, column: ColumnGuess, si: str, *, finite: bool = False) -> np.ndarray:
     """The readings of a column in SI, (n,); as they are where their unit is unknown."""
     values = found.columns[column.index]
     values = values[np.isfinite(values)] if finite else values
@@ -129,40 +123,34 @@ def increases(values: np.ndarray) -> bool:
 
 def times_of(found: FoundLayout) -> list[int]:
     """Columns that are named as times and increase from row to row."""
-    names = {index: name_and_unit(found.names[index], ["s"])[0] for index in found.columns}
-    return [index for index, name in names.items() if fits_name(name, TIME) > 0 and increases(found.columns[index])]
+    named = ((index, name_and_unit(found.names[index], ["s"])[0]) for index in found.columns)
+    return [index for index, name in named if fits_name(name, TIME) > 0 and increases(found.columns[index])]
 
 
 def is_constant(found: FoundLayout, index: int) -> bool:
     """Whether a column of several rows is the same in all of them."""
-    values = found.columns[index]
-    return len(values) > 1 and float(np.nanmax(values)) == float(np.nanmin(values))
+    return len(values := found.columns[index]) > 1 and bool(np.nanmax(values) == np.nanmin(values))
 
 
 def _with_rivals(
-    found: FoundLayout, column: ColumnGuess, others: Sequence[tuple[ColumnGuess, float]], si: str
+    found: FoundLayout, column: ColumnGuess, score: float, others: Sequence[tuple[ColumnGuess, float]], si: str
 ) -> ColumnGuess:
-    """The guess beside the ``others`` that may be meant, each with the lead of its score; equal numbers are no rivals."""
-    own = _si(found, column, si)
+    """The guess with its score beside the ``others`` that may be meant, with theirs; equal numbers are no rivals."""
+    own = readings_of(found, column, si)
     rivals = [
-        (other, lead)
-        for other, lead in others
-        if not np.allclose(_si(found, other, si), own, rtol=1e-9, atol=0.0, equal_nan=True)
+        each
+        for each in others
+        if not np.allclose(readings_of(found, each[0], si), own, rtol=1e-9, atol=0, equal_nan=True)
     ]
     if not rivals:
         return column
-    named = " ".join(
-        f"column {other.index + 1}, {found.names[other.index]!r},"
-        if found.names[other.index]
-        else f"column {other.index + 1}"
-        for other, _ in rivals
-    )
-    alike = tuple(other for other, lead in rivals if lead + UNIT_SCORE * (other.unit == UNKNOWN) >= 0.0)
-    if alike:
-        reason = f"{column.reason}; {named} fits as well"
-        return replace(column, confidence="unsure", reason=reason, rivals=alike, asked=True)
-    confidence = "likely" if column.confidence == "sure" else column.confidence
-    return replace(column, confidence=confidence, reason=f"{column.reason}; {named} fits less well")
+    # The end of a word says no more than another name.
+    least = _NO_NAME if score <= 1.0 + UNIT_SCORE else score
+    alike = tuple(other for other, its in rivals if its + UNIT_SCORE * (other.unit == UNKNOWN) >= least)
+    columns = [f"column {other.index + 1}, {found.names[other.index]!r}," for other, _ in rivals]
+    reason = f"{column.reason}; {' '.join(columns)} fits {'as well' if alike else 'less well'}"
+    confidence = "unsure" if alike else "likely" if column.confidence == "sure" else column.confidence
+    return replace(column, confidence=confidence, reason=reason, rivals=alike, asked=column.asked or bool(alike))
 
 
 def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple[float, ColumnGuess] | None:
@@ -183,13 +171,12 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     if constant and name not in (*SETTINGS, *kind.optional):
         reason = f"{said}, the same in every row: a setting, or a coarse reading"
         return by_name + CONSTANT, ColumnGuess(index, unit or UNKNOWN, "unsure", reason, asked=True)
+    if unit is None and rule.si == "1":
+        return by_name, ColumnGuess(index, "1", "likely", "a number without unit")
     if unit is None:
-        if rule.si == "1":
-            return float(by_name), ColumnGuess(index, "1", "likely", "a number without unit")
-        return float(by_name), ColumnGuess(index, UNKNOWN, "unsure", "the file states no unit")
-    exact = unit == text
-    reason = said if exact else f"{said}, read as {unit}"
-    return by_name + UNIT_SCORE, ColumnGuess(index, unit, "sure" if exact else "likely", reason)
+        return by_name, ColumnGuess(index, UNKNOWN, "unsure", "the file states no unit")
+    confidence, reason = ("sure", said) if unit == text else ("likely", f"{said}, read as {unit}")
+    return by_name + UNIT_SCORE, ColumnGuess(index, unit, confidence, reason)
 
 
 def source_of(found: FoundLayout, index: int) -> str:
@@ -205,25 +192,24 @@ def proposal(kind: KindRule, found: FoundLayout | None) -> str:
 
     ``found`` is the file (None: unknown).
     """
-    best, record = Assignment(kind.sets[0], {}, (*kind.sets[0], *kind.channels[:1]), 0.0), False
+    best, record = Assignment(kind, {}, 0.0, kind.sets[0], kind.channels[:1]), False
     if found is not None:
         best = max(assignments(found, kind), key=lambda one: (-len(one.missing), one.score))
         # A reading of a calibration is a row of a record; a trial is not.
-        trials = not any(rule.varies for rule in kind.columns.values())
-        record = trials and any(len(found.columns[index]) >= FEWEST_SAMPLES for index in times_of(found))
+        record = not any(rule.varies for rule in kind.columns.values()) and any(
+            len(found.columns[index]) >= FEWEST_SAMPLES for index in times_of(found)
+        )
     texts, words = [], []
     for name in dict.fromkeys((*best.wanted, *best.columns, *best.missing)):
         column = best.columns.get(name)
-        if column is not None and column.asked and name in kind.optional:
-            continue
-        if column is None and name == TIME and found is not None:
-            texts.append(f'{name} = {{ rate = {{ value = "{UNKNOWN}", unit = "Hz" }} }}')
-            words.append("no column holds times: state the sampling rate")
-            continue
-        source = f'"{UNKNOWN}"'
-        if found is not None and column is not None and not record and not column.asked:
-            source = source_of(found, column.index)
-        elif column is not None:
-            words.append(f"{name}: {column.reason}; {'the file is a record in time' if record else 'name the column'}")
-        texts.append(f'{name} = {{ from = {source}, unit = "{UNKNOWN if column is None else column.unit}" }}')
+        source = f'from = "{UNKNOWN}", unit = "{UNKNOWN if column is None else column.unit}"'
+        if found is not None and column is None and name == TIME:
+            source = f'rate = {{ value = "{UNKNOWN}", unit = "Hz" }}'
+        elif found is not None and column is not None:
+            if record or column.asked:
+                words.append(f"{name}: {'the file is a record in time' if record else column.reason}")
+            else:
+                source = source.replace(f'"{UNKNOWN}"', source_of(found, column.index), 1)
+        if column is None or not column.asked or name not in kind.optional:
+            texts.append(f"{name} = {{ {source} }}")
     return f"columns = {{ {', '.join(texts)} }}" + (f" ({'; '.join(words)})" if words else "")

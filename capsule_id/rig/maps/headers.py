@@ -140,8 +140,8 @@ def fits_name(name: str, column: str) -> float:
     known = WORDS.get(SAME.get(column, column), ())
     if any(word in (*words, *map("".join, pairwise(words))) for word in known):  # F_N is FN
         return 2.5 if set(words) <= set(known) or "".join(words) in known else 2
-    heads = tuple(word for word in known if len(word) >= SHORTEST_HEAD or word in SHORT_HEADS)
-    return 1 if any(word.endswith(heads) for word in words) else 0
+    heads = (word for word in known if len(word) >= SHORTEST_HEAD or word in SHORT_HEADS)
+    return float(any(word.endswith(tuple(heads)) for word in words))
 
 
 def meaning(name: str, column: str, kind: str) -> int:

@@ -91,8 +91,8 @@ def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundL
         export = EXPORTS[suffix](content, path, layout)
     columns, singles, unread = _readings(export)
     if not columns:
-        rule, remedy = "a file must have a column of numbers", "export the readings as numbers"
-        raise next(iter(unread.values()), InputError(rule, "none", remedy, path))
+        nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
+        raise next(iter(unread.values()), InputError(*nothing, path))
     names, units = _headers(export, dimensions)
     # Headers are printed: no character of them may command the terminal.
     names = tuple("".join(mark if mark.isprintable() else " " for mark in name) for name in names)
