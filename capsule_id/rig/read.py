@@ -60,9 +60,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         At the first fault: file, line and column, the rule, the value found, the remedy. Where several quantities of
         [rig] or experiments have faults, at the first one of each (``FolderError``).
     """
-    folder = Path(folder)
-    folder = folder.parent if folder.name == "rig.toml" and folder.is_file() else folder
-    document, sha256 = _read_document(folder)
+    document, sha256 = _read_document(Path(folder))
     data = document.data
     refuse_unknown_keys(document, (), data, ("rig", "model", "prior", "experiment"))
     if "rig" not in data:
@@ -95,7 +93,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
         priors=MappingProxyType(_read_priors(document, tables, [*parameter_rows(kinds).values(), *parameters])),
         tables=tables,
         files=MappingProxyType({"rig.toml": sha256, **files}),
-        folder=folder,
+        folder=document.path.parent,
         model=model,
         slope=stated.get("slope"),
         N0=stated.get("N0"),
@@ -105,6 +103,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
 
 def _read_document(folder: Path) -> tuple[TomlDocument, str]:
     """``rig.toml``, parsed and located, and its sha256."""
+    folder = folder.parent if folder.name == "rig.toml" and folder.is_file() else folder
     path = folder / "rig.toml"
     try:
         if not folder.is_dir():
