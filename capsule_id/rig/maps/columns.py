@@ -175,8 +175,8 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
         return by_name, ColumnGuess(index, "1", "likely", "a number without unit")
     if unit is None:
         return by_name, ColumnGuess(index, UNKNOWN, "unsure", "the file states no unit")
-    confidence, reason = ("sure", said) if unit == text else ("likely", f"{said}, read as {unit}")
-    return by_name + UNIT_SCORE, ColumnGuess(index, unit, confidence, reason)
+    reason = said if unit == text else f"{said}, read as {unit}"
+    return by_name + UNIT_SCORE, ColumnGuess(index, unit, "likely" if unit == "g_n" else "sure", reason)
 
 
 def source_of(found: FoundLayout, index: int) -> str:
