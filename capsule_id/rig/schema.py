@@ -162,6 +162,7 @@ class KindRule:
     rules : each raises an ``InputError`` where columns and settings are inconsistent
     masses : the masses of [rig] that an experiment with this table needs
     masses_of_free : the masses that an experiment needs where ``[model] free`` names a parameter, by its symbol
+    meant : words of ``capsule_id.rig.maps.headers`` for the forces of the file: the one that the kind takes, then others
     parameters : rows of the parameters that only experiments of this kind have
     bench : a bench test; else a forced run
     """
@@ -175,6 +176,7 @@ class KindRule:
     rules: tuple[Callable[["Entry[Any]"], None], ...] = ()
     masses: Callable[[Table[Any]], tuple[str, ...]] = field(default=lambda table: ())
     masses_of_free: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    meant: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     bench: bool = True
 

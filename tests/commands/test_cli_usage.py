@@ -103,7 +103,6 @@ def test_data_that_is_no_rig(
     (tmp_path / "loop").symlink_to("loop")
     before = listing(tmp_path)
     for data in (
-        "rig/rig.toml",
         "rig/static_friction.csv",
         "missing",
         "empty",

@@ -43,6 +43,7 @@ LAST += "    time.sleep(0.5)\n    return code\nfit.run = last\n"
 
 def start(folder: Path, *words: str, before: str = "", cache: bool = False) -> subprocess.Popen[str]:
     """Start ``fit-params``, by default without compiled programs from disk; ``folder/log`` shows every compilation."""
+    before = f"import logging\nlogging.basicConfig()\n{before}"  # libraries' logs are shown where a program wants them
     env = environment(JAX_ENABLE_COMPILATION_CACHE=str(int(cache)), JAX_LOG_COMPILES="1")
     with (folder / "log").open("w", encoding="utf-8") as log:
         return subprocess.Popen(

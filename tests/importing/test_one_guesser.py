@@ -101,6 +101,11 @@ def test_a_trace_in_time_is_not_proposed_as_trials(tmp_path: Path) -> None:
     written(tmp_path, "time [s],force [N]", 200)
     error = read(tmp_path, "static_friction")
     assert isinstance(error, capsule_id.InputError)
+    assert error.value == "a record against time"
+    assert "from =" not in error.remedy
+    written(tmp_path, "Time (s),Force (N)", 200)
+    error = read(tmp_path, "static_friction")
+    assert isinstance(error, capsule_id.InputError)
     assert 'force = { from = "?", unit = "N" }' in error.remedy
     assert "the file is a record in time" in error.remedy
     written(tmp_path, "time [s],Force (N),I [A]", 200)

@@ -92,6 +92,7 @@ KIND = Kind(
     sets=(("speed", "force"), ("speed", "coefficient"), ("force",), ("coefficient",)),
     optional=("normal_force",),
     settings=PullSettings,
+    meant=("sliding", "break-away", "no pull"),
     rules=(check_normal_force, _check_speed, _check_viscous, check_load),
     masses=_masses,
     masses_of_free=MASSES_OF_FREE,

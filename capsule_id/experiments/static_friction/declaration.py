@@ -131,6 +131,7 @@ KIND = Kind(
     optional=("normal_force",),
     masses=_masses,
     settings=TiltSettings,
+    meant=("break-away", "sliding", "no pull"),
     rules=(check_normal_force, _check_tilt, _check_ground, check_load),
     parameters=(TILT_SD, PULL_SCATTER),
     make=made_by("capsule_id.experiments.static_friction.experiment:StaticFriction"),

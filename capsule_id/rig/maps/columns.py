@@ -97,7 +97,7 @@ def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
             named = (
                 wanted[i] not in optional
                 or wanted[i] in chosen
-                or meaning(found.names[other.index], "force", kind.name)
+                or meaning(found.names[other.index], "force", kind.meant)
             )
             if k in unused and not named:  # a normal force under another name would change the number
                 reason = f"{other.reason}; remove the # if it is the {wanted[i]}"
@@ -160,7 +160,7 @@ def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple
     text = (text if text is not None else found.units[index]).strip()
     unit = unit_of(text, [rule.si]) if text else None
     constant = is_constant(found, index)
-    named, meant = fits_name(stem, name), meaning(stem, name, kind.name)
+    named, meant = fits_name(stem, name), meaning(stem, name, kind.meant)
     said = f"the file says {found.names[index]!r}"
     if (text and unit is None) or named < 0 or (constant and rule.varies):
         return None

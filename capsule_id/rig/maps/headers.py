@@ -57,11 +57,6 @@ _WORDS = {
 WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in _WORDS.items()}
 #: Names of the same quantity.
 SAME = {"acceleration_rod": "acceleration", "slope": "angle"}
-#: Kind of trials -> what it takes of the friction at break-away and while sliding, and what it does not.
-MEANT = {
-    "static_friction": ("break-away", "sliding", "no pull"),
-    "sliding_friction": ("sliding", "break-away", "no pull"),
-}
 #: Fewest letters of a word that can end a compound, and shorter words that can.
 SHORTEST_HEAD, SHORT_HEADS = 5, ("weg", "zeit")
 #: Units of headers that state none: names that programs give to their columns, and a normal force, or one in N.
@@ -144,15 +139,15 @@ def fits_name(name: str, column: str) -> float:
     return float(any(word.endswith(tuple(heads)) for word in words))
 
 
-def meaning(name: str, column: str, kind: str) -> int:
-    """1 for the name of the friction that the kind takes, at break-away or while it slides, -1 for the other, 0 for any."""
+def meaning(name: str, column: str, meant: Sequence[str]) -> int:
+    """1 for the name of the friction that is ``meant`` first, at break-away or while it slides, -1 for another, 0 for any."""
     if column == "normal_force":
         return 0
     bare = _bare(name)
     words = (*bare.split("_"), *map("".join, pairwise(bare.split("_"))))
     told = [
         any(part in (bare if len(part) >= SHORTEST_HEAD else words) for part in WORDS[which])
-        for which in MEANT.get(kind, ())[: 3 if column == "force" else 2]
+        for which in meant[: 3 if column == "force" else 2]
     ]
     return told[0] - any(told[1:]) if told else 0
 
