@@ -51,15 +51,16 @@ def test_it_is_a_maximum(twin: LogPosterior, fit: PointFit) -> None:
 
 
 def test_springs_against_scipy(twin: LogPosterior, fit: PointFit) -> None:
-    """A line with one scatter: k2 is the ordinary slope, its standard error that of least squares with this scatter."""
+    """A line with stated errors of both columns: k2 is the ordinary slope, its standard error that of least squares."""
     for experiment in twin.experiments:
         if experiment.kind == "support_spring":
             x, y = experiment.table["deflection"], experiment.table["force"]
             (slope, _), scaled = np.polyfit(x, y, 1, cov="unscaled")
-            scatter = fit.values[f"scatter[{experiment.label}]"]
+            columns = experiment.table.columns
+            noise = np.hypot(columns["force"].reading_sd, slope * columns["deflection"].reading_sd)
             name = next(row.name for row in experiment.parameters if row.symbol == "k2")
             assert fit.values[name] == pytest.approx(slope, rel=1e-4)
-            assert fit.standard_errors[name] == pytest.approx(scatter * np.sqrt(scaled[0, 0]), rel=2e-3)
+            assert fit.standard_errors[name] == pytest.approx(noise * np.sqrt(scaled[0, 0]), rel=2e-3)
 
 
 def test_truth_is_within_reach(fit: PointFit) -> None:
