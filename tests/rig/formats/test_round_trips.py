@@ -25,7 +25,7 @@ def entry(file: str, time: str | int | None, **others: int) -> str:
     sources["time"] = f'"{time}"' if isinstance(time, str) else str(time)
     maps = [f'{name} = {{ from = {source}, unit = "{UNITS[name]}" }}' for name, source in sources.items()]
     if time is None:
-        maps[0] = 'time = { rate = { value = 1000, unit = "Hz" } }'
+        maps[0] = 'time = { rate = { value = 1666.6666666666667, unit = "Hz" } }'
     return f"""\
 [rig]
 name = "round-trip"
@@ -70,7 +70,7 @@ def test_tdms_without_waveform_properties_needs_a_rate(tmp_path: Path) -> None:
 def test_channels_of_a_labview_file_with_different_rates_have_times_of_their_own(tmp_path: Path) -> None:
     text = lvm(COLUMNS, "No").decode()
     rates = next(line for line in text.split("\n") if line.startswith("Delta_X"))
-    changed = text.replace(rates, rates.replace("0.001", "0.002", 1))
+    changed = text.replace(rates, rates.replace("0.0006", "0.0012", 1))
     assert changed != text
     with pytest.raises(InputError, match="a header must be unique"):
         read(tmp_path, "run.lvm", changed.encode(), "X_Value")
