@@ -53,6 +53,10 @@ class Truth:
         known = self.flat()
         return self._replaced({n: value for kind in kinds for n, value in kind.truth.items() if n not in known})
 
+    def with_runs(self) -> "Truth":
+        """A copy with the springs that occur only in forced runs."""
+        return self.with_kinds(kind for kind in default_registry().values() if not kind.bench)
+
     def flat(self) -> dict[str, float]:
         """Values by parameter name."""
         values = asdict(self)

@@ -9,10 +9,10 @@ FAR_BELOW = 1000
 
 
 _DECISIVE = (
-    "{far} of {number} readings or stretches decide a parameter almost alone, so that the sample cannot tell how well the "
+    "{far} of {number:# reading} or stretches decide a parameter almost alone, so that the sample cannot tell how well the "
     "others predict them (Pareto shape above {limit:g}; a stretch is named by its first reading): {rows}"
 )
-_NOT_DECISIVE = "each of {number} readings or stretches can be left out: the sample predicts it from the others"
+_NOT_DECISIVE = "each of {number:# reading} or stretches can be left out: the sample predicts it from the others"
 
 
 def _disagreeing_starts(facts: Facts) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from capsule_id.views import Facts, Message
+from capsule_id.views import Facts, Message, counted
 
 
 def _unusual(facts: Facts) -> str:
@@ -41,8 +41,8 @@ def _spikes(facts: Facts) -> str:
         size = f"at {facts['time']:.5g} s stands off by {facts['size']:.2g} of the amplitude"
         return f"{place} one sample {size}. Delete its row."
     return (
-        f"{place} {number} single samples stand off (lines {facts['lines']}). Add this line to the experiment in rig.toml, "
-        f"which drops them: reject = {facts['rule']}"
+        f"{place} {counted(number, 'single sample')} stand off (lines {facts['lines']}). Add this line to the experiment in "
+        f"rig.toml, which drops them: reject = {facts['rule']}"
     )
 
 
