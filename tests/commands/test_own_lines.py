@@ -10,7 +10,7 @@ from capsule_id.cli import capsule_id, fit_params
 from tests.cli_tools import DATA, ROOT, environment, run, small_rig
 
 CORPUS = ROOT.parent / "shared" / "corpus"
-#: A workbook that names two thousand million rows; reading it is another test's subject.
+#: A workbook that names two thousand million rows: it is read for more than 400 s, which no line of a library explains.
 ENDLESS = "hostile_xlsx_row_2e9"
 SETTINGS_OF_LATEX = "text.usetex: True\nfont.family: no such font\nno.such.key: 1\n"
 
@@ -80,11 +80,9 @@ def test_a_warning_of_the_numbers_would_be_seen(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.slow
 @pytest.mark.skipif(not CORPUS.is_dir(), reason="the corpus is not at hand")
-@pytest.mark.parametrize("name", sorted(path.parent.name for path in CORPUS.glob("*/rig.toml")))
+@pytest.mark.parametrize("name", sorted({path.parent.name for path in CORPUS.glob("*/rig.toml")} - {ENDLESS}))
 def test_no_line_of_a_library_leaves_a_command(tmp_path: Path, name: str) -> None:
     """Over the corpus: check, and a fit without a sample, where a numerical warning is an error."""
-    if name == ENDLESS:
-        pytest.skip("see the readers")
     strict = environment(PYTHONWARNINGS="error::RuntimeWarning")
     words = [str(CORPUS / name), "--no-sample", "--quiet", "--out", str(tmp_path / "out")]
     for command, done in (

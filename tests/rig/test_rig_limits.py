@@ -1,12 +1,15 @@
 """Files of absurd size or nesting end in a located error, at once; white space inside a table is no part of a number."""
 
+import re
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import capsule_id
 from capsule_id.errors import InputError
+from capsule_id.experiments.registry import default_registry
 from capsule_id.rig.formats.text.csv import read_csv
 from capsule_id.rig.toml_document import DEEPEST_KEY, LARGEST_TEXT, parse_toml
 from capsule_id.rig.toml_values import closest
@@ -118,3 +121,21 @@ def test_a_seed_is_a_whole_number(seed: object) -> None:
     rig = capsule_id.read_rig(Path(__file__).parents[2] / "data")
     with pytest.raises(InputError, match="seed must be a whole number, not negative"):
         capsule_id.fit(rig, seed=seed)  # type: ignore[arg-type]
+
+
+def test_the_length_of_one_board_is_stated_as_the_template_says(tmp_path: Path) -> None:
+    """Before: "scale must not be 0", and no other place for a length that no column holds."""
+    kind = default_registry()["static_friction"]
+    (line,) = re.findall(r"#: (columns = \{ height .*\})", kind.template)
+    head = '[rig]\nname = "board"\n[[experiment]]\nkind = "static_friction"\nfile = "tilt.csv"\nlength_is = "board"\n'
+    (tmp_path / "tilt.csv").write_text("height [mm]\n178\n181\n190\n", encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(f"{head}{line}\n", encoding="utf-8")
+    (table,) = capsule_id.read_rig(tmp_path).tables
+    np.testing.assert_allclose(table["length"], 0.95, rtol=1e-12)
+    np.testing.assert_allclose(table["height"], [0.178, 0.181, 0.190], rtol=1e-12)
+    # A column of zeros is still refused, and the error says how a constant is stated.
+    (tmp_path / "rig.toml").write_text(f"{head}{line.replace('offset = 950', 'offset = 0')}\n", encoding="utf-8")
+    with pytest.raises(
+        InputError, match=r"scale must not be 0, 0, write 1, or -1 .*; for a constant, state it as offset"
+    ):
+        capsule_id.read_rig(tmp_path)
