@@ -56,9 +56,9 @@ if TYPE_CHECKING:
     from capsule_id.errors import InputError as InputError
     from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign
     from capsule_id.experiments.progression.twin import synthesize_robot as synthesize_robot
-    from capsule_id.importing.entry import propose_entry as propose_entry
-    from capsule_id.inference.choice.compare import compare_models as compare_models
-    from capsule_id.inference.choice.compare import compare_points as compare_points
+    from capsule_id.importing import propose_entry as propose_entry
+    from capsule_id.inference.compare import compare_models as compare_models
+    from capsule_id.inference.compare import compare_points as compare_points
     from capsule_id.motions.bias import smoothing_bias as smoothing_bias
     from capsule_id.motions.operating import draws_diagram as draws_diagram
     from capsule_id.motions.response import Response as Response
@@ -67,12 +67,12 @@ if TYPE_CHECKING:
     from capsule_id.motions.sweep import continuation as continuation
     from capsule_id.motions.sweep import diagram as diagram
     from capsule_id.motions.sweep import motion_map as motion_map
-    from capsule_id.physics.drives.pulses import Pulses as Pulses
-    from capsule_id.physics.drives.recorded import RecordedDrive as RecordedDrive
-    from capsule_id.physics.drives.recorded import RodMotion as RodMotion
+    from capsule_id.physics.drive import Excitation as Excitation
+    from capsule_id.physics.drives import Pulses as Pulses
+    from capsule_id.physics.drives import RecordedDrive as RecordedDrive
+    from capsule_id.physics.drives import RodMotion as RodMotion
     from capsule_id.physics.energy import energy_balance as energy_balance
     from capsule_id.physics.model import CapsuleParameters as CapsuleParameters
-    from capsule_id.physics.model import Excitation as Excitation
     from capsule_id.physics.model import Status as Status
     from capsule_id.physics.model import Trajectory as Trajectory
     from capsule_id.physics.model import simulate as simulate
@@ -83,8 +83,8 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "CapsuleParameters": "capsule_id.physics.model",
     "compare": "capsule_id.api",
-    "compare_models": "capsule_id.inference.choice.compare",
-    "compare_points": "capsule_id.inference.choice.compare",
+    "compare_models": "capsule_id.inference.compare",
+    "compare_points": "capsule_id.inference.compare",
     "continuation": "capsule_id.motions.sweep",
     "diagram": "capsule_id.motions.sweep",
     "draws_diagram": "capsule_id.motions.operating",
@@ -95,14 +95,14 @@ _MODULE_OF = {
     "InputError": "capsule_id.errors",
     "load": "capsule_id.api",
     "motion_map": "capsule_id.motions.sweep",
-    "propose_entry": "capsule_id.importing.entry",
-    "Pulses": "capsule_id.physics.drives.pulses",
+    "propose_entry": "capsule_id.importing",
+    "Pulses": "capsule_id.physics.drives",
     "read_rig": "capsule_id.api",
-    "RecordedDrive": "capsule_id.physics.drives.recorded",
+    "RecordedDrive": "capsule_id.physics.drives",
     "Response": "capsule_id.motions.response",
     "response": "capsule_id.motions.response",
     "RobotDesign": "capsule_id.experiments.progression.twin",
-    "RodMotion": "capsule_id.physics.drives.recorded",
+    "RodMotion": "capsule_id.physics.drives",
     "Settling": "capsule_id.motions.response",
     "simulate": "capsule_id.physics.model",
     "Smoothing": "capsule_id.physics.smooth.engine",

@@ -1,17 +1,26 @@
-"""What the commands do, as functions: read a rig folder, fit it, load the result."""
+"""What the commands do, as functions, and the finished fit that they return."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import MISSING, dataclass, fields
+from importlib import import_module
 from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+from scipy import stats
 
 from capsule_id.console import OnProgress, Progress
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
-from capsule_id.experiments.families.friction_model import friction_of
-from capsule_id.experiments.registry import Registry, default_registry
-from capsule_id.fitted import Fit as Fit
-from capsule_id.fitted import compare as compare
-from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.experiments.friction import friction_of
+from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.inference.joint_fit import fit_points
 from capsule_id.inference.pipeline import (
     check_fit,
     check_readings,
@@ -22,12 +31,305 @@ from capsule_id.inference.pipeline import (
     stage_seeds,
     unfinished,
 )
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.prediction import DRAWS, predict
+from capsule_id.inference.result import Result
+from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
+from capsule_id.inference.target import LogPosterior
+from capsule_id.output import check_directory, publish, work_in_progress
+from capsule_id.parameters import is_stated
+from capsule_id.physics.drive import Drive
+from capsule_id.physics.forces import warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
+from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
+from capsule_id.report.columns import table_rows, table_text, verdict_text, wrapped
+from capsule_id.report.figures import fits as comparisons
+from capsule_id.report.figures import fits as corner
+from capsule_id.report.figures import fits as runs
+from capsule_id.report.figures import fits as traces
+from capsule_id.report.figures.style import figure_of
+from capsule_id.report.html import summary_html
+from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
+from capsule_id.report.netcdf import data_tree
 from capsule_id.report.saved import load as load_fields
+from capsule_id.report.write import table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
+from capsule_id.views import Comparison, Finding, ResultTable
+
+# fitted: A finished fit as an object: words, tables, plots, simulations, files. ``fit`` and ``load`` return it.
+
+
+#: Largest number of parameters in ``repr``.
+SHOWN_PARAMETERS = 4
+#: Probability that ``compare`` calls any parameter of two equal rigs different.
+FALSE_ALARMS = 0.05
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, repr=False)
+class Fit(Result):
+    """A ``Result`` in words, tables, plots and files.
+
+    ``trust`` is the word of the whole result; ``summary`` holds value, sd and trust of every parameter. The methods
+    ``plot_*`` draw into ``ax``, or into a new pyplot figure, and return the axes.
+    """
+
+    @property
+    def failed(self) -> list[str]:
+        """Titles of the failed checks."""
+        messages = messages_of(self.registry)
+        return sorted({title_of(finding.code, messages) for finding in self.findings if finding.level == "fail"})
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in one line: trust, failed checks, number of warnings."""
+        return verdict_text(self.trust, self.failed, sum(finding.level == "warn" for finding in self.findings))
+
+    @property
+    def remarks(self) -> list[str]:
+        """Texts that the console shows under the table: a quoted model that is not the stated one, and unusual magnitudes."""
+        messages = messages_of(self.registry)
+        found = [f for f in self.findings if f.code in messages and messages[f.code].on_console and f.level != "ok"]
+        return list(dict.fromkeys(self.text(f) for f in found))
+
+    def text(self, item: Finding | ResultTable) -> str:
+        """What a finding says (what was expected, what was found, what to do), or the caption of a table."""
+        messages = messages_of(self.registry)
+        return finding_text(item, messages) if isinstance(item, Finding) else caption_of(item, messages)
+
+    def __repr__(self) -> str:
+        rows = [row for row in table_rows(self.summary) if not is_stated(row.name)]
+        shown = [f"{row.name} = {row.quoted} {row.unit}" for row in rows]
+        more = f", and {len(shown) - SHOWN_PARAMETERS} more" if len(shown) > SHOWN_PARAMETERS else ""
+        synthetic = ", synthetic" if self.rig.synthetic else ""
+        return f"<Fit of {self.rig.name}{synthetic}: {self.trust}; {', '.join(shown[:SHOWN_PARAMETERS])}{more}>"
+
+    def __str__(self) -> str:
+        table = table_text(self.summary, synthetic=self.rig.synthetic)
+        return "\n".join([table, *wrapped(self.remarks), self.verdict])
+
+    def _repr_html_(self) -> str:
+        return summary_html(self, self.verdict, self.remarks)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """The content of parameters.csv: a row per parameter, noise levels included (``role``), SI."""
+        return table_frame(self)
+
+    def to_arviz(self) -> Any:
+        """The sample for ArviZ: its InferenceData (ArviZ 0.2x), else an ``xarray.DataTree``.
+
+        Raises
+        ------
+        ValueError
+            If nothing was sampled.
+        """
+        tree = data_tree(self)
+        try:
+            kind: Any = getattr(import_module("arviz"), "InferenceData", type(tree))  # an optional package
+        except ImportError:
+            return tree
+        if isinstance(tree, kind):  # ArviZ 1
+            return tree
+        return kind(**{str(name): group.to_dataset() for name, group in tree.children.items()})
+
+    def simulate(
+        self,
+        drive: Drive,
+        times: ArrayLike,
+        draws: int = 100,
+        spring: str | None = None,
+        gap: float = math.inf,
+        given: Mapping[str, float] | None = None,
+        seed: int = 0,
+    ) -> Trajectory:
+        """Motion of the capsule from rest for draws of the posterior; every field has the axis (draws,) in front.
+
+        Parameters
+        ----------
+        drive : such as ``Excitation(P_d=4.0, Omega=34.56)``
+        times : (n,) s, increasing
+        draws : number of draws, taken at random without repetition
+        spring : name of the support spring, k2[spring]; None: no support spring
+        gap : G, m; needed with ``spring``. One far beyond the motion is a warning
+        given : leaves of ``CapsuleParameters`` that the fit does not have, SI by name
+        seed : of the choice of draws
+
+        Raises
+        ------
+        InputError
+            If nothing was sampled, there are fewer draws, the spring was not fitted, or a parameter or the gap is missing.
+        """
+        chosen = self._draws(draws, seed)
+        stated = {name: self.rig.mass(name) for name in ("m1", "m2") if getattr(self.rig, name) is not None}
+        ground = {name: q.value for name, q in (("slope", self.rig.slope), ("N0", self.rig.N0)) if q is not None}
+        values = {
+            **stated,
+            **self.fixed,
+            **ground,
+            "g": self.rig.g.value,
+            "k2": 0.0,
+            "G": gap,
+            **chosen,
+            **(given or {}),
+        }
+        if spring is not None:
+            if f"k2[{spring}]" not in chosen:
+                known = ", ".join(name[3:-1] for name in chosen if name.startswith("k2["))
+                raise InputError("spring must be a fitted one", repr(spring), f"choose from {known or 'none'}")
+            if np.any(np.isinf(values["G"])):
+                raise InputError(
+                    "a support spring needs its gap", f"{spring!r} alone", "give gap=1e-3, in m, or spring=None"
+                )
+            values["k2"] = chosen[f"k2[{spring}]"]
+        leaves = fields(CapsuleParameters)
+        if missing := [leaf.name for leaf in leaves if leaf.default is MISSING and leaf.name not in values]:
+            rule, remedy = "simulate needs every parameter of the capsule", f"state given={{{missing[0]!r}: ...}}, SI"
+            raise InputError(rule, f"the fit has no {', '.join(missing)}", remedy)
+        p = CapsuleParameters(**{leaf.name: values[leaf.name] for leaf in leaves if leaf.name in values})
+        motion = simulate(p, drive, times)
+        warn_of_far_gap(p.G, motion.x_rel)
+        return motion
+
+    def _draws(self, number: int, seed: int) -> dict[str, np.ndarray]:
+        """``number`` draws at random: name -> (number,), SI."""
+        if self.posterior is None:
+            raise InputError("draws need a sample", "the point fit alone", "fit without --no-sample (budget=None)")
+        flat = self.posterior.draws.reshape(-1, len(self.posterior.names))
+        if not 1 <= number <= len(flat):
+            raise InputError("draws must lie between 1 and the sample's", str(number), f"give at most {len(flat)}")
+        chosen = np.random.default_rng(seed).choice(len(flat), number, replace=False)
+        return dict(zip(self.posterior.names, flat[chosen].T, strict=True))
+
+    def predict(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> pd.DataFrame:
+        """Predict a new trial in a new session at each row of a table; see ``capsule_id.inference.prediction``."""
+        return predict(self, settings, draws, seed).table
+
+    def prediction_figure(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Figure:
+        """Figure of the predictions of ``predict``: mean velocity against period, with the trials of the fit."""
+        return comparisons.side_by_side(predict(self, settings, draws, seed).panels)
+
+    def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
+        """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""
+        item = _named(self.comparisons, label, lambda panel: panel.label)
+        return comparisons.comparison(item, ax or _new_axes(6.4, 4.4))
+
+    def plot_residuals(self, label: str | None = None, ax: Axes | None = None) -> Axes:
+        """Residuals of the point fit in units of the noise; ``label``: by default the first panel that has some."""
+        panels = [panel for panel in self.comparisons if panel.residuals is not None]
+        return comparisons.residuals(_named(panels, label, _label), ax or _new_axes(6.4, 2.4))
+
+    def plot_autocorrelation(self, label: str | None = None, ax: Axes | None = None) -> Axes:
+        """Autocorrelation of the residuals of a record; ``label``: by default the first record."""
+        panels = [panel for panel in self.comparisons if panel.autocorrelation is not None]
+        return comparisons.autocorrelation(_named(panels, label, _label), ax or _new_axes(6.4, 2.4))
+
+    def plot_record(self, name: str | None = None, ax: Axes | None = None) -> Figure:
+        """Channels of a recorded run and its phase plane, several panels in the place of ``ax``: the figure."""
+        view = _named(self.records, name, lambda record: record.name).view
+        return figure_of(runs.run_overview(view, ax or _new_axes(*runs.overview_size(view), constrained=False)))
+
+    def plot_force(self, name: str | None = None, ax: Axes | None = None) -> Axes:
+        """Force on the rod from the recorded current, and the fitted drive."""
+        record = _named([r for r in self.records if r.view.force is not None], name, lambda record: record.name)
+        return runs.force_on_rod(record.view, ax or _new_axes(6.4, 4.4), (record.view.time, record.force))
+
+    def plot_corner(self, ax: Axes | None = None) -> Figure:
+        """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair: the figure."""
+        width, height = corner.corner_size(self._sampled)[1:]
+        return figure_of(corner.corner(self, ax or _new_axes(width, height)))
+
+    def plot_traces(self, ax: Axes | None = None) -> Figure:
+        """A few walkers of each ensemble against the step, several panels in the place of ``ax``: the figure."""
+        size = traces.traces_size(self._sampled)
+        return figure_of(traces.traces(self, ax or _new_axes(*size, constrained=False)))
+
+    def plot_starts(self, ax: Axes | None = None) -> Axes:
+        """Where each start of the point fit began and ended, in standard deviations."""
+        return comparisons.point_fit_starts(
+            self.point_fit, ax or _new_axes(7.2, 1.5 + 0.25 * len(self.point_fit.names))
+        )
+
+    @property
+    def _sampled(self) -> int:
+        """Number of sampled physical parameters."""
+        return 0 if self.posterior is None else sum(name in self.posterior.names for name in self.summary.index)
+
+    def write(self, directory: str | Path) -> None:
+        """Write parameters.json, parameters.csv, posterior.nc, report.html and figures/ into ``directory``.
+
+        Raises
+        ------
+        InputError
+            If it exists and is not a result of this package.
+        """
+        path = Path(directory)
+        check_directory(path)
+        with work_in_progress(path, {}, resume=False) as partial:
+            write_result(self, partial)
+            publish(partial, path)
+
+
+def compare(a: Result, b: Result) -> pd.DataFrame:
+    """Which parameters of two results differ, and by how many standard deviations.
+
+    The two fits must rest on different readings: shared readings make the differences smaller than their sds say.
+
+    Returns
+    -------
+    DataFrame with a row per common parameter (index ``name``), SI: unit, value and sd of both, ``difference`` (b - a),
+    its ``sd``, ``sds`` (their ratio) and ``differs``: |sds| beyond the normal quantile that two equal rigs exceed in
+    any parameter in 1 of 20 cases.
+
+    Raises
+    ------
+    InputError
+        If ``a`` or ``b`` is something else than a result.
+    """
+    for one in (a, b):
+        if not isinstance(one, Result):
+            rule, remedy = "compare takes two results", "give results of fit, or load(DIR)"
+            raise InputError(rule, f"{type(one).__name__} {str(one)[:60]!r}", remedy)
+    names = [name for name in a.summary.index if name in b.summary.index]
+    one, other = a.summary.loc[names], b.summary.loc[names]
+    frame = pd.DataFrame({"unit": one["unit"]}, index=pd.Index(names, name="name"))
+    for word, part in (("a", one), ("b", other)):
+        frame[f"value_{word}"], frame[f"sd_{word}"] = part["value"].astype(float), part["sd"].astype(float)
+    frame["difference"] = frame["value_b"] - frame["value_a"]
+    frame["sd"] = np.hypot(frame["sd_a"], frame["sd_b"])
+    # Two exact constants have no sd: equal ones are 0 sd apart, others infinitely many.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        frame["sds"] = np.where(frame["difference"] == 0.0, 0.0, frame["difference"] / frame["sd"])
+    frame["differs"] = frame["sds"].abs() > stats.norm.isf(FALSE_ALARMS / 2.0 / max(len(names), 1))
+    return frame
+
+
+def _label(panel: Comparison) -> str:
+    return panel.label
+
+
+def _named(items: Iterable[Item], label: str | None, label_of: Callable[[Item], str]) -> Item:
+    """The item with this label; the first one where ``label`` is None."""
+    known: Sequence[Item] = tuple(items)
+    for item in known:
+        if label in (None, label_of(item)):
+            return item
+    names = ", ".join(label_of(item) for item in known)
+    rule, remedy = (
+        "the result must have this panel",
+        f"choose from {names}" if names else "fit experiments that have it",
+    )
+    raise InputError(rule, "there is none" if label is None else repr(label), remedy)
+
+
+def _new_axes(width: float, height: float, constrained: bool = True) -> Axes:
+    """The axes of a new pyplot figure, inches."""
+    from matplotlib import pyplot as plt
+
+    return plt.subplots(figsize=(width, height), layout="constrained" if constrained else None)[1]
+
+
+# api: What the commands do, as functions: read a rig folder, fit it, load the result.
 
 
 def read_rig(folder: str | Path, registry: Registry | None = None, friction: type[FrictionLaw] | None = None) -> Rig:

@@ -11,8 +11,8 @@ from typing import NoReturn, TextIO
 
 from capsule_id import console
 from capsule_id.commands.compilation import discard_damaged, use_one_blas_thread
+from capsule_id.console import INTERRUPTED, end_interrupted, interruptible
 from capsule_id.errors import InputError
-from capsule_id.interruption import INTERRUPTED, end_interrupted, interruptible
 
 BAD_INPUT, INTERNAL = 2, 1
 _RESUME = "; --resume continues the fit of one rig from the saved state"
@@ -44,7 +44,7 @@ def _parser(program: str, text: str) -> _Parser:
 
 
 def _fit_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands.fits import fit
+    from capsule_id.commands import fit
 
     text = (
         "Fit the vibro-impact capsule to a folder of rig measurements. Prints value, sd and trust of every parameter, and "
@@ -57,8 +57,7 @@ def _fit_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _capsule_parser(program: str) -> argparse.ArgumentParser:
-    from capsule_id.commands import check, import_file, init, predict, report, simulate, synthesize
-    from capsule_id.commands.maps import bifurcate
+    from capsule_id.commands import bifurcate, check, import_file, init, predict, report, simulate, synthesize
 
     parser = _parser(program, "Make, check, simulate and report; fit-params fits.")
     parser.set_defaults(run=lambda args: console.say(parser.format_help()) or 0)

@@ -1,7 +1,13 @@
-"""Switches JAX to double precision; every module that computes with JAX calls it."""
+"""Settings of JAX: double precision, and options of XLA that shorten compilation."""
 
-import jax
-import jax.numpy as jnp
+from importlib.metadata import version
+
+#: Whether XLA has the option below. XLA refuses options that it does not know; jaxlib 0.11 and later are not tried.
+HAS_EMITTER_OPTION = tuple(int(part) for part in version("jaxlib").split(".")[:2]) < (0, 11)
+#: Disable XLA's newer emitters of fused loops: they compile twice as long, and their code runs no faster.
+COMPILE: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False} if HAS_EMITTER_OPTION else {}
+#: Options for code that runs for milliseconds in total, where compilation time dominates.
+COMPILE_QUICKLY = {**COMPILE, "xla_backend_optimization_level": 0}
 
 
 def require_float64() -> None:
@@ -12,9 +18,11 @@ def require_float64() -> None:
     RuntimeError
         If JAX still computes in float32, for instance inside ``jax.enable_x64(False)``.
     """
+    import jax  # the options above are read by commands that load no JAX
+
     jax.config.update("jax_enable_x64", True)
-    dtype = jnp.zeros(()).dtype
-    if dtype != jnp.float64:
+    dtype = jax.numpy.zeros(()).dtype
+    if dtype != jax.numpy.float64:
         raise RuntimeError(
             f"float64 is needed, JAX computes in {dtype}: leave the enclosing jax.enable_x64(False) block, "
             "or unset JAX_ENABLE_X64 = 0, before using capsule_id"

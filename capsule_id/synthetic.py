@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import Kind
-from capsule_id.experiments.registry import Registry, default_registry
+from capsule_id.experiments.kind import Kind, Registry, default_registry
 from capsule_id.parameters import TABLE_1
 from capsule_id.rig.model import Rig
-from capsule_id.rig.toml_values import NAME_PATTERN
+from capsule_id.rig.toml import NAME_PATTERN
 
 
 @dataclass(frozen=True)

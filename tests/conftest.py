@@ -17,7 +17,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 from capsule_id.commands.compilation import XLA_EMITTER_OPTION
-from capsule_id.inference.target.compiling import HAS_EMITTER_OPTION
+from capsule_id.precision import HAS_EMITTER_OPTION
 from tests.capsule_cases import Cases, read_cases
 
 #: Programs that take longer than this to compile, s, are kept.
@@ -67,11 +67,9 @@ NOT_OPTIMISED = {
 
 #: Modules whose annotations are checked at run time; the hook must stand before their first import.
 CHECKED = (
-    "capsule_id.inference.fit.covariance",
-    "capsule_id.inference.fit.curvature",
-    "capsule_id.inference.sampling.diagnostics",
-    "capsule_id.inference.sampling.moves",
-    "capsule_id.inference.target.quadrature",
+    "capsule_id.inference.curvature",
+    "capsule_id.inference.moves",
+    "capsule_id.inference.marginal",
     "capsule_id.physics.exact.dense",
     "capsule_id.records",
     "capsule_id.rig.filters",

@@ -8,7 +8,8 @@ import numpy as np
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.twin import RUNS, STEP, SyntheticRun, make_runs
 from capsule_id.experiments.forced_run.twin import SAMPLES as RECORDED
-from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.synthetic import Truth
 from tests.experiments import bench

@@ -19,10 +19,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import capsule_id as cid
+from capsule_id.api import Fit, compare
 from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import BLOCKS
-from capsule_id.fitted import Fit, compare
 from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.synthetic import truth_beside
 from capsule_id.views import Finding, Level

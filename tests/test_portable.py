@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from capsule_id import read_rig
+from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from tests import matrix
 from tests.cli_tools import ROOT, run, small_rig

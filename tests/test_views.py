@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from capsule_id.experiments.registry import default_registry
-from capsule_id.report.texts.messages import messages_of
+from capsule_id.experiments.kind import default_registry
+from capsule_id.report.messages import messages_of
 from capsule_id.views import Message, counted
 from tests.cli_tools import ROOT
 

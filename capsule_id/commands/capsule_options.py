@@ -11,8 +11,9 @@ from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1
 
 if TYPE_CHECKING:
-    from capsule_id.physics.drives.pulses import Pulses
-    from capsule_id.physics.model import CapsuleParameters, Excitation
+    from capsule_id.physics.drive import Excitation
+    from capsule_id.physics.drives import Pulses
+    from capsule_id.physics.model import CapsuleParameters
 
 #: Name of the default friction law in the provenance of a result.
 EQUATION_1 = "eq. (1)"
@@ -97,8 +98,9 @@ def _check_sign(name: str, value: float, place: str) -> None:
 
 def capsule_and_drive(values: Mapping[str, Any], drive: str) -> "tuple[CapsuleParameters, Excitation | Pulses]":
     """The model's parameters and the drive of that name, from values by symbol, SI."""
-    from capsule_id.physics.drives.pulses import Pulses
-    from capsule_id.physics.model import CapsuleParameters, Excitation
+    from capsule_id.physics.drive import Excitation
+    from capsule_id.physics.drives import Pulses
+    from capsule_id.physics.model import CapsuleParameters
 
     p = CapsuleParameters(**{name: values[name] for name in CAPSULE_LEAVES if name in values})
     own = {name: values[name] for name in DRIVES[drive]}

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from capsule_id.console import say
 from capsule_id.errors import InputError
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint, lint_settings
-from capsule_id.experiments.registry import default_registry
 from capsule_id.experiments.rough_values import rough_values
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
@@ -52,7 +52,7 @@ def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
     InputError
         If the folder cannot be written.
     """
-    from capsule_id.report.figures.readings import readings_figure
+    from capsule_id.report.figures.fits import readings_figure
     from capsule_id.report.figures.style import mark, own_style, png
 
     try:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from capsule_id.inference.target.compiling import HAS_EMITTER_OPTION
+from capsule_id.precision import HAS_EMITTER_OPTION
 
 # XLA then compiles each loop of an engine as one function: fits and batches are faster. CPU only.
 XLA_LOOP_OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"

@@ -5,9 +5,8 @@ from pathlib import Path
 
 from capsule_id.console import say
 from capsule_id.errors import InputError
-from capsule_id.experiments.registry import default_registry
-from capsule_id.importing.entry import read_file
-from capsule_id.importing.report import clock_line, import_report
+from capsule_id.experiments.kind import default_registry
+from capsule_id.importing import clock_line, import_report, read_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

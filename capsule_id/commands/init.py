@@ -7,9 +7,9 @@ from pathlib import Path
 
 from capsule_id.console import say
 from capsule_id.errors import InputError
-from capsule_id.experiments.registry import Registry, default_registry
-from capsule_id.importing.entry import entry_of, read_file
-from capsule_id.rig.toml_values import NAME_PATTERN
+from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.importing import entry_of, read_file
+from capsule_id.rig.toml import NAME_PATTERN
 
 # Lines that begin with `#:` are comments; without its `# `, every other `#` line is TOML.
 HEAD = """\

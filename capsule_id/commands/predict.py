@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
         keep_programs()
     from capsule_id.api import load
     from capsule_id.inference.prediction import predict
-    from capsule_id.report.figures.comparisons import side_by_side
+    from capsule_id.report.figures.fits import side_by_side
     from capsule_id.report.figures.style import own_style, png
 
     made = predict(load(args.result), args.settings, seed=args.seed)

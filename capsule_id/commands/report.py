@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         return 0 if clean else 3
     import pandas as pd
 
-    from capsule_id.report.console_table import table_text, verdict_text
+    from capsule_id.report.columns import table_text, verdict_text
 
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
     failed = sorted({finding["check"] for finding in findings if finding["level"] == "fail"})

@@ -7,12 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsule_id.commands.capsule_options import (
-    add_capsule_arguments,
-    capsule_and_drive,
-    capsule_values,
-    number,
-)
+from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_and_drive, capsule_values, number
 from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
 from capsule_id.errors import InputError
 from capsule_id.views import counted
@@ -70,10 +65,10 @@ def run(args: argparse.Namespace) -> int:
         keep_programs()
     import numpy as np
 
-    from capsule_id.physics.contacts import warn_of_far_gap
+    from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.physics.model import Status, simulate, status_message
     from capsule_id.physics.smooth.engine import Smoothing
-    from capsule_id.report.motion_files import write_motion
+    from capsule_id.report.netcdf import write_motion
 
     p, e = capsule_and_drive(values, args.drive)
     grid = np.linspace(0.0, end, samples)
@@ -142,8 +137,7 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     import numpy as np
 
-    from capsule_id.report.figures.capsule import MotionView, motion
-    from capsule_id.report.figures.style import own_style, png
+    from capsule_id.report.figures.style import MotionView, motion, own_style, png
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
     view = MotionView(np.asarray(t.times), x_rel, np.asarray(t.X2), rate, x_rel[section], rate[section], G)

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
     if args.robot:
         return _robot(args)
-    from capsule_id.experiments.registry import default_registry
+    from capsule_id.experiments.kind import default_registry
     from capsule_id.synthetic import Truth, synthesize
 
     truth = Truth().with_kinds(kind for kind in default_registry().values() if kind.bench or args.runs)

@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import Kind, Values, own_panels
-from capsule_id.experiments.registry import Registry, default_registry
+from capsule_id.experiments.kind import Kind, Registry, Values, default_registry, own_panels
 from capsule_id.rig.model import Rig, Table
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ def make_experiments(
     for name, kind in kinds.items():
         kind.check([table for table in tables if table.kind == name])
     # The law loads JAX, which takes seconds. A faulty folder must be reported before.
-    from capsule_id.experiments.families.friction_model import EQUATION_1, friction_of
+    from capsule_id.experiments.friction import EQUATION_1, friction_of
 
     model = friction_of(rig, friction)
     model.check(kinds.parameters)

@@ -1,12 +1,4 @@
-"""Base class of experiments: their interface to inference and to the report.
-
-An experiment computes the misfit of each reading for given parameters (``misfits``). A misfit consists of the raw
-difference, the dependence of its standard deviation on a scatter, and the design of the linear nuisances.
-The base class derives likelihood, residuals, pointwise densities and the posterior predictive p-value from it.
-
-An experiment is a frozen tree (``equinox.Module``): its leaves are the numbers that the likelihood reads, its static
-fields are strings and flags. ``About`` holds all other data.
-"""
+"""Base class of experiments: their interface to inference, to checks and to the report."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -20,16 +12,26 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import block_diag
 
-from capsule_id.experiments.checks.context import Check, RunRecord, TableMaker
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
-from capsule_id.parameters import Parameter
+from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.precision import require_float64
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Facts, Finding
 
 if TYPE_CHECKING:
-    from capsule_id.experiments.families.friction_model import FrictionModel
+    from capsule_id.experiments.friction import FrictionModel
     from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.experiments.context import Check, RunRecord, TableMaker
+
+# base: Base class of experiments: their interface to inference and to the report.
+#
+# An experiment computes the misfit of each reading for given parameters (``misfits``). A misfit consists of the raw
+# difference, the dependence of its standard deviation on a scatter, and the design of the linear nuisances.
+# The base class derives likelihood, residuals, pointwise densities and the posterior predictive p-value from it.
+#
+# An experiment is a frozen tree (``equinox.Module``): its leaves are the numbers that the likelihood reads, its static
+# fields are strings and flags. ``About`` holds all other data.
+
 
 require_float64()
 
@@ -365,3 +367,29 @@ def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
         return None, None
     lower, upper = np.quantile(values, [0.025, 0.975], axis=0)
     return lower, upper
+
+
+# clock: The clock of a record: where rig.toml states the sd of its drift, the drift is a parameter of the fit.
+#
+# An error of the drift stretches the record. k1 follows it twice, c once; a record of many excitation periods runs
+# out of
+# step with its drive. An error of the offset changes nothing, because each record has its own initial state and phase.
+
+
+def clock_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
+    """The drift of the table's clock where its sd is stated; tables with equal statements share one clock."""
+    stated = table.drift
+    if stated.sd == 0.0:
+        return ()
+    same = (other.label for other in rig.tables if other.drift == stated)
+    return (parameter("clock_drift", next(same, table.label), Prior("normal", stated.value, stated.sd)),)
+
+
+def stated_rate(table: Table[Any]) -> float | None:
+    """1 + the stated drift, with which the times of ``table`` were read; None where the drift is exact."""
+    return 1.0 + table.drift.value if table.drift.sd else None
+
+
+def stretch(rate: float | None, theta: ValuesBySymbol) -> Any:
+    """True time per time as read; ``rate`` from ``stated_rate``. Rough fits of one record have no drift in ``theta``."""
+    return 1.0 if rate is None else (1.0 + theta.get("clock_drift", rate - 1.0)) / rate

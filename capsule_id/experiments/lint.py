@@ -1,22 +1,233 @@
-"""Findings on the readings of a rig before a fit."""
+"""Findings on the readings of a rig before a fit: tables, scales, and channels of a record."""
 
 import hashlib
+import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from capsule_id.experiments.kind import Estimate, Kind
-from capsule_id.experiments.lint_magnitudes import (
-    lint_magnitudes,
-    lint_rig_quantities,
-    lint_stated_sd,
-    with_line,
+from capsule_id.records.faults import (
+    Readings,
+    clipped_samples,
+    dropouts,
+    find_gaps,
+    frozen_samples,
+    jump_or_noise,
+    noisy_stretch,
+    repeated_blocks,
+    time_rounding,
 )
-from capsule_id.records.faults.duplicates import Readings, repeated_blocks
-from capsule_id.rig.formats.text.blocks import WINDOWS
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.filters import (
+    TIMING_TOLERANCE,
+    dominant_frequency,
+    hampel_outliers,
+    largest_offset,
+    loudest_part,
+    median_step,
+)
+from capsule_id.rig.formats.text import WINDOWS
+from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.schema import RIG_QUANTITIES, ColumnRule, GroundSettings, QuantityRule
+from capsule_id.rig.units import factor_to_si
 from capsule_id.views import Finding
+
+# lint magnitudes: Findings on scales: numbers of a rig, and relations between them, that a wrong unit would make
+# unusual.
+
+
+#: Usual magnitudes by SI unit: lowest and highest largest value of a column, or value of a setting. A rig with m1 of 10 g
+#: to 10 kg stays inside. What a wrong prefix leaves inside for some rigs, the relations below find.
+USUAL: Mapping[str, tuple[float, float]] = {
+    "kg": (2e-3, 60.0),
+    "m": (2e-5, 0.9),
+    "N": (0.1, 900.0),
+    "A": (0.01, 200.0),
+    "m/s": (2e-3, 100.0),
+    "m/s^2": (0.1, 3000.0),
+    "rad": (0.03, 1.57),
+    "rad/s": (0.3, 3000.0),
+    "Hz": (0.05, 500.0),
+    "1": (0.01, 10.0),
+}
+#: Usual ratios: m2 over m1, a force over the weight of the stated masses, k2 over k1, gap over amplitude. Of 60 random
+#: benches (m1 log-uniform from 10 g to 10 kg, their other ratios scattered by 30 %) none leaves these intervals; of 1,800
+#: masses and columns of theirs that are wrong by 1000 one stays inside.
+MASSES, FORCES, STIFFNESSES, GAPS = (0.03, 150.0), (0.02, 100.0), (0.01, 1000.0), (3e-3, 20.0)
+#: Usual m1 of a rig without m2: no relation judges it.
+MASS_ALONE = (8e-3, 12.0)
+#: Usual period of a decay, s, and amplitude of its acceleration, m/s^2, which holds the square of the unit of time.
+PERIODS, ACCELERATIONS = (2e-3, 20.0), (3e-3, 1e4)
+#: Largest distance of a ratio from 1000, in decades, that a wrong prefix explains.
+WRONG_PREFIX = 0.3
+#: Relations between two columns: their names, the words, the SI unit, the value, its usual interval.
+RELATIONS = (
+    (("force", "current"), "force per current", "N/A", lambda x, y: np.ptp(x) / (np.ptp(y) or 1e-30), (0.03, 300.0)),
+    (("speed", "distance"), "speed^2/(2 g distance)", "1", lambda x, y: np.median(x**2 / (19.62 * y)), (0.01, 20.0)),
+)
+#: Units that are mistaken for each other, the likeliest first.
+_ALTERNATIVES: Mapping[str, tuple[str, ...]] = {
+    "kg": ("g", "kg", "mg"),
+    "m": ("mm", "m", "um", "cm"),
+    "s": ("ms", "s", "us", "min"),
+    "N": ("N", "mN", "kN", "gf", "kgf"),
+    "A": ("A", "mA", "uA"),
+    "m/s": ("m/s", "mm/s", "cm/s"),
+    "m/s^2": ("m/s^2", "mm/s^2", "g_n"),
+    "rad": ("rad", "deg", "mrad"),
+    "rad/s": ("rad/s", "rpm", "rev/s"),
+    "Hz": ("Hz", "kHz"),
+}
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number, SI, with the words and the interval that judge it.
+
+    Attributes
+    ----------
+    scales : what it is a product of, as ``confirmed`` of [rig] names it: ``m1``, ``decay_1.time``
+    shared : further ones, those of all relations of its kind
+    label : of its experiment
+    unit, to_display : as written; "" for ``si``
+    """
+
+    name: str
+    value: float
+    si: str
+    usual: tuple[float, float]
+    scales: tuple[str, ...]
+    label: str = ""
+    unit: str = ""
+    to_display: float = 1.0
+    code: str = "readings.magnitude"
+    shared: tuple[str, ...] = ()
+
+    def unusual(self, rig: Rig) -> Iterable[Finding]:
+        """Warn where the value lies outside the interval and ``rig`` does not confirm every scale."""
+        low, high = self.usual
+        if self.value == 0.0 or low <= abs(self.value) <= high or set(self.scales) <= set(rig.confirmed):
+            return
+        facts = {
+            "name": self.name,
+            "value": self.value * self.to_display,
+            "low": low * self.to_display,
+            "high": high * self.to_display,
+            "unit": self.unit or self.si,
+            "scales": self.scales,
+            "meant": self._meant(),
+        }
+        yield Finding(self.code, "warn", facts, self.label)
+
+    def _meant(self) -> str:
+        """The likeliest unit in which the written number would be usual; "" where there is none."""
+        written, (low, high) = abs(self.value) * self.to_display, self.usual
+        units = _ALTERNATIVES.get(self.si, ()) if len(self.scales) == 1 else ()
+        return next((unit for unit in units if low <= written * factor_to_si(unit, self.si) <= high), "")
+
+
+def lint_rig_quantities(rig: Rig) -> Iterable[Finding]:
+    """Warn of unusual masses, their ratio, and an unusual g."""
+    for name, rule in RIG_QUANTITIES.items():
+        quantity: Quantity | None = getattr(rig, name)
+        if quantity is not None:
+            usual = rule.usual or (USUAL[rule.si] if rig.m2 is not None else MASS_ALONE)
+            yield from Number(f"{name} of [rig]", quantity.value, rule.si, usual, (name,)).unusual(rig)
+    if rig.m1 is not None and rig.m2 is not None:
+        yield from Number("m2 / m1", rig.m2.value / rig.m1.value, "1", MASSES, ("m1", "m2")).unusual(rig)
+
+
+def lint_magnitudes(tables: Sequence[Table[Any]], kinds: Mapping[str, Kind], rig: Rig) -> Iterable[Finding]:
+    """Warn of columns, settings and relations with unusual values."""
+    numbers = [number for table in tables for number in _numbers(table, kinds[table.kind], rig)]
+    # A factor of 1000 in shared scales would make these relations unusual, so that they are right in the others too.
+    right = {n.shared for n in numbers if n.usual[1] / 1e3 <= n.value <= n.usual[0] * 1e3}
+    for number in numbers:
+        shared = () if number.shared in right else number.shared
+        yield from replace(number, scales=(*number.scales, *shared)).unusual(rig)
+
+
+def lint_stated_sd(table: Table[Any], kind: Kind) -> Iterable[Finding]:
+    """Warn of amplitudes, lags and gaps whose normal prior reaches below 0; a slope and N0 may be 0."""
+    for key in kind.setting_rules.keys() - GroundSettings.__dataclass_fields__.keys():
+        stated = getattr(table.settings, key)
+        if isinstance(stated, Quantity) and 0.0 < abs(stated.value) < 2.0 * stated.sd:
+            yield Finding("settings.sd", "warn", {"name": key, **vars(stated)}, table.label)
+
+
+def _numbers(table: Table[Any], kind: Kind, rig: Rig) -> Iterable[Number]:
+    """The columns, settings and relations of a table that have a usual interval."""
+    label = table.label
+    for name, column in table.columns.items():
+        rule = kind.columns[name]
+        usual, masses = _usual(rule, rig)
+        largest = float(max(np.max(column.values), -np.min(column.values)))
+        if usual is not None:
+            words, written = f"the largest {name} of {table.file}", (label, column.unit, column.to_display)
+            yield Number(words, largest, rule.si, usual, (f"{label}.{name}",), *written, shared=masses)
+    for key, rule in kind.setting_rules.items():
+        stated = getattr(table.settings, key)
+        if not isinstance(rule, QuantityRule) or stated is None or key.endswith("_sd"):
+            continue
+        value, (usual, others) = stated.value if isinstance(stated, Quantity) else float(stated), _usual(rule, rig)
+        if key == "gap" and "x_rel" in table.columns:
+            size = float(np.ptp(table["x_rel"])) / 2.0
+            usual, others = (GAPS[0] * size, GAPS[1] * size), (f"{label}.x_rel",)
+        if usual is not None:
+            yield Number(f"{key} of {label}", value, rule.si, usual, (f"{label}.{key}",), label, shared=others)
+    for pair, words, si, relation, usual in RELATIONS:
+        if set(pair) <= set(table.columns):
+            value, scales = float(relation(*(table[name] for name in pair))), tuple(f"{label}.{name}" for name in pair)
+            yield Number(f"{words} of {table.file}", value, si, usual, scales, label)
+    yield from _against_k1(table, rig)
+
+
+def _usual(rule: ColumnRule | QuantityRule, rig: Rig) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
+    """The usual interval of a quantity, and the masses in it: forces of a rig grow with its weight."""
+    masses = {name: getattr(rig, name).value for name in ("m1", "m2") if getattr(rig, name) is not None}
+    if rule.si == "N" and rule.usual is None and masses:
+        weight = sum(masses.values()) * rig.g.value
+        return (FORCES[0] * weight, FORCES[1] * weight), tuple(masses)
+    return rule.usual or USUAL.get(rule.si), ()
+
+
+def _against_k1(table: Table[Any], rig: Rig) -> Iterable[Number]:
+    """The stiffness of a spring over that of the rod: m1 times the square of the frequency of the first decay."""
+    decay = next((t for t in rig.tables if t.bench and "time" in t.columns and "x_rel" in t.columns), None)
+    if decay is None or rig.m1 is None or not {"deflection", "force"} <= set(table.columns):
+        return
+    k1 = rig.m1.value * (2.0 * np.pi * frequency_of(decay["time"], decay["x_rel"])) ** 2
+    ratio = float(np.ptp(table["force"]) / (np.ptp(table["deflection"]) or 1e-30)) / k1
+    scales, shared = (f"{table.label}.force", f"{table.label}.deflection"), ("m1", f"{decay.label}.time")
+    yield Number(f"k2 of {table.file} over k1", ratio, "1", STIFFNESSES, scales, table.label, shared=shared)
+
+
+def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
+    """Dominant frequency of a record that may be sampled unevenly, Hz."""
+    part = loudest_part(values)
+    even = np.linspace(time[part][0], time[part][-1], len(time[part]))
+    return dominant_frequency(even, np.interp(even, time[part], values[part]))
+
+
+def with_line(findings: Sequence[Finding], rig: Rig) -> Iterable[Finding]:
+    """The findings, those on scales once, with the line of rig.toml that confirms them all.
+
+    A relation is left out where one of its scales is unusual by itself.
+    """
+    first = {f.facts["scales"]: f for f in reversed(findings) if "scales" in f.facts}
+    alone = {scales[0] for scales in first if len(scales) == 1}
+    names = dict.fromkeys([*rig.confirmed, *(name for scales in reversed(first) for name in scales)])
+    for finding in findings:
+        scales = finding.facts.get("scales")
+        if scales is None:
+            yield finding
+        elif finding is first[scales] and (len(scales) == 1 or not alone.intersection(scales)):
+            yield replace(finding, facts={**finding.facts, "line": f"confirmed = {json.dumps([*names])}"})
+
+
+# lint: Findings on the readings of a rig before a fit.
 
 
 def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> tuple[Finding, ...]:
@@ -119,3 +330,164 @@ def lint_reading_errors(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     if unstated:
         facts = {"names": " and ".join(unstated), "first": unstated[0]}
         yield Finding("readings.errors", "warn", facts, table.label)
+
+
+# lint records: Findings on the channels of a record, shared by all kinds with a column ``time``.
+
+
+#: Periods before a burst of noise or a jump that a decay is cut to; with fewer it begins behind it.
+KEPT_PERIODS = 3
+#: Most samples that are named as spikes, window of the rule that drops them, steps, and its limits, robust sds.
+MOST_SPIKES, WINDOW, LIMITS = 20, 10, (20.0, 12.0, 8.0, 5.0)
+
+
+def _rounded(table: Table[Any], used: slice, time: float) -> float:
+    """A time with one digit more than the sampling step needs."""
+    return float(np.round(time, max(0, int(np.ceil(-np.log10(median_step(table["time"][used]))))) + 1))
+
+
+def _cut(table: Table[Any], used: slice, key: str, time: float) -> str:
+    """The line that leaves out one side of a time of a decay; a run has no such key."""
+    line = f'{key} = {{ value = {_rounded(table, used, time):.10g}, unit = "s" }}'
+    decay = hasattr(table.settings, "stop")
+    return f"Add this line to the experiment in rig.toml: {line}" if decay else "Record again."
+
+
+def lint_times(table: Table[Any], used: slice) -> Iterable[Finding]:
+    """Report gaps and rounded times.
+
+    Parameters
+    ----------
+    used : the rows that a fit reads
+    """
+    time = table["time"][used]
+    gaps = find_gaps(time)
+    if gaps is not None:
+        first = used.start + int(gaps.rows[0])
+        facts = {
+            "file": table.file,
+            "line": int(table.rows[first]),
+            "time": float(table["time"][first]),
+            "gaps": len(gaps.rows),
+            "lost": int(gaps.lost.sum()),
+            "step": gaps.step,
+            "rows": (used.start + gaps.rows).tolist(),
+        }
+        yield Finding("readings.gaps", "warn", facts, table.label)
+        return
+    rounding = time_rounding(time)
+    if rounding is not None:
+        yield Finding("readings.rounded_times", "warn", {"step": rounding, "file": table.file}, table.label)
+
+
+def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> Iterable[Finding]:
+    """Report clipped samples, drop-outs and a frozen sensor.
+
+    Parameters
+    ----------
+    name : of the column
+    used : the rows that a fit reads
+    period : of the oscillation, s; infinite where it is unknown
+    """
+    column, time = table.columns[name], table["time"]
+    values, unit = column.values[used], column.to_display
+    if len(time[used]) < 2 or np.ptp(values) == 0.0:
+        return
+    values = values * unit if unit != 1.0 else values
+    step = median_step(time[used])
+    where = {"file": table.file, "column": name, "unit": column.unit}
+    for clipped in clipped_samples(values, period / step):
+        found = used.start + clipped.rows
+        facts = where | {
+            "side": clipped.side,
+            "level": clipped.level,
+            "samples": len(found),
+            "share": len(found) / len(values),
+            "line": int(table.rows[found[0]]),
+            "time": float(time[found[-1]]),
+            "cut": _cut(table, used, "start", float(time[min(found[-1] + 1, len(time) - 1)])),
+            "rows": found.tolist(),
+        }
+        yield Finding("readings.clipped", "fail", facts, table.label)
+    for code, wrong in (("readings.dropouts", dropouts(values)), ("readings.frozen", frozen_samples(values))):
+        if len(wrong):
+            found = used.start + wrong
+            facts = where | {
+                "value": float(values[wrong[0]]),
+                "samples": len(found),
+                "line": int(table.rows[found[0]]),
+                "lines": " ".join(map(str, table.rows[found])),
+                "time": float(time[found[0]]),
+                "rows": found.tolist(),
+            }
+            yield Finding(code, "fail", facts, table.label)
+            return
+
+
+def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone: bool = False) -> Iterable[Finding]:
+    """Report samples of a smooth oscillation that were lost without a gap in the times, or a burst of noise.
+
+    Parameters
+    ----------
+    name : of the column
+    used : the rows of the oscillation
+    period : of the oscillation, s
+    alone : leave out jumps that recur every half period
+    """
+    time = table["time"][used]
+    step = median_step(time)
+    if largest_offset(time, step) > TIMING_TOLERANCE * step:
+        return
+    values = table[name][used]
+    jump = jump_or_noise(values, period / step, alone)
+    if jump is None:
+        return
+    burst = noisy_stretch(values, period / step, jump.row)
+    if burst is not None:
+        rows = slice(used.start + burst.start, used.start + burst.stop)
+        yield _burst(table, name, rows, used, burst.start < KEPT_PERIODS * period / step)
+        return
+    if jump.noisy:
+        return
+    # Samples are spikes where the record is smooth once a rule has dropped them.
+    index = np.arange(len(values))
+    for n_sd in LIMITS:
+        spikes = np.flatnonzero(hampel_outliers(values, WINDOW + 1, n_sd))
+        good = np.delete(index, spikes)
+        left = jump_or_noise(np.interp(index, good, values[good]), period / step, alone)
+        if 0 < len(spikes) <= MOST_SPIKES and (left is None or left.noisy):
+            break
+    else:
+        spikes = index[:0]
+    code, row = ("readings.spike", spikes[0]) if len(spikes) else ("readings.jump", jump.row)
+    early = jump.row < KEPT_PERIODS * period / step
+    facts = {
+        "file": table.file,
+        "column": name,
+        "time": float(time[row]),
+        "line": int(table.rows[used.start + row]),
+        "lines": " ".join(map(str, table.rows[used.start + spikes])),
+        "size": jump.size,
+        "cut": _cut(table, used, "start" if early else "stop", float(time[row - (not early)])),
+        "rule": f'{{ rule = "hampel", window = "{1e3 * float(f"{WINDOW * step:.6g}"):g} ms", n_sd = {n_sd:g} }}',
+        "rows": (used.start + (spikes if len(spikes) else np.array([row]))).tolist(),
+    }
+    yield Finding(code, "fail", facts, table.label)
+
+
+def _burst(table: Table[Any], name: str, burst: slice, used: slice, early: bool) -> Finding:
+    """A stretch of noise, and the line of ``rig.toml`` that leaves it out: an ``early`` one with what is before it."""
+    time = table["time"]
+    begin, end = float(time[burst.start]), float(time[min(burst.stop, used.stop - 1)])
+    facts = {
+        "file": table.file,
+        "line": int(table.rows[burst.start]),
+        "column": name,
+        "begin": begin,
+        "end": end,
+        "key": "start" if early else "stop",
+        "value": _rounded(table, used, end if early else begin),
+        "cut": _cut(table, used, "start" if early else "stop", end if early else begin),
+        "rows": [burst.start, burst.stop - 1],
+    }
+    return Finding("readings.burst", "fail", facts, table.label)

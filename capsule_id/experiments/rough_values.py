@@ -3,8 +3,7 @@
 from functools import cache
 
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
-from capsule_id.experiments.kind import Estimate
-from capsule_id.experiments.registry import Registry, default_registry
+from capsule_id.experiments.kind import Estimate, Registry, default_registry
 from capsule_id.parameters import symbol_of
 from capsule_id.rig.model import Rig
 

@@ -26,27 +26,22 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from capsule_id.console import OnProgress
+from capsule_id.console import OnProgress, stop_if_interrupted
 from capsule_id.experiments import Choice, compare, select_tables
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.kind import Registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import Registry
-from capsule_id.inference.checks.agreement import check_agreement
-from capsule_id.inference.checks.model_error.record_widening import record_widenings
-from capsule_id.inference.checks.model_error.widening import beside_stated, widenings
-from capsule_id.inference.checks.predictive import decisive_readings
-from capsule_id.inference.checks.sampled_fit import SampledFit
-from capsule_id.inference.checks.trust import with_scaled
-from capsule_id.inference.checks.verdict import run_checks
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.fit.point_stage import PointStage
+from capsule_id.inference.checks.posterior import check_agreement, decisive_readings
+from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.checks.verdict import run_checks, with_scaled
+from capsule_id.inference.checks.widening import beside_stated, record_widenings, widenings
+from capsule_id.inference.joint_fit import PointStage
+from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET, DEFAULT_ESS, sample
-from capsule_id.inference.tables.notes import make_notes
-from capsule_id.inference.tables.parameter_table import parameter_tables
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior
-from capsule_id.interruption import stop_if_interrupted
+from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS, sample
+from capsule_id.inference.tables import make_notes, parameter_tables
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import truth_beside
 from capsule_id.views import Comparison, Finding
@@ -110,7 +105,7 @@ def sample_posterior(
     ----------
     budget : emcee steps of an ensemble after burn-in; None draws no sample
     store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
-    progress, ess : see ``capsule_id.inference.sampling.ensembles.sample``
+    progress, ess : see ``capsule_id.inference.sampling.sample``
     """
     target, posterior = point.target, None
     if budget is not None:

@@ -8,7 +8,7 @@ import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.families.trials_experiment import TrialsExperiment
+from capsule_id.experiments.capsule_experiment import TrialsExperiment
 from capsule_id.inference.result import Result
 from capsule_id.rig.model import Column, Table
 from capsule_id.rig.tables import read_settings

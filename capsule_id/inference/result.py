@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments import Choice
-from capsule_id.experiments.checks.context import RunRecord as RunRecord
-from capsule_id.experiments.registry import Registry
+from capsule_id.experiments.context import RunRecord as RunRecord
+from capsule_id.experiments.kind import Registry
 from capsule_id.rig.model import Rig
 from capsule_id.views import Comparison as Comparison
 from capsule_id.views import Curve as Curve

@@ -15,10 +15,8 @@ from numpy.typing import ArrayLike
 
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
-from capsule_id.motions.blocks import compute
-from capsule_id.motions.datasets import grid_of
-from capsule_id.motions.points import MOTION_COLUMNS, SUMMARY, sweep_points
 from capsule_id.motions.response import SETTLING, Settling
+from capsule_id.motions.sweep import MOTION_COLUMNS, SUMMARY, compute, grid_of, sweep_points
 from capsule_id.parameters import SWEPT
 from capsule_id.physics.batches import lanes_of
 from capsule_id.physics.drive import PeriodicDrive

@@ -1,56 +1,431 @@
-"""Bifurcation diagrams, two-parameter maps, basins of attraction: settled motions over any quantity of the model.
+"""Bifurcation diagrams, two-parameter maps, basins of attraction: settled motions over any quantity of the model."""
 
-    diagram(p, e, "k2", values)                      each value from rest
-    diagram(..., starts=spread_starts(p, e, 16))     each value from many initial states: co-existing attractors
-    continuation(p, e, "k2", values)                 forward and backward, each value from where the last one ended
-    motion_map(p, e, {"k2": ..., "P_d": ...})        label, mean velocity, efficiency over two quantities
-    basins(p, e, x_rel, rate)                        which initial state leads where, at one set of parameters
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-All of them return an ``xarray.Dataset`` in SI units whose variables say what they are (``units``, ``long_name``). A
-run that was given up is labelled "failed", and ``status`` says why.
-"""
-
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal
-
+import jax
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
-from capsule_id.console import OnProgress
+from capsule_id.console import OnProgress, stop_if_interrupted
 from capsule_id.errors import InputError
-from capsule_id.interruption import stop_if_interrupted
-from capsule_id.motions.attractors import attractors_of
-from capsule_id.motions.blocks import BLOCK, compute
-from capsule_id.motions.datasets import (
-    ATTRACTOR,
-    ATTRACTORS,
-    branched,
-    dataset_of,
-    grid_of,
-    provenance,
-    single,
-    values_of,
+from capsule_id.motions.response import (
+    SAME_POSITION,
+    SAME_VELOCITY,
+    SETTLING,
+    Settled,
+    Settling,
+    exponents,
+    settle,
+    settled_label,
 )
-from capsule_id.motions.points import (
-    MOTION_COLUMNS,
-    SECTION,
-    SUMMARY,
-    MotionColumns,
-    SweepPoints,
-    motion_columns,
-    sweep_points,
-)
-from capsule_id.motions.response import SETTLING, Settling, exponents, settle, settled_label
-from capsule_id.physics.batches import CHUNK
-from capsule_id.physics.drive import PeriodicDrive
-from capsule_id.physics.model import CapsuleParameters, Initial
+from capsule_id.parameters import CAPSULE_LEAVES, LEAVES, SWEPT
+from capsule_id.physics.batches import CHUNK, lanes_of
+from capsule_id.physics.drive import Excitation, PeriodicDrive
+from capsule_id.physics.model import CapsuleParameters, Initial, without_absent
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from distributed import Client
+
+
+# points: The points of a sweep, and the columns of their settled motions.
+#
+# A *point* is one set of leaves with one initial state. A lane of the engine is the same to the last bit in every
+# batch, so the result does not depend on the blocks or on the worker that computes them.
+
+
+MotionColumns = dict[str, np.ndarray]  # name -> (points, ...)
+
+# Columns of a settled motion: unit and meaning.
+MOTION_COLUMNS = {
+    "x_rel": ("m", "X1 - X2 at the drive's phase at the start of a period"),
+    "rate": ("m/s", "Y1 - Y2 at the drive's phase at the start of a period"),
+    "Y2": ("m/s", "velocity of the capsule at the drive's phase at the start of a period"),
+    "label": (
+        "1",
+        "P-<period>-<direction>-<contacts per excitation period>, aperiodic, not settled, or failed (see status)",
+    ),
+    "period": ("1", "period of the motion in excitation periods, 0 if there is none"),
+    "direction": ("1", "F forward, B backward, S standing, empty if failed"),
+    "contacts_per_period": ("1", "closings of the gap per excitation period"),
+    "mean_velocity": ("m/s", "mean velocity of the capsule"),
+    "work_per_period": ("J", "work of the drive per excitation period"),
+    "efficiency": ("m/J", "advance of the capsule per work of the drive"),
+    "lyapunov": ("1/s", "largest Lyapunov exponent of a motion without a period, undefined for all others"),
+    "status": ("1", "how the run ended: 0 complete, 1 complete with grazing, 2 and more given up"),
+}
+SECTION = ("x_rel", "rate", "Y2")  # one value a period, all others one value a point
+SUMMARY = tuple(name for name in MOTION_COLUMNS if name not in SECTION)
+
+
+@dataclass(frozen=True)
+class SweepPoints:
+    """Lanes of points: every leaf and every component of the initial state is (points,)."""
+
+    p: CapsuleParameters
+    e: PeriodicDrive
+    initial: Initial
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return len(np.asarray(self.p.m1))
+
+    def part(self, begin: int, end: int) -> "SweepPoints":
+        """The points begin .. end - 1."""
+        return SweepPoints(*jax.tree.map(lambda leaf: leaf[begin:end], (self.p, self.e, self.initial)))
+
+
+def sweep_points(
+    p: CapsuleParameters, e: PeriodicDrive, over: Mapping[str, np.ndarray], initial: Initial | None = None
+) -> SweepPoints:
+    """The lanes in which the quantities of ``over`` (symbol -> (points,), SI; ``f`` in Hz) replace those of p and e.
+
+    Raises
+    ------
+    InputError
+        A quantity that the model or the drive does not have, one given twice (f and Omega), shapes that do not agree.
+    """
+    leaves = {name: np.asarray(values, float) for name, values in over.items()}
+    of_model = {"f", *CAPSULE_LEAVES, *(row.symbol for row in e.parameters)}
+    own = [symbol for symbol in SWEPT if symbol in of_model]
+    for name in leaves:
+        if name not in own:
+            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(own)}")
+    if {"f", "Omega"} <= set(leaves):
+        raise InputError("f and Omega are the same quantity", "both are swept", "leave one out")
+    if "f" in leaves:
+        f, frequency = leaves.pop("f"), swept_leaf("f", e)
+        leaves[frequency] = 2.0 * np.pi * f if frequency == "Omega" else 1.0 / f
+    p = replace(p, **{name: x for name, x in leaves.items() if LEAVES[name].leaf == "capsule"})
+    drive: Any = e
+    e = replace(drive, **{name: x for name, x in leaves.items() if LEAVES[name].leaf == "drive"})
+    # What is absent is absent in all blocks of a sweep, so a point does not depend on its block.
+    p, e = without_absent(p, e)
+    lanes, _, _ = lanes_of((p, e, initial if initial is not None else (0.0, 0.0, 0.0, 0.0)), np.zeros(1))
+    return SweepPoints(*lanes)
+
+
+def swept_leaf(name: str, e: PeriodicDrive) -> str:
+    """The leaf that a swept quantity sets: ``f`` is Omega or the period of pulses."""
+    return name if name != "f" else "Omega" if isinstance(e, Excitation) else "period"
+
+
+def settled_columns(points: SweepPoints, settling: Settling) -> MotionColumns:
+    """All columns of the settled motions, by the names of ``MOTION_COLUMNS``."""
+    return motion_columns(settle(points.p, points.e, points.initial, settling), points)
+
+
+def motion_columns(seen: Settled, points: SweepPoints) -> MotionColumns:
+    """The fields of ``seen`` and the efficiency of each motion, 0 for one that stands."""
+    found: MotionColumns = {name: np.asarray(getattr(seen, name)) for name in MOTION_COLUMNS if name != "efficiency"}
+    advance = found["mean_velocity"] * np.asarray(points.e.period)
+    # Without a drive there is neither work nor advance.
+    work = np.where(found["work_per_period"] == 0.0, np.inf, found["work_per_period"])
+    return found | {"efficiency": np.where(found["direction"] == "S", 0.0, advance / work)}
+
+
+# attractors: Which motions are the same attractor: by direction and period, contacts, and the points of the Poincaré
+# section.
+
+
+# Two settled motions that are the same have come within this many times the tolerance of the section's repetition.
+SLACK = 10.0
+
+
+def attractors_of(columns: MotionColumns) -> np.ndarray:
+    """(n,) int32: number of the attractor of each of n motions *at one set of parameters*; -1 where the run failed.
+
+    columns : as ``points.settled_columns``, of n motions
+
+    Periodic motions are one attractor if their labels agree and the points of one period of their sections agree up
+    to where they begin. Aperiodic motions count as one: their points, and the sign of a slow drift, cannot be matched.
+    """
+    label, period = columns["label"], columns["period"]
+    numbers = np.full(len(label), -1, np.int32)
+    found: list[int] = []
+    for i in range(len(label)):
+        if label[i] == "failed":
+            continue
+        for number, j in enumerate(found):
+            if label[i] == label[j] and (period[i] == 0 or _same_orbit(columns, i, j, int(period[i]))):
+                numbers[i] = number
+                break
+        else:
+            numbers[i] = len(found)
+            found.append(i)
+    return numbers
+
+
+def _same_orbit(columns: MotionColumns, i: int, j: int, period: int) -> bool:
+    """Whether the last ``period`` points of motions i and j are the same but for a shift along the orbit."""
+    (x, x_other), (w, w_other) = ((columns[name][[i, j], -period:]) for name in ("x_rel", "rate"))
+    return any(
+        np.abs(np.roll(x, shift) - x_other).max() <= SLACK * SAME_POSITION
+        and np.abs(np.roll(w, shift) - w_other).max() <= SLACK * SAME_VELOCITY
+        for shift in range(period)
+    )
+
+
+# blocks: Many points block by block: in this process or on a Dask cluster, with finished blocks kept on disk.
+#
+# The same function computes a block wherever it runs, and a lane does not depend on its block: the result is the same
+# to
+# the last bit, whoever computed it and however often the work was interrupted.
+
+
+# Points of one block: seconds of work, a multiple of the lanes of one call.
+BLOCK = 256
+# File of a store that states which points its blocks belong to.
+FINGERPRINT = "points.json"
+
+
+def compute(
+    points: SweepPoints,
+    settling: Settling,
+    keep: Sequence[str] = tuple(MOTION_COLUMNS),
+    *,
+    progress: OnProgress | None = None,
+    store: Path | None = None,
+    client: "Client | None" = None,
+    block: int = BLOCK,
+) -> MotionColumns:
+    """Settled motions of all points: columns (points, ...) by name.
+
+    Parameters
+    ----------
+    keep : the names of ``MOTION_COLUMNS`` to return
+    progress : called with the points done, their number, and the word "points"
+    store : a folder, created if missing: finished blocks are saved there and read from there
+    client : of a Dask cluster; the blocks of a worker that dies are computed again by others. Workers must
+        have the same versions and XLA flags as each other, or the last bits of the blocks may differ.
+    block : points of a block
+
+    Seven arguments: three state the points, the others are options by name.
+
+    Raises
+    ------
+    InputError
+        A store that belongs to other points.
+    """
+    begins = range(0, points.size, block)
+    if store is not None:
+        _check_store(store, points, settling, keep, block)
+    parts: dict[int, MotionColumns] = {}
+    for begin in begins:
+        finished = _saved_block(store, begin)
+        if finished is not None:
+            parts[begin] = finished
+    missing = [begin for begin in begins if begin not in parts]
+    make = _in_process if client is None else _on_cluster(client)
+    done = sum(len(part["status"]) for part in parts.values())
+    _report(progress, done, points.size)
+    for begin, part in make(points, settling, tuple(keep), missing, block):
+        parts[begin] = part
+        _save_block(store, begin, part)
+        done += len(part["status"])
+        _report(progress, done, points.size)
+    return {name: np.concatenate([parts[begin][name] for begin in begins]) for name in keep}
+
+
+def settled_block(points: SweepPoints, settling: Settling, keep: Sequence[str]) -> MotionColumns:
+    """One block: the named columns and the status."""
+    seen = settled_columns(points, settling)
+    return {name: seen[name] for name in dict.fromkeys((*keep, "status"))}
+
+
+def _in_process(
+    points: SweepPoints, settling: Settling, keep: Sequence[str], missing: list[int], block: int
+) -> Iterator[tuple[int, MotionColumns]]:
+    for begin in missing:
+        yield begin, settled_block(points.part(begin, begin + block), settling, keep)
+
+
+def _on_cluster(client: "Client") -> Callable[..., Iterator[tuple[int, MotionColumns]]]:
+    from distributed import as_completed
+
+    def run(
+        points: SweepPoints, settling: Settling, keep: Sequence[str], missing: list[int], block: int
+    ) -> Iterator[tuple[int, MotionColumns]]:
+        futures: dict[Any, int] = {}
+        for begin in missing:
+            task = client.submit(settled_block, points.part(begin, begin + block), settling, keep, pure=False)
+            futures[task] = begin
+        for future, part in as_completed(list(futures), with_results=True):
+            yield futures[future], part
+
+    return run
+
+
+def _report(progress: OnProgress | None, done: int, total: int) -> None:
+    stop_if_interrupted()
+    if progress is not None:
+        progress(done, total, "points")
+
+
+def _check_store(store: Path, points: SweepPoints, settling: Settling, keep: Sequence[str], block: int) -> None:
+    """Create the folder, or check that its blocks belong to these points."""
+    leaves = hashlib.sha256(str(jax.tree.structure((points.p, points.e))).encode())
+    for leaf in jax.tree.leaves((points.p, points.e, points.initial)):
+        leaves.update(np.ascontiguousarray(leaf).tobytes())
+    mine = {
+        "points": leaves.hexdigest(),
+        "settling": asdict(settling),
+        "keep": list(keep),
+        "block": block,
+        "jax": jax.__version__,
+    }
+    store.mkdir(parents=True, exist_ok=True)
+    file = store / FINGERPRINT
+    if file.exists():
+        try:
+            theirs = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError:
+            theirs = None
+        if theirs != json.loads(json.dumps(mine)):
+            remedy = "repeat the command with the same points, or remove the folder"
+            raise InputError("finished blocks are reused for the same points only", "other points", remedy, store)
+        return
+    if any(store.iterdir()):
+        raise InputError("a store is a new folder or one of this program", "it is neither", "name another one", store)
+    file.write_text(json.dumps(mine, indent=1), encoding="utf-8", newline="\n")
+
+
+def _file(store: Path, begin: int) -> Path:
+    return store / f"block_{begin:09d}.npz"
+
+
+def _save_block(store: Path | None, begin: int, part: MotionColumns) -> None:
+    if store is None:
+        return
+    new = store / "block.new"
+    with new.open("wb") as file:
+        np.savez(file, **part)  # pyright: ignore[reportArgumentType]  (names are ours: none is "file")
+    new.replace(_file(store, begin))
+
+
+def _saved_block(store: Path | None, begin: int) -> MotionColumns | None:
+    """A saved block; None if there is none or it cannot be read."""
+    if store is None or not _file(store, begin).exists():
+        return None
+    try:
+        with _file(store, begin).open("rb") as file, np.load(file, allow_pickle=False) as saved:
+            return {name: saved[name] for name in saved.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+# datasets: From the columns of a sweep's points to an ``xarray.Dataset``, and what a sweep accepts as its axes.
+
+
+ATTRACTOR = {"units": "1", "long_name": "number of the attractor among those found here, -1 if the run failed"}
+ATTRACTORS = {"units": "1", "long_name": "number of different attractors found here"}
+
+
+def grid_of(over: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+    """The quantities that are varied, symbol -> values (n,), checked.
+
+    Raises
+    ------
+    InputError
+        A quantity that does not exist, values that are no list of finite numbers.
+    """
+    for name in over:
+        if name not in SWEPT:
+            raise InputError("only a quantity of the model can be swept", name, f"choose from {', '.join(SWEPT)}")
+    return {name: values_of(name, values) for name, values in over.items()}
+
+
+def single(p: CapsuleParameters, e: PeriodicDrive) -> tuple[CapsuleParameters, PeriodicDrive]:
+    """p and e themselves.
+
+    Raises
+    ------
+    InputError
+        Leaves with a batch axis.
+    """
+    if any(np.ndim(leaf) for leaf in jax.tree.leaves((p, e))):
+        raise InputError("a sweep starts from one set of parameters", "a batch", "give each leaf as one number")
+    return p, e
+
+
+def values_of(name: str, values: ArrayLike) -> np.ndarray:
+    """``values`` as an array (n,).
+
+    Raises
+    ------
+    InputError
+        If they are no list of finite numbers.
+    """
+    x = np.asarray(values, float)
+    if x.ndim != 1 or not x.size or not np.isfinite(x).all():
+        raise InputError(f"{name} takes a list of finite numbers", f"shape {x.shape}", "give at least one value")
+    return x
+
+
+def provenance(
+    p: CapsuleParameters, e: PeriodicDrive, over: Sequence[str], settling: Settling, method: str
+) -> dict[str, Any]:
+    """Attributes: every parameter that is not swept, and how the motions were settled."""
+    swept = {swept_leaf(name, e) for name in over}
+    given = {**vars(p), **vars(e)}
+    held = {name: float(np.asarray(x)) for name, x in given.items() if name not in swept and x is not None}
+    return {**held, **asdict(settling), "method": method, "model": "exact", "semantics": "stick-slip"}
+
+
+def dataset_of(
+    seen: MotionColumns,
+    grid: Mapping[str, np.ndarray],
+    dims: tuple[str, ...],
+    shape: tuple[int, ...],
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
+    """Columns (points, ...) as variables over ``dims`` (and the section where a column has one value a period)."""
+    variables = {}
+    for name, column in seen.items():
+        unit, meaning = MOTION_COLUMNS[name]
+        extra = ("section",) if name in SECTION and "branch" in dims else ()
+        if name in SUMMARY or extra:
+            values = column.reshape(*shape, *column.shape[1:])
+            variables[name] = ((*dims, *extra), values, {"units": unit, "long_name": meaning})
+    coordinates = {
+        name: (name, x, {"units": SWEPT[name].unit, "long_name": SWEPT[name].meaning}) for name, x in grid.items()
+    }
+    return xr.Dataset(variables, coordinates, dict(attributes))
+
+
+def branched(
+    seen: MotionColumns, names: Sequence[str], grid: Mapping[str, np.ndarray], attributes: Mapping[str, Any]
+) -> xr.Dataset:
+    """Columns (branches x values, ...) as a Dataset over (branch, value), with the attractors at each value."""
+    ((over, x),) = grid.items()
+    shape = (len(names), len(x))
+    numbers = np.empty(shape, np.int32)
+    for i in range(len(x)):
+        numbers[:, i] = attractors_of({name: column[i :: len(x)] for name, column in seen.items()})
+    data = dataset_of(seen, grid, ("branch", over), shape, attributes).assign_coords(branch=("branch", list(names)))
+    return data.assign(
+        attractor=(("branch", over), numbers, ATTRACTOR), attractors=(over, numbers.max(axis=0) + 1, ATTRACTORS)
+    )
+
+
+# sweep: Bifurcation diagrams, two-parameter maps, basins of attraction: settled motions over any quantity of the model.
+#
+#     diagram(p, e, "k2", values)                      each value from rest
+#     diagram(..., starts=spread_starts(p, e, 16))     each value from many initial states: co-existing attractors
+#     continuation(p, e, "k2", values)                 forward and backward, each value from where the last one ended
+#     motion_map(p, e, {"k2": ..., "P_d": ...})        label, mean velocity, efficiency over two quantities
+#     basins(p, e, x_rel, rate)                        which initial state leads where, at one set of parameters
+#
+# All of them return an ``xarray.Dataset`` in SI units whose variables say what they are (``units``, ``long_name``). A
+# run that was given up is labelled "failed", and ``status`` says why.
 
 
 def diagram(

@@ -13,12 +13,11 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.physics.batches import lanes_of
-from capsule_id.physics.contacts import support
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.exact.dense import values_of
 from capsule_id.physics.exact.engine import initial_lanes, march
 from capsule_id.physics.exact.taylor import constants_of
-from capsule_id.physics.forces import downhill
+from capsule_id.physics.forces import downhill, support
 from capsule_id.physics.friction import FrictionLaw, friction_law, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Initial, Status, without_absent
 

@@ -1,19 +1,109 @@
-"""The columns of a parameter table, declared once for parameters.json, parameters.csv, the page and standard output.
+"""The columns of a parameter table, how numbers and names are set, and the table of the console."""
 
-All numbers of a row keep two digits of the posterior sd (without a sample: of the standard error), the point fit those
-of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m); all rows of a symbol
-(G[run_1], G[run_2]) have the same unit.
-"""
-
-from collections.abc import Callable, Hashable, Mapping
+import math
+import re
+import shutil
+import textwrap
+import unicodedata
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
+from capsule_id.inference.result import Posterior, Result
 from capsule_id.parameters import is_stated, symbol_of
-from capsule_id.report.typography import MISSING, decimals_for, fixed, prefix_for
+from capsule_id.views import Trust, counted
+
+# typography: How numbers, units and parameter names are set: one rule each, for every table and figure.
+
+
+MISSING = "–"
+
+# Outside these magnitudes a number in bare SI units is hard to read, and the unit takes a decimal prefix instead.
+_PREFIX_ABOVE, _PREFIX_BELOW = 1e7, 1e-2
+_PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n", -12: "p"}
+# "1" has no prefix, "kg" has one already, and "m^2" with a prefix would mean the square of the prefixed unit.
+_PREFIXABLE = re.compile(r"(N|m|s|A|rad|Hz|J|W|V)(?![A-Za-z^0-9²³])")
+
+_NAME = re.compile(r"(?P<base>[A-Za-z]+?)(?:_?(?P<index>\d+|(?<=_)[A-Za-z0-9]+))?(?:\[(?P<label>.*)\])?")
+
+
+# A longer name of a spring or an experiment would push the axis off the picture.
+_LONGEST_LABEL = 24
+
+
+def decimals_for(sd: float) -> int | None:
+    """Decimal places (negative: places before the point) that leave two significant digits of ``sd``.
+
+    None where ``sd`` gives no guidance (zero, NaN or infinite).
+    """
+    if not math.isfinite(sd) or sd <= 0:
+        return None
+    # Formatting first: 0.0996 is 0.10 with two digits, one place fewer than its logarithm says.
+    return 1 - int(f"{sd:.1e}".partition("e")[2])
+
+
+def fixed(value: float, decimals: int | None) -> str:
+    """``value`` with so many decimals; six significant digits where ``decimals`` is None; a dash for NaN."""
+    if math.isnan(value):
+        return MISSING
+    if math.isinf(value) or decimals is None:
+        return f"{value:.6g}"
+    if decimals <= 0:
+        return f"{round(value, decimals):.0f}"
+    return f"{value:.{decimals}f}"
+
+
+def prefix_for(unit: str, magnitude: float) -> tuple[float, str]:
+    """Factor and unit that bring ``magnitude`` into a readable range: (1e6, "µm") for 2e-5 m, else (1.0, unit)."""
+    size = abs(magnitude)
+    readable = size == 0 or not math.isfinite(size) or _PREFIX_BELOW <= size < _PREFIX_ABOVE
+    if readable or not _PREFIXABLE.match(unit):
+        return 1.0, unit
+    power = min(max(3 * math.floor(math.log10(size) / 3), min(_PREFIXES)), max(_PREFIXES))
+    return 10.0**-power, _PREFIXES[power] + unit
+
+
+def symbol_parts(name: str) -> tuple[str, str, str]:
+    """Split a parameter name as the paper sets it: symbol, index, label.
+
+    ``k2[soft]`` -> ("k", "2", "soft"); ``mu`` -> ("μ", "", ""); ``v_s`` -> ("v", "s", "").
+    Names that are words (``tilt_sd``) stay whole: ("tilt_sd", "", "").
+    """
+    match = _NAME.fullmatch(name)
+    if match is None:
+        base, bracket, label = name.partition("[")
+        return base, "", label.removesuffix("]") if bracket else ""
+    base, index, label = match["base"], match["index"] or "", match["label"] or ""
+    try:
+        base = unicodedata.lookup(f"GREEK {'CAPITAL' if base[0].isupper() else 'SMALL'} LETTER {base}")
+    except KeyError:
+        if len(base) > 1:
+            return name.partition("[")[0], "", label
+    return base, index, label
+
+
+def plain_symbol(name: str) -> str:
+    """The name for a figure, in Unicode and without markup: ``k₂ soft``, ``μ``, ``vₛ``, ``tilt_sd``."""
+    base, index, label = symbol_parts(name)
+    small = index.translate(str.maketrans("0123456789s", "₀₁₂₃₄₅₆₇₈₉ₛ"))
+    if index and small.isascii():
+        small = f"_{index}"
+    short = label if len(label) <= _LONGEST_LABEL else label[: _LONGEST_LABEL - 1] + "…"
+    return f"{base}{small} {short}".rstrip()
+
+
+# columns: The columns of a parameter table, declared once for parameters.json, parameters.csv, the page and standard
+# output.
+#
+# All numbers of a row keep two digits of the posterior sd (without a sample: of the standard error), the point fit
+# those
+# of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m); all rows of a
+# symbol
+# (G[run_1], G[run_2]) have the same unit.
+
 
 Output = Literal["json", "csv", "html", "console"]
 FILES: frozenset[Output] = frozenset({"json", "csv"})
@@ -204,3 +294,115 @@ def columns_of(output: Output, frame: pd.DataFrame | None = None) -> list[Output
         return columns
     sampled, rows = bool(frame["ess"].notna().any()), table_rows(frame)
     return [c for c in columns if (sampled or not c.sampled) and any(c.text(row) not in ("", MISSING) for row in rows)]
+
+
+# console table: The parameter table for standard output.
+
+
+#: Width of the table where standard output is no terminal.
+WIDTH = 110
+#: Columns that are printed at any width: unit, value ± sd and trust.
+KEPT = 3
+_GAP = "  "
+
+SYNTHETIC = "*** SYNTHETIC RIG: computer-made data, nothing here was measured ***"
+
+
+def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = None) -> str:
+    """The parameter table as aligned text. Columns at the right give way where the terminal is narrow; names are whole.
+
+    Parameters
+    ----------
+    summary : as ``Result.summary``; without a sample the sampled columns are left out
+    synthetic : the rig is a synthetic one: said in a line of its own
+    width : columns of the terminal; None: those of standard output
+    """
+    width = shutil.get_terminal_size((WIDTH, 24)).columns if width is None else width
+    columns = columns_of("console", summary)
+    table = [["", *(column.header for column in columns)]]
+    for row in table_rows(summary):
+        cells = [column.text(row) for column in columns]
+        table.append([row.name, *("NO" if cell == "no" else cell for cell in cells)])
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    shown = len(widths)
+    while shown > 1 + KEPT and sum(widths[:shown]) + len(_GAP) * (shown - 1) > width:
+        shown -= 1
+    lines = [_line(cells[:shown], widths[:shown]) for cells in table]
+    rule = "-" * max(map(len, lines))
+    left_out = ", ".join(table[0][shown:])
+    more = wrapped([f"in a wider terminal and in report.html: {left_out}"] if left_out else [], width)
+    if skewed := skewed_names(summary):
+        names = f"{', '.join(skewed)}: skewed; quote the value with its 95 % interval"
+        more = [*wrapped([names], width), *more]
+    return "\n".join([*([SYNTHETIC] if synthetic else []), lines[0], rule, *lines[1:], *more])
+
+
+def wrapped(texts: Sequence[str], width: int | None = None) -> list[str]:
+    """Lines of the ``texts``, no wider than the terminal."""
+    width = shutil.get_terminal_size((WIDTH, 24)).columns if width is None else width
+    return [line for text in texts for line in textwrap.wrap(text, max(width, 20), break_on_hyphens=False)]
+
+
+def verdict_text(trust: Trust, failed: Sequence[str], warned: int) -> str:
+    """The verdict in one line: titles of the ``failed`` checks, number of warnings. Console and report have these words."""
+    found = f"failed: {', '.join(failed)}" if failed else "no check failed"
+    if trust == "not judged" and not failed:
+        found += ", but not every number could be checked"
+    return f"verdict: {trust}; {found}" + (f"; {counted(warned, 'warning')}" if warned else "")
+
+
+def _line(cells: list[str], widths: list[int]) -> str:
+    words = [cells[0].ljust(widths[0]), cells[1].ljust(widths[1])]
+    words += [cell.rjust(width) for cell, width in zip(cells[2:], widths[2:], strict=True)]
+    return _GAP.join(words).rstrip()
+
+
+# sampled parameters: The sampled physical parameters as columns, in display units: what corner plot and traces have
+# in common.
+
+
+@dataclass(frozen=True)
+class SampledParameters:
+    """Sampled physical parameters, nuisances left out.
+
+    Attributes
+    ----------
+    names : (n,) as in the summary
+    symbols, units : (n,) for display
+    draws : (ensemble, draw, walker, n) in display units
+    map, paper : (n,) point fit and the paper's estimate (NaN where it has none), display units
+    """
+
+    names: tuple[str, ...]
+    symbols: tuple[str, ...]
+    units: tuple[str, ...]
+    draws: np.ndarray
+    map: np.ndarray
+    paper: np.ndarray
+    posterior: Posterior
+
+
+def sampled_parameters(result: Result) -> SampledParameters:
+    """The columns of ``result``.
+
+    Raises
+    ------
+    ValueError
+        If nothing was sampled.
+    """
+    if result.posterior is None:
+        raise ValueError("nothing was sampled (point fit only): fit without --no-sample (budget=None)")
+    place = {name: i for i, name in enumerate(result.posterior.names)}
+    summary = result.summary.loc[[name in place for name in result.summary.index]]
+    names = tuple(str(name) for name in summary.index)
+    display = [prefix_for(str(row["unit"]), magnitude(row)) for row in summary.to_dict("records")]
+    scale = np.array([factor for factor, _ in display])
+    return SampledParameters(
+        names=names,
+        symbols=tuple(plain_symbol(name) for name in names),
+        units=tuple(unit for _, unit in display),
+        draws=result.posterior.draws[..., [place[name] for name in names]] * scale,
+        map=summary["map"].to_numpy(float) * scale,
+        paper=summary["paper"].to_numpy(float) * scale,
+        posterior=result.posterior,
+    )

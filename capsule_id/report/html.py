@@ -1,25 +1,240 @@
-"""The page: one self-contained HTML file, figures embedded, one small script, nothing loaded from elsewhere."""
+"""The page: one self-contained HTML file with all pictures of a result, nothing loaded from elsewhere."""
 
 import base64
 import math
 import numbers
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
 
+from capsule_id.console import stop_if_interrupted
+from capsule_id.experiments.context import RunRecord
 from capsule_id.inference.result import Result
 from capsule_id.parameters import is_stated
-from capsule_id.report.columns import Output, columns_of, skewed_names, table_rows
-from capsule_id.report.console_table import verdict_text
-from capsule_id.report.gallery import Picture
-from capsule_id.report.texts.advice import next_steps
-from capsule_id.report.texts.citation import AUTHORS, PUBLISHED, TITLE, bibtex, latex_table, methods_paragraph
-from capsule_id.report.texts.messages import caption_of, finding_text, messages_of, title_of
-from capsule_id.report.texts.terms import OF_A_SAMPLE, TERMS
-from capsule_id.report.typography import MISSING, fixed, symbol_parts
-from capsule_id.views import Finding, Level, Message, ResultTable, counted
+from capsule_id.records.motion import UNDECIDED
+from capsule_id.report.columns import (
+    MISSING,
+    Output,
+    columns_of,
+    fixed,
+    sampled_parameters,
+    skewed_names,
+    symbol_parts,
+    table_rows,
+    verdict_text,
+)
+from capsule_id.report.figures import fits as figures
+from capsule_id.report.figures.fits import TWO_SIDED_95, corner, force_on_rod, run_overview, traces
+from capsule_id.report.figures.style import figure_of, mark, png
+from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, title_of
+from capsule_id.report.sentences import AUTHORS, PUBLISHED, TITLE, bibtex, latex_table, methods_paragraph, next_steps
+from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, counted
+
+# gallery: All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``.
+
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
+# Characters of a file's name from a label, which may be longer than a name.
+_LONGEST = 80
+# Wider than this (CSS pixels) does not go in pairs.
+_HALF_PAGE = 650
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawn figure.
+
+    Attributes
+    ----------
+    name : file name without suffix, safe and unique within the result
+    section : "measured", "sample" or "point_fit"
+    title, caption : plain text
+    alt : what is seen, for readers who do not see it
+    group : label of the experiment, "" for figures of the whole fit
+    width, height : of the page's picture, CSS pixels
+    png : the file
+    """
+
+    name: str
+    section: Literal["measured", "sample", "point_fit"]
+    title: str
+    caption: str
+    width: int
+    height: int
+    png: bytes
+    alt: str = ""
+    group: str = ""
+
+    @property
+    def wide(self) -> bool:
+        """Whether the picture takes the whole width of the page."""
+        return self.width > _HALF_PAGE
+
+
+def pictures(result: Result) -> tuple[Picture, ...]:
+    """Draw every figure of the result; synthetic data are marked on each of them."""
+    names = _unique(_comparison_name(item) for item in result.comparisons)
+    drawn = [
+        Drawing(
+            name,
+            "measured",
+            item.title,
+            comparison_caption(item, result.registry.captions),
+            comparison_alt(item),
+            _group(result, item.label),
+        ).on(result, figures.comparison_figure(item))
+        for name, item in zip(names, result.comparisons, strict=True)
+    ]
+    labels = _unique(_safe(record.name) for record in result.records)
+    for label, record in zip(labels, result.records, strict=True):
+        drawn += _record_pictures(result, label, record)
+    if result.posterior is not None:
+        corner_caption = "Posterior of the physical parameters: histograms, and contours of every pair."
+        ensembles = len(result.posterior.draws)
+        trace_caption = f"A few walkers of each ensemble, one colour per ensemble ({counted(ensembles, 'ensemble')})."
+        drawing = Drawing("corner", "sample", "Corner plot", corner_caption, _corner_alt(result))
+        drawn.append(drawing.on(result, figure_of(corner(result))))
+        worst = f"{counted(ensembles, 'ensemble')}; the largest split R-hat is {max(result.posterior.rhat):.4f}."
+        drawing = Drawing("traces", "sample", "Traces", trace_caption, f"Traces of every physical parameter, {worst}")
+        drawn.append(drawing.on(result, figure_of(traces(result))))
+    fit = result.point_fit
+    starts_caption = "Where each start began and where it ended, in posterior standard deviations from its curvature."
+    ended = int(fit.at_other_maximum.sum())
+    starts_alt = f"{counted(len(fit.starts), 'start')}; {ended} ended at another maximum than the best."
+    drawing = Drawing("point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts_alt)
+    return (*drawn, drawing.on(result, figure_of(figures.point_fit_starts(fit))))
+
+
+def _group(result: Result, label: str) -> str:
+    """The table that a panel belongs to, by the longest label that begins it; the panel's own label for shared ones."""
+    own = [table.label for table in result.rig.tables if label == table.label or label.startswith(f"{table.label}_")]
+    return max(own, key=len, default=label)
+
+
+def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Picture]:
+    """The record as the paper draws it (its Figs. 4 and 9); ``label`` is safe and unique."""
+    view, contact = record.view, record.view.at_contact
+    left = f"{view.at_drive.rate:.0%} of a rate at the drive's frequency" + (
+        f" and {contact.rate:.0%} at that of the contacts ({contact.f:.3g} Hz)" if contact else ""
+    )
+    caption = (
+        "The record itself: raw channels, and the phase plane through Savitzky–Golay with the impact line and a point a "
+        f"period. The filter ({view.samples} samples) leaves {left}."
+    )
+    word = view.label if view.label == UNDECIDED else f"{view.label} (probability {view.probability:.2g})"
+    title, group = f"{record.name}: the record, {word}", _group(result, record.name)
+    alt = (
+        f"{len(view.time)} samples of {', '.join(view.channels)} over {view.time[-1] - view.time[0]:.3g} s; x_rel from "
+        f"{1e3 * view.x_rel.min():.3g} to {1e3 * view.x_rel.max():.3g} mm; {len(view.section_x_rel)} points, one a period."
+    )
+    drawing = Drawing(f"record_{label}", "measured", title, caption, alt, group)
+    drawn = [drawing.on(result, figure_of(run_overview(view)))]
+    if view.force is not None:
+        figure = figure_of(force_on_rod(view, model=(view.time, record.force)))
+        text = (
+            "Force on the rod (the paper's Fig. 4d): K times the recorded current, and the drive of the fitted model."
+        )
+        misses = float(np.std(view.force - record.force))
+        alt = f"Force between {view.force.min():.3g} and {view.force.max():.3g} N; the model differs by {misses:.2g} N (rms)."
+        drawing = Drawing(f"force_{label}", "measured", f"{record.name}: force on the rod", text, alt, group)
+        drawn.append(drawing.on(result, figure))
+    return drawn
+
+
+def comparison_alt(item: Comparison) -> str:
+    """What the panel shows, in numbers: how many readings over which range, and how far the model misses them."""
+    readings = [points for points in item.points if points.x.size]
+    parts = [f"{item.y_label} against {item.x_label}"]
+    if readings:
+        x = np.concatenate([points.x for points in readings])
+        parts.append(f"{counted(x.size, 'reading')} from {np.nanmin(x):.3g} to {np.nanmax(x):.3g}")
+    parts.append(f"curves: {', '.join(curve.label for curve in item.curves)}" if item.curves else "no curve")
+    if item.residuals is not None and item.residuals.size:
+        size = np.abs(item.residuals)
+        inside = np.mean(size <= TWO_SIDED_95)
+        parts.append(f"{inside:.0%} of the residuals within ±1.96 sd, the largest {np.max(size):.2g} sd")
+    flagged = sum(int(points.flagged.sum()) for points in item.points if points.flagged is not None)
+    parts += [f"{flagged} rows flagged by a check"] if flagged else []
+    return "; ".join(parts) + "."
+
+
+def _corner_alt(result: Result) -> str:
+    """Number of parameters and the strongest correlation."""
+    columns = sampled_parameters(result)
+    names, flat = columns.names, columns.draws.reshape(-1, len(columns.names))
+    if len(names) < 2 or not np.all(np.std(flat, axis=0) > 0.0):
+        return f"Histograms of {counted(len(names), 'parameter')}."
+    correlation = np.triu(np.corrcoef(flat.T), 1)
+    i, j = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
+    strongest = f"strongest correlation {correlation[i, j]:.2f}, of {names[i]} with {names[j]}"
+    return f"Histograms of {len(names)} parameters and contours of their pairs; {strongest}."
+
+
+def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
+    """What the panel shows, and its posterior predictive p-value where there is one."""
+    parts = [captions.get(item.kind, "Measured beside predicted.")]
+    if item.residuals is not None:
+        parts.append("Shaded: the range that holds 95 % of a good fit's residuals.")
+    if any(points.flagged is not None and points.flagged.any() for points in item.points):
+        parts.append("Framed rows are flagged by a check; they stay in the fit.")
+    if item.predictive_p is not None:
+        parts.append(f"Posterior predictive p = {item.predictive_p:.2g} (chi-square discrepancy).")
+    return " ".join(parts)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """The words of a picture; see ``Picture``."""
+
+    name: str
+    section: Literal["measured", "sample", "point_fit"]
+    title: str
+    caption: str
+    alt: str
+    group: str = ""
+
+    def on(self, result: Result, figure: Figure) -> Picture:
+        """The picture of ``figure``, with the mark of a synthetic rig."""
+        stop_if_interrupted()
+        if result.rig.synthetic:
+            mark(figure, "synthetic data")
+        width, height = (round(96 * inches) for inches in figure.get_size_inches())
+        return Picture(
+            self.name, self.section, self.title, self.caption, width, height, png(figure), self.alt, self.group
+        )
+
+
+def _comparison_name(item: Comparison) -> str:
+    name = item.label if item.label.startswith(item.kind) else f"{item.kind}_{item.label}"
+    return _safe(name)
+
+
+def _safe(name: str) -> str:
+    return _UNSAFE.sub("_", name)[:_LONGEST]
+
+
+def _unique(names: Iterable[str]) -> list[str]:
+    """Number names that would overwrite another picture (also on file systems that ignore case)."""
+    taken = {"corner", "traces", "point_fit_starts"}
+    unique = []
+    for name in names:
+        candidate, number = name, 2
+        while candidate.lower() in taken:
+            candidate, number = f"{name}_{number}", number + 1
+        taken.add(candidate.lower())
+        unique.append(candidate)
+    return unique
+
+
+# html: The page: one self-contained HTML file, figures embedded, one small script, nothing loaded from elsewhere.
+
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _WORST_FIRST: tuple[Level, ...] = ("fail", "warn", "ok")

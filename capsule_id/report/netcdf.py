@@ -1,5 +1,6 @@
-"""``posterior.nc``: the sample in the groups and dimensions that ArviZ knows."""
+"""``posterior.nc`` in the groups of ArviZ, written and read back, and simulated motions as tables."""
 
+import csv
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -8,8 +9,12 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from capsule_id.errors import InputError
 from capsule_id.inference.result import Pointwise, Posterior, Result
-from capsule_id.parameters import TABLE
+from capsule_id.parameters import LEAVES, TABLE
+
+# netcdf: ``posterior.nc``: the sample in the groups and dimensions that ArviZ knows.
+
 
 # The extra dimension of bracketed names; every other family gets "<base>_of".
 _DIMENSIONS = {"k2": "spring"}
@@ -199,3 +204,84 @@ def _members_of(dataset: xr.Dataset) -> dict[str, np.ndarray]:
 
 def _members(base: str, names: Mapping[str, np.ndarray]) -> set[str]:
     return {name for name in names if name == base or (name.startswith(f"{base}[") and name.endswith("]"))}
+
+
+# motion files: A simulated motion as a table: CSV with ``name [unit]`` headers, or NetCDF with units as attributes.
+
+
+UNITS = {"time": "s", "X1": "m", "Y1": "m/s", "X2": "m", "Y2": "m/s", "x_rel": "m"}
+MEANINGS = {
+    "X1": "displacement of the rod",
+    "Y1": "velocity of the rod",
+    "X2": "displacement of the capsule",
+    "Y2": "velocity of the capsule",
+    "x_rel": "X1 - X2, positive towards the support spring",
+}
+
+
+def write_motion(path: Path, columns: Mapping[str, np.ndarray], provenance: Mapping[str, float | str]) -> None:
+    """Write the columns (n,), named as in ``UNITS``, to a ``.csv`` or ``.nc`` file; numbers keep all their digits.
+
+    provenance : parameters and model; attributes of the NetCDF file (a CSV file holds the table alone)
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    if path.suffix == ".nc":
+        _write_netcdf(path, columns, provenance)
+        return
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([f"{name} [{UNITS[name]}]" for name in columns])
+        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+
+def _write_netcdf(path: Path, columns: Mapping[str, np.ndarray], provenance: Mapping[str, float | str]) -> None:
+    data = {
+        name: ("time", column, {"units": UNITS[name], "long_name": MEANINGS[name]})
+        for name, column in columns.items()
+        if name != "time"
+    }
+    dataset = xr.Dataset(data, {"time": ("time", columns["time"], {"units": UNITS["time"]})}, dict(provenance))
+    dataset.to_netcdf(path, engine="h5netcdf")
+
+
+# posterior file: ``posterior.nc`` read back: draws of the model's leaves.
+
+
+def read_draws(path: Path, count: int, seed: int, spring: str | None = None) -> dict[str, np.ndarray]:
+    """``count`` draws, taken at random without repetition: symbol -> (count,), SI, for every leaf in the file.
+
+    spring : whose k2; None where the file has one spring, or k2 is of no interest (it is left out then)
+
+    Raises
+    ------
+    InputError
+        No file of fit-params, fewer draws than wanted, a spring that is not in it.
+    """
+    try:
+        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as data:
+            data.load()
+        size = data.sizes["chain"] * data.sizes["draw"]
+    except (OSError, KeyError, ValueError) as error:
+        rule, remedy = "--posterior takes the posterior.nc of a result", "give results/<rig>/posterior.nc"
+        raise InputError(rule, type(error).__name__, remedy, path) from None
+    if not 1 <= count <= size:
+        raise InputError(
+            "--draws must lie between 1 and the draws of the file", str(count), f"give at most {size}", path
+        )
+    chosen = np.random.default_rng(seed).choice(size, count, replace=False)
+    flat = data.stack(sample=("chain", "draw"))
+    found = {str(name): flat[name] for name in flat.data_vars if name in LEAVES}
+    if "k2" in found and "spring" in found["k2"].dims:
+        springs = [str(name) for name in found["k2"]["spring"].to_numpy()]
+        named = spring if spring is not None else springs[0] if len(springs) == 1 else None
+        if named is None:
+            del found["k2"]
+        elif named in springs:
+            found["k2"] = found["k2"].isel(spring=springs.index(named))
+        else:
+            raise InputError("--spring must be a fitted one", named, f"choose from {', '.join(springs)}", path)
+    return {name: column.to_numpy()[chosen] for name, column in found.items()}

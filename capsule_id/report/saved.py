@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.registry import Registry
+from capsule_id.experiments.kind import Registry
 from capsule_id.inference.result import Result
 from capsule_id.report.netcdf import read_sample
 

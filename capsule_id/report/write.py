@@ -14,11 +14,10 @@ import pandas as pd
 from capsule_id.inference.result import Result
 from capsule_id.report.columns import columns_of
 from capsule_id.report.figures.style import own_style
-from capsule_id.report.gallery import Picture, pictures
-from capsule_id.report.html import render
+from capsule_id.report.html import Picture, pictures, render
+from capsule_id.report.messages import finding_text, messages_of, title_of
 from capsule_id.report.netcdf import write_posterior
 from capsule_id.report.saved import save
-from capsule_id.report.texts.messages import finding_text, messages_of, title_of
 
 
 def write_result(result: Result, directory: Path) -> None:

@@ -10,20 +10,29 @@ from typing import Any
 
 import numpy as np
 
+from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
-from capsule_id.interruption import stop_if_interrupted
 from capsule_id.parameters import Parameter
-from capsule_id.rig.choices import check_masses_of_free, check_normal_forces, read_confirmed, read_model
-from capsule_id.rig.entry import Entry
-from capsule_id.rig.formats.text.blocks import TextFile
-from capsule_id.rig.maps.declared import MAP_KEYS
+from capsule_id.rig.formats.text import TextFile
+from capsule_id.rig.maps import MAP_KEYS
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Settings, Table
-from capsule_id.rig.schema import RIG_QUANTITIES, TABLE_KEYS, KindRule, parameter_rows
-from capsule_id.rig.tables import TableFile, read_experiment_files
-from capsule_id.rig.toml_document import KeyPath, TomlDocument, parse_toml
-from capsule_id.rig.toml_values import (
+from capsule_id.rig.schema import (
+    RIG_QUANTITIES,
+    TABLE_KEYS,
+    KindRule,
+    check_masses_of_free,
+    check_normal_forces,
+    parameter_rows,
+    read_confirmed,
+    read_model,
+)
+from capsule_id.rig.tables import Entry, TableFile, read_experiment_files
+from capsule_id.rig.toml import (
     NAME_PATTERN,
+    KeyPath,
+    TomlDocument,
     closest,
+    parse_toml,
     read_bool,
     read_name,
     read_prior,

@@ -7,30 +7,76 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.domains import LARGEST, SMALLEST, is_plausible
+from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.export import Layout
-from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.formats.text.blocks import TextFile
-from capsule_id.rig.formats.text.csv import HEADER_CELL, MissingCellsError
-from capsule_id.rig.maps.clock import on_reference, read_clock
-from capsule_id.rig.maps.columns import proposal
-from capsule_id.rig.maps.declared import ColumnMap, read_map
-from capsule_id.rig.maps.layout import find_layout
-from capsule_id.rig.maps.mapped import apply_map
-from capsule_id.rig.maps.plateaus import Plateaus, read_plateaus, readings_of_plateaus
-from capsule_id.rig.maps.rejection import Rejection, outlying_rows, read_rejection
-from capsule_id.rig.model import NO_DRIFT, Column, Quantity
-from capsule_id.rig.order import remedy_of_order
-from capsule_id.rig.schema import ColumnRule, KindRule
-from capsule_id.rig.toml_document import KeyPath, TomlDocument
-from capsule_id.rig.toml_values import closest, read_string, shown
+from capsule_id.rig.formats.raw import Layout, RawTable
+from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError, TextFile
+from capsule_id.rig.guess import find_layout, proposal
+from capsule_id.rig.maps import ColumnMap, apply_map, on_reference, read_clock, read_map
+from capsule_id.rig.model import NO_DRIFT, Column, Quantity, S, Table
+from capsule_id.rig.plateaus import (
+    Plateaus,
+    Rejection,
+    outlying_rows,
+    read_plateaus,
+    read_rejection,
+    readings_of_plateaus,
+)
+from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, KindRule, place_of
+from capsule_id.rig.toml import LARGEST, SMALLEST, KeyPath, TomlDocument, closest, is_plausible, read_string, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
+from capsule_id.views import counted
+
+# order: Finds why the times of a table do not increase, and the remedy that cures this cause.
+
+
+#: Largest share of rows with a repeated time where the clock stood still; of rounded times more are repeated.
+STANDS = 0.05
+_MOST_LINES = 20  # named in a remedy
+
+
+def remedy_of_order(raw: RawTable, index: int) -> str:
+    """The cause that keeps column ``index`` from increasing, tested on the rows, and its remedy; else what is seen."""
+    time, name, step = raw.columns[index], raw.names[index], np.diff(raw.columns[index])
+    back = 1 + np.flatnonzero(step <= 0.0)
+    few, falls = len(back) * FEWEST_PERIODS < len(time), bool(np.any(step < 0.0))
+    rising = [
+        other for other, c in zip(raw.names, raw.columns, strict=True) if other != name and np.all(np.diff(c) > 0.0)
+    ]
+    copies = np.setdiff1d(np.arange(len(time)), np.unique(raw.values, axis=0, return_index=True)[1])
+    order = np.argsort(time, kind="stable")
+    rough = [sum(float(np.sum(np.abs(np.diff(c[rows])))) for c in raw.columns) for rows in (order, slice(None))]
+    # A clock that stood still makes up for the lost time in one step.
+    levels, counts = np.unique(time, return_counts=True)
+    even = (time[-1] - time[0]) / (len(time) - 1)
+    made_up = np.all(np.abs(np.diff(levels) - counts[:-1] * even)[counts[:-1] > 1] < 0.5 * even)
+    where = f"line {' '.join(map(str, raw.rows[back][:_MOST_LINES]))}{' …' if len(back) > _MOST_LINES else ''}"
+    files, rows = f"at {counted(len(back), 'row')} ({where}): write a file of each record", counted(len(back), "row")
+    still = "the clock stands still and then goes on; delete the rows with a repeated time:"
+    causes = (
+        (rising and not few, f"{' '.join(rising)} increases in every row and {name} does not: exchange the headers of "
+         f"{name} and {' '.join(rising)}, or their from in a column map"),
+        (len(clock_starts(time)) and np.all(step[back - 1] < 0.0), f"the clock starts anew {files}"),
+        (len(copies) and np.all(np.diff(np.delete(time, copies)) > 0.0),
+         f"delete the repeated rows: line {' '.join(map(str, raw.rows[copies]))}"),
+        (not falls and len(back) <= STANDS * len(time) and made_up, f"{still} {where}"),
+        (not falls, f"the times are rounded, up to {counted(int(counts.max()), 'row')} share one: export them with more "
+         "digits"),
+        (len(levels) == len(time) and rough[0] <= rough[1],
+         f"sort the rows by {name}: in that order the readings are smoother"),
+        (few, f"the clock is set back {files}"),
+    )  # fmt: skip
+    other = f"{name} falls or stays in {rows} of {len(time)}: check which column holds the times"
+    return next((text for holds, text in causes if holds), other)
+
+
+# tables: Reads the files of one experiment: path check, bytes, hash, column map, columns in SI.
+
 
 _A_TRIAL = "a row per trial"
 
@@ -370,3 +416,71 @@ def _raise_at_first_false(table: TableFile, index: int, good: np.ndarray, messag
     if not good.all():
         row, name, (rule, remedy) = first + int(np.argmin(good)), table.raw.names[index], message
         raise table.error(row, name, rule, f"{table.raw.columns[index][row]:g} {table.raw.units[index]}", remedy)
+
+
+# entry: One ``[[experiment]]`` during its check: its table, and the places for error lines.
+
+
+@dataclass(frozen=True)
+class Entry(Generic[S]):
+    """The argument of a kind's rules.
+
+    Attributes
+    ----------
+    table : columns and settings, SI
+    document, path : ``rig.toml``, and the key path of the entry
+    file : the table as written
+    """
+
+    table: Table[S]
+    document: TomlDocument
+    path: KeyPath
+    file: TableFile
+
+    def error(self, key: str, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
+        """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
+        path = (*self.path, key) if key else self.path
+        return self.document.error(path, rule, value, remedy, of_key)
+
+    def refuse_ground(self, key: str, rule: str) -> None:
+        """Refuse a slope or N0 that this experiment cannot have, its own or that of [rig].
+
+        Raises
+        ------
+        InputError
+            Where ``key``, "slope" or "N0", is stated.
+        """
+        settings: Any = self.table.settings
+        if stated := settings.ground.get(key):
+            unit = "deg" if key == "slope" else "N"
+            remedy = f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it'
+            value = f"{stated.value:.3g}{f' ± {stated.sd:.3g}' if stated.sd else ''} in SI units"
+            raise self.document.error(place_of(self.document, self.path, key), rule, value, remedy)
+
+    def check_spring_with_gap(self) -> None:
+        """Require a gap where a spring is within reach.
+
+        Raises
+        ------
+        InputError
+            At the one of spring and gap that stands alone.
+        """
+        settings: Any = self.table.settings
+        if (settings.spring is None) != (settings.gap is None):
+            one, other = ("spring", "gap") if settings.gap is None else ("gap", "spring")
+            remedy = f"add {other}, or remove {one} where the support spring is out of reach"
+            raise self.error(one, "spring and gap must stand together", f"{one} alone", remedy, of_key=True)
+
+    def check_length(self) -> None:
+        """Refuse a record that is too short to fit.
+
+        Raises
+        ------
+        InputError
+            At the last sample.
+        """
+        samples = len(self.table.rows)
+        if samples < SHORTEST_RECORD:
+            rule = f"a record must have at least {SHORTEST_RECORD} samples"
+            remedy = f"record {self.table.kind} for longer or faster"
+            raise self.file.error(samples - 1, "time", rule, counted(samples, "sample"), remedy)

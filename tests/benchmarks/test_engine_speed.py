@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.model import CapsuleParameters, simulate
 from tests.scipy_capsule import simulate_scipy
 
 pytestmark = pytest.mark.benchmark

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 
-from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import states_of
 from tests.scipy_general import pulses, simulate_general

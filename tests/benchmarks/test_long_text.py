@@ -22,10 +22,10 @@ RATE, FREQUENCY, BYTES_PER_ROW, PART = 20_000.0, 17.6, 63.9, 200_000
 MOST_MEMORY, EMPTY_MB, MOST_TIME = 4.0, 300.0, 2.0
 #: Modules that the measured parts import, so that their time does not count.
 READ = """
-import sys, time, pandas, pyarrow.csv, capsule_id.rig.formats.text.any_layout
+import sys, time, pandas, pyarrow.csv, capsule_id.rig.formats.layouts
 from pathlib import Path
 from capsule_id.rig.formats import EXPORTS
-from capsule_id.rig.formats.export import Layout
+from capsule_id.rig.formats.raw import Layout
 path = Path(sys.argv[1])
 begin = time.process_time()
 {}

@@ -17,7 +17,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import DATA
 from tests.forced_runs import NOISE, TRUTH, recorded
 from tests.scipy_capsule import simulate_scipy

@@ -16,19 +16,19 @@ import xarray as xr
 
 from capsule_id.cli import fit_params
 from capsule_id.console import Progress
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.kind import default_registry
 from tests.cli_tools import CODE, environment, listing, same_result, small_rig
 
 WORDS = ("rig", "--quiet", "--max-steps", "60")
 #: A short run that is checked often and never converges, so that every ensemble goes on after several checks; and
 #: chains saved after every draw.
 SHORT = {
-    "ensembles.FIRST_CHECK": 15,
-    "ensembles.CHECK_EVERY": 15,
-    "ensembles.PILOT_STEPS": 60,
-    "ensembles.MAX_RHAT": 0.0,
+    "FIRST_CHECK": 15,
+    "CHECK_EVERY": 15,
+    "PILOT_STEPS": 60,
+    "MAX_RHAT": 0.0,
 }
-SHORT |= {"chain_store.SAVE_EVERY": 0.0}
+SHORT |= {"SAVE_EVERY": 0.0}
 
 
 class Killed(BaseException):
@@ -92,7 +92,7 @@ def test_an_ensemble_never_repeats_itself(here: Path) -> None:
     """emcee restarts from the state it receives; after a convergence check it must continue from the last draw."""
     with xr.open_datatree(here / "whole" / "posterior.nc", engine="h5netcdf") as tree:
         mu = tree["posterior"]["mu"].to_numpy()
-    assert mu.shape[1] > 2 * SHORT["ensembles.CHECK_EVERY"]
+    assert mu.shape[1] > 2 * SHORT["CHECK_EVERY"]
     states = np.unique(np.round(mu, 15), axis=1)
     assert states.shape == mu.shape
 
@@ -178,9 +178,9 @@ def test_damaged_chains_are_drawn_again(here: Path, monkeypatch: pytest.MonkeyPa
 
 def test_killed_from_outside_and_resumed(here: Path) -> None:
     """SIGKILL at a real process: nothing of Python runs after it."""
-    kill = "import os, signal\nfrom capsule_id.commands.fits.fit import Progress\n"
-    kill += "from capsule_id.inference.sampling import chain_store, ensembles\n"
-    kill += "".join(f"{name} = {value}\n" for name, value in SHORT.items())
+    kill = "import os, signal\nfrom capsule_id.console import Progress\n"
+    kill += "from capsule_id.inference import sampling\n"
+    kill += "".join(f"sampling.{name} = {value}\n" for name, value in SHORT.items())
     kill += "call = lambda self, done, total, text: done > 100 and os.kill(os.getpid(), signal.SIGKILL)\n"
     kill += "Progress.__call__ = call\n"
     code = kill + CODE.format(name="fit_params")
@@ -221,7 +221,7 @@ def test_resume_refuses_what_has_changed(
     with monkeypatch.context() as patch:
         kinds = default_registry()
         with_package = replace(kinds, packages={**kinds.packages, "rolling-rig": "0.2"})
-        patch.setattr("capsule_id.commands.fits.fit.default_registry", lambda: with_package)
+        patch.setattr("capsule_id.commands.fit.default_registry", lambda: with_package)
         assert fit_params([*WORDS, "--out", "out", "--resume"]) == 2
         assert "the same versions" in capsys.readouterr().err
     _remove(here / "out.partial")

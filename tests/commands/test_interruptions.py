@@ -14,29 +14,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id import interruption
-from capsule_id.interruption import GRACE, interruptible, stop_if_interrupted
+from capsule_id import console
+from capsule_id.console import GRACE, interruptible, stop_if_interrupted
 from tests.cli_tools import DATA, argv, environment, same_result, small_rig
 
 #: Longest time between a signal and the end of the process, s.
 LONGEST = 5.0
 #: A fit of a few seconds that saves its chains after every draw.
-SHORT = "from capsule_id.inference.sampling import chain_store, ensembles\nchain_store.SAVE_EVERY = 0.0\n"
-SHORT += "ensembles.FIRST_CHECK, ensembles.CHECK_EVERY, ensembles.PILOT_STEPS = 15, 15, 60\n"
+SHORT = "from capsule_id.inference import sampling\nsampling.SAVE_EVERY = 0.0\n"
+SHORT += "sampling.FIRST_CHECK, sampling.CHECK_EVERY, sampling.PILOT_STEPS = 15, 15, 60\n"
 #: The step that starts the first ensemble hangs; the time until the process is ended is short.
-HANGING = "import time\nfrom capsule_id import interruption\nfrom capsule_id.inference.sampling import ensembles\n"
-HANGING += "interruption.GRACE = 0.5\nensembles.pilot = lambda *_: open('hanging', 'w').close() or time.sleep(60)\n"
+HANGING = "import time\nfrom capsule_id import console\nfrom capsule_id.inference import sampling\n"
+HANGING += "console.GRACE = 0.5\nsampling.pilot = lambda *_: open('hanging', 'w').close() or time.sleep(60)\n"
 
 #: The step that starts the first ensemble waits for an interruption, while a worker thread computes for a minute.
-WORKING = "import time\nfrom concurrent.futures import ThreadPoolExecutor\nfrom capsule_id import interruption\n"
-WORKING += "from capsule_id.inference.sampling import ensembles\ninterruption.GRACE = 1.0\n"
+WORKING = "import time\nfrom concurrent.futures import ThreadPoolExecutor\nfrom capsule_id import console\n"
+WORKING += "from capsule_id.inference import sampling\nconsole.GRACE = 1.0\n"
 WORKING += "def step(*_):\n    ThreadPoolExecutor(1).submit(time.sleep, 60)\n    open('working', 'w').close()\n"
-WORKING += (
-    "    while True:\n        interruption.stop_if_interrupted()\n        time.sleep(0.01)\nensembles.pilot = step\n"
-)
+WORKING += "    while True:\n        console.stop_if_interrupted()\n        time.sleep(0.01)\nsampling.pilot = step\n"
 #: The last step of the command takes half a second, while a worker thread computes for a minute.
-LAST = "import time\nfrom concurrent.futures import ThreadPoolExecutor\nfrom capsule_id import interruption\n"
-LAST += "from capsule_id.commands.fits import fit\ninterruption.GRACE = 1.0\nrun = fit.run\ndef last(args):\n"
+LAST = "import time\nfrom concurrent.futures import ThreadPoolExecutor\nfrom capsule_id import console\n"
+LAST += "from capsule_id.commands import fit\nconsole.GRACE = 1.0\nrun = fit.run\ndef last(args):\n"
 LAST += "    code = run(args)\n    ThreadPoolExecutor(1).submit(time.sleep, 60)\n    open('last', 'w').close()\n"
 LAST += "    time.sleep(0.5)\n    return code\nfit.run = last\n"
 
@@ -94,7 +92,7 @@ def test_the_time_counts_from_the_signal_and_not_from_its_handler() -> None:
         after = time.monotonic()
         with pytest.raises(KeyboardInterrupt):
             stop_if_interrupted()
-    (arrival,) = interruption._arrivals
+    (arrival,) = console._arrivals
     assert before < arrival < before + 0.5 * (after - before)
 
 

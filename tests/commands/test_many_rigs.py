@@ -11,8 +11,8 @@ import dask
 import pytest
 
 from capsule_id.cli import fit_params
-from capsule_id.commands.cluster import cluster
-from capsule_id.commands.fits import many_rigs
+from capsule_id.commands import fit as many_rigs
+from capsule_id.commands.bifurcate import cluster
 from tests.cli_tools import listing, small_rig
 
 TABLES = {"tilts": ("static_friction",), "spring": ("support_spring_soft",)}
@@ -52,7 +52,7 @@ def test_a_change_of_the_model_stands_below_the_line_of_its_rig(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     changed = property(lambda fit: ["the second fit is quoted"] if fit.rig.name == "tilts" else [])
-    monkeypatch.setattr("capsule_id.fitted.Fit.remarks", changed)
+    monkeypatch.setattr("capsule_id.api.Fit.remarks", changed)
     fit_params(["tilts", "spring", "--no-sample", "--quiet"])
     first, second, third = capsys.readouterr().out.splitlines()
     assert (first.split(":")[0], second, third.split(":")[0]) == ("tilts", "the second fit is quoted", "spring")

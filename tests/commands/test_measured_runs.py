@@ -8,8 +8,8 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.cli import capsule_id
-from capsule_id.commands.maps import bifurcate
-from capsule_id.commands.maps.measured_runs import Span, overlay
+from capsule_id.commands import bifurcate
+from capsule_id.commands.measured_runs import Span, overlay
 from capsule_id.report.figures.sweeps import MeasuredPoint
 from capsule_id.synthetic import Truth, synthesize
 

@@ -74,7 +74,7 @@ def test_the_users_matplotlibrc_has_no_say_in_a_command(tmp_path: Path) -> None:
 def test_a_warning_of_the_numbers_would_be_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control: nothing is silenced; a division by zero in a command ends it here, where warnings are errors."""
     shutil.copytree(DATA, tmp_path / "rig")
-    monkeypatch.setattr("capsule_id.records.label.find_period", lambda *_: np.ones(1) / np.zeros(1))
+    monkeypatch.setattr("capsule_id.records.motion.find_period", lambda *_: np.ones(1) / np.zeros(1))
     assert capsule_id(["check", str(tmp_path / "rig")]) == 1
 
 

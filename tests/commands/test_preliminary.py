@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 import capsule_id as cid
+from capsule_id.api import Fit
 from capsule_id.cli import fit_params
-from capsule_id.fitted import Fit
 from capsule_id.inference import pipeline
 from capsule_id.rig.model import Rig
 from tests.cli_tools import small_rig

@@ -10,7 +10,7 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.commands import check, init
 from capsule_id.errors import InputError
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.kind import default_registry
 from capsule_id.rig.schema import ChoiceRule
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 

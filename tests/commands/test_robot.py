@@ -8,7 +8,8 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.cli import capsule_id, fit_params
-from capsule_id.inference.sampling import ensembles, refinement
+from capsule_id.inference import proposal as refinement
+from capsule_id.inference import sampling as ensembles
 
 PERIODS = 1e-3 * np.array([60.0, 80.0, 100.0])
 SETTINGS = "period [ms],duty [%],periods [1]\n70,30,20\n90,30,20\n"

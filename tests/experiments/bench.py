@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.kind import default_registry
 from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Table
 
 G = 9.81

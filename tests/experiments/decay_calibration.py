@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import capsule_id as cid
-from capsule_id.experiments.free_vibration.decay_models import decay
+from capsule_id.experiments.free_vibration.models import decay
 from tests.experiments import bench
 from tests.experiments.misfit_study import study
 

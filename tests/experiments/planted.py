@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize

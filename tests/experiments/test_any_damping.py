@@ -8,10 +8,9 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.decrement import exponential_fit, likelihood_gain, viscous_fit
-from capsule_id.experiments.free_vibration.second_fit.fits import Screening
-from capsule_id.experiments.free_vibration.second_fit.screening import open_models, rank
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.free_vibration.models import exponential_fit, likelihood_gain, viscous_fit
+from capsule_id.experiments.free_vibration.second_fit import Screening, open_models, rank
+from capsule_id.experiments.kind import default_registry
 from tests.experiments import random_decays
 from tests.experiments.test_second_fit import SPRING_FORCE, record
 from tests.scipy_decay import scipy_decay

@@ -10,13 +10,12 @@ from scipy.optimize import least_squares
 
 from capsule_id.api import fit
 from capsule_id.errors import InputError
-from capsule_id.experiments.forced_run.base_run import BaseRun
-from capsule_id.experiments.forced_run.checks.feasibility import feasibility
-from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.start_state.slides import slides
-from capsule_id.inference.fit.joint_starts import choose_starts
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.records.label import measured_motion
+from capsule_id.experiments.forced_run.checks import feasibility
+from capsule_id.experiments.forced_run.experiment import BaseRun, ForcedRun
+from capsule_id.experiments.forced_run.start_state import slides
+from capsule_id.inference.joint_fit import choose_starts
+from capsule_id.inference.target import LogPosterior
+from capsule_id.records.motion import measured_motion
 from capsule_id.rig.model import Quantity, Rig
 from tests.experiments import bench
 from tests.forced_runs import table, theta

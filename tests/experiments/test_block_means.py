@@ -10,16 +10,19 @@ import pytest
 import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.refit import refit
-from capsule_id.experiments.free_vibration.decay_models import half_cycles, interpolate
-from capsule_id.experiments.free_vibration.decrement import Decrement
+from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
-from capsule_id.experiments.free_vibration.readings.blocks import Blocks, block_mean, block_means, default_block_size
-from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, averaged_process, whiten_by_shape
-from capsule_id.experiments.free_vibration.second_fit.fits import Screening
-from capsule_id.experiments.free_vibration.settings import DecayModel
-from capsule_id.records.faults import release
+from capsule_id.experiments.free_vibration.models import Decrement, half_cycles, interpolate
+from capsule_id.experiments.free_vibration.readings import (
+    Blocks,
+    DecayModel,
+    block_mean,
+    block_means,
+    default_block_size,
+)
+from capsule_id.experiments.free_vibration.second_fit import ReadingTimes, Screening, averaged_process, whiten_by_shape
+from capsule_id.records import release
 from tests.capsule_cases import jit_quickly
 from tests.experiments import bench
 

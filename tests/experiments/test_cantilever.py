@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.context import Fitted
-from capsule_id.experiments.registry import default_registry
-from capsule_id.experiments.support_spring.checks import cantilever_exponent, check_cantilever
-from capsule_id.experiments.support_spring.experiment import SupportSpring
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.support_spring import SupportSpring, cantilever_exponent, check_cantilever
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.model import Quantity
 from capsule_id.views import Finding
 from tests.experiments import bench

@@ -9,14 +9,14 @@ from scipy.optimize import minimize_scalar
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.dynamic_friction.experiment import DynamicFriction
-from capsule_id.experiments.families.capsule_bench import CapsuleDecay, CapsulePushes
-from capsule_id.experiments.families.friction_experiment import unit_law
+from capsule_id.experiments.capsule_experiment import CapsuleDecay, CapsulePushes
+from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.checks import check_free_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.fit.point_stage import PointStage, fit_points
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.experiments.friction_experiment import unit_law
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference.joint_fit import PointStage, fit_points
+from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity, Table

@@ -9,9 +9,9 @@ import pytest
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import NO_DRIFT, Quantity, Table
 from tests.experiments import bench
 from tests.experiments.test_slope import CAPSULE, THETA

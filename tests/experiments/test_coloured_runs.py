@@ -11,16 +11,15 @@ from scipy.signal import lfilter
 
 from capsule_id.api import fit
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.series import LEVEL
-from capsule_id.experiments.families.friction_model import FrictionModel
-from capsule_id.experiments.forced_run.base_run import BaseRun
-from capsule_id.experiments.forced_run.checks.repeated import FEWEST_PERIODS, repetition
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.fit import second_fits
-from capsule_id.inference.fit.point_stage import fit_points
-from capsule_id.inference.fit.second_fits import error_of_sum, law_of_runs
+from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments.forced_run.checks import FEWEST_PERIODS, repetition
+from capsule_id.experiments.forced_run.experiment import BaseRun
+from capsule_id.experiments.friction import FrictionModel
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference import joint_fit as second_fits
+from capsule_id.inference.joint_fit import error_of_sum, fit_points, law_of_runs
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 from tests import forced_runs

@@ -11,18 +11,15 @@ from scipy.integrate import solve_ivp
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.refit import refit
+from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.checks import check_drift, check_halves, check_positions, fast_rms
-from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
-from capsule_id.experiments.free_vibration.readings.channels import CHANNELS
-from capsule_id.experiments.free_vibration.second_fit.fits import Screened, Screening
-from capsule_id.experiments.free_vibration.second_fit.screening import second_models
-from capsule_id.experiments.free_vibration.second_fit.sensitivities import whitened
-from capsule_id.experiments.free_vibration.settings import DecayModel
-from capsule_id.experiments.registry import default_registry
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.experiments.free_vibration.models import decay
+from capsule_id.experiments.free_vibration.readings import CHANNELS, DecayModel
+from capsule_id.experiments.free_vibration.second_fit import Screened, Screening, second_models, whitened
+from capsule_id.experiments.kind import default_registry
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.experiments.decay_calibration import twin

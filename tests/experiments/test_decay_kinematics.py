@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.experiments.free_vibration.decay_models import decay
+from capsule_id.experiments.free_vibration.models import decay
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.read import read_rig
 from capsule_id.views import Finding
 from tests.experiments import bench

@@ -7,11 +7,10 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.forced_run.checks.predictability import growth
+from capsule_id.experiments.forced_run.checks import growth
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.drives.pulses import Pulses
-from capsule_id.physics.drives.recorded import RecordedDrive
+from capsule_id.physics.drives import Pulses, RecordedDrive
 from capsule_id.physics.model import CapsuleParameters, simulate
 from tests.rig.faults import fault_of
 

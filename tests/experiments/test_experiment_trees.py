@@ -15,16 +15,16 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
-from capsule_id.experiments.checks.context import Fitted
+from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.settings import DecayModel
+from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.inference import target as log_posterior
+from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import run_checks
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.tables.notes import make_notes
-from capsule_id.inference.target import log_posterior
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.tables import make_notes
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig, Table
 from capsule_id.synthetic import synthesize

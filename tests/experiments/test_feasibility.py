@@ -6,12 +6,13 @@ import bench
 import numpy as np
 import pytest
 
-from capsule_id.experiments.forced_run.checks.feasibility import RunConditions, contact_time, feasibility, held_rod
+from capsule_id.experiments.forced_run.checks import RunConditions, contact_time, feasibility, held_rod
 from capsule_id.experiments.forced_run.declaration import MESSAGES
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.rough_values import rough_values
-from capsule_id.physics.grazing import grazing_load
-from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.forces import grazing_load
+from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 from capsule_id.views import Finding
 

@@ -6,8 +6,8 @@ import pytest
 from scipy import stats
 
 from capsule_id.experiments.forced_run.experiment import SETTLING_PERIODS, ForcedRun
-from capsule_id.experiments.forced_run.start_state.rough import rough_start
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.experiments.forced_run.start_state import rough_start
+from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.model import simulate
 from capsule_id.rig.model import Quantity
 from tests.capsule_cases import jit_quickly

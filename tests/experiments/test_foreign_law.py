@@ -14,15 +14,16 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
-from capsule_id.experiments.registry import Registry, default_registry
-from capsule_id.experiments.static_friction.experiment import StaticFriction
-from capsule_id.inference.fit.point_stage import fit_points
-from capsule_id.inference.sampling.chain_store import ChainStore
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.experiments.friction import EQUATION_1, FrictionModel
+from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.experiments.static_friction import StaticFriction
+from capsule_id.inference.joint_fit import fit_points
+from capsule_id.inference.sampling import ChainStore
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
+from capsule_id.physics.drive import Excitation
 from capsule_id.physics.friction import CoulombStribeck
-from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 from tests.experiments import bench
 from tests.rig.folder import RIG_TOML, write_folder

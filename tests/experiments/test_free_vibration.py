@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.experiments.checks.series import autocorrelation, ljung_box
-from capsule_id.experiments.free_vibration.decay_models import fold
+from capsule_id.experiments.checks import autocorrelation, ljung_box
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.target.compiling import COMPILE_QUICKLY
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.experiments.free_vibration.models import fold
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.target import LogPosterior
+from capsule_id.precision import COMPILE_QUICKLY
 
 TIME = np.arange(1000) / 2000.0  # s: half a second at 2 kHz, as in the twin
 RELEASE, NOISE = 2e-3, 2e-5  # m: 1 % noise

@@ -8,11 +8,9 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.series import LEVEL
-from capsule_id.experiments.families.friction_checks import check_variants
-from capsule_id.experiments.families.friction_experiment import FrictionExperiment, paper_friction_fit
-from capsule_id.experiments.families.friction_model import FrictionModel
-from capsule_id.experiments.families.friction_variants import Points, fit_variant, model_lines, order_p
+from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments.friction import FrictionModel, VariantPoints, fit_variant, model_lines, order_p
+from capsule_id.experiments.friction_experiment import FrictionExperiment, check_variants, paper_friction_fit
 from capsule_id.physics.friction import CoulombStribeck
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
@@ -44,7 +42,7 @@ def findings(points: list[FrictionExperiment]) -> dict[str, Finding]:
 def test_the_marginal_likelihood_against_quadrature(constant: bool, ratio: float) -> None:
     """mu in closed form, v_s and the scatter on a grid of quantiles of their priors."""
     model = FrictionModel(constant=constant)
-    found = fit_variant(Points(experiments(SPEED, LEVEL_READINGS)), model, seed=0).evidence
+    found = fit_variant(VariantPoints(experiments(SPEED, LEVEL_READINGS)), model, seed=0).evidence
     middle = (np.arange(400) + 0.5) / 400
     v_s = 0.3 * np.exp(np.log(10.0) / stats.norm.ppf(0.975) * stats.norm.ppf(middle))[:, None]
     s = 0.05 * stats.norm.ppf(0.5 * (1.0 + middle))[None, :]

@@ -12,13 +12,10 @@ from scipy.special import logsumexp
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.progression.density.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.density.linear_misfit import linear_misfit
-from capsule_id.experiments.progression.density.outliers import MOST_TRIALS, SHARE, TIMES, alternatives
-from capsule_id.experiments.progression.density.sessions import MIDDLE, NODES, Sessions
-from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.panels import new_trials
-from capsule_id.inference.checks.regression import outliers
+from capsule_id.experiments.progression.declaration import MOST_TRIALS, OUTLIER_SHARE, TIMES, alternatives
+from capsule_id.experiments.progression.density import MIDDLE, NODES, Sessions, TrialGroups, TrialMisfit, linear_misfit
+from capsule_id.experiments.progression.experiment import Progression, new_trials
+from capsule_id.inference.checks.settings import outliers
 from tests.experiments.summed_sessions import integrated
 from tests.inference.three_settings import THETA, three_settings
 from tests.rig.faults import fault_of
@@ -43,9 +40,12 @@ def test_the_density_is_the_sum_over_outlying_trials(lone: tuple[int, ...]) -> N
         own, variance = [X2[k] for k in cases], [0.04 + scatter**2 + 0.0 * X2[k] for k in cases]
         trials, found = [distance[j == k] for k in cases], list[float]()
         for outlying in (-1, *rows):
-            relative, share = np.where(rows == outlying, TIMES**2, 1.0), SHARE if outlying >= 0 else 1.0 - SHARE
+            relative, share = (
+                np.where(rows == outlying, TIMES**2, 1.0),
+                OUTLIER_SHARE if outlying >= 0 else 1.0 - OUTLIER_SHARE,
+            )
             found.append(integrated(trials, own, variance, discrepancy**2, z, relative) + np.log(share))
-        return float(logsumexp(found)) - np.log(1.0 - SHARE + len(rows) * SHARE)
+        return float(logsumexp(found)) - np.log(1.0 - OUTLIER_SHARE + len(rows) * OUTLIER_SHARE)
 
     trials = TrialMisfit(TrialGroups(distance, sessions, heavy=True), at_nodes, 0.04, 0.0, np.array([0.3, 0.8]))
     by_sums = [[expected(setting, d, scatter) for setting, d in ((0, 0.3), (1, 0.8))] for scatter in scatters]

@@ -7,9 +7,9 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 import capsule_id as cid
-from capsule_id.experiments.motor_current.experiment import MotorCurrent
-from capsule_id.experiments.support_spring.experiment import SupportSpring
-from capsule_id.inference.checks.regression import outliers
+from capsule_id.experiments.motor_current import MotorCurrent
+from capsule_id.experiments.support_spring import SupportSpring
+from capsule_id.inference.checks.settings import outliers
 
 K, CURRENT_SD, FORCE_SD = 2.0, 0.15, 0.1
 CURRENTS = np.linspace(0.0, 2.0, 40)

@@ -11,13 +11,13 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.families.friction_model import FrictionModel, other_laws
-from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
 from capsule_id.experiments.free_vibration.lint import lint_decay
+from capsule_id.experiments.free_vibration.models import decay as rubbed
+from capsule_id.experiments.friction import FrictionModel, other_laws
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
 from capsule_id.parameters import TABLE, Parameter, Prior
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
 from capsule_id.rig.read import read_rig
 from capsule_id.views import Finding

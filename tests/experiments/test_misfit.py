@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.experiments.linear import MANY_NUISANCES
-from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.experiments.misfit import MANY_NUISANCES, Misfit, Moments
 
 RNG = np.random.default_rng(5)
 RAW, DESIGN = RNG.standard_normal(7), RNG.standard_normal((7, 3))

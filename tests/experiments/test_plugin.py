@@ -12,10 +12,10 @@ import pytest
 from capsule_id import experiments
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments import registry
-from capsule_id.experiments.registry import GROUP, Registry, default_registry
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.experiments import kind as registry
+from capsule_id.experiments.kind import GROUP, Registry, default_registry
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.target import LogPosterior
 from tests import cli_tools
 
 #: The kinds without the package, made before a test installs it.

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from capsule_id.experiments.forced_run.checks import predictability
-from capsule_id.experiments.forced_run.checks.predictability import LARGEST_GROWTH, check_predictable, growth
+from capsule_id.experiments.forced_run import checks as predictability
+from capsule_id.experiments.forced_run.checks import LARGEST_GROWTH, check_predictable, growth
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from tests.forced_runs import make, theta
 
 #: The chaotic motion of tests/motions/test_lyapunov.py.

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import capsule_id as cid
+from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.registry import default_registry
-from capsule_id.fitted import Fit
+from capsule_id.experiments.kind import default_registry
 from capsule_id.parameters import parameter
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.model import PriorOverride, Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.views import Finding

@@ -11,15 +11,14 @@ from scipy.interpolate import make_interp_spline
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import KIND
-from capsule_id.experiments.progression.density.sessions import INNER, NODES
-from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.experiments.progression.density import INNER, NODES
+from capsule_id.experiments.progression.experiment import Progression, check_discrepancy
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
-from capsule_id.inference.fit.joint_fit import _rescaled
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.joint_fit import _rescaled
+from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.displacement import displacement
-from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters, simulate
 from tests.capsule_cases import jit_quickly
 from tests.experiments.summed_sessions import integrated

@@ -16,15 +16,22 @@ from scipy.stats import multivariate_normal, norm
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.context import Fitted
-from capsule_id.experiments.progression.density.groups import TrialGroups, TrialMisfit, _log_probability
-from capsule_id.experiments.progression.density.linear_misfit import linear_misfit
-from capsule_id.experiments.progression.density.run_emulator import RunEmulator
-from capsule_id.experiments.progression.density.sessions import INNER, MIDDLE, NODES, Sessions, parameters_of
-from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.experiments.progression.tables import session_table
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.progression.density import (
+    INNER,
+    MIDDLE,
+    NODES,
+    RunEmulator,
+    Sessions,
+    TrialGroups,
+    TrialMisfit,
+    _log_probability,
+    linear_misfit,
+    parameters_of,
+)
+from capsule_id.experiments.progression.experiment import Progression, session_table
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
-from capsule_id.inference.checks.regression import outliers
+from capsule_id.inference.checks.settings import outliers
 from tests.experiments.summed_sessions import integrated
 from tests.inference.three_settings import THETA, three_settings
 

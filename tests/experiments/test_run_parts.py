@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.experiments.forced_run.parts import parts_of
-from capsule_id.experiments.forced_run.start_state.restart import better_start
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.experiments.forced_run.experiment import ForcedRun, parts_of
+from capsule_id.experiments.forced_run.start_state import better_start
+from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.model import simulate
 from capsule_id.rig.model import Quantity, Table
 from tests.experiments import bench

@@ -9,19 +9,18 @@ import pytest
 
 import capsule_id as cid
 from capsule_id import cli
-from capsule_id.experiments.free_vibration.decay_models import decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.lint import lint_decay
-from capsule_id.experiments.free_vibration.messages import MESSAGES
-from capsule_id.experiments.free_vibration.second_fit.fits import Screening
-from capsule_id.experiments.free_vibration.second_fit.screening import (
+from capsule_id.experiments.free_vibration.lint import MESSAGES, lint_decay
+from capsule_id.experiments.free_vibration.models import decay
+from capsule_id.experiments.free_vibration.readings import DecayModel
+from capsule_id.experiments.free_vibration.second_fit import (
     BIC_MARGIN,
     Ranking,
+    Screening,
     demands_another,
     second_models,
     simplest,
 )
-from capsule_id.experiments.free_vibration.settings import DecayModel
 from tests.experiments import bench
 from tests.measured.folders import Entry, make_rig, quantity
 
@@ -107,7 +106,7 @@ def test_a_record_with_two_excitations_keeps_its_model(monkeypatch: pytest.Monke
     (same,), (finding,) = second_models([uncut], readings)
     assert same.model == uncut.model
     assert (finding.code, finding.level) == ("decays.first_fit", "warn")
-    monkeypatch.setattr("capsule_id.experiments.free_vibration.second_fit.screening.LONGEST_UNCUT", 100)
+    monkeypatch.setattr("capsule_id.experiments.free_vibration.second_fit.LONGEST_UNCUT", 100)
     (thinned,), (finding,) = second_models([uncut], readings)
     assert (thinned.model, thinned.replaced) == (DecayModel(thin=5), False)
     assert "means of 5 samples" in MESSAGES["decays.first_fit"].text("warn", finding.facts)

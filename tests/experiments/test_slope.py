@@ -11,12 +11,13 @@ from scipy.optimize import root_scalar
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.families.capsule_bench import CapsuleDecay
+from capsule_id.experiments.capsule_experiment import CapsuleDecay
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import equilibrium
-from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.rig.model import Quantity, Table
 from tests.capsule_cases import jit_quickly
 from tests.experiments import bench

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.refit import refit
-from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.experiments.checks import refit
+from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import PriorOverride, Quantity, Rig
 from tests.experiments import bench
 from tests.experiments.test_slope import MU, N0, SLOPE, THETA, V_S, readings, run_table, slid

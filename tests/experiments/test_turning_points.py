@@ -12,12 +12,11 @@ import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.free_vibration.turning_points.experiment import TurningPoints
-from capsule_id.experiments.free_vibration.turning_points.linear import fitted, standard_errors
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.experiments.free_vibration.turning_points import TurningPoints, fitted, standard_errors
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.target import LogPosterior
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.model import Quantity
 from capsule_id.views import Finding
 from tests.scipy_decay import scipy_decay

@@ -12,10 +12,10 @@ import pytest
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.checks.trust import with_scaled
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.inference.checks.verdict import with_scaled
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.model import Quantity, Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.synthetic import Truth, synthesize

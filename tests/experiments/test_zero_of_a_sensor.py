@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.checks.refit import refit
+from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.checks import check_zero
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.views import Finding

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import capsule_id
-from capsule_id.rig.maps.layout import find_layout
+from capsule_id.rig.guess import find_layout
 from capsule_id.rig.model import Rig
 
 TITLES = "Instrument 7, 2026\nStep No. {step}\nSpeed = 240\nForce = {step}\n\nT,X,F\nsec,mm,N\n\n"

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.experiments.registry import default_registry
-from capsule_id.importing.entry import dimensions_of, propose_entry
-from capsule_id.importing.guess import Guess, guess
-from capsule_id.rig.maps.layout import FoundLayout, find_layout
+from capsule_id.experiments.kind import default_registry
+from capsule_id.importing import Guess, dimensions_of, guess, propose_entry
+from capsule_id.rig.guess import FoundLayout, find_layout
 from capsule_id.rig.units import UNKNOWN, factor_to_si
 from tests.importing.layouts_of_kinds import SETS, Layouted, layout
 

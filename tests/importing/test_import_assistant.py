@@ -9,7 +9,7 @@ import pytest
 
 import capsule_id
 from capsule_id import cli
-from capsule_id.rig.maps.headers import name_and_unit
+from capsule_id.rig.guess import name_and_unit
 from tests.importing.spoiled_exports import Spoiled, spoiled_exports
 from tests.measured.sources import measured_file
 

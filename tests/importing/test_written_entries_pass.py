@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id import cli, read_rig
-from capsule_id.experiments.registry import default_registry
+from capsule_id import cli
+from capsule_id.api import read_rig
+from capsule_id.experiments.kind import default_registry
 from tests.rig.formats.writers import Columns, csv_gz, hdf5, lvm, mat_5, npz, parquet_file, tdms, text_rows, txt, xlsx
 
 DATA = Path(__file__).parents[2] / "data"

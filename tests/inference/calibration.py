@@ -11,7 +11,7 @@ from scipy import stats
 import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.inference.result import Posterior, Result
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
+from capsule_id.inference.sampling import DEFAULT_BUDGET
 from capsule_id.synthetic import Truth, synthesize
 
 #: Truths are log-uniform within this factor of the paper's Table 1.

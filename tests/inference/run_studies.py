@@ -11,11 +11,11 @@ import pandas as pd
 import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.checks.agreement import check_agreement
-from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference.checks.posterior import check_agreement
+from capsule_id.inference.joint_fit import PointStage, fit_points
 from capsule_id.inference.result import Posterior
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.calibration import normal_score
 

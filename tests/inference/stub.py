@@ -9,7 +9,7 @@ import numpy as np
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.inference.target.scales import Scale
+from capsule_id.inference.target import Scale
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import PriorOverride, Quantity, Rig, Settings, Table
 from capsule_id.views import Comparison

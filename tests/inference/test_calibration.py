@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.sampling import ensembles as sampling
+from capsule_id.inference import sampling
 from tests.inference.calibration import Outcome, study, summarise
 
 

@@ -12,16 +12,24 @@ from scipy import stats
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.experiment import Progression
-from capsule_id.inference.choice import leave_out
-from capsule_id.inference.choice.importance import LARGEST_SHAPE, _bridge, log_evidence, smoothed_weights
-from capsule_id.inference.choice.leave_out import WeightedDraws, leave_settings_out, weighted_draws
-from capsule_id.inference.choice.predictions import left_out_predictions, predictions_text
-from capsule_id.inference.choice.variants import variants_of
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, Places
-from capsule_id.inference.sampling.proposal import block_proposal
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import density_of
+from capsule_id.inference import leave_out
+from capsule_id.inference.compare import variants_of
+from capsule_id.inference.leave_out import (
+    LARGEST_SHAPE,
+    WeightedDraws,
+    _bridge,
+    leave_settings_out,
+    left_out_predictions,
+    log_evidence,
+    predictions_text,
+    smoothed_weights,
+    weighted_draws,
+)
+from capsule_id.inference.marginal import density_of
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.proposal import block_proposal
+from capsule_id.inference.sampling import Emulation, ExactMotions, Places
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
 from tests.experiments import bench
 from tests.inference.stub import Gaussian

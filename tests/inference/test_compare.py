@@ -14,13 +14,13 @@ from scipy.stats import multivariate_normal, norm
 from capsule_id.api import read_rig
 from capsule_id.cli import fit_params
 from capsule_id.errors import InputError
-from capsule_id.experiments.families.trials_experiment import TrialsExperiment
+from capsule_id.experiments.capsule_experiment import TrialsExperiment
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.choice import compare, leave_out
-from capsule_id.inference.choice.compare import Choice, _choose, _Variant, compare_models, compare_points
-from capsule_id.inference.choice.leave_out import LeftOut, WeightedDraws
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference import compare, leave_out
+from capsule_id.inference.compare import Choice, _choose, _Variant, compare_models, compare_points
+from capsule_id.inference.leave_out import LeftOut, WeightedDraws
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import ModelChoices, Rig
 from tests.inference.three_settings import PERIODS, THETA, three_settings
 

@@ -10,8 +10,8 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.fit.point_stage import PointStage, fit_points
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference.joint_fit import PointStage, fit_points
 from capsule_id.inference.pipeline import (
     check_fit,
     check_readings,
@@ -21,7 +21,7 @@ from capsule_id.inference.pipeline import (
     stage_seeds,
 )
 from capsule_id.inference.result import Pointwise, Posterior
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import small_rig
 
 BUDGET = 40

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsule_id.inference.choice import compare
-from capsule_id.inference.fit import joint_starts
-from capsule_id.inference.fit.joint_fit import joint_fit
+from capsule_id.inference import compare
+from capsule_id.inference import joint_fit as joint_starts
+from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from tests.inference.calibration import summarise
 from tests.inference.robots import WRONG_LAWS, found_by_points, study
 

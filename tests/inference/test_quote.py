@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.fitted import Fit
+from capsule_id.api import Fit
 from capsule_id.inference.result import Result
-from capsule_id.inference.tables.parameter_table import _limited, quote
-from capsule_id.report.columns import table_rows
-from capsule_id.report.console_table import table_text
+from capsule_id.inference.tables import _limited, quote
+from capsule_id.report.columns import table_rows, table_text
 from capsule_id.report.html import render
-from capsule_id.report.texts.citation import latex_table, methods_paragraph
+from capsule_id.report.sentences import latex_table, methods_paragraph
 from capsule_id.report.write import parameters_json
 from tests.report.conftest import make_result
 

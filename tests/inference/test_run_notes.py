@@ -3,8 +3,8 @@
 from types import SimpleNamespace
 from typing import cast
 
-from capsule_id.inference.tables.run_notes import shared_symbols
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.tables import shared_symbols
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior, parameter, scatter
 
 PRIOR = Prior("lognormal", 1.0, 10.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.sampling.ensembles import DEFAULT_BUDGET
+from capsule_id.inference.sampling import DEFAULT_BUDGET
 from capsule_id.synthetic import Truth, synthesize
 from tests.inference.run_studies import disagreement_of, named_by, plant_spring, plant_surface, recover
 

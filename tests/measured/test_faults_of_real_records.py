@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, quantity
 from tests.measured.sources import pendulum, ship_roll

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from capsule_id.commands.cluster import cluster
+from capsule_id.commands.bifurcate import cluster
 from capsule_id.errors import InputError
-from capsule_id.motions import blocks
-from capsule_id.motions.points import sweep_points
+from capsule_id.motions import sweep as blocks
 from capsule_id.motions.response import Settling
-from capsule_id.motions.sweep import motion_map
-from capsule_id.physics.model import CapsuleParameters, Excitation
+from capsule_id.motions.sweep import motion_map, sweep_points
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.model import CapsuleParameters
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
 E = Excitation(4.0, 34.56)

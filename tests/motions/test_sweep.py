@@ -8,12 +8,21 @@ import pytest
 import xarray as xr
 
 from capsule_id.errors import InputError
-from capsule_id.motions.points import MOTION_COLUMNS, SUMMARY, swept_leaf
 from capsule_id.motions.response import Settling, response
-from capsule_id.motions.sweep import basins, continuation, diagram, motion_map, spread_starts
+from capsule_id.motions.sweep import (
+    MOTION_COLUMNS,
+    SUMMARY,
+    basins,
+    continuation,
+    diagram,
+    motion_map,
+    spread_starts,
+    swept_leaf,
+)
 from capsule_id.parameters import CAPSULE_LEAVES, SWEPT
-from capsule_id.physics.drives.pulses import Pulses
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.drives import Pulses
+from capsule_id.physics.model import CapsuleParameters, Status
 
 P = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
 E = Excitation(4.0, 34.56)

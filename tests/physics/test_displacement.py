@@ -8,7 +8,7 @@ import numpy as np
 
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drives import Pulses
 from capsule_id.physics.friction import CoulombStribeck, Scaled, friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import jit_quickly

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import Cases, states_of
 
 # The threshold force is 2 N: F_b = mu (m1 + m2) g with round numbers.

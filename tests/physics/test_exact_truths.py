@@ -6,8 +6,9 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 
 from capsule_id.errors import InputError
+from capsule_id.physics.drive import Excitation
 from capsule_id.physics.energy import energy_balance
-from capsule_id.physics.model import CapsuleParameters, Excitation, simulate
+from capsule_id.physics.model import CapsuleParameters, simulate
 from tests.capsule_cases import Cases, states_of
 
 M1, M2, g = 0.11, 0.53, 9.81

@@ -11,10 +11,10 @@ import pytest
 from scipy.integrate import quad
 
 from capsule_id.parameters import Parameter
-from capsule_id.physics.contacts import support, support_smooth
+from capsule_id.physics import forces as steps
+from capsule_id.physics.forces import support, support_smooth
 from capsule_id.physics.friction import CoulombStribeck, friction
-from capsule_id.physics.smooth import steps
-from capsule_id.physics.smooth.friction import breakaway, force_gate, friction_smooth
+from capsule_id.physics.smooth.engine import breakaway, force_gate, friction_smooth
 
 LAW = CoulombStribeck(mu=jnp.asarray(0.66), N=jnp.asarray(6.2784), v_s=jnp.asarray(0.3))
 F_B = 0.66 * 6.2784

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from capsule_id.physics.drive import Excitation
 from capsule_id.physics.friction import CoulombStribeck, friction_law, slide_distance
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import assert_both_ways_as_scipy, jit_quickly, states_of
 from tests.scipy_capsule import simulate_scipy
 

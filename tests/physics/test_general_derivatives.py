@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.physics.drives.pulses import Pulses
-from capsule_id.physics.drives.recorded import RecordedDrive, RodMotion
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
+from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import jit_quickly
 
 #: Every term acts, and both contacts close.

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.physics.drives.pulses import Pulses
-from capsule_id.physics.drives.recorded import RecordedDrive, RodMotion
+from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
 from capsule_id.physics.model import CapsuleParameters, Status, Trajectory, simulate
 from tests.capsule_cases import jit_quickly, states_of
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from capsule_id.physics.drives.recorded import RodMotion
+from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import states_of
 from tests.general_cases import DRIVES, read_general_cases

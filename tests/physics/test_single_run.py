@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.physics.drives.recorded import RecordedDrive
-from capsule_id.physics.exact.engine import SHORTEST
-from capsule_id.physics.exact.one_function import as_one_function
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.drives import RecordedDrive
+from capsule_id.physics.exact.engine import SHORTEST, as_one_function
 from capsule_id.physics.friction import Scaled
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import Cases, states_of
 from tests.general_cases import read_general_cases
 

@@ -13,12 +13,12 @@ from capsule_id.errors import InputError
 from capsule_id.motions.bias import smoothing_bias
 from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import CHUNK
-from capsule_id.physics.contacts import support_smooth
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.forces import smooth_abs, support_smooth
 from capsule_id.physics.friction import friction_law
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, simulate
+from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from capsule_id.physics.smooth import engine as smooth
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.physics.smooth.steps import smooth_abs
 from tests.capsule_cases import Cases, jit_quickly, states_of
 
 # Runs of one capsule have eleven samples, as the reference cases have: they share their compiled programs.

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.physics.model import CapsuleParameters, Excitation, Status, Trajectory, simulate
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.model import CapsuleParameters, Status, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from tests.capsule_cases import Cases, jit_quickly
 

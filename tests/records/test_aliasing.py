@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
-from capsule_id.records.faults import aliasing
-from capsule_id.records.faults.aliasing import RATES, aliases, sampling
+from capsule_id.records import faults as aliasing
+from capsule_id.records.faults import RATES, aliases, sampling
 from capsule_id.rig.model import PriorOverride
 from tests.experiments import bench
 

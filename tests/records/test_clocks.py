@@ -7,7 +7,7 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.errors import InputError
-from capsule_id.records.clocks import Clock, estimate_clock
+from capsule_id.records.tones import Clock, estimate_clock
 
 #: True clock of the second logger: s, and pure number.
 OFFSET, DRIFT = 0.3e-3, 20e-6

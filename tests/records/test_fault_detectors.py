@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from capsule_id.records.faults.clipping import clipped_samples
-from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
-from capsule_id.records.faults.phase import Jump, jump_or_noise
-from capsule_id.records.faults.timing import Gaps, dropouts, find_gaps, frozen_samples, time_rounding
+from capsule_id.records.faults import (
+    Gaps,
+    Jump,
+    Readings,
+    clipped_samples,
+    dropouts,
+    find_gaps,
+    frozen_samples,
+    jump_or_noise,
+    reading_step,
+    repeated_blocks,
+    time_rounding,
+)
 from tests.experiments.bench import K1, M1, C, released
 
 RATE = 2000.0

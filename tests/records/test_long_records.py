@@ -6,13 +6,22 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.records import noise
-from capsule_id.records.faults import duplicates, release
-from capsule_id.records.faults.clipping import clipped_samples
-from capsule_id.records.faults.duplicates import Readings, reading_step, repeated_blocks
-from capsule_id.records.faults.phase import Jump, jump_or_noise
-from capsule_id.records.faults.release import FreeDecay, find_free_decay
-from capsule_id.records.faults.timing import dropouts, find_gaps, frozen_samples, time_rounding
+from capsule_id.records import faults as duplicates
+from capsule_id.records import release
+from capsule_id.records import tones as noise
+from capsule_id.records.faults import (
+    Jump,
+    Readings,
+    clipped_samples,
+    dropouts,
+    find_gaps,
+    frozen_samples,
+    jump_or_noise,
+    reading_step,
+    repeated_blocks,
+    time_rounding,
+)
+from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.rig import filters
 
 PERIOD, SAMPLES = 40.0, 6000

@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
-from capsule_id.records.fold import intervals_above, local_polynomials
-from capsule_id.records.mean_velocity import STANDING_ADVANCE, fit_mean_velocity
-from capsule_id.records.noise import noise_level
-from capsule_id.records.repeat import find_period
+from capsule_id.records.motion import (
+    STANDING_ADVANCE,
+    find_period,
+    fit_mean_velocity,
+    intervals_above,
+    local_polynomials,
+)
+from capsule_id.records.tones import noise_level
 
 TIME = np.arange(2000) / 1000.0
 T = 2.0 * np.pi / 73.58

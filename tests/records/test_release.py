@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from capsule_id.experiments.free_vibration.decay_models import decay as rubbed
-from capsule_id.records.faults.release import FreeDecay, find_free_decay
+from capsule_id.experiments.free_vibration.models import decay as rubbed
+from capsule_id.records.release import FreeDecay, find_free_decay
 from tests.experiments.bench import K1, M1, released
 from tests.records.test_fault_detectors import PERIOD, RATE, TIME, decay, encoder
 from tests.release_records import FORMS, draw

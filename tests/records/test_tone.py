@@ -5,7 +5,7 @@ import pytest
 from jaxtyping import TypeCheckError
 
 from capsule_id.errors import InputError
-from capsule_id.records.tone import Harmonic, fit_harmonic, tone_at
+from capsule_id.records.tones import Harmonic, fit_harmonic, tone_at
 
 TIME = np.arange(2000) / 1000.0
 OMEGA, AMPLITUDE, PHASE, OFFSET, NOISE_SD = 34.56, 2.0, -1.1, 0.02, 5e-3

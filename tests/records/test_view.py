@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.registry import default_registry
-from capsule_id.records.run_description import describe_run
-from capsule_id.records.view import SMALLEST_RATE_GAIN, Gains, RecordView, view_record
-from capsule_id.report.figures.runs import channel_history, force_on_rod, phase_plane_of_run, run_overview
+from capsule_id.experiments.kind import default_registry
+from capsule_id.records.view import SMALLEST_RATE_GAIN, Gains, RecordView, describe_run, view_record
+from capsule_id.report.figures.fits import channel_history, force_on_rod, phase_plane_of_run, run_overview
 from capsule_id.report.figures.style import figure_of, new_figure, png
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import filter_gain
 from tests.experiments import bench
 from tests.records.runs import Known, noisier, reference, table_of

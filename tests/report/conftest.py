@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
-from capsule_id.report.gallery import Picture, pictures
+from capsule_id.report.html import Picture, pictures
 from capsule_id.rig.model import Quantity, Rig
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 

@@ -9,8 +9,7 @@ from typing import cast
 import pytest
 
 from capsule_id.inference.result import Result
-from capsule_id.report.gallery import Picture
-from capsule_id.report.html import render
+from capsule_id.report.html import Picture, render
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from capsule_id.inference.result import Result
-from capsule_id.report.columns import table_rows
-from capsule_id.report.console_table import SYNTHETIC, WIDTH, table_text, verdict_text
+from capsule_id.report.columns import SYNTHETIC, WIDTH, table_rows, table_text, verdict_text
 
 
 def test_rows_in_order_and_aligned(result: Result) -> None:

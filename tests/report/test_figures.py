@@ -12,11 +12,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from capsule_id.inference.result import Posterior, Result
-from capsule_id.report.figures import comparisons as figures
-from capsule_id.report.figures.corner import _ticks, corner
+from capsule_id.report.figures import fits as figures
+from capsule_id.report.figures.fits import _ticks, corner, traces
 from capsule_id.report.figures.style import figure_of, png
-from capsule_id.report.figures.traces import traces
-from capsule_id.report.gallery import Picture, pictures
+from capsule_id.report.html import Picture, pictures
 from capsule_id.views import Comparison
 
 UNIT = re.compile(r"\[[^\]]+\]$")
@@ -195,7 +194,7 @@ def test_synthetic_mark_changes_every_picture(result: Result, drawn: tuple[Pictu
 def test_no_pyplot_and_no_matplotlib_for_text() -> None:
     code = """
 import sys
-import capsule_id.report.console_table
+import capsule_id.report.columns
 assert "matplotlib" not in sys.modules and "xarray" not in sys.modules
 import capsule_id.report.write
 assert "matplotlib.figure" in sys.modules

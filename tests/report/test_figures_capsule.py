@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from capsule_id.report.figures.capsule import MotionView, motion, phase_plane
-from capsule_id.report.figures.style import new_figure, png
+from capsule_id.report.figures.style import MotionView, motion, new_figure, phase_plane, png
 
 
 def test_phase_plane_shows_impact_line_and_section() -> None:

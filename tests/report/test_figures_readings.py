@@ -8,9 +8,9 @@ import pytest
 
 from capsule_id.commands import check
 from capsule_id.errors import InputError
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
-from capsule_id.report.figures.readings import readings_figure
+from capsule_id.report.figures.fits import readings_figure
 from capsule_id.report.figures.style import png
 from capsule_id.rig.model import Table
 from tests.cli_tools import small_rig

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from capsule_id.report.figures import bands as figures_bands
-from capsule_id.report.figures import maps as figures_map
+from capsule_id.report.figures import sweeps as figures_bands
+from capsule_id.report.figures import sweeps as figures_map
 from capsule_id.report.figures import sweeps as figures_sweep
-from capsule_id.report.figures.motion_looks import label_classes, shown
 from capsule_id.report.figures.style import png
-from capsule_id.report.figures.sweeps import AxisUnit, MeasuredPoint
+from capsule_id.report.figures.sweeps import AxisUnit, MeasuredPoint, label_classes, shown
 
 UNITS = {"k2": AxisUnit("kN/m", 1e3)}
 

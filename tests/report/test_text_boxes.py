@@ -12,10 +12,9 @@ from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 from capsule_id.inference.result import Result
-from capsule_id.report.figures import comparisons
-from capsule_id.report.figures.corner import corner
+from capsule_id.report.figures import fits as comparisons
+from capsule_id.report.figures.fits import corner, traces
 from capsule_id.report.figures.style import figure_of, make_room, own_axes, set_legend
-from capsule_id.report.figures.traces import traces
 
 #: Boxes may share this much, pixels: a renderer rounds.
 SLACK = 1.0

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from capsule_id.report.typography import decimals_for, fixed, plain_symbol, prefix_for, symbol_parts
+from capsule_id.report.columns import decimals_for, fixed, plain_symbol, prefix_for, symbol_parts
 
 
 @pytest.mark.parametrize(

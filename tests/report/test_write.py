@@ -17,7 +17,7 @@ import xarray as xr
 from capsule_id.inference.result import Pointwise, Posterior, Result
 from capsule_id.parameters import symbol_of
 from capsule_id.report import columns
-from capsule_id.report.console_table import table_text
+from capsule_id.report.columns import table_text
 from capsule_id.report.netcdf import read_sample, write_posterior
 from capsule_id.report.write import parameters_json, write_result
 from capsule_id.views import Finding

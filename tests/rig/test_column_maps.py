@@ -10,8 +10,8 @@ from scipy.io import savemat
 from capsule_id import cli
 from capsule_id.api import read_rig
 from capsule_id.errors import FolderError, InputError
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
 from capsule_id.rig.model import Rig
 from tests.rig.faults import MARK, assert_fault, place_of
 

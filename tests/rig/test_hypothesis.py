@@ -11,7 +11,7 @@ from hypothesis.strategies import SearchStrategy
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError, collecting
 from capsule_id.rig.formats import EXPORTS, READERS
-from capsule_id.rig.formats.export import Layout
+from capsule_id.rig.formats.raw import Layout
 
 #: The same examples in every run.
 QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=80)

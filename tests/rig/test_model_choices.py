@@ -8,8 +8,8 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.parameters import TABLE
-from capsule_id.rig.choices import OPTIONAL
 from capsule_id.rig.model import ModelChoices
+from capsule_id.rig.schema import OPTIONAL
 from tests.rig.faults import assert_fault, fault_of
 
 HEAD = '[rig]\nname = "slide"\n'

@@ -10,11 +10,11 @@ import pytest
 import capsule_id
 from capsule_id import cli
 from capsule_id.errors import InputError
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.pipeline import provenance
 from capsule_id.rig.filters import hampel_outliers
-from capsule_id.rig.maps.plateaus import MOST_BLOCKS, find_steps
 from capsule_id.rig.model import Rig
+from capsule_id.rig.plateaus import MOST_BLOCKS, find_steps
 from tests.measured.sources import load_cells, measured_file
 
 LEVELS = [0.0, 10.0, 20.0, 30.0, 40.0, 30.0, 20.0, 10.0, 0.0]

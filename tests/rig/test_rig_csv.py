@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.text.blocks import TextFile
-from capsule_id.rig.formats.text.csv import _read_cells, read_csv
-from capsule_id.rig.formats.text.rows import Shape, plain_block
+from capsule_id.rig.formats.text import Shape, TextFile, _read_cells, plain_block, read_csv
 
 DIALECTS = [
     (delimiter, decimal, ending, mark)

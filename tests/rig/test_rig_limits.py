@@ -9,10 +9,9 @@ import pytest
 
 import capsule_id
 from capsule_id.errors import InputError
-from capsule_id.experiments.registry import default_registry
-from capsule_id.rig.formats.text.csv import read_csv
-from capsule_id.rig.toml_document import DEEPEST_KEY, LARGEST_TEXT, parse_toml
-from capsule_id.rig.toml_values import closest
+from capsule_id.experiments.kind import default_registry
+from capsule_id.rig.formats.text import read_csv
+from capsule_id.rig.toml import DEEPEST_KEY, LARGEST_TEXT, closest, parse_toml
 from tests.cli_tools import small_rig
 
 TOML, TABLE = Path("rig.toml"), Path("table.csv")

@@ -10,8 +10,8 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.settings import decay_window
-from capsule_id.experiments.registry import default_registry
+from capsule_id.experiments.free_vibration.readings import decay_window
+from capsule_id.experiments.kind import default_registry
 from capsule_id.rig.model import PriorOverride, Quantity, Table
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.rig.toml_document import KeyPath, parse_toml
+from capsule_id.rig.toml import KeyPath, parse_toml
 
 # Every way to write TOML that moves a value; each value is unlike all others, so that `find` gives its place.
 TEXT = '''\

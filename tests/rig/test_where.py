@@ -7,9 +7,9 @@ import pytest
 from scipy.io import savemat
 
 from capsule_id.api import read_rig
+from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
-from capsule_id.experiments.registry import default_registry
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.report.messages import finding_text, messages_of
 from tests.rig.test_column_maps import BY_NAME, DISP, TIME, assert_read, fault_of, rig_of, rows
 
 

@@ -1,26 +1,229 @@
-"""Forced runs: columns, settings, rules, template, lint and description of a record."""
+"""Forced runs: columns, settings, rules of the drive, template, lint and description of a record."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
-from capsule_id.experiments.forced_run.drives.rules import check_base, check_drive
-from capsule_id.experiments.forced_run.lint import MESSAGES as LINT_MESSAGES
-from capsule_id.experiments.forced_run.lint import lint_run
+from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Estimate, Kind, Twin, Values, made_by
+from capsule_id.experiments.lint import lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import Prior, nuisance, scatter
-from capsule_id.records.run_description import describe_run
-from capsule_id.rig.domains import ANY, NOT_NEGATIVE
-from capsule_id.rig.entry import Entry
+from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, drive_power, phasor
+from capsule_id.records.tones import recorded_drive, stated_Omega
+from capsule_id.records.view import describe_run
+from capsule_id.rig.filters import median_step, sampling_step
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings, NameRule, QuantityRule
+from capsule_id.rig.tables import Entry
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message, stated_p
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
-    from capsule_id.experiments.families.friction_model import FrictionModel
+    from capsule_id.experiments.friction import FrictionModel
+
+
+# rules: Rules on the drive of a forced run: what each kind of drive needs, and what it does not have.
+
+
+#: Settings of pulses alone.
+OF_PULSES = ("duty", "P_on", "lag")
+
+
+def check_base(entry: "Entry[RunSettings]") -> None:
+    """Require x_base with drive = "base" and only there, and nothing that belongs to a force on the rod."""
+    settings, columns = entry.table.settings, entry.table.columns
+    if settings.drive != "base":
+        if "x_base" in columns:
+            rule, remedy = "x_base prescribes the motion of the rod", 'add drive = "base", or remove the column'
+            raise entry.error("", rule, "a force", remedy)
+        return
+    if "x_base" not in columns:
+        raise entry.error("drive", 'drive = "base" needs a column x_base', f"columns {' '.join(columns)}", "add it")
+    present = [name for name in ("acceleration_rod", "current") if name in columns]
+    if present:
+        rule = "a run with a prescribed rod has x_capsule, x_rel or both, and no other channel"
+        raise entry.error("drive", rule, f"columns {' '.join(columns)}", f"remove {' and '.join(present)}")
+    if settings.P_d is not None:
+        raise entry.error("P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True)
+    if settings.start == "settled":
+        rule, remedy = 'start = "settled" needs a harmonic force', 'write start = "auto"'
+        raise entry.error("start", rule, 'drive = "base"', remedy)
+    if settings.Omega is None and settings.f is None:
+        try:
+            sampling_step(entry.table["time"])
+        except InputError as error:
+            rule = "the frequency of a base sampled unevenly must be stated"
+            raise entry.error("", rule, error.value, 'add f = { value = ..., unit = "Hz" }') from None
+
+
+def check_drive(entry: "Entry[RunSettings]") -> None:
+    """Require one frequency, and an amplitude from P_d or from the recorded current."""
+    settings, columns = entry.table.settings, entry.table.columns
+    stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
+    if settings.drive == "base" and not stated:
+        return
+    if len(stated) != 1:
+        rule = "forced_run must have Omega (rad/s) or f (Hz), not both"
+        raise entry.error("f" if stated else "", rule, " and ".join(stated) or "none", "state one of them")
+    if settings.drive == "base":
+        return
+    _check_other_drives(entry)
+    if settings.drive != "harmonic":
+        return
+    if settings.P_d is None and "current" not in columns:
+        rule = "forced_run must have P_d where current is not recorded"
+        remedy = 'add P_d = { value = ..., sd = ..., unit = "N" }'
+        raise entry.error("", rule, f"columns {' '.join(columns)}", remedy)
+    if "current" in columns and settings.P_d is not None and settings.P_d.sd == 0.0:
+        rule = "P_d beside a recorded current is a second reading of the same amplitude and must have an sd"
+        raise entry.error("P_d", rule, "none", "add sd = ... to it, or leave P_d out")
+
+
+def _check_other_drives(entry: "Entry[RunSettings]") -> None:
+    """Require a current with drive = "recorded", duty and P_on with pulses, and none of them elsewhere."""
+    settings, columns, drive = entry.table.settings, entry.table.columns, entry.table.settings.drive
+    if drive != "pulses":
+        for key in OF_PULSES:
+            if getattr(settings, key) is not None:
+                raise entry.error(key, f'only drive = "pulses" has {key}', key, f"remove {key}", of_key=True)
+    if drive == "harmonic":
+        return
+    if settings.P_d is not None:
+        raise entry.error("P_d", f'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True)
+    if settings.start == "settled":
+        rule, remedy = 'start = "settled" needs a harmonic force', 'write start = "auto"'
+        raise entry.error("start", rule, f'drive = "{drive}"', remedy)
+    if drive == "recorded":
+        if "current" not in columns or len(columns) < 3:
+            rule = 'drive = "recorded" needs the column current and another channel'
+            raise entry.error("drive", rule, f"columns {' '.join(columns)}", "add it")
+        return
+    if "current" in columns:
+        rule, remedy = "pulses have no column current", 'write drive = "recorded", or remove the column'
+        raise entry.error("drive", rule, f"columns {' '.join(columns)}", remedy)
+    for key in ("duty", "P_on"):
+        if getattr(settings, key) is None:
+            raise entry.error(
+                "drive", f'drive = "pulses" needs {key}', "none", f"add {key} = {{ value = ..., unit = ... }}"
+            )
+
+
+# lint: Findings on the readings of a forced run: its frequency, mislabelled columns, and those of any record.
+
+
+#: Harmonics of the drive that are compared, and the smallest share of the acceleration's standard deviation there.
+HARMONICS, STRONG = (1, 2, 3, 4, 5), 0.15
+#: Fewest samples in a period of the drive.
+FEWEST_SAMPLES = 4.0
+#: Admissible ratio of the recorded acceleration to that of the recorded position X1 = x_rel + x_capsule; without
+#: x_capsule its motion is unknown, so the limits are wide.
+RATIO_OF_X1, RATIO_OF_X_REL = (0.5, 2.0), (0.1, 10.0)
+
+
+def lint_run(table: Table[Any], rig: Rig) -> Iterable[Finding]:
+    """Report faults of the record, a stated frequency that differs from that of the current, and wrong columns."""
+    del rig
+    used = slice(0, len(table.rows))
+    yield from lint_times(table, used)
+    period = 2.0 * np.pi / stated_Omega(table)
+    faults = list(_time_scale(table, period))
+    for name in table.columns:
+        # A capsule may rest at an extreme position, which is no clipping.
+        if name not in ("time", "x_capsule"):
+            faults += lint_channel(table, name, used, period)
+    faults = faults or [*_columns(table)]
+    if "current" in table.columns and not faults:
+        faults += lint_smooth(table, "current", used, period)
+    yield from faults
+    try:
+        drive = recorded_drive(table)
+    except InputError:
+        return
+    if drive is not None and drive.disagrees:
+        facts = {"stated": drive.stated_Omega, "Omega": drive.Omega, "sd": drive.Omega_sd}
+        yield Finding("runs.frequency", "warn", facts, table.label)
+
+
+def _time_scale(table: Table[Any], period: float) -> Iterable[Finding]:
+    """Report a stated frequency of which the record holds no period, or which its sampling cannot follow."""
+    time = table["time"]
+    samples, periods = period / median_step(time), float(time[-1] - time[0]) / period
+    if samples < FEWEST_SAMPLES or periods < 1.0:
+        facts = {"file": table.file, "periods": periods, "samples": samples}
+        yield Finding("runs.time_scale", "fail", facts, table.label)
+
+
+def _columns(table: Table[Any]) -> Iterable[Finding]:
+    """Report columns that contradict kinematics or the sign of the power of the drive."""
+    time, Omega = table["time"], stated_Omega(table)
+    if "x_rel" not in table.columns or (time[-1] - time[0]) * Omega < FEWEST_PERIODS * 2.0 * np.pi:
+        return
+    whole = {name: table[name] for name in table.columns if name != "time"}
+    position = whole["x_rel"] + whole.get("x_capsule", 0.0)
+    first = phasor(time, position, Omega)
+    if abs(first.value) < SIGN_ERRORS * first.sd:
+        return
+    if "acceleration_rod" in whole:
+        low, high = RATIO_OF_X1 if "x_capsule" in whole else RATIO_OF_X_REL
+        for harmonic in HARMONICS if "x_capsule" in whole else HARMONICS[:1]:
+            frequency = harmonic * Omega
+            moves, accelerates = phasor(time, position, frequency), phasor(time, whole["acceleration_rod"], frequency)
+            expected = frequency**2 * abs(moves.value)
+            strong = max(expected, abs(accelerates.value)) > STRONG * float(np.std(whole["acceleration_rod"]))
+            ratio = derivative_ratio(moves, accelerates, frequency, 2)
+            if strong and abs(moves.value) > SIGN_ERRORS * moves.sd and not low <= ratio.real <= high:
+                other = "x_rel + x_capsule" if "x_capsule" in whole else "x_rel"
+                facts = {"file": table.file, "position": other, "ratio": ratio.real, "low": low, "high": high}
+                yield Finding("runs.kinematics", "fail", {**facts, "harmonic": harmonic}, table.label)
+                return
+    if "current" in whole:
+        power, error = drive_power(phasor(time, whole["current"], Omega), first, Omega)
+        if power < -SIGN_ERRORS * error:
+            yield Finding("runs.power", "fail", {"file": table.file}, table.label)
+
+
+def _contradiction(facts: Facts) -> str:
+    """The ratio of the two columns, and what to check."""
+    check = "Check the names and units of these columns."
+    if -facts["high"] <= facts["ratio"] <= -facts["low"]:
+        check = "One of them has the wrong sign: x_rel is positive towards the spring, and so is the acceleration."
+    return (
+        f"{facts['file']}: acceleration_rod must be the second derivative of {facts['position']}; at {facts['harmonic']} times "
+        f"the drive's frequency it is {facts['ratio']:.3g} times that ({facts['low']:g} to {facts['high']:g} allowed). {check}"
+    )
+
+
+LINT_MESSAGES = {
+    "runs.frequency": Message(
+        "frequency of the drive",
+        warn=(
+            "the stated Omega must be that of the current; stated {stated:g} rad/s, the current has {Omega:.6g} ± {sd:.2g} "
+            "rad/s. Correct Omega."
+        ),
+    ),
+    "runs.time_scale": Message(
+        "time scale of a run",
+        fail=(
+            "{file}: the record holds {periods:.3g} periods of the stated drive with {samples:.3g} samples each. Check the "
+            "unit of time (s or ms) and that of the frequency (rad/s or Hz)."
+        ),
+    ),
+    "runs.kinematics": Message("columns of a run", fail=_contradiction),
+    "runs.power": Message(
+        "columns of a run",
+        fail=(
+            "{file}: the drive must supply energy; by current and x_rel it takes energy away. Check the signs of x_rel "
+            "(positive towards the spring) and current (positive pushes towards it)."
+        ),
+    ),
+}
+
+
+# declaration: Forced runs: columns, settings, rules, template, lint and description of a record.
+
 
 #: Recorded channels: name, unit, LaTeX subscript.
 _CHANNELS = (("x_rel", "m", "x"), ("x_capsule", "m", "X2"), ("acceleration_rod", "m/s^2", "a"), ("current", "A", "I"))
@@ -49,9 +252,9 @@ RUN_SPRINGS = {"hard": 59410.0}
 #: Module and class of the runs of each drive.
 RUNS_OF_DRIVES = {
     "harmonic": "experiment:ForcedRun",
-    "base": "base_run:BaseRun",
-    "pulses": "drives.runs:PulseRun",
-    "recorded": "drives.runs:RecordedRun",
+    "base": "experiment:BaseRun",
+    "pulses": "experiment:PulseRun",
+    "recorded": "experiment:RecordedRun",
 }
 
 
@@ -92,8 +295,8 @@ class RunSettings(GroundSettings):
 
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
-    from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE
-    from capsule_id.experiments.forced_run.checks.feasibility import feasibility
+    from capsule_id.experiments.forced_run.checks import feasibility
+    from capsule_id.experiments.friction import EQUATION_1, NORMAL_FORCE
 
     settings = table.settings
     if settings.drive != "harmonic" or settings.ground:

@@ -1,12 +1,6 @@
-"""Likelihood of forced runs: the motor drives the capsule (paper, sections 3 and 4).
+"""Likelihood of forced runs: the motor drives the capsule (paper, sections 3 and 4)."""
 
-    theta -> capsule model from the first sample on -> channels -> misfit of each channel
-
-The recorded channels (x_rel, x_capsule, acceleration_rod, current) are independent given the motion. Each has its own
-noise, and an offset that enters linearly and is integrated out. A gain and, to first order, a delay are integrated
-out too where their sd is stated. X2 = 0 at the first sample, because the offset of x_capsule is free.
-"""
-
+from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, ClassVar
@@ -15,33 +9,431 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
 
-from capsule_id.experiments.base import Start, ValuesBySymbol
-from capsule_id.experiments.checks.context import RunRecord
-from capsule_id.experiments.clock import stated_rate, stretch
-from capsule_id.experiments.families.capsule_experiment import CapsuleForward
-from capsule_id.experiments.families.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
-from capsule_id.experiments.families.inclined import ground_of
-from capsule_id.experiments.forced_run.checks.feasibility import check_feasible
-from capsule_id.experiments.forced_run.checks.predictability import check_predictable, predictable_parts
-from capsule_id.experiments.forced_run.checks.repeated import check_repeated
-from capsule_id.experiments.forced_run.declaration import NOISE
-from capsule_id.experiments.forced_run.nuisances import run_parameters, run_starts, stated_sds
-from capsule_id.experiments.forced_run.panels import filtered_record, run_comparisons
-from capsule_id.experiments.forced_run.parts import parts_of
-from capsule_id.experiments.forced_run.second_fit import coloured_starts, second_fit_table
-from capsule_id.experiments.forced_run.start_state.restart import corrected_start
-from capsule_id.experiments.forced_run.start_state.rough import AboutRun, RunStart, rough_start
-from capsule_id.experiments.forced_run.tables import predicted_motion, scaled_groups
-from capsule_id.experiments.linear import NUISANCE_WIDTH
-from capsule_id.experiments.misfit import Misfit, innovations
-from capsule_id.physics.drive import Drive
-from capsule_id.physics.forces import equilibrium, rod_acceleration
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import Start, ValuesBySymbol, axis_label, band, clock_parameters, stated_rate, stretch
+from capsule_id.experiments.capsule_experiment import CapsuleForward
+from capsule_id.experiments.checks import autocorrelation
+from capsule_id.experiments.context import Fitted, RunRecord
+from capsule_id.experiments.forced_run.checks import (
+    check_feasible,
+    check_predictable,
+    check_repeated,
+    predictable_parts,
+)
+from capsule_id.experiments.forced_run.declaration import CAPSULE_START, CORRELATION, CURRENT_AMPLITUDE, NOISE
+from capsule_id.experiments.forced_run.start_state import (
+    PARABOLA_SAMPLES,
+    AboutRun,
+    RunStart,
+    corrected_start,
+    rough_start,
+    slides,
+)
+from capsule_id.experiments.friction import EQUATION_1, NORMAL_FORCE, FrictionModel, ground_of, ground_parameters
+from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
+from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.drive import Drive, Excitation
+from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
+from capsule_id.physics.forces import downhill, equilibrium, rod_acceleration, rod_on_capsule
 from capsule_id.physics.friction import FrictionLaw
-from capsule_id.physics.model import CapsuleParameters, Excitation, Trajectory
-from capsule_id.records.stated_settings import stated_gap, stated_Omega
+from capsule_id.physics.model import CapsuleParameters, Trajectory
+from capsule_id.records.motion import MeasuredMotion, fit_mean_velocity, measured_motion
+from capsule_id.records.tones import relative_position, stated_gap, stated_Omega
+from capsule_id.records.view import view_record
+from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay, window_samples
 from capsule_id.rig.model import Rig, Table
-from capsule_id.views import Comparison, Facts, Finding
+from capsule_id.rig.schema import SHORTEST_RECORD
+from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable
+
+# parts: Multiple shooting: division of a record into parts, each with its own initial state.
+#
+# Where a motion amplifies small errors, one initial state cannot predict a whole record. It can predict a part of a few
+# periods. All parts share gap, drive, noise and delays.
+
+
+#: Separator between record label and number in the label of a part. File names do not contain it.
+PART_MARK = "~"
+#: Largest shift of a cut towards smooth motion, as a fraction of a part's length.
+LEEWAY = 0.3
+
+
+def parts_of(table: Table, seconds: float) -> list[Table]:
+    """Divide the record into parts of about ``seconds``; return [``table``] if it is not longer."""
+    time = table["time"]
+    count = max(1, min(round((time[-1] - time[0]) / seconds), len(time) // SHORTEST_RECORD))
+    if count == 1:
+        return [table]
+    edges = _edges(table, count)
+    return [_part(table, i, slice(*edges[i : i + 2])) for i in range(count)]
+
+
+def _edges(table: Table, count: int) -> list[int]:
+    """First samples of ``count`` parts, and the end.
+
+    The state at a first sample comes from a parabola through the next samples. A cut therefore avoids samples where a
+    contact begins or ends, or where the capsule sticks or slips.
+    """
+    samples = len(table["time"])
+    length, rough = samples / count, _roughness(table)
+    edges = [0]
+    for i in range(1, count):
+        first, last = (int((i + side * LEEWAY) * length) for side in (-1.0, 1.0))
+        window = rough[max(first, edges[-1] + SHORTEST_RECORD) : last + 1]
+        edges.append(
+            max(first, edges[-1] + SHORTEST_RECORD) + int(np.argmin(window)) if len(window) else int(i * length)
+        )
+    return [*edges, samples]
+
+
+def _roughness(table: Table) -> np.ndarray:
+    """(n,) residual of a parabola through the samples from each one on, summed over positions, in units of noise."""
+    time, n = table["time"], PARABOLA_SAMPLES
+    total = np.zeros(len(time))
+    # One projection serves all samples. It is approximate for uneven sampling, which suffices to choose a cut.
+    design = np.vander(np.arange(n) - 0.5 * (n - 1), 3)
+    rest = np.eye(n) - design @ np.linalg.pinv(design)
+    for name in ("x_rel", "x_capsule"):
+        if name in table.columns and len(time) >= n:
+            windows = np.lib.stride_tricks.sliding_window_view(table[name], n)
+            miss = np.sqrt(np.sum((windows @ rest) ** 2, axis=1))
+            total[: len(miss)] += miss / max(float(np.median(miss)), 1e-300)
+            total[len(miss) :] = np.inf
+    return total
+
+
+def _part(table: Table, index: int, rows: slice) -> Table:
+    columns = {name: replace(column, values=column.values[rows]) for name, column in table.columns.items()}
+    return replace(table, label=f"{table.label}{PART_MARK}{index + 1}", columns=columns, rows=table.rows[rows])
+
+
+# nuisances: Parameters of a forced run with their priors and starting values.
+
+
+#: Default prior of a channel's noise, without reading error: log-normal, median 1 % of its range, factor 100.
+NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
+#: Default prior of the current's amplitude: log-normal about half its range.
+AMPLITUDE_FACTOR = 3.0
+#: sd of the normal prior of the drive's phase, rad; wide but proper.
+PHASE_WIDTH = np.pi
+
+
+def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...]:
+    """Return the parameters sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
+    of, whole, settings = run.label, run.about.record, run.table.settings
+    rows = [parameter("k1"), parameter("c"), *run.friction.parameters, *ground_parameters(run.table, run.rig)]
+    free = ("k_cubic",) if run.spring is None else ("k_cubic", "c2")
+    rows += [parameter(symbol) for symbol in free if symbol in run.rig.model.free]
+    rows += clock_parameters(run.table, run.rig)
+    if run.spring is not None:
+        rows.append(parameter("k2", run.spring))
+    if not run.gap_known:
+        rows.append(parameter("G", whole, Prior("positive_normal", settings.gap.value, settings.gap.sd)))
+    if run.driven_by_current:
+        amplitude = 0.5 * float(np.ptp(run.table["current"]))
+        rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
+    elif not run.drive_known:
+        rows.append(parameter("P_d", whole, Prior("positive_normal", run.drive, run.drive_sd)))
+    if "current" in run.inputs:
+        rows.append(parameter("K"))
+    if settings.P_on is not None and settings.P_on.sd > 0.0:
+        rows.append(parameter("P_on", prior=Prior("normal", settings.P_on.value, settings.P_on.sd)))
+    if settings.lag is not None and settings.lag.sd > 0.0:
+        rows.append(parameter("lag", prior=Prior("positive_normal", settings.lag.value, settings.lag.sd)))
+    elif settings.drive == "pulses" and settings.lag is None and "lag" in run.rig.model.free:
+        rows.append(parameter("lag"))
+    if run.has_phase and not run.prescribed:
+        rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
+    length = NUISANCE_WIDTH * run.rough.length
+    if not run.settled:
+        rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
+        if not run.prescribed:
+            rows.append(parameter("y_start", of, Prior("normal", 0.0, run.Omega * length)))
+    if run.moves:
+        rows.append(CAPSULE_START.named(of, Prior("normal", 0.0, run.Omega * length)))
+    for name, scale in zip(run.channels, ranges.tolist(), strict=True):
+        rows.append(NOISE[name].named(whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
+    if run.coloured:
+        rows += [CORRELATION[name].named(whole) for name in run.channels]
+    return tuple(rows)
+
+
+def run_starts(run: "ForcedRun") -> dict[str, Start]:
+    """Starts of the nuisances from the record; other parameters start at bench estimates or prior centres."""
+    rough, of = run.rough, run.label
+    starts = _starts_of_record(run) if run.about.leads else {}
+    if not run.settled:
+        starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
+        starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * run.Omega * rough.length)
+    if run.moves:
+        starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * run.Omega * rough.length)
+    return starts
+
+
+def _starts_of_record(run: "ForcedRun") -> dict[str, Start]:
+    rough, of = run.rough, run.about.record
+    starts = {f"phase[{of}]": Start(rough.phase, 0.02)}
+    if not run.gap_known:
+        starts[f"G[{of}]"] = Start(run.gap, 0.5 * run.table.settings.gap.sd / run.gap)
+    if run.driven_by_current:
+        starts[f"I_d[{of}]"] = Start(rough.amplitude, 0.005)
+    elif not run.drive_known:
+        starts[f"P_d[{of}]"] = Start(run.drive, 0.5 * run.drive_sd / run.drive)
+    for name, noise in rough.noise.items():
+        starts[f"noise_{name}[{of}]"] = Start(noise, 0.1)
+    if run.coloured:
+        starts |= {f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in run.channels}
+    return starts
+
+
+def stated_sds(settings: Any, channels: Sequence[str], nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
+    """Stated sd of a gain or delay by channel, and whether it is stated."""
+    sds = [getattr(settings, f"{name}_{nuisance}_sd") for name in channels]
+    return np.array([sd or 0.0 for sd in sds]), tuple(sd is not None for sd in sds)
+
+
+# tables: Tables of forced runs: nondimensional groups and predicted motion.
+
+
+#: Draws at which velocities are computed, and errors of a record's velocity drawn for each.
+VELOCITY_DRAWS, ERRORS = 50, 200
+
+
+def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
+    """Return the paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
+
+    Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0. Omega0 = sqrt(k1/m1); F_b is the break-away force.
+    """
+    if not fit.draws:
+        return []
+    columns: dict[str, list[float]] = {}
+    for values in fit.draws:
+        for run in runs:
+            for name, value in _groups(run, run.local(values)).items():
+                columns.setdefault(name, []).append(value)
+    rows = {name: [np.mean(column), np.std(column, ddof=1)] for name, column in columns.items()}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["mean", "sd"]).rename_axis("group")
+    return [ResultTable("runs.groups", frame)]
+
+
+def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
+    p, e = run.capsule(theta)
+    m1, m2, k1, k2, c, G = (float(leaf) for leaf in (p.m1, p.m2, p.k1, p.k2, p.c, p.G))  # pyright: ignore[reportArgumentType]
+    Omega0, F_b = np.sqrt(k1 / m1), float(run.law(theta).forward(0.0))
+    length, of = F_b / k1, run.label
+    scales = {"N": ("F_b", F_b), "m/s": ("(Omega0 F_b/k1)", Omega0 * length)}
+    own = [(row.symbol, *scales[row.unit]) for row in run.friction.parameters if row.unit in scales]
+    return {
+        "Omega0, rad/s": Omega0,
+        "zeta": c / (2.0 * m1 * Omega0),
+        "m2/m1": m2 / m1,
+        **{f"{symbol} / {scale}": theta[symbol] / value for symbol, scale, value in own},
+        f"Omega/Omega0 [{of}]": run.Omega / Omega0,
+        f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore
+        **({f"k2/k1 [{run.spring}]": k2 / k1, f"G k1/F_b [{of}]": G / length} if run.spring is not None else {}),
+    }
+
+
+def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
+    """Contacts and mean velocity of the capsule over the record: observed, point fit, 95 % interval of a new record.
+
+    Both velocities come from the estimator of ``capsule_id.records.motion``, the model's at the sample times.
+    """
+    rows = {}
+    for run in runs:
+        best = run.motion(run.local(fit.values), np)
+        local = [run.local(draw) for draw in fit.draws[:VELOCITY_DRAWS]]
+        stacked = {name: np.array([theta[name] for theta in local]) for name in (local[0] if local else {})}
+        sample = run.motion(stacked, np) if local else None
+        seen = measured_motion(run.table)
+        row: dict[str, object] = {
+            "motion of the record": seen.label,
+            "probability": seen.probability,
+            "contacts, model": int(best.contacts),
+        }
+        if sample is not None:
+            low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
+            row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"
+        row |= _velocities(run, seen, np.asarray(best.X2), None if sample is None else np.asarray(sample.X2))
+        rows[run.label] = row
+    frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("run")
+    return [ResultTable("runs.motion", frame)]
+
+
+def _velocities(
+    run: "ForcedRun", seen: MeasuredMotion, best: np.ndarray, sample: np.ndarray | None
+) -> dict[str, object]:
+    """Mean velocity of the model, band of a new record, and the record's own with its standard error.
+
+    Parameters
+    ----------
+    best, sample : X2 of the point fit (n,) and of the draws (draws, n), m
+    """
+    evidence = seen.evidence
+    period = evidence.repeat.period if evidence.repeat else None
+
+    def velocity(place: np.ndarray) -> float:
+        return 1e3 * fit_mean_velocity(run.time, place, 2.0 * np.pi / evidence.Omega, period).velocity
+
+    found = evidence.mean_velocity
+    sd = 0.0 if found is None or not np.isfinite(found.velocity_sd) else 1e3 * found.velocity_sd
+    row: dict[str, object] = {"mean velocity, model, mm/s": velocity(best)}
+    if sample is not None:
+        error = sd * np.random.default_rng(0).standard_normal((ERRORS, 1))
+        low, high = np.quantile(error + np.array([velocity(place) for place in sample]), [0.025, 0.975])
+        row["95 % band, mm/s"] = f"{low:.4g} to {high:.4g}"
+    if found is not None:
+        row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
+    return row
+
+
+# panels: Plot data of a forced run: every channel with its residuals, and the phase portrait.
+
+
+#: Channels that depend on the motion; the current is the drive itself.
+SHOWN = {"x_rel": "x_rel", "x_capsule": "capsule", "acceleration_rod": "rod's acceleration"}
+#: Largest number of posterior draws for a band; number of lags of an autocorrelation.
+BAND_DRAWS, LAGS = 50, 60
+#: Polynomial order of the Savitzky–Golay filter for the measured phase portrait.
+PORTRAIT_ORDER = 3
+
+
+def run_comparisons(run: "ForcedRun", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
+    """Return a panel per channel (prediction, 95 % band, residuals, autocorrelation), then the phase portrait.
+
+    ``theta`` is the point fit. Bands use at most ``BAND_DRAWS`` of ``draws`` and exclude the noise.
+    """
+    predicted = run.predict(theta, np)
+    scaled = run.scaled(theta, np)
+    stacked = {name: np.array([draw[name] for draw in draws[:BAND_DRAWS]]) for name in (draws[0] if draws else {})}
+    bands = run.predict(stacked, np) if draws else []
+    panels = []
+    for i, name in enumerate(run.channels):
+        if name not in SHOWN:
+            continue
+        column, part = run.table.columns[name], scaled[i]
+        residuals, nuisance = part.at_nuisance_mean(np)
+        fitted = run.values[i] - part.raw + part.design @ nuisance
+        # The band represents the uncertainty of the motion: offset and gain of a draw hardly differ from the fit.
+        shift = fitted - predicted[i]
+        lower, upper = band((bands[i] + shift) * column.to_display) if draws else (None, None)
+        panels.append(
+            Comparison(
+                run.kind,
+                f"{run.label}_{name}",
+                f"{run.label}: {SHOWN[name]}",
+                "time [s]",
+                axis_label(column),
+                (Points(run.label, run.time, run.values[i] * column.to_display),),
+                (Curve("this fit", run.time, fitted * column.to_display, lower, upper),),
+                run.time,
+                np.asarray(residuals),
+                autocorrelation(np.asarray(residuals), min(LAGS, len(run.time) // 4)),
+                1.96 / float(np.sqrt(len(run.time))),
+            )
+        )
+    if "x_rel" in run.channels:
+        panels += _portrait(run, theta)
+    return tuple(panels)
+
+
+def _portrait(run: "ForcedRun", theta: ValuesBySymbol) -> list[Comparison]:
+    """Phase portrait, rate of x_rel by Savitzky–Golay against x_rel; [] for a record sampled unevenly."""
+    index = run.channels.index("x_rel")
+    values, unit = run.values[index], run.table.columns["x_rel"].to_display
+    motion = run.motion(theta, np)
+    offset = run.scaled(theta, np)[index].at_nuisance_mean(np)[1][0] * run.widths[index]
+    x, y = np.asarray(motion.x_rel) + offset, np.asarray(motion.Y1 - motion.Y2)
+    try:
+        window = choose_window(run.time, values, PORTRAIT_ORDER)
+        recorded, fitted = (_filtered(run.time, column, window) for column in (values, x))
+    except InputError:
+        return []
+    p, _ = run.capsule(theta)
+    lines = []
+    if run.spring is not None:
+        gap = (float(p.G) + offset) * unit  # pyright: ignore[reportArgumentType]
+        ends = np.array([y.min(), y.max()])
+        lines.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
+    return [
+        Comparison(
+            "phase_portrait",
+            f"{run.label}_phase_portrait",
+            f"{run.label}: phase portrait",
+            axis_label(run.table.columns["x_rel"]),
+            "rate of x_rel [m/s]",
+            (Points("record, Savitzky–Golay", recorded[0] * unit, recorded[1]),),
+            (
+                Curve("this fit", x * unit, y),
+                Curve("this fit through the same filter", fitted[0] * unit, fitted[1], role="alternative"),
+                *lines,
+            ),
+        )
+    ]
+
+
+def _filtered(time: np.ndarray, values: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed value and rate, without the half window at both ends, where the derivative is inaccurate."""
+    half = window_samples(window, sampling_step(time)) // 2
+    inside = slice(half, len(time) - half)
+    value, rate = (savitzky_golay(time, values, window, PORTRAIT_ORDER, derivative=n) for n in (0, 1))
+    return value[inside], rate[inside]
+
+
+def filtered_record(run: "ForcedRun", theta: ValuesBySymbol) -> RunRecord | None:
+    """The record through the paper's filter, and its drive; None where x_rel is not recorded, or not evenly."""
+    _, e = run.capsule(theta)
+    try:
+        view = view_record(run.table, K=theta["K"] if run.driven_by_current else None)
+    except InputError:
+        return None
+    return RunRecord(run.label, view, np.asarray(e.force_at(run.time)))
+
+
+# second fit: Second fits of a run, where the residuals of the first one are correlated: starts of coloured noise, and
+# tables.
+#
+# A real sensor filters, and no model is exact, so that residuals of dense samples are hardly ever white. White noise
+# then
+# gives intervals that are far too short.
+
+
+#: Largest lag-1 correlation of the noise at which a fit starts.
+LARGEST_CORRELATION = 0.99
+
+
+def coloured_starts(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
+    """Starts of the AR(1) noise of ``run`` by name, SI, from the residuals of a fit with white noise."""
+    values = {}
+    for name, (_, residuals) in zip(run.channels, run.records(theta), strict=True):
+        rho = float(np.clip(autocorrelation(residuals, 1)[0], 0.0, LARGEST_CORRELATION))
+        values[f"ar1_{name}[{run.about.record}]"] = float(np.arctanh(rho))
+        values[f"noise_{name}[{run.about.record}]"] = theta[f"noise_{name}"] * float(np.sqrt(1.0 - rho**2))
+    return values
+
+
+def second_fit_table(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
+    """Tables of the second fits of runs: coloured noise, and other friction laws; [] without one."""
+    del runs
+    found = {finding.code: finding.facts for finding in fit.findings}
+    tables = {"runs.second_fit": "fits", "runs.laws": "laws"}
+    return [
+        ResultTable(code, pd.DataFrame(found[code][rows]).set_index("fit"))
+        for code, rows in tables.items()
+        if code in found
+    ]
+
+
+# experiment: Likelihood of forced runs: the motor drives the capsule (paper, sections 3 and 4).
+#
+#     theta -> capsule model from the first sample on -> channels -> misfit of each channel
+#
+# The recorded channels (x_rel, x_capsule, acceleration_rod, current) are independent given the motion. Each has its own
+# noise, and an offset that enters linearly and is integrated out. A gain and, to first order, a delay are integrated
+# out too where their sd is stated. X2 = 0 at the first sample, because the offset of x_capsule is free.
+
 
 #: Excitation periods from rest after which the motion counts as periodic (start = "settled").
 SETTLING_PERIODS = 40
@@ -348,3 +740,151 @@ class ForcedRun(CapsuleForward):
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         return run_comparisons(self, theta, draws)
+
+
+# runs: Runs with a drive that is not harmonic: pulses, or K times the recorded current.
+
+
+#: Periods before the first sample from which pulses act: a lag forgets its start in a few periods.
+EARLIER_PERIODS = 50.0
+
+
+class OtherRun(ForcedRun):
+    """A run without a harmonic force: what the paper's protocol and figures take from one is left out."""
+
+    checks = (check_predictable, check_repeated)
+    tables = (second_fit_table, predicted_motion)
+
+    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
+        del theta
+        return None
+
+
+class RecordedRun(OtherRun):
+    """One record whose drive is K times the recorded current, linear between the samples.
+
+    The current is taken as recorded: its noise and the phase shift of its filter act as a force on the rod. Noise of
+    standard deviation s at n samples per period changes the amplitude of a tone by about s sqrt(2/n), which the noise
+    levels of the other channels absorb. An offset of the current is a constant force.
+
+    Attributes
+    ----------
+    current : (n,) A
+    """
+
+    current: np.ndarray
+
+    has_phase = False
+    inputs = ("current",)
+
+    def read_drive(self, table: Table) -> None:
+        self.current = table["current"]
+
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
+        force = jnp.multiply.outer(jnp.asarray(theta["K"]), self.current)
+        return self.with_spring(theta), RecordedDrive(self.true_time(theta), force, self.reaction)
+
+    def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
+        p = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.with_spring(theta))
+        force = xp.asarray(theta["K"])[..., None] * self.current
+        return (force - rod_on_capsule(p, x_rel, rate) - downhill(p, p.m1)) / p.m1
+
+
+class PulseRun(OtherRun):
+    """One record driven by pulses of stated period and duty, which act since long before the first sample.
+
+    Attributes
+    ----------
+    duty, P_on, lag : 1, N, s; stated, the last two where they are exact
+    """
+
+    duty: float
+    P_on: float
+    lag: float
+
+    def read_drive(self, table: Table) -> None:
+        settings = table.settings
+        self.duty, self.P_on = settings.duty, settings.P_on.value
+        self.lag = 0.0 if settings.lag is None else settings.lag.value
+
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
+        force, lag = theta.get("P_on", self.P_on), theta.get("lag", self.lag)
+        period = 2.0 * np.pi / self.Omega
+        return self.with_spring(theta), Pulses(
+            force, period, self.duty, phase=theta["phase"], lag=lag, reaction=self.reaction
+        )
+
+    def simulated(
+        self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
+    ) -> Trajectory:
+        earlier = EARLIER_PERIODS * 2.0 * np.pi / self.Omega
+        return super().simulated(theta, p, e, jnp.asarray(times) - self.first + earlier, initial)
+
+
+# base run: Runs whose record prescribes the motion of the rod: a shaken base, or a position-controlled inner mass.
+#
+#     x_base -> X1(t) -> capsule model -> x_capsule, x_rel
+#
+# Only the equation of the capsule is left. X1 is the cubic spline through x_base, whose own noise is neglected. The
+# zeros
+# of x_base and x_capsule are independent, so the extension of the rod's spring at the first sample is sampled.
+
+
+#: Dispersion of the starts of k1, c and mu about their estimates from the record, natural logarithm.
+SPREAD = {"k1": 0.05, "c": 0.5, "mu": 0.1}
+
+
+class BaseRun(OtherRun):
+    """One record of a capsule on a spring whose other end moves as recorded.
+
+    Attributes
+    ----------
+    base, base_rate : (n,) X1 relative to the first sample, m, and its velocity, m/s
+    """
+
+    base: np.ndarray
+    base_rate: np.ndarray
+
+    prescribed = True
+
+    def read_drive(self, table: Table) -> None:
+        motion = RodMotion.through(table["time"], table["x_base"] - table["x_base"][0])
+        self.base, self.base_rate = np.asarray(motion.X1), np.asarray(motion.Y1)
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        # The rod's mass acts through the normal force alone.
+        return ("m2",) if self.normal_force_stated or self.rig.m1 is None else ("m1", "m2")
+
+    def first_state(self, table: Table) -> RunStart:
+        relative = relative_position(table)
+        assert relative is not None, "the reader requires x_capsule or x_rel beside x_base"
+        # Friction is about as strong in both directions, so the spring is unextended near the mean.
+        seen = {name: table[name] for name in self.channels} | {"x_rel": relative[0] - np.mean(relative[0])}
+        return rough_start(table["time"], seen, self.Omega)
+
+    def starts(self) -> dict[str, Start]:
+        """Starts as of any run, and those of spring, damper and friction from the slides of the record."""
+        starts, relative = super().starts(), relative_position(self.table)
+        if relative is None or self.rig.m2 is None or self.spring is not None:
+            return starts
+        r = relative[0] - np.mean(relative[0])
+        found = slides(self.time, r, self.table["x_base"] - relative[0], 2.0 * np.pi / self.Omega, self.rig.m2.value)
+        if found is None:
+            return starts
+        m1 = 0.0 if self.rig.m1 is None else self.rig.m1.value
+        masses = {"m1": m1, "m2": self.rig.m2.value, "g": self.rig.g.value}
+        per_mu = self.law({**masses, **self.stated_ground, "mu": 1.0, "mu_back": 1.0}).forward(found.speed)
+        values = {"k1": found.k1, "c": found.c, "mu": found.friction / float(per_mu)}
+        sampled = {row.symbol for row in self.parameters}
+        starts |= {name: Start(value, SPREAD[name]) for name, value in values.items() if name in sampled}
+        at_first = f"x_start[{self.label}]"
+        return starts | {at_first: Start(float(r[0]) + found.extension, starts[at_first].spread)}
+
+    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
+        return super().law({"m1": 0.0, **theta})
+
+    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Any]:
+        X1, time = jnp.add.outer(theta["x_start"], self.base), self.true_time(theta)
+        rate = jnp.multiply.outer(1.0 / stretch(self.clock_rate, theta), self.base_rate)
+        return self.with_spring({"m1": 0.0, **theta}), RodMotion(time, X1, rate)

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage, stats
 
-from capsule_id.experiments.checks.context import Fitted
-from capsule_id.experiments.checks.refit import refit
-from capsule_id.experiments.checks.series import LEVEL
-from capsule_id.experiments.free_vibration.decrement import equilibrium
-from capsule_id.experiments.free_vibration.readings.noise import drift_by_shape
-from capsule_id.experiments.free_vibration.readings.zero import zero_jumps
-from capsule_id.experiments.free_vibration.second_fit.fits import Screening
-from capsule_id.experiments.free_vibration.second_fit.sensitivities import sensitivities, whitened
-from capsule_id.experiments.free_vibration.settings import EFFECTS, decay_window
+from capsule_id.experiments.checks import LEVEL, refit
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.free_vibration.models import equilibrium
+from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
+from capsule_id.experiments.free_vibration.second_fit import (
+    Screening,
+    drift_by_shape,
+    sensitivities,
+    whitened,
+    zero_jumps,
+)
 from capsule_id.parameters import parameter
-from capsule_id.records.faults.aliasing import sampling
-from capsule_id.records.faults.duplicates import reading_step
-from capsule_id.records.noise import length_of_motion
+from capsule_id.records.faults import reading_step, sampling
+from capsule_id.records.tones import length_of_motion
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding
 

@@ -1,4 +1,4 @@
-"""Free vibration: columns, settings, rules, template, lint and the paper's estimates."""
+"""Free vibration: columns, settings, rules, template, lint, the paper's estimates and the twin."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,38 +8,74 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.free_vibration.decay_models import STRONGEST
-from capsule_id.experiments.free_vibration.decrement import (
+from capsule_id.experiments.free_vibration.lint import MESSAGES, check_thin, lint_decay
+from capsule_id.experiments.free_vibration.models import (
+    STRONGEST,
     exponential_fit,
     likelihood_gain,
     swings_enough,
     viscous_fit,
 )
-from capsule_id.experiments.free_vibration.lint import check_thin, lint_decay
-from capsule_id.experiments.free_vibration.messages import MESSAGES
-from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, channel_of
-from capsule_id.experiments.free_vibration.settings import (
+from capsule_id.experiments.free_vibration.readings import (
+    CHANNELS,
     DecayModel,
     DecaySettings,
+    channel_of,
     check_ground,
     cut_at_release,
     decay_window,
     first_periods,
 )
-from capsule_id.experiments.free_vibration.twin import measure
-from capsule_id.experiments.kind import Kind, Values, made_by
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.parameters import Parameter, Prior, nuisance, scatter
-from capsule_id.records.faults.release import shortened
-from capsule_id.rig.entry import Entry
+from capsule_id.records.release import shortened
 from capsule_id.rig.filters import median_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
+from capsule_id.rig.tables import Entry
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
-    from capsule_id.experiments.families.friction_model import FrictionModel
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
+    from capsule_id.experiments.friction import FrictionModel
+
+
+# twin: Synthetic free decays.
+
+
+#: Release amplitudes of the paper's protocol, m, and noise sd relative to the release.
+RELEASES = (1.5e-3, 2.0e-3, 2.5e-3)
+DECAY_NOISE = 0.01
+
+
+def measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+    """Simulate one record per release amplitude."""
+    del seed
+    decays = [decay(rng, values["k1"], values["c"], values["m1"], release, DECAY_NOISE) for release in RELEASES]
+    return Twin(tuple(TwinTable(f"free_vibration_{n}.csv", columns) for n, columns in enumerate(decays, start=1)))
+
+
+def decay(
+    rng: np.random.Generator,
+    k1: float,
+    c: float,
+    m1: float,
+    release: float,
+    relative_sd: float,
+    duration: float = 0.5,
+    rate: float = 2000.0,
+) -> dict[str, np.ndarray]:
+    """Simulate a decay from rest at ``release`` m at time 0; the noise sd is ``relative_sd`` of the release."""
+    from capsule_id.experiments.free_vibration.models import viscous_basis
+
+    time = np.arange(round(duration * rate)) / rate
+    x = release * viscous_basis(time, k1, c, m1, np)[:, 0]
+    return {"time [s]": time, "x_rel [mm]": 1e3 * (x + relative_sd * release * rng.standard_normal(time.size))}
+
+
+# declaration: Free vibration: columns, settings, rules, template, lint and the paper's estimates.
+
 
 #: Twice the log-likelihood ratio beyond which one description of a stroke is better than another. A stroke that friction
 #: ends gained 6.5 or more in 20 records of such rods, with noise of 0.1 to 3 %, and -3.6 or less in 20 viscous ones.
@@ -183,10 +219,10 @@ def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "
     """Make the experiment of the class that the settings demand; its record begins with the release."""
     make = made_by(
         "capsule_id.experiments.free_vibration.experiment:FreeVibration",
-        capsule="capsule_id.experiments.families.capsule_bench:CapsuleDecay",
+        capsule="capsule_id.experiments.capsule_experiment:CapsuleDecay",
     )
     if table.settings.samples == "turning_points":
-        make = made_by("capsule_id.experiments.free_vibration.turning_points.experiment:TurningPoints")
+        make = made_by("capsule_id.experiments.free_vibration.turning_points:TurningPoints")
     table = cut_at_release(table)
     if DecayModel.stated(table.settings).slow and table.settings.samples == "record":
         table = first_periods(table)

@@ -3,59 +3,177 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
-from capsule_id.experiments.base import About, Start, ValuesBySymbol
-from capsule_id.experiments.clock import clock_parameters, stated_rate, stretch
-from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
-from capsule_id.experiments.free_vibration.checks import CHECKS, later_start
-from capsule_id.experiments.free_vibration.decay_models import (
-    decay,
-    decay_moments,
-    fold,
-    rates,
-    steps_of,
-    uniform_step,
-    viscous_basis,
+from capsule_id.experiments.base import (
+    About,
+    Start,
+    ValuesBySymbol,
+    axis_label,
+    band,
+    clock_parameters,
+    stated_rate,
+    stretch,
 )
+from capsule_id.experiments.checks import LEVEL, autocorrelation, ljung_box, refit
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.free_vibration.checks import CHECKS, later_start, stiffness_by_record
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, TURNING_TIME
-from capsule_id.experiments.free_vibration.decrement import (
+from capsule_id.experiments.free_vibration.models import (
     UNKNOWNS,
     Decrement,
     damping_of_peaks,
+    decay,
+    decay_moments,
     equilibrium,
+    fold,
     logarithmic_decrement,
+    rates,
+    steps_of,
     trend,
+    uniform_step,
+    viscous_basis,
     viscous_fit,
 )
-from capsule_id.experiments.free_vibration.readings.blocks import block_mean, block_means, is_even
-from capsule_id.experiments.free_vibration.readings.channels import CHANNELS, Channel, channel_of
-from capsule_id.experiments.free_vibration.readings.noise import ReadingTimes, noise_parameters, whiten
-from capsule_id.experiments.free_vibration.second_fit.hidden_terms import check_hidden_terms, reduced_record
-from capsule_id.experiments.free_vibration.settings import DecayModel, decay_window, stated_model
-from capsule_id.experiments.free_vibration.starts import (
+from capsule_id.experiments.free_vibration.readings import (
+    CHANNELS,
+    Channel,
+    DecayModel,
+    block_mean,
+    block_means,
+    channel_of,
+    decay_window,
+    is_even,
+    stated_model,
+)
+from capsule_id.experiments.free_vibration.second_fit import (
+    ReadingTimes,
+    Screened,
+    Screening,
+    check_hidden_terms,
     decay_starts,
     first_turning_point,
     further_parameters,
     nested_starts,
+    noise_parameters,
+    reduced_record,
+    whiten,
 )
-from capsule_id.experiments.free_vibration.tables import damping_table, decay_comparison, decay_table, second_fit_table
-from capsule_id.experiments.linear import NUISANCE_WIDTH
-from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.experiments.friction import EQUATION_1, FrictionModel, SurfaceExperiment
+from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.records.faults.release import shortened
-from capsule_id.records.noise import noise_level
-from capsule_id.records.tone import other_tone
+from capsule_id.records.release import shortened
+from capsule_id.records.tones import noise_level, other_tone
 from capsule_id.rig.filters import choose_window, savitzky_golay
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Facts, Finding
+from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable
 
-if TYPE_CHECKING:
-    from capsule_id.experiments.free_vibration.second_fit.fits import Screened
+# tables: Views of free decays: estimates by record, comparison of the stated with the quoted model, and the fitted
+# curve.
+
+
+def decay_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
+    """Compare k1 and c of every record alone with the paper's protocol."""
+    k1, k1_sd, deflection = stiffness_by_record(records, fit.values)
+    rows = []
+    for i, record in enumerate(records):
+        raw, smooth = record.paper_decrement(smooth=False), record.paper_decrement()
+        ours = refit(record, record.local(fit.values), [])
+        rows.append(
+            {
+                "record": record.label,
+                "largest deflection, m": deflection[i],
+                "k1, N/m": k1[i],
+                "± k1": k1_sd[i],
+                "c, N s/m": ours["c"][0],
+                "± c": ours["c"][1],
+                "k1 = m1Ω_o²": smooth.k1 if smooth else np.nan,
+                "c, smoothed peaks": smooth.c if smooth else np.nan,
+                "c, raw peaks": raw.c if raw else np.nan,
+            }
+        )
+    return [ResultTable("decays.records", pd.DataFrame(rows).set_index("record"))]
+
+
+def damping_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
+    """Correlations of the damping parameters; [] where all damping is viscous."""
+    symbols = dict.fromkeys(symbol for record in records for symbol in record.model.symbols if symbol != "k_cubic")
+    if not symbols:
+        return []
+    names = ["c", *symbols]
+    frame = pd.DataFrame(fit.correlation(names), index=pd.Index(names, name="correlation"), columns=names)
+    return [ResultTable("decays.damping", frame)]
+
+
+def second_fit_table(records: "Sequence[FreeVibration]", fit: Fitted) -> list[ResultTable]:
+    """Compare the decays alone under the stated model and under the quoted one; [] where both are the same."""
+    del fit
+    replaced = [(record, record.about.screened) for record in records if record.about.screened is not None]
+    if not replaced:
+        return []
+    # Both fits use the same samples, so that their BIC can be compared.
+    thins = [replace(DecayModel.stated(record.table.settings), thin=record.model.thin) for record, _ in replaced]
+    stated = [Screening(record, model.thin).fit(model)[0] for (record, _), model in zip(replaced, thins, strict=True)]
+    rows = []
+    for role, model, fits in (
+        ("stated", thins[0], stated),
+        ("quoted", replaced[0][0].model, [screened for _, screened in replaced]),
+    ):
+        means = {symbol: _weighted_mean(fits, symbol) for symbol in ("k1", "c", *model.symbols)}
+        white = all(ljung_box(one.residuals)[1] * len(records) >= LEVEL for one in fits)
+        rows.append(
+            {
+                "fit": role,
+                "model": model.name,
+                "parameters": ", ".join(f"{name} = {mean:.5g} ± {sd:.2g}" for name, (mean, sd) in means.items()),
+                "noise, SI": float(np.mean([one.noise for one in fits])),
+                "BIC": sum(one.bic for one in fits),
+                "residuals white": "yes" if white else "no",
+            }
+        )
+    frame = pd.DataFrame(rows).set_index("fit")
+    frame["BIC"] -= frame["BIC"].min()
+    return [ResultTable("decays.second_fit", frame, {"lines": replaced[0][0].model.lines})]
+
+
+def _weighted_mean(fits: "Sequence[Screened]", symbol: str) -> tuple[float, float]:
+    """Mean of the estimates of every record, weighted by their standard errors, and its standard error."""
+    weight = np.array([one.errors[symbol] for one in fits]) ** -2.0
+    return float(np.average([one.values[symbol] for one in fits], weights=weight)), float(np.sum(weight) ** -0.5)
+
+
+def decay_comparison(e: "FreeVibration", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+    """Return the readings, the curve at ``theta``, the band of at most 50 ``draws``, and the residuals of one record."""
+
+    def curve(values: ValuesBySymbol) -> np.ndarray:
+        raw, design = e.unwhitened(values, np)
+        return e.values - raw + e.width * design @ e.nuisance_mean(values)
+
+    unit, time = e.column.to_display, e.time + float(decay_window(e.table)[0][0])
+    lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)
+    residuals = np.asarray(e.residuals(theta, np))[: e.n]
+    return Comparison(
+        e.kind,
+        e.label,
+        f"{e.label}: free decay",
+        "time [s]",
+        axis_label(e.column),
+        (Points(e.label, time, e.values * unit),),
+        (Curve(f"this fit, {e.model_name}", time, curve(theta) * unit, lower, upper),),
+        time,
+        residuals,
+        autocorrelation(residuals, min(60, e.n // 4)),
+        1.96 / float(np.sqrt(e.n)),
+    )
+
+
+# experiment: Free vibration of the rod, motor switched on, capsule at rest (paper, section 2.2): k1 and c.
+
 
 #: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
 NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
@@ -87,7 +205,7 @@ class FreeVibration(SurfaceExperiment):
     For viscous damping and a linear spring the two solutions enter linearly and are integrated out. Any other decay
     starts at its last turning point before the record, which is sampled. Offset and linear drift are integrated out.
 
-    The readings are block means of the record (``capsule_id.experiments.free_vibration.readings.blocks``), at ``time``
+    The readings are block means of the record (``capsule_id.experiments.free_vibration.readings``), at ``time``
     (n,); ``relative_sd`` is the sd of one over that of a sample, () or (n,).
     """
 
@@ -178,7 +296,7 @@ class FreeVibration(SurfaceExperiment):
     def second_models(
         cls, records: "Sequence[Any]", readings: Sequence[Finding] = ()
     ) -> tuple[list[Any], list[Finding]]:
-        from capsule_id.experiments.free_vibration.second_fit.screening import second_models
+        from capsule_id.experiments.free_vibration.second_fit import second_models
 
         return second_models(records, readings)
 
@@ -356,7 +474,7 @@ class FreeVibration(SurfaceExperiment):
         return self.deflection * float(np.max(np.abs(self.values - equilibrium(self.values))))
 
     def reduced(self, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See ``capsule_id.experiments.free_vibration.second_fit.hidden_terms.Decay``."""
+        """See ``capsule_id.experiments.free_vibration.second_fit.Decay``."""
         return reduced_record(self, theta)
 
     @property

@@ -1,19 +1,53 @@
-"""Progressions: columns, settings, rules, template and texts."""
+"""Progressions: columns, settings, sessions, rules, template and texts."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from capsule_id.experiments.kind import Kind, made_by
-from capsule_id.experiments.progression.density.outliers import MOST_TRIALS
 from capsule_id.parameters import Prior, nuisance, scatter
-from capsule_id.rig.domains import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
-from capsule_id.rig.entry import Entry
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings, QuantityRule
+from capsule_id.rig.tables import Entry
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
 from capsule_id.views import Finding, Message
+
+# outliers: Outlying trials of a progression with ``tails = "heavy"``: which trial of a setting has the larger scatter.
+#
+# Each trial has ``TIMES`` the scatter with probability ``SHARE``, independently of the others: a contaminated normal
+# distribution (Tukey 1960), here given that a setting has at most one such trial. No outlying trial, or one of them:
+# these
+# are the alternatives of a setting, and their densities are added.
+
+
+#: Probability that a trial is outlying, and its scatter relative to that of the others.
+OUTLIER_SHARE, TIMES = 0.05, 10.0
+#: Most trials of a setting: among more of them, several would be outlying.
+MOST_TRIALS = 12
+
+
+def alternatives(
+    setting: Float[np.ndarray, "n settings"], heavy: bool
+) -> tuple[Float[np.ndarray, "alternatives n"], Float[np.ndarray, " alternatives"], Int[np.ndarray, " alternatives"]]:
+    """Variance of every trial relative to the usual one, log-probability within the setting, and setting of each.
+
+    The first alternative of a setting has no outlying trial, and is the only one where the tails are not ``heavy``.
+    """
+    variance, log_share, of = list[np.ndarray](), list[float](), list[int]()
+    for b, own in enumerate(setting.T):
+        trials = np.flatnonzero(own) if heavy else np.array([], dtype=int)
+        odds = np.append(1.0, np.full(len(trials), OUTLIER_SHARE / (1.0 - OUTLIER_SHARE)))
+        log_share += np.log(odds / np.sum(odds)).tolist()
+        variance += [np.ones(len(setting)), *(np.where(np.arange(len(setting)) == i, TIMES**2, 1.0) for i in trials)]
+        of += [b] * (1 + len(trials))
+    return np.array(variance), np.array(log_share), np.array(of)
+
+
+# declaration: Progressions: columns, settings, rules, template and texts.
+
 
 SESSION_SD = scatter(
     "session_sd", "1", "relative scatter of the friction from session to session", r"\sigma_\mathrm{ses}",
@@ -45,7 +79,7 @@ FEWEST_SETTINGS = 6
 class ProgressionSettings(GroundSettings):
     """Settings of a progression, SI. ``P_on``, ``P_d`` and ``lag`` are priors where they have an sd.
 
-    With heavy ``tails`` a trial may be outlying, see ``capsule_id.experiments.progression.density.outliers``.
+    With heavy ``tails`` a trial may be outlying, see ``capsule_id.experiments.progression.declaration``.
     """
 
     drive: Literal["pulses", "harmonic"] = "pulses"
@@ -200,3 +234,40 @@ KIND = Kind(
     messages=MESSAGES,
     lint=(_lint_settings,),
 )
+
+
+# trials: Settings and sessions of the rows of a progression.
+
+
+def settings_of(columns: Mapping[str, Any], settings: ProgressionSettings) -> tuple[np.ndarray, str]:
+    """(n, 4) period, s, number of periods, duty and amplitude of every row; where the amplitude comes from.
+
+    ``columns`` hold values (n,) SI by name. The amplitude is from a "column" (N) or a "current" (A), or a parameter with
+    a "prior", or "exact"; it is 1 in the last two cases.
+    """
+    period = columns["period"] if "period" in columns else 1.0 / columns["f"]
+    one = np.ones(len(period))
+    own = AMPLITUDE[settings.drive]
+    source = next((name for name in (own, "current") if name in columns), None)
+    stated = getattr(settings, own)
+    kind = {own: "column", "current": "current"}.get(source or "", "prior" if stated and stated.sd > 0.0 else "exact")
+    parts = (period, columns["periods"], columns.get("duty", one))
+    return np.stack([*parts, one if source is None else columns[source]], axis=1), kind
+
+
+def sessions_of(table: Table, rows: np.ndarray) -> np.ndarray:
+    """(n, sessions) membership: by the column, else blocks of consecutive rows with equal settings."""
+    if "session" in table.columns:
+        index = np.unique(table["session"], return_inverse=True)[1]
+    else:
+        index = np.cumsum(np.concatenate([[0], np.any(rows[1:] != rows[:-1], axis=1)]))
+    return np.eye(int(np.max(index)) + 1)[index]
+
+
+def name_of(setting: np.ndarray, drive: str, amplitude_from: str) -> str:
+    """Name of one row of ``settings_of``: period, duty and amplitude where they may differ, number of periods."""
+    period, periods, duty, amplitude = setting
+    parts = [f"{1e3 * period:g} ms"]
+    parts += [f"duty {100.0 * duty:g} %"] if drive == "pulses" else []
+    parts += {"column": [f"{amplitude:g} N"], "current": [f"{amplitude:g} A"]}.get(amplitude_from, [])
+    return ", ".join([*parts, f"{periods:g} periods"])

@@ -1,55 +1,281 @@
-"""Likelihood of progressions: displacement of the capsule after a number of drive periods, from rest.
+"""Likelihood of progressions: displacement of the capsule after a number of drive periods, from rest."""
 
-    distance_i = X2(setting, friction exp(s_j)) (1 + trial scatter) + discrepancy_b v t_b + trial sd + reading error
-
-Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see
-``capsule_id.experiments.progression.density.sessions``.
-The discrepancy is an error of the model's mean velocity at setting b that all trials of the setting share. It enters
-linearly and is integrated out; see ``capsule_id.experiments.progression.density.groups``. With heavy tails some trials have a
-larger error; see ``capsule_id.experiments.progression.density.outliers``.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
-from capsule_id.experiments.base import About, Start, ValuesBySymbol
-from capsule_id.experiments.families.friction_model import EQUATION_1, FrictionModel
-from capsule_id.experiments.families.inclined import ground_of, ground_parameters
-from capsule_id.experiments.families.trials_experiment import TrialsExperiment
+from capsule_id.experiments.base import About, Start, ValuesBySymbol, band
+from capsule_id.experiments.capsule_experiment import TrialsExperiment
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.friction import EQUATION_1, FrictionModel, ground_of, ground_parameters
 from capsule_id.experiments.misfit import Misfit
-from capsule_id.experiments.progression.batches import batched
-from capsule_id.experiments.progression.checks import check_discrepancy
 from capsule_id.experiments.progression.declaration import (
     AMPLITUDE,
     DISCREPANCY,
+    OUTLIER_SHARE,
     SESSION_SD,
     SESSIONS,
+    TIMES,
     TRIAL_SCATTER,
     TRIAL_SD,
+    name_of,
+    sessions_of,
+    settings_of,
 )
-from capsule_id.experiments.progression.density.groups import TrialGroups, TrialMisfit
-from capsule_id.experiments.progression.density.linear_misfit import linear_misfit
-from capsule_id.experiments.progression.density.run_emulator import RunEmulator
-from capsule_id.experiments.progression.density.sessions import MIDDLE, Sessions, parameters_of
-from capsule_id.experiments.progression.panels import new_trials, progression_panels, speed_panels
-from capsule_id.experiments.progression.starts import starts_of
-from capsule_id.experiments.progression.tables import session_table
-from capsule_id.experiments.progression.trials import name_of, sessions_of, settings_of
+from capsule_id.experiments.progression.density import (
+    MIDDLE,
+    RunEmulator,
+    Sessions,
+    TrialGroups,
+    TrialMisfit,
+    linear_misfit,
+    parameters_of,
+)
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.batches import pool
 from capsule_id.physics.displacement import Displacement, displacement
 from capsule_id.physics.drive import Drive, Excitation
-from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import equilibrium
 from capsule_id.physics.friction import scaled
 from capsule_id.physics.model import CapsuleParameters
 from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison
+from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
+
+# tables: Table of the sessions of a fitted progression: which trials belong to a parameter, and its friction.
+
+
+def session_table(experiments: "Sequence[Progression]", fit: Fitted) -> list[ResultTable]:
+    """Name the sessions that have parameters by the file's own numbers; [] where there are none.
+
+    The friction is relative to a session with z = 0: of the point fit, with mean and sd where there are draws.
+    """
+    rows = []
+    for e in experiments:
+        theta, draws = e.local(fit.values), [e.local(draw) for draw in fit.draws]
+        for session in np.flatnonzero(e.parameter >= 0):
+            symbol = e.sessions.symbols[e.parameter[session]]
+            factors = np.array([np.exp(one["session_sd"] * one[symbol]) for one in draws or [theta]])
+            trials = np.flatnonzero(e.session[:, session])
+            rows.append(
+                {
+                    "parameter": f"{symbol}[{e.label}]",
+                    # Without this column each block of rows is a session with one setting, which has no parameter.
+                    "session": f"{e.table['session'][trials[0]]:.15g}",
+                    "settings": int(np.count_nonzero(e.session[:, session] @ e.setting)),
+                    "trials": len(trials),
+                    "friction": float(np.mean(factors)),
+                    "its sd": float(np.std(factors)) if draws else np.nan,
+                }
+            )
+    if not rows:
+        return []
+    return [ResultTable("progression.sessions", pd.DataFrame(rows).set_index("parameter").round(4))]
+
+
+# batches: Functions of many draws of the parameters, in compiled batches on all cores.
+
+
+#: Draws of one compiled batch.
+DRAWS_OF_A_BATCH = 16
+
+
+def batched(
+    function: Callable[..., Any],
+    e: "Progression",
+    draws: Sequence[ValuesBySymbol],
+    s: np.ndarray,
+    settings: np.ndarray,
+) -> np.ndarray:
+    """``function(e, theta, s, settings)`` at every draw and row of ``s``, in batches of one size, on all cores."""
+    symbols = tuple(name for name in draws[0] if np.ndim(draws[0][name]) == 0)
+    rows = np.concatenate([np.array([[draw[name] for name in symbols] for draw in draws]), s], axis=1)
+    padded = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % DRAWS_OF_A_BATCH, axis=0)])
+    parts = np.split(padded, len(padded) // DRAWS_OF_A_BATCH)
+    found = pool().map(lambda part: np.asarray(_of_rows(function, e, symbols, part, settings)), parts)
+    return np.concatenate(list(found))[: len(rows)]
+
+
+@eqx.filter_jit
+def _of_rows(function: Callable[..., Any], e: "Progression", symbols: tuple[str, ...], rows: Any, settings: Any) -> Any:
+    def one(row: Any) -> Any:
+        theta = dict(zip(symbols, row[: len(symbols)], strict=True))
+        return function(e, theta, row[len(symbols) :], settings)
+
+    return jax.vmap(one)(rows)
+
+
+# panels: Predictions of progressions and their panels: mean velocity against period, for every duty and amplitude.
+
+
+#: Symbols of the scatters.
+SCATTERS = ("session_sd", "trial_scatter", "trial_sd", "discrepancy")
+#: Draws of a band.
+BAND_DRAWS = 200
+#: Seed of the sessions and trials of a band.
+BAND_SEED = 0
+
+
+def new_trials(
+    e: "Progression", draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """(draws, rows) displacement, m, of a new trial in a new session at each row of ``settings`` (rows, 4).
+
+    Each row has a session, a discrepancy and a trial of its own.
+    """
+    time = settings[:, 0] * settings[:, 1]
+    z = rng.standard_normal((3, len(draws), len(settings)))
+    own = {name: np.array([draw[name] for draw in draws])[:, None] for name in SCATTERS}
+    X2 = e.displacements_of_draws(draws, own["session_sd"] * z[0], settings)
+    variance = e.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
+    if e.heavy:
+        variance = np.where(rng.uniform(size=variance.shape) < OUTLIER_SHARE, TIMES**2, 1.0) * variance
+    return X2 + own["discrepancy"] * time * z[1] + np.sqrt(variance) * z[2]
+
+
+def progression_panels(e: "Progression", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
+    """One panel per duty and amplitude: trials, the point fit, and the band of a new trial in a new session."""
+    settings = e.settings
+    speed = 1e3 / e.time
+    centre = np.asarray(e.displacements(theta, np.zeros(len(settings)), settings)) * speed
+    chosen = draws[:: max(1, len(draws) // BAND_DRAWS)]
+    trials = new_trials(e, chosen, settings, np.random.default_rng(BAND_SEED)) if chosen else np.empty((0, 0))
+    lower, upper = band(trials * speed if chosen else trials)
+    panels = speed_panels(e, settings, centre, (lower, upper), "this fit, 95 % band of a new trial")
+    residuals = np.asarray(e.residuals(theta, np))[: e.n]
+    rows = [_rows_of(e, group) for group in _groups(settings)]
+    period = e.setting @ (1e3 * settings[:, 0])
+    return tuple(
+        replace(panel, residual_x=period[own], residuals=residuals[own])
+        for panel, own in zip(panels, rows, strict=True)
+    )
+
+
+def speed_panels(
+    e: "Progression",
+    settings: np.ndarray,
+    centre: np.ndarray,
+    limits: tuple[np.ndarray | None, np.ndarray | None],
+    label: str,
+) -> tuple[Comparison, ...]:
+    """One panel per duty and amplitude of ``settings`` (rows, 4): mean velocity against period, and the trials there.
+
+    Parameters
+    ----------
+    centre, limits : (rows,) mean velocity and the limits of its band, mm/s
+    label : of the curve
+    """
+    speed, panels = 1e3 / e.time, []
+    for group in _groups(settings):
+        own = np.flatnonzero(np.all(settings[:, 2:] == group, axis=1))
+        own = own[np.argsort(settings[own, 0], kind="stable")]
+        lower, upper = (None if limit is None else limit[own] for limit in limits)
+        rows = _rows_of(e, group)
+        trials = Points(e.label, (e.setting @ (1e3 * e.settings[:, 0]))[rows], (e.distance * (e.setting @ speed))[rows])
+        amplitude = {"column": f", {group[1]:g} N", "current": f", {group[1]:g} A"}.get(e.amplitude_from, "")
+        duty = f", duty {100.0 * group[0]:g} %" if e.drive == "pulses" else ""
+        panels.append(
+            Comparison(
+                "progression",
+                e.label,
+                f"{e.label}{duty}{amplitude}: mean velocity",
+                "period [ms]",
+                "mean velocity [mm/s]",
+                (trials,) if len(rows) else (),
+                (Curve(label, 1e3 * settings[own, 0], centre[own], lower, upper),),
+            )
+        )
+    return tuple(panels)
+
+
+def _groups(settings: np.ndarray) -> np.ndarray:
+    """(groups, 2) duty and amplitude."""
+    return np.unique(settings[:, 2:], axis=0)
+
+
+def _rows_of(e: "Progression", group: np.ndarray) -> np.ndarray:
+    """Rows of the trials with the duty and amplitude of ``group``."""
+    own = np.flatnonzero(np.all(e.settings[:, 2:] == group, axis=1))
+    return np.flatnonzero(e.setting[:, own].any(axis=1))
+
+
+# starts: Starting points of the point fit of a progression, from the readings alone.
+
+
+#: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
+DAMPING_RATIO, FRICTION = 0.1, 0.3
+
+
+def starts_of(e: "Progression") -> dict[str, Start]:
+    """Start of every parameter by name."""
+    m1, m2 = e.rig.mass("m1"), e.rig.mass("m2")
+    k1 = m1 * (2.0 * np.pi / float(np.median(e.settings[:, 0]))) ** 2
+    largest = float(np.max(np.abs(e.distance)))
+    priors = {row.symbol: cast(Prior, row.prior) for row in e.parameters if row.prior}
+    starts = {
+        "k1": Start(k1, 0.7),
+        "c": Start(2.0 * DAMPING_RATIO * float(np.sqrt(k1 * m1)), 1.0),
+        "mu": Start(FRICTION, 0.5),
+        "mu_back": Start(FRICTION, 0.5),
+        "v_s": Start(0.3, 1.0),
+        "ratio": Start(0.7, 0.3),
+        "lag": Start(0.05 * float(np.median(e.settings[:, 0])), 1.0),
+        "session_sd": Start(0.05, 0.3),
+        **{f"{symbol}[{e.label}]": Start(0.0, 1.0) for symbol in e.sessions.symbols},
+        "trial_scatter": Start(0.05, 0.3),
+        f"trial_sd[{e.label}]": Start(max(0.01 * largest, float(np.sqrt(e.reading_variance))), 0.3),
+        f"discrepancy[{e.label}]": Start(0.5 * priors["discrepancy"].spread, 0.3),
+    }
+    for name in e.mirrored:
+        prior = priors[name]
+        friction = FRICTION * (m1 + m2) * e.rig.g.value
+        starts[name] = Start(prior.location if abs(prior.location) > prior.spread else friction, 0.5 * prior.spread)
+    known = {row.name for row in e.parameters}
+    return {name: start for name, start in starts.items() if name in known}
+
+
+# checks: Check of a fitted progression: how much of the motion the model leaves unexplained.
+
+
+#: Largest discrepancy of a model that explains the motion, relative to the rms of the measured mean velocities.
+LARGEST_DISCREPANCY = 0.3
+
+
+def check_discrepancy(experiments: "Sequence[Progression]", fit: Fitted) -> list[Finding]:
+    """Compare the discrepancy with the scatter of the trials and with the measured velocities."""
+    findings = []
+    for e in experiments:
+        theta = e.local(fit.values)
+        sizes = [e.local(draw)["discrepancy"] for draw in fit.draws] or [theta["discrepancy"]]
+        size, time = float(np.median(sizes)), e.setting @ e.time
+        velocity = e.distance / time
+        variance = e.reading_variance + theta["trial_sd"] ** 2 + (theta["trial_scatter"] * e.distance) ** 2
+        rms = float(np.sqrt(np.mean(velocity**2)))
+        facts = {"size": 1e3 * size, "scatter": 1e3 * float(np.sqrt(np.mean(variance / time**2))), "rms": 1e3 * rms}
+        within = "ok" if facts["size"] <= facts["scatter"] else "warn"
+        level = "fail" if size > LARGEST_DISCREPANCY * rms else within
+        findings.append(Finding("progression.discrepancy", level, facts, e.label))
+    return findings
+
+
+# experiment: Likelihood of progressions: displacement of the capsule after a number of drive periods, from rest.
+#
+#     distance_i = X2(setting, friction exp(s_j)) (1 + trial scatter) + discrepancy_b v t_b + trial sd + reading error
+#
+# Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see
+# ``capsule_id.experiments.progression.density``.
+# The discrepancy is an error of the model's mean velocity at setting b that all trials of the setting share. It enters
+# linearly and is integrated out; see ``capsule_id.experiments.progression.density``. With heavy tails some trials
+# have a
+# larger error; see ``capsule_id.experiments.progression.declaration``.
+
 
 #: Scales of the half-normal priors of trial_sd and discrepancy, relative to the largest reading.
 TRIAL_PRIOR, DISCREPANCY_PRIOR = 0.05, 0.1
@@ -72,7 +298,7 @@ class Progression(TrialsExperiment):
     reading_variance : m^2
     force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
     has_lag : whether the lag is a parameter
-    heavy : whether trials have heavy tails, see ``capsule_id.experiments.progression.density.outliers``
+    heavy : whether trials have heavy tails, see ``capsule_id.experiments.progression.declaration``
     emulator : of ``runs``; None: they are exact
     """
 

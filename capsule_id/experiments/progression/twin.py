@@ -10,7 +10,7 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.parameters import TABLE
 from capsule_id.physics.displacement import displacement
-from capsule_id.physics.drives.pulses import Pulses
+from capsule_id.physics.drives import Pulses
 from capsule_id.physics.friction import friction_law, scaled
 from capsule_id.physics.model import CapsuleParameters
 

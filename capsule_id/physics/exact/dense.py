@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from capsule_id.physics.exact.taylor import CapsuleState, StepSeries
+from capsule_id.physics.friction import DEGREE, horner, mean
 from capsule_id.physics.model import Initial
-from capsule_id.physics.series import DEGREE, horner, mean
 
 # Numbers in a row: t0, h, r, X2, and two series.
 WIDTH = 4 + 2 * (DEGREE + 1)

@@ -1,12 +1,4 @@
-"""The event-driven engine: Taylor steps inside a mode, located changes of mode, a clock of its own for every lane.
-
-    mode_at -> [series -> trusted -> first_event -> advance -> correct -> motion_at] ... -> samples read off the rows
-
-Each lane has its own time, mode and step; one loop runs them all. Derivatives: forward mode goes through the loop. Step
-lengths and located times are held constant. At an event the state and the time get one Newton correction, dt = -g/g',
-whose value is next to nothing and whose tangent is the event's own (the saltation matrix). Switching times of the drive
-are events with g = t - t_switch.
-"""
+"""The event-driven engine: Taylor steps inside a mode, located changes of mode."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,33 +9,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.lax import stop_gradient
 
 from capsule_id.physics.batches import is_traced
 from capsule_id.physics.drive import Drive, SwitchingDrive
-from capsule_id.physics.drives.recorded import RodMotion
+from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact.dense import WIDTH, Samples, read_off, row_of, samples_at
-from capsule_id.physics.exact.events import (
+from capsule_id.physics.exact.taylor import (
     BACK,
     GAP,
     NONE,
     SWITCH,
     UPPER,
     VELOCITY,
-    first_event,
-    force_rate,
-    mode_at,
-    motion_at,
-)
-from capsule_id.physics.exact.one_function import as_one_function
-from capsule_id.physics.exact.taylor import (
     CapsuleState,
     Constants,
     Mode,
     StepSeries,
     advance,
     constants_of,
+    first_event,
     force_on_capsule,
+    force_rate,
+    mode_at,
+    motion_at,
     rod_force,
     rod_rate,
     series,
@@ -53,6 +43,47 @@ from capsule_id.physics.exact.taylor import (
 from capsule_id.physics.friction import FrictionLaw, Scaled, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Initial, Status, Trajectory, admissible
 from capsule_id.precision import require_float64
+
+# one function: A program that XLA compiles as one function on a CPU.
+
+
+#: XLA emits a call with these attributes as one function, as it does itself with loops that need little memory. Its
+#: runtime dispatches the parts of all other loops one by one in every step, which takes several times as long.
+ONE_FUNCTION = {"xla_cpu_small_call": "true", "inlineable": "false"}
+
+
+def as_one_function(run: Callable[..., Any]) -> Callable[..., tuple[Any, jax.Array]]:
+    """``run``, jitted, on a CPU as one function. It takes concrete arguments, no empty arrays, and also returns a number.
+
+    XLA cannot emit every operation this way: scatter, sort and calls of libraries are errors.
+    """
+
+    @jax.jit
+    def call(*args: Any) -> tuple[Any, jax.Array]:
+        with set_xla_metadata(**dict.fromkeys(ONE_FUNCTION)):
+            # XLA ends the process where such a call leaves an argument without use: each one enters the number.
+            return run(*args), sum((jnp.ravel(x)[0].astype(float) for x in jax.tree.leaves(args)), jnp.zeros(()))
+
+    @jax.jit
+    def program(*args: Any) -> tuple[Any, jax.Array]:
+        with set_xla_metadata(**(ONE_FUNCTION if jax.default_backend() == "cpu" else {})):
+            return call(*args)
+
+    return program
+
+
+# engine: The event-driven engine: Taylor steps inside a mode, located changes of mode, a clock of its own for every
+# lane.
+#
+#     mode_at -> [series -> trusted -> first_event -> advance -> correct -> motion_at] ... -> samples read off the rows
+#
+# Each lane has its own time, mode and step; one loop runs them all. Derivatives: forward mode goes through the loop.
+# Step
+# lengths and located times are held constant. At an event the state and the time get one Newton correction, dt = -g/g',
+# whose value is next to nothing and whose tangent is the event's own (the saltation matrix). Switching times of the
+# drive
+# are events with g = t - t_switch.
+
 
 require_float64()
 

@@ -7,18 +7,10 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from capsule_id.rig.formats.binary.hdf5 import read_hdf5
-from capsule_id.rig.formats.binary.mat import read_mat
-from capsule_id.rig.formats.binary.npz import read_npz
-from capsule_id.rig.formats.binary.parquet import read_parquet
-from capsule_id.rig.formats.binary.tdms import read_tdms
-from capsule_id.rig.formats.binary.xlsx import read_xlsx
-from capsule_id.rig.formats.export import Export, Layout
-from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.formats.text.any_layout import read_text
-from capsule_id.rig.formats.text.blocks import COMPRESSED, Content
-from capsule_id.rig.formats.text.csv import read_csv
-from capsule_id.rig.formats.text.lvm import read_lvm
+from capsule_id.rig.formats.binary import read_hdf5, read_mat, read_npz, read_parquet, read_tdms, read_xlsx
+from capsule_id.rig.formats.layouts import read_lvm, read_text
+from capsule_id.rig.formats.raw import Export, Layout, RawTable
+from capsule_id.rig.formats.text import COMPRESSED, Content, read_csv
 
 _TEXTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
     ".csv": read_text,

@@ -1,9 +1,74 @@
-"""A table as written: numbers in the units of the file, and the place of each cell."""
+"""What every reader gives: a table as written with the place of each cell; limits and errors that readers share."""
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+
+from capsule_id.errors import InputError
+
+# limits: Limits and errors that all readers of files share.
+
+
+#: Largest decompressed size of a file, bytes. It stops archives that grow without limit when they are unpacked.
+LARGEST_CONTENT = 1 << 30
+
+
+def refuse_large(size: int, path: Path) -> None:
+    """Refuse a file with more than ``LARGEST_CONTENT`` bytes of readings.
+
+    Raises
+    ------
+    InputError
+        Naming the size.
+    """
+    if size > LARGEST_CONTENT:
+        rule = f"a {path.suffix} file must hold at most {LARGEST_CONTENT >> 20} MiB, decompressed"
+        raise InputError(rule, f"{size >> 20} MiB", "export a part of the record, or fewer channels", path)
+
+
+@contextmanager
+def installed(package: str, path: Path) -> Iterator[None]:
+    """Name the optional package that reads ``path`` where its import in the body fails.
+
+    Raises
+    ------
+    InputError
+        With the command that installs it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError:
+        rule, remedy = f"a {path.suffix} file needs the package {package}", 'run pip install "capsule-id[formats]"'
+        raise InputError(rule, "not installed", remedy, path) from None
+
+
+@contextmanager
+def complete(path: Path, remedy: str) -> Iterator[None]:
+    """Turn every exception of a library about a damaged file into an error line; its warnings are not shown.
+
+    Libraries document no list of exceptions for damaged files, and fuzzing finds most of Python's.
+
+    Raises
+    ------
+    InputError
+        Where the body raises an exception; an ``InputError`` passes unchanged.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        value = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"a {path.suffix} file must be complete", value[:200], remedy, path) from None
+
+
+# raw: A table as written: numbers in the units of the file, and the place of each cell.
 
 
 @dataclass(frozen=True)
@@ -30,3 +95,129 @@ class RawTable:
     def values(self) -> np.ndarray:
         """A copy of the numbers, (rows, columns)."""
         return np.column_stack(self.columns)
+
+
+# export: A table of any layout, as a logger or a program exports it; a column map of ``rig.toml`` selects its columns.
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What ``rig.toml`` states about the layout of the files of an experiment.
+
+    Attributes
+    ----------
+    data_from_line, data_to_line : 1-based lines of the first and the last row of numbers (None: the first line that holds
+        a number, and the last line of the file)
+    missing : texts of cells without a reading, such as ``--`` or ``NaN``
+    decimal : decimal mark of a text table, "." or "," (None: found in the file)
+    columns : headers, or numbers counted from 1, of the columns that a text reader keeps (None: all)
+    words : headers, or numbers counted from 1, of those whose texts it keeps too
+    """
+
+    data_from_line: int | None = None
+    data_to_line: int | None = None
+    missing: tuple[str, ...] = ()
+    decimal: str | None = None
+    columns: tuple[str | int, ...] | None = None
+    words: tuple[str | int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Export:
+    """One file with all its columns, read or not.
+
+    Attributes
+    ----------
+    path : of the file
+    headers : rows of headers, the last one first; each row has one header a column
+    width : number of columns
+    lines : (rows,) 1-based line of every row
+    values : index of a column that ``Layout.columns`` names -> (rows,) numbers in the file's units, NaN at a stated
+        missing marker; it raises ``InputError`` at the first other cell
+    place : (row index or None for the header, column index) -> 1-based (line, column) in the file
+    encoding : of a text
+    words : index of a column that ``Layout.words`` names -> (rows,) numbers of its texts, and the texts; None: the format
+        has no texts
+    """
+
+    path: Path
+    headers: tuple[tuple[str, ...], ...]
+    width: int
+    lines: np.ndarray
+    values: Callable[[int], np.ndarray]
+    place: Callable[[int | None, int], tuple[int, int]]
+    encoding: str = "UTF-8"
+    words: Callable[[int], tuple[np.ndarray, tuple[str, ...]]] | None = None
+
+
+# arrays: Makes an export of named arrays: the form of every format without lines.
+
+
+#: A matrix this many times as wide as high holds its channels in rows.
+WIDE = 10
+
+
+def refuse_line(layout: Layout, path: Path) -> None:
+    """Refuse the keys of text files.
+
+    Raises
+    ------
+    InputError
+        If ``layout`` states ``data_from_line``, ``data_to_line`` or ``decimal``.
+    """
+    for key in ("data_from_line", "data_to_line", "decimal"):
+        if (value := getattr(layout, key)) is not None:
+            raise InputError(f"a {path.suffix} file has no {key}", f"{key} = {value}", f"remove {key}", path)
+
+
+def export_of_arrays(
+    arrays: Mapping[str, np.ndarray], path: Path, layout: Layout, units: Mapping[str, str] | None = None
+) -> Export:
+    """The columns of named arrays: every vector, and every column of a matrix, ``data(:,2)`` for the second.
+
+    A matrix far wider than high holds its channels in rows: ``data(2,:)`` for the second.
+
+    Parameters
+    ----------
+    arrays : real numbers; arrays that are empty or have more than two dimensions are left out
+    path : of the file, for error lines
+    layout : ``missing`` may hold "NaN"
+    units : by name of an array, as the file states them; a second row of headers
+
+    Raises
+    ------
+    InputError
+        If there is no column.
+    """
+    refuse_line(layout, path)
+    columns, stated = {}, []
+    for name, array in arrays.items():
+        if array.size and name.isprintable() and array.ndim in (1, 2):
+            own = {name: array.ravel()}
+            if array.ndim == 2 and 1 not in array.shape:
+                rows = array.shape[1] > WIDE * array.shape[0]
+                form = "({},:)" if rows else "(:,{})"
+                own = {name + form.format(i + 1): one for i, one in enumerate(array if rows else array.T)}
+            columns |= own
+            stated += [(units or {}).get(name, "")] * len(own)
+    if not columns:
+        raise InputError(
+            f"a {path.suffix} file must hold real numeric vectors", "none", "export the readings as vectors", path
+        )
+    names = tuple(columns)
+
+    def values(column: int) -> np.ndarray:
+        found = columns[names[column]].astype(np.float64)
+        refused = ~np.isfinite(found) & ~(np.isnan(found) & ("NaN" in layout.missing))
+        if refused.any():
+            row = int(np.argmax(refused))
+            remedy = 'add "NaN" to missing = [...] to drop its row' if np.isnan(found[row]) else "correct the value"
+            raise InputError(f"{names[column]} must be finite", f"{found[row]}", remedy, path, *place(row, column))
+        return found
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        return 1 if row is None else row + 1, column + 1
+
+    longest = max(vector.size for vector in columns.values())
+    headers = (names, tuple(stated)) if any(stated) else (names,)
+    return Export(path, headers, len(names), np.arange(1, longest + 1), values, place)

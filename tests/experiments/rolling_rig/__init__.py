@@ -8,9 +8,9 @@ import numpy as np
 
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Parameter, Prior, scatter
-from capsule_id.rig.domains import POSITIVE
 from capsule_id.rig.model import Rig, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule
+from capsule_id.rig.toml import POSITIVE
 from capsule_id.views import Finding, Message
 
 C_RR = Parameter("c_rr", "1", "rolling resistance coefficient", r"c_\mathrm{rr}", Prior("lognormal", 0.01, 100.0))

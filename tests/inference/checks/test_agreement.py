@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.checks.agreement import Distance, RunsAlone, _by_sample, agreement, disagreement
+from capsule_id.inference.checks.posterior import Distance, RunsAlone, _by_sample, agreement, disagreement
 from capsule_id.inference.result import PointFit
-from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
+from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.views import Finding
 
 NAMES = ("k1", "c")

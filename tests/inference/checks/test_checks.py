@@ -9,17 +9,16 @@ import pytest
 import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.families.line_experiment import Line, curvature_test
-from capsule_id.experiments.free_vibration.decay_models import decay as rubbed_decay
-from capsule_id.experiments.free_vibration.twin import DECAY_NOISE, RELEASES, decay
-from capsule_id.experiments.registry import default_registry
-from capsule_id.experiments.static_friction.declaration import tilts as tilted
-from capsule_id.inference.checks.regression import _basis, outliers
-from capsule_id.inference.checks.sampled_fit import SampledFit
+from capsule_id.experiments.free_vibration.declaration import DECAY_NOISE, RELEASES, decay
+from capsule_id.experiments.free_vibration.models import decay as rubbed_decay
+from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.line import Line, curvature_test
+from capsule_id.experiments.static_friction import tilts as tilted
+from capsule_id.inference.checks.settings import SampledFit, _basis, outliers
 from capsule_id.inference.checks.verdict import run_checks
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.texts.messages import finding_text, messages_of
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.target import LogPosterior
+from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Finding
 

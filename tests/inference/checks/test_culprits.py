@@ -12,11 +12,11 @@ from scipy.optimize import least_squares
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.checks.agreement import RunsAlone, agreement, disagreement
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference.checks.posterior import RunsAlone, agreement, disagreement
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
+from capsule_id.inference.target import LogPosterior
+from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import Table
 from capsule_id.views import Finding
 from tests import forced_runs

@@ -10,15 +10,15 @@ from scipy import stats
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.checks.modes import check_maximum, check_starts, modes
-from capsule_id.inference.checks.sampled_fit import SampledFit
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.fit.point_stage import fit_points
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference.checks.posterior import check_maximum, check_starts, modes
+from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.joint_fit import fit_points
 from capsule_id.inference.pipeline import higher_maximum, sample_posterior, stage_seeds
+from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import Posterior
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
+from capsule_id.inference.target import LogPosterior
+from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import Rig
 from capsule_id.views import Finding
 from tests.measured.folders import Entry, make_rig

@@ -8,8 +8,8 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.api import Fit
-from capsule_id.experiments.families.line_replicates import lack_of_fit
-from capsule_id.inference.checks.order import ORDER_LEVEL, POWER, added_effect, between, heterogeneity, lag_1
+from capsule_id.experiments.line import lack_of_fit
+from capsule_id.inference.checks.settings import ORDER_LEVEL, POWER, added_effect, between, heterogeneity, lag_1
 from tests.measured.folders import Entry, make_rig, quantity
 
 

@@ -11,9 +11,9 @@ import pytest
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.settings import DecayModel
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.checks.predictive import STATISTICS, check_statistics, experiment_p_values, p_values
+from capsule_id.experiments.free_vibration.readings import DecayModel
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference.checks.posterior import STATISTICS, check_statistics, experiment_p_values, p_values
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.scipy_decay import scipy_decay

@@ -12,10 +12,10 @@ from scipy import stats
 import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.priors import conflicts
-from capsule_id.inference.checks.sampled_fit import SampledFit
-from capsule_id.inference.fit.point_fit import point_fit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.checks.posterior import conflicts
+from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import PriorOverride, Rig
 from capsule_id.synthetic import synthesize
 from tests.experiments.bench import column, rig, table

@@ -8,22 +8,23 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.experiments.forced_run.base_run import BaseRun
-from capsule_id.experiments.free_vibration.decay_models import decay
+from capsule_id.experiments.forced_run.experiment import BaseRun
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.inference.checks.model_error.record_widening import (
+from capsule_id.experiments.free_vibration.models import decay
+from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.checks.widening import (
+    FEWEST_PARTS,
     PRIORS,
     by_phase,
     by_time,
     parts_of_residuals,
     record_widenings,
     steps_of_parts,
+    widening,
 )
-from capsule_id.inference.checks.model_error.widening import FEWEST_PARTS, widening
-from capsule_id.inference.checks.sampled_fit import SampledFit
-from capsule_id.inference.fit.point_fit import residual_jacobian
+from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.experiments import test_base_run as shaken

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.dynamic_friction.declaration import DISTANCE_SD, SPEED_SD, pushes
-from capsule_id.experiments.registry import default_registry
-from capsule_id.experiments.static_friction.declaration import tilts
-from capsule_id.inference.checks.tension import tension
+from capsule_id.experiments.dynamic_friction import DISTANCE_SD, SPEED_SD, pushes
+from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.static_friction import tilts
+from capsule_id.inference.checks.settings import tension
 from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.synthetic import Truth
 

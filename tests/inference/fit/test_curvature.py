@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.inference.fit.curvature import BATCH, hessian, in_batches, jacobian, require_width
+from capsule_id.inference.curvature import BATCH, hessian, in_batches, jacobian, require_width
 from capsule_id.precision import require_float64
 
 require_float64()

@@ -15,30 +15,32 @@ import pytest
 from jax.tree_util import Partial
 from scipy import optimize
 
+from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.experiment import ForcedRun
-from capsule_id.inference.checks.modes import check_starts
-from capsule_id.inference.fit import joint_fit as module
-from capsule_id.inference.fit import joint_starts
-from capsule_id.inference.fit.joint_fit import (
+from capsule_id.inference import joint_fit as joint_starts
+from capsule_id.inference import joint_fit as module
+from capsule_id.inference.checks.posterior import check_starts
+from capsule_id.inference.joint_fit import (
     LEAST_INCREASE,
+    STARTS,
     _at_another_maximum,
     _better_point,
     _descend,
     _is_converged,
     _suffice,
+    choose_starts,
     joint_fit,
     scatter_modes,
+    weigh,
 )
-from capsule_id.inference.fit.joint_starts import STARTS, choose_starts, weigh
-from capsule_id.inference.fit.least_squares import Solver, least_squares, linearised
+from capsule_id.inference.least_squares import Solver, least_squares, linearised
+from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.sampling.ensembles import laplace_proposal
-from capsule_id.inference.tables.run_notes import smoothing_shift
-from capsule_id.inference.target.log_posterior import HeldResiduals, LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior
-from capsule_id.interruption import stop_if_interrupted
+from capsule_id.inference.sampling import laplace_proposal
+from capsule_id.inference.tables import smoothing_shift
+from capsule_id.inference.target import HeldResiduals, LogPosterior
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import PriorOverride, Quantity
 from tests.experiments import bench

@@ -8,8 +8,8 @@ import scipy.optimize
 from jax.tree_util import Partial
 
 from capsule_id.errors import InputError
-from capsule_id.inference.fit.covariance import covariance
-from capsule_id.inference.fit.least_squares import LeastSquaresFit, Solver, least_squares
+from capsule_id.inference.curvature import covariance
+from capsule_id.inference.least_squares import LeastSquaresFit, Solver, least_squares
 from tests.inference.fit.nist_strd import PROBLEMS
 
 RAT43 = next(problem for problem in PROBLEMS if problem.name == "Rat43")

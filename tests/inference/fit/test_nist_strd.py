@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from capsule_id.inference.fit.least_squares import LeastSquaresFit, least_squares
+from capsule_id.inference.least_squares import LeastSquaresFit, least_squares
 from tests.inference.fit.nist_strd import PROBLEMS, StrdProblem
 
 # Five significant digits would be 1e-5; NIST prints eleven, and the solver's tolerance allows 1e-6 on every problem.

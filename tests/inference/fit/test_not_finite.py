@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from capsule_id.inference.fit import joint_fit
+from capsule_id.inference import joint_fit
 
 
 @pytest.mark.parametrize("motion", [True, False])

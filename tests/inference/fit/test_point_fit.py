@@ -9,10 +9,10 @@ from scipy import optimize
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.checks.modes import check_starts
-from capsule_id.inference.fit.point_fit import dispersed_starts, point_fit
+from capsule_id.inference.checks.posterior import check_starts
+from capsule_id.inference.point_fit import dispersed_starts, point_fit
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.target import LogPosterior
 from capsule_id.synthetic import Truth, synthesize
 
 

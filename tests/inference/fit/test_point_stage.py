@@ -8,9 +8,9 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.declaration import MESSAGES
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.twin import RunSetup, make_runs
-from capsule_id.inference.fit import point_stage
-from capsule_id.inference.fit.point_stage import cut_unpredictable
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference import joint_fit as point_stage
+from capsule_id.inference.joint_fit import cut_unpredictable
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Quantity, Table
 from tests.experiments import bench
 from tests.forced_runs import TRUTH, make
@@ -56,7 +56,7 @@ def test_a_start_that_wavers_is_said_and_the_fit_is_that_of_its_target(monkeypat
     monkeypatch.setattr(point_stage, "joint_fit", joint_fit)
     monkeypatch.setattr(point_stage, "correct_starts", other_kind)
     target, fit, findings = point_stage._fit_with_right_starts(LogPosterior(run.rig, [run]), {}, 0)
-    assert len(fitted) == point_stage.ROUNDS
+    assert len(fitted) == point_stage.STAGE_ROUNDS
     assert target is fit is fitted[-1]
     assert [(finding.level, finding.experiment) for finding in findings] == [("fail", "run_3")]
     monkeypatch.setattr(point_stage, "correct_starts", lambda *_: None)

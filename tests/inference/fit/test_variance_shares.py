@@ -6,10 +6,10 @@ import pytest
 
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
-from capsule_id.inference.fit.point_fit import point_fit
+from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import STATED, PointFit
-from capsule_id.inference.tables.notes import share_table
-from capsule_id.inference.target.log_posterior import LogPosterior
+from capsule_id.inference.tables import share_table
+from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Quantity
 from tests.cli_tools import DATA
 

@@ -5,13 +5,13 @@ import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD
-from capsule_id.experiments.registry import default_registry
-from capsule_id.inference.checks.experiment_checks import check_whiteness
-from capsule_id.inference.checks.sampled_fit import SampledFit
-from capsule_id.inference.fit import point_stage
-from capsule_id.inference.fit.point_stage import fit_points
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.report.texts.messages import FIT_MESSAGES, finding_text
+from capsule_id.experiments.kind import default_registry
+from capsule_id.inference import joint_fit as point_stage
+from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.checks.verdict import check_whiteness
+from capsule_id.inference.joint_fit import fit_points
+from capsule_id.inference.target import LogPosterior
+from capsule_id.report.messages import FIT_MESSAGES, finding_text
 from capsule_id.rig.model import PriorOverride, Quantity
 from capsule_id.views import Finding
 from tests.experiments import bench

@@ -7,13 +7,7 @@ import emcee
 import numpy as np
 import pytest
 
-from capsule_id.inference.sampling.diagnostics import (
-    bulk_and_tail_size,
-    effective_sample_size,
-    ensemble_time,
-    pooled_time,
-    split_rhat,
-)
+from capsule_id.inference.moves import bulk_and_tail_size, effective_sample_size, ensemble_time, pooled_time, split_rhat
 
 
 def autoregressive(rho: float, shape: tuple[int, int, int, int], seed: int) -> np.ndarray:

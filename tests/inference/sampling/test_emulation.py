@@ -11,17 +11,16 @@ import pytest
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.emulator import Emulator, _cosine
-from capsule_id.experiments.progression.density.run_emulator import RunEmulator
+from capsule_id.experiments.progression.density import RunEmulator
 from capsule_id.experiments.progression.experiment import Progression
+from capsule_id.inference import moves
+from capsule_id.inference import sampling as emulation
+from capsule_id.inference import sampling as ensembles
+from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.proposal import block_proposal
 from capsule_id.inference.result import PointFit, Posterior
-from capsule_id.inference.sampling import emulation, ensembles, moves
-from capsule_id.inference.sampling.emulation import Emulation, ExactMotions, Places
-from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
-from capsule_id.inference.sampling.ensembles import DELAYED, sample
-from capsule_id.inference.sampling.proposal import block_proposal
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior
-from capsule_id.inference.target.scales import Scale
+from capsule_id.inference.sampling import DELAYED, Emulation, Ensemble, ExactMotions, Places, initial_state, sample
+from capsule_id.inference.target import LogPosterior, Scale
 from tests.inference.sampling.test_sampling import LIMIT, scores
 from tests.inference.stub import Gaussian
 from tests.inference.three_settings import THETA, three_settings

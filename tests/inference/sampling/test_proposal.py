@@ -7,14 +7,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.inference.sampling import coordinates, refinement
-from capsule_id.inference.sampling.coordinates import Coordinates, coordinates_of
-from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time
-from capsule_id.inference.sampling.ensemble import Ensemble, initial_state
-from capsule_id.inference.sampling.ensembles import pilot, sample
-from capsule_id.inference.sampling.proposal import BlockProposal, Mixture, block_proposal, concentric
-from capsule_id.inference.sampling.refinement import _Rounds, effective_size, refined, tempered
-from capsule_id.inference.sampling.transport import Transported
+from capsule_id.inference import proposal as coordinates
+from capsule_id.inference import proposal as refinement
+from capsule_id.inference.moves import effective_sample_size, ensemble_time
+from capsule_id.inference.proposal import (
+    BlockProposal,
+    Coordinates,
+    Mixture,
+    Transported,
+    _Rounds,
+    block_proposal,
+    concentric,
+    coordinates_of,
+    effective_size,
+    refined,
+    tempered,
+)
+from capsule_id.inference.sampling import Ensemble, initial_state, pilot, sample
 from tests.inference.stub import Gaussian
 
 #: Normal prior of the logarithms of both terms: centre, width.

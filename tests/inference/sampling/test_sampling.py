@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
+from capsule_id.inference import sampling as ensembles
+from capsule_id.inference.marginal import uniform_at
+from capsule_id.inference.moves import effective_sample_size, ensemble_time
 from capsule_id.inference.result import Posterior
-from capsule_id.inference.sampling import ensembles
-from capsule_id.inference.sampling.diagnostics import effective_sample_size, ensemble_time
-from capsule_id.inference.sampling.ensembles import DEFAULT_ESS, ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
-from capsule_id.inference.target.marginal import uniform_at
+from capsule_id.inference.sampling import DEFAULT_ESS, ENSEMBLES, LENGTH_IN_TAU, MAX_RHAT, sample
 from tests.inference.stub import Gaussian
 
 #: Largest |z| of the 16 numbers tested at once: false alarm in 1 of 1000.
@@ -183,7 +183,7 @@ def test_no_private_attribute_of_emcee_is_used() -> None:
     """Names with a leading underscore are read from ``self`` only."""
     found = [
         f"{path.name}:{node.lineno}: {node.attr}"
-        for path in Path(ensembles.__file__).parent.glob("*.py")
+        for path in (Path(ensembles.__file__).with_name(f"{name}.py") for name in ("sampling", "moves", "proposal"))
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__")
         if not (isinstance(node.value, ast.Name) and node.value.id == "self")

@@ -15,10 +15,10 @@ import tests.experiments.bench as bench
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.inference.fit.curvature import BATCH, hessian
+from capsule_id.inference.curvature import BATCH, hessian
+from capsule_id.inference.marginal import MarginalPosterior, conditional, density_of, uniform_at
 from capsule_id.inference.result import PointFit
-from capsule_id.inference.target.log_posterior import LogPosterior
-from capsule_id.inference.target.marginal import MarginalPosterior, conditional, density_of, uniform_at
+from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import Truth, synthesize

@@ -24,7 +24,7 @@ with atheris.instrument_imports(include=["capsule_id.rig", "nptdms", "openpyxl",
 
     from capsule_id.errors import InputError
     from capsule_id.rig.formats import EXPORTS, READERS
-    from capsule_id.rig.formats.export import Layout
+    from capsule_id.rig.formats.raw import Layout
 
 from tests.rig.formats.writers import WRITERS
 

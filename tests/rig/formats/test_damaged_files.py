@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats import EXPORTS, limits
-from capsule_id.rig.formats.export import Layout
+from capsule_id.rig.formats import EXPORTS
+from capsule_id.rig.formats import raw as limits
+from capsule_id.rig.formats.raw import Layout
 from tests.rig.formats.writers import WRITERS, hdf5, lvm, mat_73, npz, parquet_file, tdms, xlsx
 
 TIME = np.arange(6) * 0.25

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.export import Layout
-from capsule_id.rig.formats.text import lvm
+from capsule_id.rig.formats import layouts as lvm
+from capsule_id.rig.formats.raw import Layout
 from tests.rig.formats.writers import WRITERS
 
 TIME = np.arange(8) * 0.25

@@ -9,8 +9,8 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from capsule_id.errors import InputError, collecting
-from capsule_id.rig.formats.binary.mat import read_mat
-from capsule_id.rig.formats.export import Layout
+from capsule_id.rig.formats.binary import read_mat
+from capsule_id.rig.formats.raw import Layout
 
 PATH = Path("m.mat")
 

@@ -9,14 +9,14 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id import read_rig
+from capsule_id.api import read_rig
 from capsule_id.cli import capsule_id
 from capsule_id.errors import InputError
 from capsule_id.rig.formats import EXPORTS, READERS
-from capsule_id.rig.formats.export import Layout
-from capsule_id.rig.formats.text import blocks, rows
-from capsule_id.rig.formats.text.blocks import TextFile
-from capsule_id.rig.formats.text.rows import Shape, plain_block
+from capsule_id.rig.formats import text as blocks
+from capsule_id.rig.formats import text as rows
+from capsule_id.rig.formats.raw import Layout
+from capsule_id.rig.formats.text import Shape, TextFile, plain_block
 
 #: Texts with every layout and every fault that depends on more than one line.
 TEXTS = [

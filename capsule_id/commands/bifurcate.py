@@ -1,0 +1,442 @@
+"""``capsule-id bifurcate``: the settled motions over one quantity or two, as NetCDF and as a figure."""
+
+import argparse
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from capsule_id.commands.capsule_options import (
+    DEFAULTS,
+    add_capsule_arguments,
+    capsule_and_drive,
+    capsule_values,
+    fitted_values,
+    number,
+)
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
+from capsule_id.console import Progress, say
+from capsule_id.errors import InputError
+from capsule_id.experiments.kind import default_registry
+from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
+from capsule_id.rig.model import Rig
+from capsule_id.rig.read import read_rig
+from capsule_id.rig.units import UnitError, factor_to_si
+from capsule_id.views import counted
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+    from distributed import Client
+    from matplotlib.figure import Figure
+
+    from capsule_id.report.figures.sweeps import MeasuredPoint
+
+
+# sweep output: Writes a sweep: FILE.nc and FILE.png, each complete or absent; FILE.nc.partial holds finished blocks.
+
+
+STORE_FILE = "points.json"  # in every store, see motions/blocks.py
+
+
+def prepare_store(out: Path, resume: bool) -> Path:
+    """The folder for finished blocks, ``FILE.nc.partial``. Blocks of an earlier run are kept (``resume``) or removed.
+
+    Raises
+    ------
+    InputError
+        If the name does not end in .nc, the folder cannot be written, is a result or belongs to something else, or
+        ``resume`` finds no blocks.
+    """
+    if out.suffix != ".nc":
+        raise InputError("the output must end in .nc", str(out), "change the suffix")
+    if out.is_dir() or out.with_suffix(".png").is_dir():
+        raise InputError("the output must be a file", f"{out} is a folder", "choose another --out")
+    parent = next(path for path in out.absolute().parents if path.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError("the folder of the output must be writable", f"{parent} is not", "choose another --out")
+    if (out.parent / "parameters.json").exists():
+        rule, remedy = "the output must not lie in a result of fit-params", "choose another --out"
+        raise InputError(rule, f"{out.parent} is one", remedy, out)
+    store = out.with_name(out.name + ".partial")
+    if resume and not (store / STORE_FILE).is_file():
+        raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)
+    if store.exists() and not resume:
+        names = {path.name for path in store.iterdir()} if store.is_dir() else set()
+        if not store.is_dir() or (names and STORE_FILE not in names):
+            raise InputError(
+                "FILE.nc.partial must be unfinished work", "it is something else", "choose another --out", store
+            )
+        shutil.rmtree(store)
+    return store
+
+
+def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
+    """Write both files under temporary names in the same folder, then rename them.
+
+    Raises
+    ------
+    InputError
+        If they cannot be written.
+    """
+    from capsule_id.report.figures.style import png
+
+    picture = out.with_suffix(".png")
+    new = [path.with_name(f".{path.name}.new") for path in (out, picture)]
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        data.to_netcdf(new[0], engine="h5netcdf")
+        new[1].write_bytes(png(figure))
+        new[0].replace(out)
+        new[1].replace(picture)
+    except OSError as error:
+        raise InputError("the output must be writable", str(error.strerror), "choose another --out", out) from None
+    finally:
+        for path in new:
+            path.unlink(missing_ok=True)
+
+
+def remove_store(store: Path) -> None:
+    """Remove the finished blocks."""
+    shutil.rmtree(store, ignore_errors=True)
+
+
+# cluster: A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running
+# cluster.
+
+
+#: Longest wait for a scheduler at an address, s.
+CONNECT_TIMEOUT = 10.0
+
+
+def client_of(scheduler: str | None) -> "AbstractContextManager[Client | None]":
+    """A context manager: a Dask client, or None to compute in this process."""
+    return nullcontext() if scheduler is None else cluster(scheduler)
+
+
+@contextmanager
+def cluster(scheduler: str) -> "Iterator[Client]":
+    """A client of a local cluster ("threads", "processes") or of the scheduler at an address. A local cluster ends with it.
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, or no scheduler answers at the address.
+    """
+    try:
+        import distributed  # noqa: F401
+        from dask import config
+    except ImportError:
+        remedy = "install capsule-id[maps], or remove --scheduler"
+        raise InputError("--scheduler needs Dask", "distributed is not installed", remedy) from None
+    # A client that no scheduler answers does not restore the setting of Dask, and nothing could be computed later.
+    with config.set(scheduler=config.get("scheduler", None)), _client(scheduler) as client:
+        yield client
+
+
+@contextmanager
+def _client(scheduler: str) -> "Iterator[Client]":
+    from distributed import Client, LocalCluster
+
+    if scheduler not in ("threads", "processes"):
+        try:
+            client = Client(scheduler, timeout=CONNECT_TIMEOUT)
+        except (OSError, ValueError) as error:
+            rule = "--scheduler is threads, processes or the address of a Dask scheduler"
+            raise InputError(
+                rule, f"{scheduler}: {type(error).__name__}", "start the scheduler, or check the address"
+            ) from None
+        with client:
+            yield client
+        return
+    # Each process computes with as many threads as there are cores; see physics/batches.py.
+    processes = scheduler == "processes"
+    local = {
+        "processes": processes,
+        "threads_per_worker": 1 if processes else None,
+        "dashboard_address": None,
+        "silence_logs": logging.CRITICAL,
+    }
+    with LocalCluster(**local) as workers, Client(workers) as client:
+        yield client
+
+
+# bifurcate: ``capsule-id bifurcate``: the settled motions over one quantity or two, as NetCDF and as a figure.
+
+
+# Defaults of the options: Table 1, with gap and drive of the paper's Fig. 6.
+FIG_6_DEFAULTS = {**DEFAULTS, "G": 1e-3, "P_d": 4.0, "Omega": 34.56}
+METHODS = ("rest", "states", "forward", "backward", "both")
+MOST_POINTS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A varied quantity: values from begin to end in ``unit``, SI = value * factor."""
+
+    name: str
+    begin: float
+    end: float
+    points: int
+    unit: str
+    factor: float
+
+    def values(self) -> "np.ndarray":
+        """(points,), SI (f in Hz)."""
+        import numpy as np
+
+        return np.linspace(self.begin, self.end, self.points) * self.factor
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add DATA and the options of quantities, motions and output. ``run`` parses all numbers."""
+    text = "fitted rig folder, for its parameters (default: Table 1)"
+    parser.add_argument("data", metavar="DATA", nargs="?", help=text)
+    group = parser.add_argument_group("varied quantities")
+    group.add_argument("--over", metavar="NAME", required=True, choices=tuple(SWEPT), help=", ".join(SWEPT))
+    group.add_argument("--from", dest="begin", metavar="X", required=True, help="first value")
+    group.add_argument("--to", dest="end", metavar="X", required=True, help="last value")
+    group.add_argument("--unit", metavar="U", help="of --from and --to, e.g. kN/m (default SI)")
+    group.add_argument("--points", metavar="N", help="number of values (default 500; 200 in a map)")
+    group.add_argument("--with", dest="second", metavar="NAME", choices=tuple(SWEPT), help="a second quantity: a map")
+    for word in ("from", "to", "unit", "points"):
+        group.add_argument(f"--with-{word}", metavar="X", help=f"--{word} of the second quantity")
+    group = parser.add_argument_group("motions")
+    text = "initial state: rest (default), many states, or the last state at the previous value"
+    group.add_argument("--method", choices=METHODS, default="rest", help=text)
+    group.add_argument("--states", metavar="N", default="16", help="initial states of --method states (default 16)")
+    text = "random seed of the initial states and of --draws (default 0)"
+    group.add_argument("--seed", metavar="N", default="0", help=text)
+    group.add_argument("--dropped", metavar="N", default="300", help="excitation periods dropped (default 300)")
+    group.add_argument("--observed", metavar="N", default="48", help="excitation periods observed (default 48)")
+    text = "s; contacts separated by less count as one (default 0: off)"
+    group.add_argument("--merge-contacts", metavar="X", default="0", help=text)
+    group.add_argument("--posterior", metavar="FILE", type=Path, help="posterior.nc: compute probabilities and bands")
+    group.add_argument("--draws", metavar="N", help="number of draws with --posterior (default 100)")
+    add_capsule_arguments(parser, FIG_6_DEFAULTS)
+    group = parser.add_argument_group("execution and output")
+    text = "Dask for maps and bands: threads, processes or an address tcp://..."
+    group.add_argument("--scheduler", metavar="S", help=text)
+    group.add_argument("--resume", action="store_true", help="reuse the finished blocks of an interrupted map")
+    group.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    text = "FILE.nc; the figure is FILE.png (default results/<rig>-<quantity>.nc)"
+    group.add_argument("--out", metavar="FILE", type=Path, help=text)
+    add_cache_argument(group)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Sweep, write FILE.nc and FILE.png; 0.
+
+    Raises
+    ------
+    InputError
+        If a number, unit or combination is not admissible, DATA has no result, or the output cannot be written.
+    """
+    axes = _axes(args)
+    _check_combination(args, axes)
+    rig = read_rig(args.data, default_registry()) if args.data is not None else None
+    if rig is not None and args.result is None:
+        args.result = Path("results") / rig.name
+        if not (args.result / "parameters.json").is_file():
+            remedy = "run fit-params on it, or give --result"
+            raise InputError("DATA must have been fitted", f"no {args.result}", remedy)
+    free = frozenset(_frequency_leaf(args) if axis.name == "f" else axis.name for axis in axes)
+    values = capsule_values(args, FIG_6_DEFAULTS, free | _names_from_posterior(args))
+    out = args.out if args.out is not None else _default_out(rig.name if rig is not None else None, axes)
+    store = prepare_store(out, args.resume)
+    set_xla_options()
+    if not args.no_cache:
+        keep_programs()
+    from capsule_id.physics.forces import warn_of_far_gap
+    from capsule_id.report.figures.style import own_style
+
+    with Progress(not args.quiet, unit="point") as progress, client_of(args.scheduler) as client:
+        data = _dataset(args, axes, values, {"store": store, "client": client, "progress": progress})
+        if "x_rel" in data and all(axis.name != "G" for axis in axes):
+            warn_of_far_gap(values["G"], data["x_rel"])
+        data.attrs["rig"] = rig.name if rig is not None else ""
+        measured = _measured_points(args, rig, axes, values) if rig is not None else ()
+        with own_style():
+            publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
+    remove_store(store)
+    say(_summary_text(data, axes, out))
+    return 0
+
+
+def draw(
+    data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredPoint]" = (), synthetic: bool = False
+) -> "Figure":
+    """The figure of a computed Dataset. A diagram also shows measured runs, each with its own label."""
+    from capsule_id.report.figures import sweeps as figures_bands
+    from capsule_id.report.figures import sweeps as figures_map
+    from capsule_id.report.figures import sweeps as figures_sweep
+    from capsule_id.report.figures.style import mark
+
+    units = {axis.name: figures_sweep.AxisUnit(axis.unit, axis.factor) for axis in axes}
+    title = str(data.attrs["rig"])
+    if "probability" in data:
+        figure = figures_bands.bands(data, units, title)
+    elif len(axes) == 2:
+        figure = figures_map.motion_map(data, units, title)
+    else:
+        figure = figures_sweep.bifurcation(data, units, measured, title)
+    if synthetic:
+        mark(figure, "synthetic data")
+    return figure
+
+
+def _dataset(
+    args: argparse.Namespace, axes: Sequence[Axis], values: dict[str, float], work: dict[str, Any]
+) -> "xr.Dataset":
+    """The Dataset for the options."""
+    from capsule_id.motions import operating, sweep
+    from capsule_id.motions.response import Settling
+    from capsule_id.report.netcdf import read_draws
+
+    settling = Settling(
+        dropped=_whole_number("dropped", args.dropped),
+        observed=_whole_number("observed", args.observed),
+        merge_contacts=number("merge-contacts", args.merge_contacts),
+    )
+    leaves: dict[str, Any] = dict(values)
+    if args.posterior is not None:
+        spring = None if any(axis.name == "k2" for axis in axes) or args.k2 is not None else args.spring
+        draws = read_draws(
+            args.posterior, _whole_number("draws", args.draws or "100"), _whole_number("seed", args.seed), spring
+        )
+        if "k2" not in draws and args.k2 is None and all(axis.name != "k2" for axis in axes):
+            raise InputError("k2 must be given", "the posterior has several springs or none", "add --spring or --k2")
+        given = {name for name in LEAVES if getattr(args, name) is not None}
+        leaves |= {name: column for name, column in draws.items() if name not in given}
+    p, e = capsule_and_drive(leaves, args.drive)
+    x = {axis.name: axis.values() for axis in axes}
+    (over, grid), *_ = x.items()
+    if args.posterior is not None:
+        return operating.bands(operating.draws_diagram(p, e, over, grid, settling=settling, **work))
+    if len(axes) == 2:
+        return sweep.motion_map(p, e, x, settling=settling, **work)
+    plain = {"settling": settling, "progress": work["progress"]}
+    if args.method in ("rest", "states"):
+        many = args.method == "states"
+        starts = (
+            sweep.spread_starts(p, e, _whole_number("states", args.states), _whole_number("seed", args.seed))
+            if many
+            else None
+        )
+        return sweep.diagram(p, e, over, grid, starts=starts, **plain)
+    both = ("forward", "backward")
+    return sweep.continuation(p, e, over, grid, directions=both if args.method == "both" else (args.method,), **plain)
+
+
+def _measured_points(
+    args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
+) -> "tuple[MeasuredPoint, ...]":
+    """The forced runs with the settings of a diagram. Standard error lists the omitted runs."""
+    from capsule_id.commands.measured_runs import Span, overlay
+
+    diagram = len(axes) == 1 and args.posterior is None and args.drive == "harmonic"
+    if not diagram or not rig.has_runs:
+        return ()
+    x = axes[0].values()
+    by_name = args.spring if args.k2 is None else None
+    found = overlay(rig, Span(axes[0].name, x[0], x[-1]), values, fitted_values(args.result), by_name)
+    print(found.sentence(), file=sys.stderr, flush=True)
+    return found.motions
+
+
+def _axes(args: argparse.Namespace) -> tuple[Axis, ...]:
+    """The varied quantities, one or two."""
+    many = "500" if args.second is None else "200"
+    first = _axis("", args.over, args.begin, args.end, args.unit, args.points or many)
+    if args.second is None:
+        for word in ("from", "to", "unit", "points"):
+            if getattr(args, f"with_{word}") is not None:
+                raise InputError(f"--with-{word} needs a second quantity", "there is none", "add --with NAME")
+        return (first,)
+    if args.with_from is None or args.with_to is None:
+        raise InputError("a second quantity needs its range", args.second, "add --with-from X --with-to X")
+    points = args.with_points or many
+    return first, _axis("with-", args.second, args.with_from, args.with_to, args.with_unit, points)
+
+
+def _axis(prefix: str, name: str, begin: str, end: str, unit: str | None, points: str) -> Axis:
+    si = SWEPT[name].unit
+    try:
+        factor = factor_to_si(unit, si.replace(" ", "*")) if unit is not None else 1.0
+    except UnitError as error:
+        raise InputError(error.rule, f"--{prefix}unit {unit}", error.remedy) from None
+    low, high = number(f"{prefix}from", begin), number(f"{prefix}to", end)
+    if not low < high:
+        raise InputError(f"--{prefix}from must be less than --{prefix}to", f"{low:g} and {high:g}", "swap them")
+    n = _whole_number(f"{prefix}points", points)
+    if not 2 <= n <= MOST_POINTS:
+        raise InputError(f"--{prefix}points must lie between 2 and {MOST_POINTS}", points, "give e.g. 500")
+    positive = SWEPT[name].sign == "positive" or name in ("Omega", "f")
+    if positive and not low > 0.0:
+        raise InputError(f"{name} must be positive", f"--{prefix}from {low:g}", "begin above 0")
+    if SWEPT[name].sign == "not negative" and low < 0.0:
+        raise InputError(f"{name} must not be negative", f"--{prefix}from {low:g}", "begin at 0 or above")
+    return Axis(name, low, high, n, unit if unit is not None else si, factor)
+
+
+def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
+    """Refuse options that do not apply together."""
+    names = {axis.name for axis in axes}
+    for name in sorted(names - {"f", *CAPSULE_LEAVES, *DRIVES[args.drive]}):
+        raise InputError(f"the {args.drive} drive has no {name}", f"--over or --with {name}", "change --drive")
+    if len(names) < len(axes) or names == {"f", _frequency_leaf(args)}:
+        raise InputError("a map needs two different quantities", f"{args.over} and {args.second}", "name another one")
+    blocks = len(axes) == 2 or args.posterior is not None
+    if args.posterior is not None and len(axes) == 2:
+        raise InputError("--posterior takes one quantity", "--with", "remove --posterior or --with")
+    if blocks and args.method != "rest":
+        raise InputError("maps and bands start from rest", f"--method {args.method}", "remove --method")
+    if args.scheduler is not None and not blocks:
+        raise InputError("--scheduler is for maps and bands", "one quantity", "remove it, or add --with or --posterior")
+    if args.resume and not blocks:
+        raise InputError("--resume is for maps and bands", "one quantity", "remove --resume")
+    if args.draws is not None and args.posterior is None:
+        raise InputError("--draws needs --posterior", "there is none", "add --posterior FILE")
+    for name in sorted(names | ({_frequency_leaf(args)} if "f" in names else set())):
+        if getattr(args, name, None) is not None:
+            raise InputError(f"a varied {name} has no fixed value", f"--{name} is given", f"remove --{name}")
+
+
+def _frequency_leaf(args: argparse.Namespace) -> str:
+    """The leaf that the frequency f stands for."""
+    return "Omega" if args.drive == "harmonic" else "period"
+
+
+def _names_from_posterior(args: argparse.Namespace) -> frozenset[str]:
+    """Parameters that need no option because the posterior supplies them."""
+    return frozenset({"k2"}) if args.posterior is not None else frozenset()
+
+
+def _whole_number(name: str, text: str) -> int:
+    value = number(name, text)
+    if value != int(value) or value < 0:
+        raise InputError(f"--{name} must be a whole number", text, "give 0 or more")
+    return int(value)
+
+
+def _default_out(rig: str | None, axes: Sequence[Axis]) -> Path:
+    names = "-".join(axis.name for axis in axes)
+    return Path("results") / f"{rig}-{names}.nc" if rig is not None else Path(f"bifurcation-{names}.nc")
+
+
+def _summary_text(data: "xr.Dataset", axes: Sequence[Axis], out: Path) -> str:
+    """The result in one line or two."""
+    if "probability" in data:
+        axis, (low, middle, high) = axes[0], data["chosen_mean_velocity_quantiles"].to_numpy() * 1e3
+        best = float(data["chosen"]) / axis.factor
+        found = f"best in the mean of {data.attrs['draws']} draws: {axis.name} = {best:.4g} {axis.unit}, "
+        return f"{found}{middle:.3g} mm/s (95 %: {low:.3g} to {high:.3g})\nwrote {out} and {out.with_suffix('.png')}"
+    label = data["label"].to_numpy().ravel()
+    failed, kinds = int((label == "failed").sum()), len(set(label.tolist()) - {"failed"})
+    failures = f", {counted(failed, 'run')} failed (see status)" if failed else ""
+    return f"{counted(label.size, 'motion')} of {counted(kinds, 'kind')}{failures}\nwrote {out} and {out.with_suffix('.png')}"

@@ -1,0 +1,126 @@
+"""``fit-params DATA``: from one rig folder or several to parameters, posterior and report."""
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
+from capsule_id.console import Progress, say
+from capsule_id.errors import InputError
+from capsule_id.experiments import CHOICES
+from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.rig.model import Rig
+from capsule_id.rig.read import read_rig
+from capsule_id.views import counted
+
+if TYPE_CHECKING:
+    pass
+from capsule_id.commands.rigs import Options, fit_many, fit_one
+
+# fit: ``fit-params DATA``: from one rig folder or several to parameters, posterior and report.
+
+
+DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 4000
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add DATA and the options."""
+    parser.add_argument("data", metavar="DATA", nargs="+", help="rig folder: rig.toml and the tables that it names")
+    text = "result directory (default results/<rig name>); of several rigs DIR/<rig name>"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=text)
+    text = "Dask for several rigs: threads, processes or an address tcp://... (default: one after the other)"
+    parser.add_argument("--scheduler", metavar="S", help=text)
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="random seed (default 0); the same seed gives the same numbers"
+    )
+    parser.add_argument("--experiments", choices=CHOICES, default="all", help="experiments to fit (default all)")
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted fit")
+    parser.add_argument("--no-sample", action="store_true", help="point fit only: no posterior, no intervals")
+    parser.add_argument(
+        "--max-steps",
+        type=int,
+        default=DEFAULT_MAX_STEPS,
+        metavar="N",
+        help=f"most emcee steps per ensemble (default {DEFAULT_MAX_STEPS})",
+    )
+    parser.add_argument(
+        "--ess",
+        type=int,
+        default=DEFAULT_ESS,
+        metavar="N",
+        help=f"draw so many effectively independent samples of every parameter (default {DEFAULT_ESS})",
+    )
+    parser.add_argument("--json", action="store_true", help="print parameters.json instead of the table")
+    parser.add_argument(
+        "--compare",
+        metavar="WORDS",
+        help="compare models instead of a fit: some of friction,reaction,lag,cubic; needs a progression. With --no-sample "
+        "roughly, by the point fits alone",
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    add_cache_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit and write; return 0 for a clean verdict, else 3. See ``fit_many`` for several rigs.
+
+    Raises
+    ------
+    InputError
+        If the input is bad; then nothing is written.
+    """
+    _check_numbers(args)
+    kinds = default_registry()
+    rigs = [read_rig(folder, kinds) for folder in args.data]
+    if args.compare is not None:
+        return _compare(args, rigs, kinds)
+    budget = None if args.no_sample else args.max_steps
+    command = shlex.join(["fit-params", *sys.argv[1:]])
+    options = Options(args.seed, args.experiments, budget, args.ess, not args.no_cache, command)
+    root = args.out or Path("results")
+    if len(rigs) > 1:
+        if args.resume or args.json:
+            rule, remedy = "--resume and --json are for one rig", "remove them; a repetition fits all rigs again"
+            raise InputError(rule, counted(len(rigs), "rig"), remedy)
+        with Progress(not args.quiet, "rig") as progress:
+            return fit_many(rigs, options, root, args.scheduler, kinds, progress)
+    if args.scheduler is not None:
+        raise InputError("--scheduler is for several rigs", "one rig", "remove it, or name further folders")
+    directory = args.out or root / rigs[0].name
+    with Progress(not args.quiet) as progress:
+        return fit_one(rigs[0], options, directory, kinds, progress, resume=args.resume, as_json=args.json)
+
+
+def _check_numbers(args: argparse.Namespace) -> None:
+    """Refuse numbers that no fit has."""
+    if args.seed < 0:
+        raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
+    if args.max_steps < 1:
+        raise InputError("--max-steps must be positive", str(args.max_steps), "give 1 or more")
+    if args.ess < 1:
+        raise InputError("--ess must be positive", str(args.ess), "give 1 or more")
+
+
+def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:
+    """Print the comparison of models; 0."""
+    if len(rigs) > 1:
+        raise InputError("--compare takes one rig", counted(len(rigs), "rig"), "name one folder")
+    unused = {"out": None, "scheduler": None, "json": False, "resume": False}
+    unused |= {"experiments": "all", "max_steps": DEFAULT_MAX_STEPS, "ess": DEFAULT_ESS}
+    ignored = [f"--{name}" for name, default in unused.items() if getattr(args, name) != default]
+    if ignored:
+        names = ", ".join(ignored).replace("_", "-")
+        raise InputError("--compare prints tables, writes nothing and fits all experiments", names, f"remove {names}")
+    set_xla_options()
+    if not args.no_cache:
+        keep_programs()
+    from capsule_id.inference.compare import compare_models, compare_points
+
+    compare = compare_points if args.no_sample else compare_models
+    with Progress(not args.quiet, "step") as progress:
+        choice = compare(rigs[0], args.compare.split(","), kinds, args.seed, progress)
+    say(choice.text)
+    return 0

@@ -1,1 +1,0 @@
-"""Fits of one rig folder or of several."""

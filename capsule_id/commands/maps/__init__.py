@@ -1,1 +1,0 @@
-"""Maps of motions: the command ``bifurcate``, its stores, and measured runs on its figures."""

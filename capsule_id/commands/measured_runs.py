@@ -1,0 +1,132 @@
+"""Selects the measured forced runs of a rig for a diagram of the model: those with the settings of the diagram."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from capsule_id.experiments.forced_run.declaration import RunSettings
+from capsule_id.experiments.rough_values import rough_values
+from capsule_id.parameters import SWEPT
+from capsule_id.records.motion import measured_motion
+from capsule_id.records.tones import recorded_drive, stated_gap, stated_Omega
+from capsule_id.report.figures.sweeps import MeasuredPoint
+from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.views import counted
+
+#: A setting agrees with the diagram within this relative difference, or within this many of its own sds.
+RELATIVE_TOLERANCE: Mapping[str, float] = {"k2": 0.05, "G": 0.05, "P_d": 0.05, "Omega": 0.005}
+TOLERANCE_SDS = 3.0
+
+
+class Span(NamedTuple):
+    """The range of a diagram: symbol, smallest and largest value, SI (f in Hz)."""
+
+    name: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Runs with the settings of a diagram, and a reason for each other run."""
+
+    motions: tuple[MeasuredPoint, ...]
+    left_out: tuple[str, ...]
+
+    def sentence(self) -> str:
+        """Number of shown runs, and the other runs with reasons, in one line."""
+        count = f"{len(self.motions)} of {counted(len(self.motions) + len(self.left_out), 'measured run')} overlaid"
+        return f"{count}; omitted: {'; '.join(self.left_out)}" if self.left_out else count
+
+
+def overlay(
+    rig: Rig, span: Span, values: Mapping[str, float], fitted: Mapping[str, float], spring: str | None = None
+) -> Overlay:
+    """The forced runs of ``rig`` on a diagram over ``span``.
+
+    Parameters
+    ----------
+    values : of the diagram by symbol, SI; that of the swept quantity is ignored
+    fitted : fitted values by name (K, k2[<spring>]); defaults are the paper's estimate, then the median of the prior
+    spring : its name, if the k2 of the diagram was chosen by name; None compares stiffnesses
+
+    A run agrees if k2, G, P_d and Omega lie within ``RELATIVE_TOLERANCE`` or ``TOLERANCE_SDS`` sds; the swept one is free.
+    P_d is the stated one, else K times the amplitude of the current.
+    """
+    estimate = rough_values(rig)
+
+    def known(name: str) -> Quantity:
+        """The fitted value, the paper's estimate, or the stated prior: TOLERANCE_SDS sds are its 95 % range."""
+        value, measured = (fitted[name], True) if name in fitted else estimate(name)
+        prior = rig.priors.get(name)
+        if measured or prior is None or prior.factor is None:
+            # A default prior (factor 1000) is too broad for a comparison.
+            return Quantity(value if measured else np.nan)
+        return Quantity(value, value * float(np.log(prior.factor)) / TOLERANCE_SDS)
+
+    motions, left_out = [], []
+    for table in rig.tables:
+        if isinstance(table.settings, RunSettings):
+            if table.settings.drive == "base" or table.settings.spring is None:
+                left_out.append(f"{table.label} (no harmonic force, or no support spring)")
+                continue
+            found = _point_or_reason(table, _settings(table, known), span, values, spring)
+            if isinstance(found, MeasuredPoint):
+                motions.append(found)
+            else:
+                left_out.append(f"{table.label} ({found})")
+    return Overlay(tuple(motions), tuple(left_out))
+
+
+def _point_or_reason(
+    table: Table[RunSettings],
+    settings: Mapping[str, Quantity],
+    span: Span,
+    values: Mapping[str, float],
+    spring: str | None,
+) -> MeasuredPoint | str:
+    """The run as a point of the diagram, or the reason for its omission."""
+    swept = "Omega" if span.name == "f" else span.name
+    if swept not in settings:
+        return f"{swept} is not a setting of a run"
+    by_name = spring is not None and swept != "k2"
+    if by_name and table.settings.spring != spring:
+        return f"spring {table.settings.spring}, not {spring}"
+    for name, quantity in settings.items():
+        if name == "k2" and by_name:
+            continue
+        if np.isnan(quantity.value):
+            return f"{name} is neither fitted nor stated"
+        allowed = max(RELATIVE_TOLERANCE[name] * abs(values[name]), TOLERANCE_SDS * quantity.sd)
+        if name != swept and abs(quantity.value - values[name]) > allowed:
+            return f"{name} = {quantity.value:.4g}, not {values[name]:.4g} {SWEPT[name].unit}"
+    value = settings[swept].value / (2.0 * np.pi if span.name == "f" else 1.0)
+    if not span.low <= value <= span.high:
+        return f"{span.name} = {value:.4g} {SWEPT[span.name].unit} is outside the diagram"
+    motion = measured_motion(table)
+    if not np.isfinite(motion.mean_velocity):
+        return "x_capsule was not recorded"
+    return MeasuredPoint(value, motion.label, motion.mean_velocity)
+
+
+def _settings(table: Table[RunSettings], known: Callable[[str], Quantity]) -> dict[str, Quantity]:
+    """k2, G, P_d and Omega of a run, SI; NaN for an unknown value."""
+    k2 = known(f"k2[{table.settings.spring}]")
+    return {
+        "k2": k2,
+        "G": stated_gap(table),
+        "P_d": _drive_amplitude(table, known),
+        "Omega": Quantity(stated_Omega(table)),
+    }
+
+
+def _drive_amplitude(table: Table[RunSettings], known: Callable[[str], Quantity]) -> Quantity:
+    """P_d of a run, N."""
+    drive = recorded_drive(table)
+    if table.settings.P_d is not None:
+        return table.settings.P_d
+    assert drive is not None, "the reader requires P_d or the current"
+    K = known("K")
+    return Quantity(K.value * drive.amplitude, K.sd * drive.amplitude)

@@ -1,0 +1,291 @@
+"""Fits of one rig or of several: result directory, table, verdict; one after the other, or on a Dask cluster."""
+
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from capsule_id.commands.bifurcate import client_of
+from capsule_id.commands.compilation import keep_programs, set_xla_options
+from capsule_id.console import OnProgress, Progress, one_line, save_traceback, say, stop_if_interrupted
+from capsule_id.errors import InputError
+from capsule_id.experiments import Choice, make_experiments
+from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.output import CHAINS, WORK_FILES, check_directory, check_unfinished, publish, work_in_progress
+from capsule_id.rig.model import Rig
+from capsule_id.views import counted
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from capsule_id.api import Fit
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a fit.
+
+    Attributes
+    ----------
+    seed, experiments, budget, ess : see ``capsule_id.api.fit``
+    cached : whether compiled programs are kept in the user's cache
+    command : the command line, for the report
+    """
+
+    seed: int
+    experiments: Choice
+    budget: int | None
+    ess: float
+    cached: bool
+    command: str
+
+
+def check_output(directory: Path, options: Options) -> None:
+    """Refuse a result directory that the fit must not replace.
+
+    Raises
+    ------
+    InputError
+        If it is no result, or holds a sample and the fit makes none.
+    """
+    check_directory(directory)
+    if options.budget is None and (directory / "posterior.nc").exists():
+        rule, remedy = "--no-sample must not replace a result with a sample", "choose another --out, or move it away"
+        raise InputError(rule, "it holds posterior.nc", remedy, directory)
+
+
+def prepare_jax(options: Options, has_runs: bool) -> None:
+    """Set the options of XLA, before JAX loads, the heap, and the cache of programs."""
+    set_xla_options(loop=options.experiments != "bench" and has_runs)
+    if options.cached:
+        keep_programs()
+
+
+def fingerprint_of(rig: Rig, options: Options, kinds: Registry) -> Mapping[str, object]:
+    """What an interrupted fit must have in common with the one that resumes it."""
+    from capsule_id.inference.pipeline import PACKAGES, package_versions
+
+    return {
+        "data": dict(rig.files),
+        "seed": options.seed,
+        "experiments": options.experiments,
+        "max-steps": options.budget,
+        "ess": options.ess,
+        "versions": {**package_versions(PACKAGES), **kinds.packages},
+    }
+
+
+def write_fit(
+    rig: Rig,
+    options: Options,
+    folder: Path,
+    kinds: Registry,
+    progress: OnProgress,
+    preliminary: Callable[["Fit"], None] | None = None,
+) -> "Fit":
+    """Fit, and write the result and the saved chains to ``folder``. ``preliminary`` as in ``capsule_id.fit``."""
+    from capsule_id.api import fit
+    from capsule_id.report.write import write_result
+
+    store = folder / CHAINS
+    result = fit(
+        rig,
+        options.seed,
+        options.experiments,
+        options.budget,
+        store,
+        progress,
+        kinds,
+        ess=options.ess,
+        preliminary=preliminary,
+    )
+    made = result.provenance.made[0], options.command
+    result = replace(result, provenance=replace(result.provenance, made=made))
+    progress(0, 1, "report")
+    write_result(result, folder)
+    return result
+
+
+def fit_one(
+    rig: Rig,
+    options: Options,
+    directory: Path,
+    kinds: Registry,
+    progress: Progress,
+    *,
+    resume: bool = False,
+    as_json: bool = False,
+) -> int:
+    """Fit, write ``directory``, print the table; 0 for a clean verdict, else 3. As many parameters as the command has.
+
+    Raises
+    ------
+    InputError
+        If the input is bad; then nothing is written.
+    """
+    check_output(directory, options)
+    prepare_jax(options, rig.has_runs)
+    # JAX loads only now, so that a faulty folder is reported at once.
+    from capsule_id.report.columns import table_text, wrapped
+    from capsule_id.report.messages import messages_of
+    from capsule_id.report.write import write_report
+
+    make_experiments(rig, options.experiments, kinds)
+    messages_of(kinds)  # refuses conflicting messages before the fit
+    with work_in_progress(directory, fingerprint_of(rig, options, kinds), resume) as partial:
+
+        def show_point(first: "Fit") -> None:
+            write_report(first, partial)
+            table = [table_text(first.summary, synthetic=rig.synthetic), *wrapped(first.remarks)]
+            progress.note("\n".join([f"point fit, before the sample; report: {partial / 'report.html'}", *table]))
+
+        # A fit of bench tests ends as soon.
+        preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
+        result = write_fit(rig, options, partial, kinds, progress, preliminary)
+        publish(partial, directory)
+    report = directory / "report.html"
+    if as_json:
+        say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
+    else:
+        table = table_text(result.summary, synthetic=rig.synthetic)
+        changes = wrapped(result.remarks)
+        say("\n".join([table, *changes, f"report: {report}", result.verdict]))
+    if result.clean:
+        return 0
+    print(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}", file=sys.stderr)
+    return 3
+
+
+#: Exit codes: a rig that cannot be fitted, a failed check, none of them.
+FAILED, NOT_CLEAN, CLEAN = 1, 3, 0
+#: Time between two looks at the tasks of a cluster, s.
+POLL = 0.1
+
+
+@dataclass(frozen=True)
+class FittedRig:
+    """A result as it comes from a worker: the content of its files by path, changes of the model, and the verdict."""
+
+    files: Mapping[str, bytes]
+    changes: str
+    verdict: str
+    clean: bool
+
+
+def fit_many(
+    rigs: Sequence[Rig], options: Options, root: Path, scheduler: str | None, kinds: Registry, progress: OnProgress
+) -> int:
+    """Fit every rig, write ``root``/<rig name> as soon as it is fitted, and print its verdict.
+
+    Returns
+    -------
+    0 where all verdicts are clean, 3 where a check failed, 1 where a rig could not be fitted; the others are fitted
+    all the same.
+
+    Raises
+    ------
+    InputError
+        If two rigs have one name, one of them is bad, or an output directory cannot be; then nothing is written.
+    """
+    twice = [name for name, number in Counter(rig.name.casefold() for rig in rigs).items() if number > 1]
+    if twice:
+        rule, remedy = "rigs that are fitted together must have different names", "change one name in rig.toml"
+        raise InputError(rule, twice[0], f"{remedy}, or name each folder once")
+    if (root / "parameters.json").exists():
+        rule = "the output directory of several rigs must be none of a result"
+        raise InputError(rule, "it holds parameters.json", "choose another --out", root)
+    for rig in rigs:
+        check_output(root / rig.name, options)
+        check_unfinished(root / rig.name)
+    prepare_jax(options, any(rig.has_runs for rig in rigs))
+    from capsule_id.report.messages import messages_of
+
+    messages_of(kinds)
+    for rig in rigs:
+        make_experiments(rig, options.experiments, kinds)
+    failures, unclean = list[str](), list[str]()
+    with client_of(scheduler) as client:
+        outcomes = _in_process(rigs, options, kinds) if client is None else _on_cluster(client, rigs, options)
+        progress(0, len(rigs), "rigs")
+        for done, (rig, found) in enumerate(outcomes, start=1):
+            stop_if_interrupted()
+            try:
+                if isinstance(found, Exception):
+                    raise found
+                _write(found, root / rig.name, fingerprint_of(rig, options, kinds))
+            except (InputError, OSError) as error:
+                failures.append(f"{rig.name} ({one_line(error)})")
+            except Exception as error:  # the other rigs are fitted all the same
+                failures.append(f"{rig.name} ({one_line(error)}; {save_traceback(error)})")
+            else:
+                say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}{found.changes}")
+                unclean += [rig.name] * (not found.clean)
+            progress(done, len(rigs), "rigs")
+    if not failures and not unclean:
+        return CLEAN
+    parts = [f"verdict not clean: {', '.join(unclean)}"] * bool(unclean)
+    parts += [f"{counted(len(failures), 'rig')} not fitted: {'; '.join(failures)}"] * bool(failures)
+    print(f"fit-params: {'; '.join(parts)}", file=sys.stderr)
+    return FAILED if failures else NOT_CLEAN
+
+
+def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> FittedRig:
+    """Fit one rig in a folder of its own; on a worker with the kinds installed there.
+
+    Raises
+    ------
+    RuntimeError
+        If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
+    """
+    prepare_jax(options, rig.has_runs)
+    from capsule_id.report.columns import wrapped
+
+    kinds = kinds or default_registry()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            result = write_fit(rig, options, folder, kinds, lambda *_: None)
+        except KeyboardInterrupt:
+            raise RuntimeError("interrupted") from None
+        files = {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in folder.rglob("*")
+            if path.is_file() and path.name not in WORK_FILES
+        }
+    changes = "".join(f"\n{line}" for line in wrapped(result.remarks))
+    return FittedRig(files, changes, result.verdict, result.clean)
+
+
+def _in_process(rigs: Sequence[Rig], options: Options, kinds: Registry) -> Iterator[tuple[Rig, FittedRig | Exception]]:
+    for rig in rigs:
+        yield rig, _outcome(lambda rig=rig: fitted_rig(rig, options, kinds))
+
+
+def _on_cluster(client: "Client", rigs: Sequence[Rig], options: Options) -> Iterator[tuple[Rig, FittedRig | Exception]]:
+    """Results as they arrive. The scheduler gives the rig of a worker that dies to another one."""
+    tasks = {client.submit(fitted_rig, rig, options, pure=False): rig for rig in rigs}
+    while tasks:
+        # A wait for the next result would not notice an interruption.
+        stop_if_interrupted()
+        for task in [task for task in tasks if task.done()]:
+            yield tasks.pop(task), _outcome(task.result)
+        time.sleep(POLL)
+
+
+def _outcome(result: Callable[[], FittedRig]) -> FittedRig | Exception:
+    try:
+        return result()
+    except Exception as error:
+        return error
+
+
+def _write(found: FittedRig, directory: Path, fingerprint: Mapping[str, object]) -> None:
+    with work_in_progress(directory, fingerprint, resume=False) as partial:
+        for name, content in found.files.items():
+            (partial / name).parent.mkdir(exist_ok=True)
+            (partial / name).write_bytes(content)
+        publish(partial, directory)

@@ -1,1 +1,0 @@
-"""Pushes, speed and distance slid: mu and v_s."""

@@ -1,1 +1,0 @@
-"""Checks of forced runs at a fit."""

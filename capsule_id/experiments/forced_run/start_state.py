@@ -1,0 +1,273 @@
+"""Starting values of a forced run from its record: state, drive, springs and friction."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import nnls
+
+from capsule_id.experiments.base import About, ValuesBySymbol
+from capsule_id.records.tones import noise_level, tone_at
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.forced_run.experiment import ForcedRun
+
+
+# slides: Starting values of spring, damper and friction from a record with both ends of the rod's spring.
+#
+# Where the capsule slides in one direction, its equation of motion is linear in the unknowns. Integrated twice from the
+# start of the slide, it needs no derivative of the record:
+#
+#     m2 X2 = k1 ∬(r + x0) + c ∫(r − r(0)) − sign(Y2) F t²/2 + a + b t,   r = x_base − x_capsule
+
+
+#: Samples whose mean speed tells whether the capsule slides: this share of a period.
+SMOOTHED = 1.0 / 30.0
+#: The capsule slides where its speed exceeds this share of its largest speed. Shortest slide, samples.
+SLIDING, SHORTEST_SLIDE = 0.2, 10
+#: Least starting value of the damping ratio of capsule and spring.
+LEAST_DAMPING = 1e-3
+
+
+class Slides(NamedTuple):
+    """Starting values, SI; ``extension``: of the spring where r = 0; ``speed``: mean of the sliding capsule."""
+
+    k1: float
+    c: float
+    friction: float
+    extension: float
+    speed: float
+
+
+def slides(time: np.ndarray, r: np.ndarray, X2: np.ndarray, period: float, m2: float) -> Slides | None:
+    """Estimate spring, damper and constant friction from the slides of a record; None where they do not determine them.
+
+    Parameters
+    ----------
+    time, r, X2 : (n,) s, m, m; r differs from the spring's extension by a constant
+    period : of the motion, s
+    m2 : mass of the capsule, kg
+    """
+    samples = max(3, round(SMOOTHED * period * len(time) / (time[-1] - time[0])))
+    rate = uniform_filter1d(np.gradient(X2, time), samples)
+    direction = np.where(np.abs(rate) > SLIDING * np.max(np.abs(rate)), np.sign(rate), 0.0)
+    edges = np.flatnonzero(np.diff(direction)) + 1
+    pieces = np.split(np.arange(len(time)), edges.tolist())
+    slides = [i for i in pieces if direction[i[0]] != 0.0 and len(i) >= SHORTEST_SLIDE]
+    own = [_slide(time[i], r[i], m2 * X2[i], float(direction[i[0]])) for i in slides]
+    if not own:
+        return None
+    rows = np.concatenate(own)
+    size = np.linalg.norm(rows, axis=0)
+    if not np.all(size > 0.0):
+        return None
+    # The constant part of the extension has either sign.
+    design = rows[:, [0, 1, 2, 2, 3]] * np.array([1.0, 1.0, 1.0, -1.0, 1.0]) / size[[0, 1, 2, 2, 3]]
+    found = nnls(design, rows[:, 4])[0] / size[[0, 1, 2, 2, 3]]
+    k1, c, force, friction = float(found[0]), float(found[1]), float(found[2] - found[3]), float(found[4])
+    if not (k1 > 0.0 and friction > 0.0):
+        return None
+    speed = float(np.mean(np.abs(rate[direction != 0.0])))
+    return Slides(k1, max(c, 2.0 * LEAST_DAMPING * float(np.sqrt(k1 * m2))), friction, force / k1, speed)
+
+
+def _slide(time: np.ndarray, r: np.ndarray, momentum: np.ndarray, direction: float) -> np.ndarray:
+    """(n, 5) coefficients of k1, c, k1 x0 and F, and ``momentum`` = m2 X2, of one slide, without its line in time."""
+    t = time - time[0]
+    once = cumulative_trapezoid(r, t, initial=0.0)
+    twice = cumulative_trapezoid(once, t, initial=0.0)
+    rows = np.stack([twice, once - r[0] * t, 0.5 * t**2, -0.5 * direction * t**2, momentum], axis=1)
+    line = np.linalg.qr(np.stack([np.ones_like(t), t], axis=1))[0]
+    return rows - line @ (line.T @ rows)
+
+
+# rough: Starting values of a forced run: state and drive at the first sample, estimated from the record.
+
+
+#: Number of samples of the polynomials through the start of the record. A line gives the capsule's speed, a parabola
+#: position and speed of the rod.
+LINE_SAMPLES, PARABOLA_SAMPLES = 4, 9
+#: The capsule counts as moving where its initial speed exceeds its standard error by this factor.
+MOVING = 4.0
+#: Frequency, rad/s, and damping ratio of the rod at the medians of the default priors. Without a current they give the
+#: lag of x_rel's fundamental behind the drive, which suffices as a starting value.
+ROD_FREQUENCY, ROD_DAMPING = 115.0, 0.16
+
+
+@dataclass(frozen=True)
+class RunStart:
+    """Starting values estimated from a record, SI.
+
+    Attributes
+    ----------
+    kind : "moving" where the capsule moves significantly at the first sample, else "stuck"
+    x_rel, rate, capsule_rate : m, m/s, m/s at the first sample; 0 where the channel is missing
+    length : amplitude of the rod's motion, m
+    amplitude : amplitude of the current, A (NaN where it is not recorded)
+    phase : phase of the drive, rad, in (-pi, pi]
+    noise : noise level by channel
+    """
+
+    kind: Literal["stuck", "moving"]
+    x_rel: float
+    rate: float
+    capsule_rate: float
+    length: float
+    amplitude: float
+    phase: float
+    noise: Mapping[str, float]
+
+    def at_rate(self, capsule_rate: float | None) -> "RunStart":
+        """The same values with another speed of the capsule, m/s, 0 for stuck; None: these."""
+        if capsule_rate is None:
+            return self
+        return replace(self, capsule_rate=capsule_rate, kind="stuck" if capsule_rate == 0.0 else "moving")
+
+
+@dataclass(frozen=True)
+class AboutRun(About):
+    """Inputs of a run that no likelihood reads.
+
+    Attributes
+    ----------
+    record : label of the whole record
+    leads : whether the run is a whole record, or the first part of one
+    start : kind of initial state
+    start_is_open : whether no kind of initial state is stated
+    rough : state and drive at the first sample, estimated from the record (the speed by the model, where available)
+    """
+
+    record: str = field(compare=False)
+    leads: bool = field(compare=False)
+    start: str = field(compare=False)
+    start_is_open: bool = field(compare=False)
+    rough: RunStart = field(compare=False)
+
+
+def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: float) -> RunStart:
+    """Estimate the starting values of a run.
+
+    Parameters
+    ----------
+    time : (n,) s
+    channels : by column name, (n,) each, SI; at least one
+    Omega : excitation frequency, rad/s
+    """
+    noise = {name: max(noise_level(y), 1e-5 * float(np.ptp(y)), 1e-12) for name, y in channels.items()}
+    amplitude, phase = float("nan"), 0.0
+    if "current" in channels:
+        amplitude, phase, _ = tone_at(time, channels["current"], Omega)
+    elif "x_rel" in channels:
+        ratio = Omega / ROD_FREQUENCY
+        lag = np.arctan2(2.0 * ROD_DAMPING * ratio, 1.0 - ratio**2)
+        phase = float(np.angle(np.exp(1j * (tone_at(time, channels["x_rel"], Omega)[1] + lag))))
+    x_rel = rate = 0.0
+    if "x_rel" in channels:
+        x_rel, rate = _polynomial(time, channels["x_rel"], PARABOLA_SAMPLES, 2)[0]
+        length = 0.5 * float(np.ptp(channels["x_rel"]))
+    elif "acceleration_rod" in channels:
+        # Contacts are short spikes, and quartiles are robust against them.
+        length = float(np.subtract(*np.quantile(channels["acceleration_rod"], [0.75, 0.25]))) / Omega**2
+    elif "x_capsule" in channels:
+        length = max(float(np.ptp(channels["x_capsule"])), 1e-4)
+    else:
+        length = 1e-3
+    capsule_rate, kind = 0.0, "stuck"
+    if "x_capsule" in channels:
+        (_, slope), factor = _polynomial(time, channels["x_capsule"], LINE_SAMPLES, 1)
+        if abs(slope) > MOVING * factor * noise["x_capsule"]:
+            capsule_rate, kind = slope, "moving"
+    return RunStart(kind, x_rel, rate, capsule_rate, length, amplitude, phase, noise)  # type: ignore[arg-type]
+
+
+def _polynomial(time: np.ndarray, values: np.ndarray, samples: int, order: int) -> tuple[tuple[float, float], float]:
+    """Value and rate at the first sample, of a polynomial through ``samples`` samples; sd of the rate per noise sd."""
+    samples = min(samples, len(time))
+    design = np.vander(time[:samples] - time[0], order + 1, increasing=True)
+    inverse = np.linalg.pinv(design)
+    coefficients = inverse @ values[:samples]
+    return (float(coefficients[0]), float(coefficients[1])), float(np.linalg.norm(inverse[1]))
+
+
+# restart: Test with the whole record whether the capsule is at rest at the first sample of a run.
+#
+# The first samples alone do not distinguish a slowly sliding capsule from one that is about to slip. Given the other
+# parameters, the later motion does.
+
+
+#: Trial speeds of the capsule at the first sample, m/s. Logarithmic spacing resolves slow and fast sliding.
+TRIAL_SPEEDS = np.concatenate([-np.geomspace(60e-3, 0.5e-3, 13), [0.0], np.geomspace(0.5e-3, 60e-3, 13)])
+#: Index of zero speed in ``TRIAL_SPEEDS``.
+ZERO_SPEED = 13
+#: Number of Gauss–Newton steps.
+GAUSS_NEWTON_STEPS = 5
+#: Steps of the difference quotients, and largest Gauss–Newton steps, of x_rel, m, and of the rod's speed, m/s.
+DIFFERENCE_STEPS, LARGEST_STEPS = (1e-8, 1e-6), (2e-4, 0.1)
+#: Smallest increase in log-likelihood over a capsule at rest for which the capsule counts as moving.
+LOG_LIKELIHOOD_RATIO = 3.0
+
+
+def corrected_start(run: "ForcedRun", theta: ValuesBySymbol) -> "tuple[ForcedRun, dict[str, float]] | None":
+    """Replace the kind of initial state of ``run``; also return values by name from which a fit continues.
+
+    None: the initial state is stated, x_capsule is not recorded, or no other initial state fits better.
+    """
+    if not run.about.start_is_open or "x_capsule" not in run.channels:
+        return None
+    better = better_start(run, theta)
+    if better is None:
+        return None
+    restarted = run.restarted(better["capsule_start"])
+    # A prescribed rod has no initial speed to sample, and a capsule at rest none either.
+    sampled = {row.symbol for row in restarted.parameters}
+    return restarted, {f"{symbol}[{run.label}]": value for symbol, value in better.items() if symbol in sampled}
+
+
+def better_start(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float] | None:
+    """Initial state, SI by symbol, that fits the whole record better than that of ``theta``; None: there is none.
+
+    capsule_start is 0 where it does not differ significantly from rest. For every trial speed, Gauss–Newton estimates
+    position and speed of the rod again, because they compensate much of the change. Other values are as in ``theta``.
+    """
+    moving, own = run.restarted(1.0), float(theta.get("capsule_start", 0.0))
+    speeds = np.append(TRIAL_SPEEDS, own)
+    rod = np.full((2, len(speeds)), [[theta["x_start"]], [theta.get("y_start", 0.0) + own]])
+    offsets = np.array([[0.0, 0.0], [DIFFERENCE_STEPS[0], 0.0], [0.0, DIFFERENCE_STEPS[1]]])
+    best, where = np.full(len(speeds), np.inf), rod
+    for _ in range(GAUSS_NEWTON_STEPS):
+        miss = np.stack([_misses(moving, theta, *one, speeds) for one in rod + offsets[..., None]])
+        squares = np.sum(miss[0] ** 2, axis=1)
+        better = squares < best
+        best, where = np.where(better, squares, best), np.where(better, rod, where)
+        slope = (miss[1:] - miss[0]) / np.array(DIFFERENCE_STEPS)[:, None, None]
+        normal = np.einsum("iln,jln->lij", slope, slope)
+        pull = np.einsum("iln,ln->li", slope, miss[0])
+        known = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(pull).all(axis=1)
+        normal, pull = np.where(known[:, None, None], normal, np.eye(2)), np.where(known[:, None], pull, 0.0)
+        step = -np.einsum("lij,lj->il", np.linalg.pinv(normal), pull)
+        rod = rod + np.clip(step, -np.array(LARGEST_STEPS)[:, None], np.array(LARGEST_STEPS)[:, None])
+    found = int(np.argmin(best))
+    if 0.5 * (best[ZERO_SPEED] - best[found]) < LOG_LIKELIHOOD_RATIO:
+        found = ZERO_SPEED
+    # The last speed is that of ``theta``.
+    same_kind = np.sign(speeds[found]) == (np.sign(own) if run.moves else 0.0)
+    if same_kind or (0.5 * (best[-1] - best[found]) < LOG_LIKELIHOOD_RATIO and speeds[found] != 0.0):
+        return None
+    x, Y1 = where[:, found].tolist()
+    speed = float(speeds[found])
+    return {"x_start": x, "y_start": Y1 - speed, "capsule_start": speed}
+
+
+def _misses(run: "ForcedRun", theta: ValuesBySymbol, x: np.ndarray, Y1: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """(lanes, readings) residuals of the channels that depend on the motion, without offsets, in units of noise."""
+    lanes = {name: np.full(len(x), value) for name, value in theta.items() if np.ndim(value) == 0}
+    seen = run.predict({**lanes, "x_start": x, "y_start": Y1 - speeds, "capsule_start": speeds}, np)
+    parts = []
+    for values, model, name in zip(run.values, seen, run.channels, strict=True):
+        if name != "current":
+            miss = (values - model) / theta[f"noise_{name}"]
+            parts.append(miss - np.mean(miss, axis=1, keepdims=True))
+    return np.concatenate(parts, axis=1)

@@ -1,0 +1,436 @@
+"""Readings of free decays: channels, block means, settings, and the window that contains the decay."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.parameters import Parameter, scatter
+from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, phasor
+from capsule_id.records.release import FreeDecay, find_free_decay
+from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part, median_step, sampling_step
+from capsule_id.rig.model import Quantity, Table
+from capsule_id.rig.schema import CountRule, GroundSettings, NameRule, QuantityRule, WordsRule
+from capsule_id.rig.tables import Entry
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE
+from capsule_id.views import Facts, Finding, Message
+
+# channels: Channels of a free decay: the displacement x_rel, its rate, or the rod's absolute acceleration.
+#
+# The capsule is at rest, so the rate of x_rel is the rod's velocity, and its second derivative the rod's
+# acceleration. A
+# constant part, such as the component of gravity along the sensor's axis, is the offset that every fit integrates out.
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One recorded quantity: ``order`` of the time derivative of x_rel, and the noise of a sample."""
+
+    order: int
+    noise: Parameter
+
+    def deflection(self, omega: float) -> float:
+        """x_rel at a turning point over the peak of the channel that belongs to it, at ``omega`` rad/s; SI."""
+        return (1.0, 1.0 / omega, -1.0 / omega**2)[self.order]
+
+
+#: By column, in the order of the derivative, which is the order in which the channels of a file are fitted.
+CHANNELS = {
+    "x_rel": Channel(0, scatter("noise_sd", "m", "noise of a record", r"\sigma")),
+    "velocity": Channel(1, scatter("noise_velocity", "m/s", "noise of a velocity record", r"\sigma_v")),
+    "acceleration": Channel(2, scatter("noise_acceleration", "m/s^2", "noise of an acceleration record", r"\sigma_a")),
+}
+
+
+def channel_of(table: Table) -> str:
+    """Column of the first channel of ``table``."""
+    return next(name for name in CHANNELS if name in table.columns)
+
+
+# kinematics: Finding on the columns of a free decay: each further channel must be a derivative of the first one.
+
+
+#: Admissible ratio of a channel to the derivative of the first one, at the frequency of the decay.
+LOWEST, HIGHEST = 0.5, 2.0
+#: Name of a derivative by its order.
+DERIVATIVES = {1: "derivative", 2: "second derivative"}
+
+
+def lint_kinematics(table: Table[Any], used: slice, period: float) -> Iterable[Finding]:
+    """Report channels that contradict each other at the frequency 1/``period`` of the decay, Hz."""
+    first, *others = [name for name in CHANNELS if name in table.columns]
+    time, Omega = table["time"][used], 2.0 * np.pi / period
+    if table.settings.capsule != "held" or time[-1] - time[0] < FEWEST_PERIODS * period:
+        return
+    lower = phasor(time, table[first][used], Omega)
+    for name in others:
+        higher = phasor(time, table[name][used], Omega)
+        order = CHANNELS[name].order - CHANNELS[first].order
+        ratio = derivative_ratio(lower, higher, Omega, order).real
+        seen = all(abs(one.value) > SIGN_ERRORS * one.sd for one in (lower, higher))
+        if seen and not LOWEST <= ratio <= HIGHEST:
+            facts = {"file": table.file, "name": name, "first": first, "order": order, "ratio": ratio}
+            yield Finding("decays.kinematics", "fail", facts, table.label)
+
+
+def _contradiction(facts: Facts) -> str:
+    """The ratio of the two columns, and what to check."""
+    check = "Check the units of both columns."
+    if -HIGHEST <= facts["ratio"] <= -LOWEST:
+        check = "One of them has the wrong sign: map it with scale = -1."
+    return (
+        f"{facts['file']}: {facts['name']} must be the {DERIVATIVES[facts['order']]} of {facts['first']}; at the frequency "
+        f"of the decay it is {facts['ratio']:.3g} times that ({LOWEST:g} to {HIGHEST:g} allowed). {check} Or leave one of "
+        f"them out."
+    )
+
+
+KINEMATIC_MESSAGES = {"decays.kinematics": Message("columns of a decay", fail=_contradiction)}
+
+
+# blocks: Block means of a record: few readings that hold nearly all of its information on a decay.
+#
+# A block of an evenly sampled record is ``size`` consecutive readings. An unevenly sampled record is divided into
+# intervals of ``size`` median steps, with any number of readings. The model's block mean is the two-point Gauss rule of
+# the reading times themselves, so it is exact for cubics of the time, at any sampling. Its error relative to the
+# amplitude
+# is below (omega W)^4/4320 for blocks of duration W, and 0.0026 (omega W)^2 of twice F_dry/k1 where a rod with dry
+# friction turns inside the block. At ``READINGS_PER_PERIOD`` these are 4e-7 and 1e-4.
+
+
+#: Block means per period that replace a long record; with more, a decay's parameters gain less than 0.5 % in precision.
+READINGS_PER_PERIOD = 32
+#: Shorter records, in samples, are used whole; a block has at least two samples. Records of so many periods that more block
+#: means are left than this have fewer per period, but at least so many: intervals are then some 3 % wider.
+LONGEST_WHOLE, FEWEST_PER_PERIOD = 2000, 8
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Means of N blocks of readings.
+
+    Attributes
+    ----------
+    time, values : (N,) means of the times, s, and of the readings
+    first, last : (N,) times of the first and the last reading of each block, s
+    count : (N,) readings of each block
+    nodes, weights : (N, q) s and 1: the block mean of a smooth function is the sum of its weighted values at the nodes
+    """
+
+    time: np.ndarray
+    values: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    count: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+
+
+def block_means(time: np.ndarray, values: np.ndarray, size: int, by_sample: bool = False) -> Blocks:
+    """Divide a record into blocks of ``size`` samples; 1 leaves it as it is.
+
+    Parameters
+    ----------
+    time, values : (n,) s, increasing, and readings. The last samples of an even record may not fill a block; they are
+        left out
+    by_sample : take every sample as a node. A velocity with dry friction has kinks and an acceleration jumps, so two
+        nodes do not suffice
+    """
+    if size == 1:
+        one = np.ones((len(time), 1))
+        return Blocks(time, values, time, time, one[:, 0], time[:, None], one)
+    if not is_even(time):
+        width = size * median_step(time)
+        number = np.unique(((time - time[0]) // width).astype(int), return_inverse=True)[1]
+        return _means(time, values, number, by_sample)
+    samples, step = len(time) // size * size, max(PIECE // size, 1) * size
+    parts = []
+    for first in range(0, samples, step):
+        part = slice(first, min(first + step, samples))
+        parts.append(_means(time[part], values[part], np.arange(part.stop - first) // size, by_sample))
+    return Blocks(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Blocks)))
+
+
+def _means(time: np.ndarray, values: np.ndarray, number: np.ndarray, by_sample: bool) -> Blocks:
+    """Means of the readings with each ``number`` (n,), which counts blocks from 0."""
+    count = np.bincount(number).astype(float)
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        return np.bincount(number, weights=x) / count
+
+    middle = mean(time)
+    offset = time - middle[number]
+    variance = mean(offset**2)
+    lone = variance == 0.0
+    variance[lone] = 1.0
+    skew = np.where(lone, 0.0, mean(offset**3) / variance)
+    root = np.sqrt(skew**2 + 4.0 * variance)
+    sides = 0.5 * np.stack([skew + root, skew - root], axis=1)
+    weights = np.stack([-sides[:, 1], sides[:, 0]], axis=1) / root[:, None]
+    sides[lone] = 0.0
+    nodes = middle[:, None] + sides
+    edges = np.flatnonzero(np.diff(number, prepend=-1, append=number[-1] + 1))
+    first, last = time[edges[:-1]], time[edges[1:] - 1]
+    if by_sample:
+        place = np.arange(int(np.max(count)))[None]
+        inside = place < count[:, None]
+        nodes = time[np.where(inside, edges[:-1, None] + place, edges[:-1, None])]
+        weights = inside / count[:, None]
+    return Blocks(middle, mean(values), first, last, count, nodes, weights)
+
+
+def is_even(time: np.ndarray) -> bool:
+    """Whether the record is evenly sampled, as filters require."""
+    try:
+        sampling_step(time)
+    except InputError:
+        return False
+    return True
+
+
+def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READINGS_PER_PERIOD) -> int:
+    """Samples per block that leave about ``per_period`` readings a period; 1 for a record that does not oscillate."""
+    part = loudest_part(values)
+    time, values = time[part], values[part]
+    grid = np.linspace(time[0], time[-1], len(time))
+    try:
+        period = 1.0 / dominant_frequency(grid, np.interp(grid, time, values))
+    except (InputError, ZeroDivisionError):
+        return 1
+    return max(1, int(period / per_period / median_step(time)))
+
+
+def default_block_size(time: np.ndarray, values: np.ndarray) -> int:
+    """Samples per block where the settings do not state it: 1 for records of at most ``LONGEST_WHOLE`` samples."""
+    if len(time) <= LONGEST_WHOLE:
+        return 1
+    size = block_size(time, values)
+    if len(time) <= size * LONGEST_WHOLE:
+        return size
+    return max(size, min(len(time) // LONGEST_WHOLE, block_size(time, values, FEWEST_PER_PERIOD)))
+
+
+def block_mean(values: Any, weights: Any, xp: Any) -> Any:
+    """Block means (N, ...) of a function from its values (N q, ...) at the nodes, row by row."""
+    shape = (*weights.shape, *values.shape[1:])
+    return xp.einsum("nq,nq...->n...", weights, xp.reshape(values, shape))
+
+
+# settings: Settings of a free vibration, the model that they state, and the window that contains the free decay.
+
+
+#: Parameter of every damping term besides the viscous one, and of the cubic spring.
+DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
+
+#: Parameters of all forces besides those of the linear model.
+FURTHER = (*DAMPING.values(), "k_cubic")
+#: What every parameter of a further force stands for, in words.
+EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
+#: Periods of a record that a model with further forces, correlated noise or a Gaussian-process drift is fitted to, at most:
+#: its evaluations take milliseconds then.
+MOST_PERIODS = 250
+_DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
+_NOISES = {"ar1": "coloured noise (AR(1))", "arma": "white and coloured noise (ARMA)"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecaySettings(GroundSettings):
+    """Settings of a free vibration, SI.
+
+    Absent words of the model stand for viscous damping, a linear spring, no drift and white noise. Where the record
+    contradicts that, a second fit may choose others (``capsule_id.experiments.free_vibration.second_fit``).
+    """
+
+    start: Annotated[float | None, QuantityRule("s", ANY)] = None
+    stop: Annotated[float | None, QuantityRule("s", ANY)] = None
+    capsule: Literal["held", "free"] = "held"
+    damping: Annotated[tuple[str, ...] | None, WordsRule(("viscous", *DAMPING))] = None
+    stiffness: Literal["linear", "cubic"] | None = None
+    drift: Literal["none", "linear", "gp"] | None = None
+    noise: Literal["white", "ar1", "arma"] | None = None
+    thin: Annotated[int | None, CountRule()] = None
+    samples: Literal["record", "turning_points"] = "record"
+    smoothing_window: Annotated[float | None, QuantityRule("s")] = None
+    spring: Annotated[str | None, NameRule()] = None
+    gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
+    forward: Literal["closed", "capsule"] = "closed"
+
+    @property
+    def offers_cubic(self) -> bool:
+        """Whether a cubic spring may be fitted where no stiffness is stated: on a slope it is refused."""
+        return "slope" not in self.ground
+
+
+def check_ground(entry: Entry[DecaySettings]) -> None:
+    """Refuse a slope that the closed form does not have: of a held capsule it shifts the rest position alone."""
+    settings = entry.table.settings
+    if settings.forward == "capsule":
+        return
+    if settings.stiffness == "cubic":
+        entry.refuse_ground("slope", "a decay with a cubic spring must be on level ground")
+    if settings.capsule == "free":
+        for key in ("slope", "N0"):
+            entry.refuse_ground(key, f'the closed form of a free capsule has no {key}; forward = "capsule" has')
+
+
+@dataclass(frozen=True)
+class DecayModel:
+    """Forces of a free decay besides the viscous damping and the linear spring, drift and noise of its record.
+
+    Attributes
+    ----------
+    damping : words of ``DAMPING``, in that order
+    cubic : whether the spring has a cubic term
+    drift, noise : as in ``DecaySettings``
+    thin : the likelihood uses means of so many consecutive samples
+    """
+
+    damping: tuple[str, ...] = ()
+    cubic: bool = False
+    drift: str = "none"
+    noise: str = "white"
+    thin: int = 1
+
+    @classmethod
+    def stated(cls, settings: DecaySettings) -> "DecayModel":
+        """Return the model that ``settings`` state; without ``thin`` it uses every sample."""
+        damping = tuple(word for word in DAMPING if word in (settings.damping or ()))
+        return cls(
+            damping,
+            settings.stiffness == "cubic",
+            settings.drift or "none",
+            settings.noise or "white",
+            settings.thin or 1,
+        )
+
+    @property
+    def lines(self) -> str:
+        """Lines of ``rig.toml`` that state the model."""
+        return f'{self.force_lines}, drift = "{self.drift}", noise = "{self.noise}", thin = {self.thin}'
+
+    @property
+    def force_lines(self) -> str:
+        """Lines of ``rig.toml`` that state the forces."""
+        return f"{self.damping_line}, {self.stiffness_line}"
+
+    @property
+    def damping_line(self) -> str:
+        """Line of ``rig.toml`` that states the damping."""
+        words = ", ".join(f'"{word}"' for word in ("viscous", *self.damping))
+        return f"damping = [{words}]"
+
+    @property
+    def stiffness_line(self) -> str:
+        """Line of ``rig.toml`` that states the spring."""
+        word = "cubic" if self.cubic else "linear"
+        return f'stiffness = "{word}"'
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """Symbols of the parameters besides k1 and c."""
+        return (*(DAMPING[word] for word in self.damping), *(("k_cubic",) if self.cubic else ()))
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Symbols of the forces that the model lacks."""
+        return tuple(symbol for symbol in FURTHER if symbol not in self.symbols)
+
+    @property
+    def _terms(self) -> set[str]:
+        """Everything that the model adds to the simplest one."""
+        noise = {"white": (), "ar1": ("ar1",), "arma": ("ar1", "white")}[self.noise]
+        return {*self.symbols, *noise, *(() if self.drift == "none" else (self.drift,))}
+
+    @property
+    def size(self) -> int:
+        """Number of terms that it adds to the simplest model; a model contains only smaller ones."""
+        return len(self._terms)
+
+    def nested_in(self, other: "DecayModel") -> bool:
+        """Whether ``other`` contains this model."""
+        return self._terms < other._terms
+
+    @property
+    def slow(self) -> bool:
+        """Whether an evaluation takes a time in proportion to the length of the record."""
+        return bool(self.symbols) or self.whitened
+
+    @property
+    def whitened(self) -> bool:
+        """Whether noise or drift correlate the readings."""
+        return self.noise != "white" or self.drift == "gp"
+
+    @property
+    def shapes(self) -> tuple[str, ...]:
+        """Symbols of the shape parameters of noise and drift."""
+        noise = {"white": (), "ar1": ("noise_time",), "arma": ("noise_time", "white_ratio")}[self.noise]
+        return (*noise, *(("drift_ratio", "drift_time") if self.drift == "gp" else ()))
+
+    @property
+    def additions(self) -> list[str]:
+        """Effects of the model that the default lacks, in words."""
+        words = [EFFECTS[symbol] for symbol in self.symbols]
+        return words + (["drift of the zero"] if self.drift != "none" else [])
+
+    @property
+    def name(self) -> str:
+        """Words for tables and legends."""
+        words = [" + ".join(("viscous", *self.damping)) + " damping"]
+        words += ["cubic spring"] if self.cubic else []
+        words += [_DRIFTS[self.drift]] if self.drift != "none" else []
+        words += [_NOISES[self.noise]] if self.noise != "white" else []
+        words += [f"means of {self.thin} samples"] if self.thin > 1 else []
+        return ", ".join(words)
+
+
+def window_of(table: Table) -> slice:
+    """The rows from ``start`` to ``stop`` inclusive, which a fit reads; default: all."""
+    time, settings = table["time"], table.settings
+    first = 0 if settings.start is None else int(np.searchsorted(time, settings.start, side="left"))
+    last = len(time) if settings.stop is None else int(np.searchsorted(time, settings.stop, side="right"))
+    return slice(first, max(first, last))
+
+
+def decay_window(table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Return (time, channel) of a free vibration, SI, from ``start`` to ``stop`` inclusive; default: the whole record."""
+    inside = window_of(table)
+    return table["time"][inside], table[channel_of(table)][inside]
+
+
+def stated_model(table: Table) -> DecayModel:
+    """Return the model that the settings of ``table`` state; a long record is thinned where they leave that open."""
+    model = DecayModel.stated(table.settings)
+    if table.settings.thin is not None:
+        return model
+    return replace(model, thin=default_block_size(*decay_window(table)))
+
+
+def first_periods(table: Table[DecaySettings]) -> Table[DecaySettings]:
+    """Return the table with a stop after ``MOST_PERIODS``, where none is stated and the record is longer."""
+    time, values = decay_window(table)
+    last = MOST_PERIODS * block_size(time, values, 1.0)
+    if table.settings.stop is not None or last >= len(time) or block_size(time, values, 1.0) == 1:
+        return table
+    return replace(table, settings=replace(table.settings, stop=float(time[last])))
+
+
+def release_time(decay: FreeDecay) -> float:
+    """Start of a free decay, s, in hundredths of its period; none of what comes before it is left in."""
+    size = 10.0 ** max(0, int(np.ceil(-np.log10(0.01 * decay.period))))
+    return float(np.ceil(decay.start * size - 1e-6)) / size
+
+
+def cut_at_release(table: Table[DecaySettings]) -> Table[DecaySettings]:
+    """Return the table with the release found in its record as ``start``, where there is rest before it.
+
+    A stated ``start`` stays, and a table of turning points has no rest.
+    """
+    settings = table.settings
+    if settings.start is not None or settings.samples != "record":
+        return table
+    decay = find_free_decay(*decay_window(table), displacement=channel_of(table) == "x_rel")
+    if decay is None or decay.rest == 0.0:
+        return table
+    return replace(table, settings=replace(settings, start=release_time(decay)))

@@ -1,1 +1,0 @@
-"""Second fit of free decays whose record contradicts the stated model."""

@@ -1,0 +1,383 @@
+"""Calibration lines: shared declarations, the line y = y0 + slope x, and its lack of fit."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from types import ModuleType
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, band
+from capsule_id.experiments.checks import LEVEL, refit
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.kind import Values
+from capsule_id.experiments.lint import lint_reading_errors, lint_rows
+from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
+from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.rig.model import Column, Rig, Table
+from capsule_id.rig.tables import Entry
+from capsule_id.views import Comparison, Curve, Finding, Message, Points, ResultTable
+
+# line: Shared declarations of calibration lines: rule on reading errors, the paper's straight line, lint.
+
+
+MESSAGES = {
+    "lines.rise": Message(
+        "linearity",
+        fail="{name} is positive, but the line falls: {slope:.3g} {unit}. Check the signs of {x} and {y}.",
+    ),
+    "lines.straight": Message(
+        "linearity",
+        ok="no bend in {number:# calibration line}",
+        fail=(
+            "expected a straight line; a parabola departs from it by {departure:.1%} of the range at mid range "
+            "({p:p}), so {name} depends on where it is read. Use the part of the range that the runs use."
+        ),
+    ),
+    "lines.replicates": Message(
+        "repeated readings",
+        ok="the means of repeated readings lie on {number:# calibration line}",
+        fail=(
+            "expected the means of repeated readings on the line; they deviate by {deviation:.1f} sd of a reading "
+            "({p:p}), so {name} has errors that repetition does not show. Set {x} anew before each reading, and check "
+            "for hysteresis."
+        ),
+    ),
+    "lines.two_rows": Message(
+        "scatter of calibration lines",
+        warn=(
+            "two readings show nothing of their own scatter, so the sd of {name} follows from an assumed one. State {y}_sd, "
+            "or measure more rows."
+        ),
+    ),
+    "lines.step": Message(
+        "scatter of calibration lines",
+        warn=(
+            "the readings lie closer to the line than their step, so the sd of {name} follows from the step of their digits, "
+            "{step:g} {unit}. State {y}_resolution or {y}_sd."
+        ),
+    ),
+    "lines.slopes": Message(
+        "Calibration lines",
+        caption=(
+            "Slopes by generalised least squares. The ordinary line is the paper's estimate. Flagged rows are shown, not "
+            "dropped."
+        ),
+    ),
+}
+
+
+def line_estimates(experiments: Sequence["Line"]) -> Values:
+    """Return the slopes of ordinary straight lines, by name; the mean over tables."""
+    slopes: dict[str, list[float]] = {}
+    for e in experiments:
+        slopes.setdefault(e.slope.name, []).append(e.ordinary_line()[0])
+    return {name: float(np.mean(values)) for name, values in slopes.items()}
+
+
+def refuse_idle_sd_ratio(entry: Entry[Any]) -> None:
+    """Reject ``sd_ratio`` where both reading errors are stated, because they already define the ratio.
+
+    Raises
+    ------
+    InputError
+        If ``sd_ratio`` and both reading errors are stated.
+    """
+    columns = entry.table.columns
+    if entry.table.settings.sd_ratio is not None and all(column.sd is not None for column in columns.values()):
+        one, other = (f"{name}_sd" for name in sorted(columns, key=lambda name: name != "force"))
+        rule = f"state sd_ratio or both of {one} and {other}"
+        raise entry.error("sd_ratio", rule, "all three", "remove sd_ratio", of_key=True)
+
+
+def lint_line(table: Table[Any], rig: Rig) -> Iterable[Finding]:
+    """Report few rows and missing reading errors."""
+    yield from lint_rows(table, rig, 5)
+    if table.settings.sd_ratio is None:
+        yield from lint_reading_errors(table, rig)
+
+
+# line replicates: Lack of fit of a calibration line against the scatter of repeated readings.
+
+
+#: Values of x closer than this count as repeated, relative to their range.
+SAME = 1e-9
+#: Smallest deviation of the levels from the line that counts, in sd of the repeated readings.
+SMALLEST_DEVIATION = 0.5
+
+
+def check_replicates(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Check that the means of repeated readings lie on the line (F test; Draper & Smith 1998, section 2.1)."""
+    judged, findings = 0, []
+    for e in lines:
+        keep = np.setdiff1d(np.arange(e.n), fit.flagged.get(e.label, []))
+        found = lack_of_fit(e.x[keep], e.y[keep])
+        if found is None:
+            continue
+        judged += 1
+        deviation, p = found
+        if p * len(lines) < LEVEL and deviation > SMALLEST_DEVIATION:
+            facts = {"name": e.slope.name, "x": e.x_name, "deviation": deviation, "p": p}
+            findings.append(Finding("lines.replicates", "fail", facts, e.label))
+    return findings or [Finding("lines.replicates", "ok", {"number": judged})] * bool(judged)
+
+
+def lack_of_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
+    """Deviation of the levels from the line, in sd of repeated readings, and p-value; None without repetitions."""
+    order = np.argsort(x, kind="stable")
+    level = np.concatenate([[0], np.cumsum(np.diff(x[order]) > SAME * np.ptp(x))])
+    count = np.bincount(level)
+    levels, freedom = len(count), len(x) - len(count)
+    if levels < 3 or freedom < 3:
+        return None
+    mean = np.bincount(level, y[order]) / count
+    within = float(np.sum((y[order] - mean[level]) ** 2)) / freedom
+    total = np.polyval(np.polyfit(x, y, 1), x[order])
+    between = float(np.sum((mean[level] - total) ** 2)) / (levels - 2)
+    if within == 0.0:
+        return None
+    size = len(x) / levels
+    return float(np.sqrt(max(between / within - 1.0, 0.0) / size)), float(
+        stats.f.sf(between / within, levels - 2, freedom)
+    )
+
+
+# line experiment: Calibration line y = y0 + slope x, shared by motor current and support spring.
+#
+# Both columns have errors where both reading errors, or their ratio, are stated. Otherwise the model has one total
+# scatter about the line, in addition to any stated reading error. The true point of a reading is integrated out along
+# the line. Its prior is flat in length, in units of the reading errors, so that neither column is preferred. Where one
+# reading error alone is stated, it is flat in x, because the other error is not known.
+# The slope is then that of orthogonal (Deming) regression (Hogg, Bovy & Lang 2010, section 7; Fuller 1987, section
+# 1.3).
+# A prior flat in x would bias the slope towards ordinary least squares, by -(sd_x / sd of the x's)^2 relative. The
+# intercept is integrated out under a wide normal prior.
+
+
+#: Default prior of a scatter: log-normal, median 1 % of the range of y, factor 100.
+SCATTER_MEDIAN, SCATTER_FACTOR = 0.01, 100.0
+#: Its factor where the table has too few rows to show any scatter.
+SCATTER_FACTOR_OF_FEW = 3.0
+
+
+def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Check that calibration lines rise and are straight, without flagged rows."""
+    findings = []
+    for e in lines:
+        theta, left_out = e.local(fit.values), fit.flagged.get(e.label, [])
+        # One outlier can tilt the whole line. The outlier check reports it, so it is excluded here.
+        slope = refit(e, theta, left_out)[e.symbol][0]
+        if slope <= 0.0:
+            facts = {"name": e.slope.name, "slope": slope, "unit": e.slope.unit, "x": e.x_name, "y": e.y_name}
+            findings.append(Finding("lines.rise", "fail", facts, e.label))
+            continue
+        bend, p = curvature_test(e, theta, left_out)
+        if p * len(lines) < LEVEL:
+            facts = {"name": e.slope.name, "departure": bend, "p": p}
+            findings.append(Finding("lines.straight", "fail", facts, e.label))
+    return findings or [Finding("lines.straight", "ok", {"number": len(lines)})]
+
+
+def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
+    """Report lines whose scatter the readings do not show: two rows, or readings closer to the line than their step."""
+    del fit
+    findings = []
+    for e in lines:
+        column = e.y_column
+        if e.errors_known or (e.n > 2 and e.step == 0.0) or (column.sd is not None and e.n < 3):
+            continue
+        code = "lines.two_rows" if e.n < 3 else "lines.step"
+        facts = {"y": e.y_name, "unit": column.unit, "step": e.step * column.to_display, "name": e.slope.name}
+        findings.append(Finding(code, "warn", facts, e.label, (e.slope.name,)))
+    return findings
+
+
+def curvature_test(line: "Line", theta: ValuesBySymbol, left_out: Sequence[int]) -> tuple[float, float]:
+    """Test a calibration line for curvature: relative deviation of the best parabola at mid range, and p-value."""
+    misfit = line.misfit(theta)
+    keep = np.setdiff1d(np.arange(line.n), left_out)
+    x, sd = line.x[keep], misfit.sd[keep]
+    if len(keep) < 4 or len(np.unique(x)) < 3:
+        return 0.0, 1.0
+    z = (x - np.mean(x)) / np.ptp(x)
+    columns = np.stack([np.ones_like(z), z, z**2], axis=1) / sd[:, None]
+    y = line.y[keep] / sd
+    coefficients, *_ = np.linalg.lstsq(columns, y, rcond=None)
+    rest = y - columns @ coefficients
+    covariance = np.linalg.inv(columns.T @ columns)
+    freedom = len(keep) - 3
+    variance = 1.0 if line.scale_known else float(rest @ rest) / max(freedom, 1)
+    score = abs(coefficients[2]) / np.sqrt(max(variance * covariance[2, 2], 1e-300))
+    p = 2.0 * (stats.norm.sf(score) if line.scale_known else stats.t.sf(score, max(freedom, 1)))
+    return float(coefficients[2] * 0.25 / abs(coefficients[1])), float(p)
+
+
+def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
+    """Compare the slopes with and without flagged rows and the paper's ordinary line."""
+    rows = []
+    for e in lines:
+        theta, left_out = e.local(fit.values), fit.flagged.get(e.label, [])
+        value, sd = refit(e, theta, [])[e.symbol]
+        row: dict[str, object] = {
+            "table": e.label,
+            "slope": f"{e.slope.name}, {e.slope.unit}",
+            "all rows": value,
+            "±": sd,
+            "ordinary line": e.ordinary_line()[0],
+        }
+        if fit.flagged:
+            without = refit(e, theta, left_out)[e.symbol] if left_out else (np.nan, np.nan)
+            row |= {"without flagged rows": without[0], "± without": without[1]}
+        rows.append(row | e.table_extras() | {"errors": e.errors})
+    return [ResultTable("lines.slopes", pd.DataFrame(rows).set_index("table"))]
+
+
+class Line(Experiment):
+    """A line y against x; subclasses name the columns and the slope.
+
+    Attributes
+    ----------
+    x, y : (n,) readings, SI
+    x_sd, y_sd : stated reading errors, SI
+    width : sd of the intercept's prior, SI
+    sd_ratio : stated ratio of both errors; None: not stated
+    step : step of the last digit of y, SI, where it exceeds the scatter about the line and no error of y is stated; else 0
+    symbol : symbol of the slope
+    errors_known : whether both reading errors are stated
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    x_sd: float
+    y_sd: float
+    width: float
+    sd_ratio: float | None
+    step: float
+    symbol: str = eqx.field(static=True)
+    x_name: str = eqx.field(static=True)
+    y_name: str = eqx.field(static=True)
+    errors_known: bool = eqx.field(static=True)
+
+    #: SI unit of y.
+    unit_of_y: ClassVar[str] = "N"
+    estimates_may_be_negative = True
+    checks = (check_linearity, check_replicates, check_scatter)
+    tables = (line_table,)
+
+    def __init__(self, table: Table, rig: Rig, x: str, y: str, slope: Parameter, sd_ratio: float | None) -> None:
+        self.x_name, self.y_name, self.symbol = x, y, slope.symbol
+        x_column, y_column = table.columns[x], table.columns[y]
+        self.x, self.y = x_column.values, y_column.values
+        self.x_sd, self.y_sd = x_column.reading_sd, y_column.reading_sd
+        size = float(np.ptp(self.y))
+        self.width = NUISANCE_WIDTH * size
+        self.sd_ratio = sd_ratio
+        self.errors_known = x_column.sd is not None and y_column.sd is not None
+        step = y_column.unstated_step
+        self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
+        self.y_sd = max(self.y_sd, self.step / np.sqrt(12.0))
+        factor = SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
+        row = parameter("scatter", table.label, Prior("lognormal", SCATTER_MEDIAN * size, factor))
+        scatter = replace(row, unit=self.unit_of_y)
+        self.about = About(table, rig, (slope,) if self.errors_known else (slope, scatter))
+
+    @property
+    def slope(self) -> Parameter:
+        return self.parameters[0]
+
+    @property
+    def scale_known(self) -> bool:
+        return self.errors_known
+
+    @property
+    def scatters(self) -> tuple[str | None, ...]:
+        return (None,) if self.errors_known else ("scatter",)
+
+    @property
+    def x_column(self) -> Column:
+        return self.table.columns[self.x_name]
+
+    @property
+    def y_column(self) -> Column:
+        return self.table.columns[self.y_name]
+
+    @property
+    def errors(self) -> str:
+        """Error model in words, for the report."""
+        if self.errors_known:
+            return "errors in both columns, as stated"
+        if self.sd_ratio is not None:
+            return "errors in both columns, their ratio as stated, their size estimated"
+        return "one total scatter about the line (the reading errors of both columns are not stated)"
+
+    def table_extras(self) -> dict[str, float]:
+        """Additional columns of the table of calibration lines, name with unit -> number."""
+        return {}
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.y
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        slope, design = theta[self.symbol], self.width * xp.ones((self.n, 1))
+        # Readings scatter in y, and in x where the ratio of both errors is stated.
+        across = 0.0 if self.sd_ratio is None else (slope / self.sd_ratio) ** 2
+        estimated = 0.0 if self.errors_known else 1.0
+        fixed, scale = self.y_sd**2 + slope**2 * self.x_sd**2, estimated * xp.sqrt(1.0 + across)
+        # The ratio of both errors must not depend on the scatter: its density would then have no upper limit at 0.
+        ordinate = None
+        if self.errors_known:
+            ordinate = self.y_sd**2, 0.0
+        elif self.sd_ratio is not None:
+            ordinate = fixed / (1.0 + across), 1.0
+        return (Misfit(self.y - slope * self.x, fixed, scale, design, ordinate),)
+
+    def intercept(self, theta: ValuesBySymbol) -> float:
+        """Conditional mean of y0, SI."""
+        return float(self.nuisance_mean(theta)[0] * self.width)
+
+    def ordinary_line(self) -> tuple[float, float, float]:
+        """Slope, intercept and residual sd of ordinary least squares, the paper's fit; slope 0 at one level of x."""
+        x, y = self.x - np.mean(self.x), self.y - np.mean(self.y)
+        slope = x @ y / (x @ x) if x @ x > 0.0 else 0.0
+        intercept = np.mean(self.y) - slope * np.mean(self.x)
+        rest = y - slope * x
+        return float(slope), float(intercept), float(np.sqrt(rest @ rest / max(self.n - 2, 1)))
+
+    def starts(self) -> dict[str, Start]:
+        slope, _, sd = self.ordinary_line()
+        starts = {self.slope.name: Start(abs(slope), 0.4)}
+        if not self.errors_known:
+            starts[f"scatter[{self.label}]"] = Start(max(sd, 1e-6 * float(np.ptp(self.y))), 0.3)
+        return starts
+
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+        x_unit, y_unit = self.x_column.to_display, self.y_column.to_display
+        low, high = np.min(self.x), np.max(self.x)
+        x = np.linspace(low - 0.04 * (high - low), high + 0.04 * (high - low), 60)
+
+        def line(values: ValuesBySymbol) -> np.ndarray:
+            return (self.intercept(values) + values[self.symbol] * x) * y_unit
+
+        lower, upper = band(np.array([line(draw) for draw in draws]))
+        slope, intercept, _ = self.ordinary_line()
+        curves = (
+            Curve("this fit", x * x_unit, line(theta), lower, upper),
+            Curve("the paper's fit", x * x_unit, (intercept + slope * x) * y_unit, role="paper"),
+        )
+        y_error = np.full(self.n, self.y_column.sd * y_unit) if self.y_column.sd else None
+        return Comparison(
+            self.kind,
+            self.label,
+            f"{self.label}: {self.y_column.name} against {self.x_column.name}",
+            axis_label(self.x_column),
+            axis_label(self.y_column),
+            (Points(self.label, self.x * x_unit, self.y * y_unit, y_error),),
+            curves,
+            self.x * x_unit,
+            self.residuals(theta, np)[: self.n],
+        )

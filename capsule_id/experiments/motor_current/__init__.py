@@ -1,1 +1,0 @@
-"""Motor force against current, which determines K."""

@@ -1,0 +1,449 @@
+"""Density of the trials of a progression: sessions, runs, and sums over the trials of one setting."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.scipy.special as jax_special
+import numpy as np
+import scipy.special as scipy_special
+from jaxtyping import Float, Int
+from numpy.polynomial.hermite_e import hermegauss
+
+from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.emulator import Emulator
+from capsule_id.experiments.misfit import LOG_2PI, Misfit
+from capsule_id.experiments.progression.declaration import SESSIONS, alternatives
+from capsule_id.physics.batches import pool
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.progression.experiment import Progression
+
+
+# sessions: Sessions of a progression: how the friction of each one enters, and the runs of the capsule that follow.
+#
+# Session j has friction multiplied by exp(session_sd z_j), z_j ~ N(0, 1). Where it has several settings, z_j is a
+# parameter; at most eight sessions are. All others are integrated out, in each of their settings alone, with a motion
+# that
+# is piecewise linear in z_j between runs. There are more runs where the setting has several of these sessions,
+# because they determine z_j apart from the discrepancy, also far from 0.
+
+
+#: z beyond which a session has no weight.
+FAR = 1e3
+#: z of the runs of a session that is integrated out. One that has its setting for itself has the inner ones only. The
+#: outer lines go on beyond their runs.
+NODES = np.array([-2.5, -1.25, 0.0, 1.25, 2.5])
+INNER, MIDDLE = slice(1, 4), 2
+
+
+class Sessions(eqx.Module):
+    """Cases, each a setting in a session, and their runs, in the order of the cases.
+
+    Attributes
+    ----------
+    rows : (n, cases) 1 where a trial belongs to a case
+    setting : (cases,) index of its setting
+    alone : (cases,) 1 where z is integrated out
+    columns : (cases, lone) 1 where a case is the one of these that has this number
+    shared : (cases,) 1 where z of another session of the setting is integrated out too
+    at : (cases, nodes) index of the run at each of ``NODES``, or of the nearest one
+    case, node : (runs,) index of the case; z of a session that is integrated out, else 0
+    own : (runs, parameters) 1 where z is this parameter
+    """
+
+    rows: np.ndarray
+    setting: np.ndarray
+    alone: np.ndarray
+    columns: np.ndarray
+    shared: np.ndarray
+    at: np.ndarray
+    case: np.ndarray
+    node: np.ndarray
+    own: np.ndarray
+
+    def __init__(
+        self,
+        setting: Float[np.ndarray, "n settings"],
+        session: Float[np.ndarray, "n sessions"],
+        parameter: Int[np.ndarray, " sessions"],
+    ) -> None:
+        """Cases of trials with these memberships, see ``parameters_of`` for ``parameter``."""
+        trials = np.stack([np.argmax(setting, axis=1), np.argmax(session, axis=1)], axis=1)
+        cases, case = np.unique(trials, axis=0, return_inverse=True)
+        of = parameter[cases[:, 1]]
+        alone = of < 0
+        shared = alone & (np.bincount(cases[:, 0], weights=alone)[cases[:, 0]] > 1.0)
+        self.rows, self.setting = np.eye(len(cases))[case], cases[:, 0]
+        self.alone, self.columns, self.shared = 1.0 * alone, np.eye(len(cases))[:, alone], 1.0 * shared
+        kept = np.arange(len(NODES))
+        nodes = [
+            kept if many else kept[INNER] if one else kept[[MIDDLE]] for one, many in zip(alone, shared, strict=True)
+        ]
+        runs = np.array(list(map(len, nodes)))
+        self.case, self.node = np.repeat(np.arange(len(cases)), runs), NODES[np.concatenate(nodes)]
+        self.at = (np.cumsum(runs) - runs)[:, None] + np.array(
+            [np.clip(kept - own[0], 0, len(own) - 1) for own in nodes]
+        )
+        self.own = 1.0 * (of[self.case][:, None] == np.arange(1 + int(np.max(parameter))))
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """Of the parameters z."""
+        return tuple(row.symbol for row in SESSIONS[: self.own.shape[1]])
+
+    def log_friction(self, theta: ValuesBySymbol) -> Any:
+        """(runs,) logarithm of what multiplies the friction."""
+        known = [theta[symbol] for symbol in self.symbols]
+        z = self.node + (self.own @ jnp.stack(known) if known else 0.0)
+        return theta["session_sd"] * z
+
+    @property
+    def setting_of_run(self) -> Any:
+        """(runs,) index of the setting of each run."""
+        return _index(self.setting)[_index(self.case)]
+
+    def responses(self, X2: Any) -> Any:
+        """(..., cases, nodes) X2 of every case at ``NODES``, from (..., runs): beyond the outer runs linear."""
+        X = jnp.asarray(X2)[..., _index(self.at)]
+        outer = jnp.stack([2.0 * X[..., 1] - X[..., 2], 2.0 * X[..., 3] - X[..., 2]], axis=-1)
+        beyond = jnp.concatenate([outer[..., :1], X[..., INNER], outer[..., 1:]], axis=-1)
+        return jnp.where((jnp.asarray(self.shared) > 0.0).reshape(*(1,) * (X.ndim - 2), -1, 1), X, beyond)
+
+
+def _index(numbers: Any) -> Any:
+    # The log-posterior stores all numbers of experiments as floats.
+    return jnp.asarray(numbers).astype(int)
+
+
+def lines(X: Any, nodes: np.ndarray, xp: ModuleType = jnp) -> tuple[Any, Any]:
+    """(..., lines) value at z = 0 and slope of the lines between X (..., nodes)."""
+    z = xp.asarray(nodes.reshape(*(1,) * (X.ndim - 1), -1))
+    slope = (X[..., 1:] - X[..., :-1]) / (z[..., 1:] - z[..., :-1])
+    return X[..., 1:] - slope * z[..., 1:], slope
+
+
+def edges(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(lines,) z where each line begins and ends; the outer ones go on."""
+    return np.append(-FAR, nodes[1:-1]), np.append(nodes[1:-1], FAR)
+
+
+def parameters_of(
+    setting: Float[np.ndarray, "n settings"], session: Float[np.ndarray, "n sessions"]
+) -> Int[np.ndarray, " sessions"]:
+    """Index of the parameter of each session, -1 where it is integrated out, in each of its settings alone.
+
+    Sessions with several settings have parameters, at most as many as there are ``SESSIONS``: those with most settings.
+    """
+    settings = np.sum((session.T @ setting) > 0.0, axis=1)
+    most = np.argsort(-settings, kind="stable")[: len(SESSIONS)]
+    chosen = np.sort(most[settings[most] > 1])
+    found = np.full(len(settings), -1)
+    found[chosen] = np.arange(len(chosen))
+    return found
+
+
+# linear misfit: Misfit of the trials of a progression, linear about the most probable friction of each session.
+
+
+def linear_misfit(e: "Progression", theta: ValuesBySymbol, X2: Any, xp: ModuleType = jnp) -> Misfit:
+    """The misfit at the ``responses`` (cases, nodes), m, the motion of a session linear about its most probable z.
+
+    With heavy tails the outlying trials are those of the most probable alternative of each setting.
+    """
+    rows, columns = xp.asarray(e.sessions.rows), xp.asarray(e.sessions.columns)
+    usual = _relative_variance(e, theta, X2, xp)
+    start, slope, expected = _most_probable_lines(e, theta, xp.asarray(X2), 1.0 / usual, xp)
+    discrepancy = theta["discrepancy"] * e.setting * e.time[None]
+    design = xp.concatenate([(rows @ columns) * (slope @ columns)[None], discrepancy], axis=1)
+    variance = e.reading_variance + (theta["trial_scatter"] * (rows @ expected)) ** 2
+    return Misfit(e.distance - rows @ start, usual * variance, xp.sqrt(usual), design)
+
+
+def _relative_variance(e: "Progression", theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> Any:
+    """(n,) variance of each trial relative to the usual one."""
+    groups = e.groups
+    if not e.heavy:
+        return xp.ones(e.n)
+    density = e.trials_of(theta, X2, xp).of_alternatives(xp.asarray(theta["trial_sd"]).reshape(1), xp)[0]
+    own = xp.asarray(e.setting) @ (xp.arange(len(e.settings))[:, None] == xp.asarray(groups.setting)[None])
+    best = xp.argmax(xp.where(own > 0.0, density[None], -xp.inf), axis=1)
+    return xp.take_along_axis(xp.asarray(groups.variance), best[None], axis=0)[0]
+
+
+def _most_probable_lines(
+    e: "Progression", theta: ValuesBySymbol, X2: Any, weight: Any, xp: ModuleType
+) -> tuple[Any, ...]:
+    """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m.
+
+    The slope is 0 where this z is at a kink: no small change of it explains more.
+
+    Parameters
+    ----------
+    weight : (n,) of each trial
+    """
+    start, slope = lines(X2, NODES, xp)
+    rows = xp.asarray(e.sessions.rows)
+    count = weight @ rows
+    r = ((weight * e.distance) @ rows / count)[:, None] - start
+    time = xp.asarray(e.time)[xp.asarray(e.sessions.setting).astype(int)][:, None]
+    variance = e.reading_variance + (theta["trial_scatter"] * X2[:, MIDDLE, None]) ** 2 + theta["trial_sd"] ** 2
+    w = variance / count[:, None] + (theta["discrepancy"] * time) ** 2
+    low, high = (xp.asarray(edge[None]) for edge in edges(NODES))
+    z = xp.clip(slope * r / (w + slope**2), low, high)
+    best = xp.argmin(z**2 + (r - slope * z) ** 2 / w, axis=1)[:, None]
+    expected, inside = start + slope * z, (z > low) & (z < high)
+    found = xp.where(inside, start, expected), xp.where(inside, slope, 0.0), expected
+    return tuple(xp.take_along_axis(x, best, axis=1)[:, 0] for x in found)
+
+
+# run emulator: Emulator of the runs of a progression.
+
+
+class RunEmulator(eqx.Module):
+    """One emulator of the runs of each session that is a parameter, and one of all others.
+
+    A run depends on the friction of its own session alone, and inputs without effect make an emulator less accurate.
+
+    Attributes
+    ----------
+    symbols : of the parameters of sessions
+    parts : the emulators that are needed
+    place : (runs,) place of each run among the outputs of ``parts``
+    """
+
+    symbols: tuple[str, ...] = eqx.field(static=True)
+    parts: tuple[Emulator, ...]
+    place: np.ndarray
+
+    def __init__(
+        self,
+        sessions: Sessions,
+        positive: Mapping[str, bool],
+        draws: Sequence[ValuesBySymbol],
+        motions: Float[np.ndarray, "n runs"],
+    ) -> None:
+        """Fit to the ``motions`` at ``draws``; ``positive``: parameters of the motion, and whether each is positive."""
+        self.symbols = sessions.symbols
+        groups = [({**positive, "session_sd": True}, np.all(sessions.own == 0.0, axis=1))]
+        groups += [({**positive, name: False}, sessions.own[:, j] > 0.0) for j, name in enumerate(self.symbols)]
+        groups = [(inputs, np.flatnonzero(own)) for inputs, own in groups if np.any(own)]
+        known = [self._inputs(draw) for draw in draws]
+        self.parts = tuple(pool().map(lambda group: Emulator(group[0], known, motions[:, group[1]]), groups))
+        self.place = np.argsort(np.concatenate([own for _, own in groups]))
+
+    def __call__(self, theta: ValuesBySymbol) -> Any:
+        """(runs,) motions at parameters by symbol, () each."""
+        inputs = self._inputs(theta)
+        return jnp.concatenate([part(inputs) for part in self.parts])[jnp.asarray(self.place).astype(int)]
+
+    def _inputs(self, theta: ValuesBySymbol) -> dict[str, Any]:
+        """Sessions enter by the logarithm of their friction."""
+        return {**theta, **{symbol: theta["session_sd"] * theta[symbol] for symbol in self.symbols}}
+
+
+# groups: Density of the trials of a progression from sums over cases: the trials of one setting in one session.
+#
+# Trials of a case differ only by their own scatter, so their number, mean and spread are sufficient. Given the
+# parameters, settings are independent. The discrepancy of a setting is integrated out in closed form, and so is the
+# session of a case that has none as a parameter: its motion is piecewise linear in z. Where a setting has several of
+# these, they share its discrepancy, which is integrated by Gauss-Hermite quadrature about a normal approximation.
+#
+# With heavy tails a setting has an alternative for every choice of its outlying trials, see
+# ``capsule_id.experiments.progression.declaration``, and its density is their sum. Without, it has one.
+
+
+#: Nodes of the discrepancy of a setting with several sessions that are integrated out. Errors are below 0.01 where it is
+#: up to 3 sds of the mean of a case, and reach 2 at 10 sds where a motion is flat on one side of a kink and steep beyond.
+DISCREPANCIES = 13
+#: Within these z a line may explain the readings, for the variance of a trial that depends on its displacement.
+FARTHEST_Z = 3.0
+#: Smallest probability that is computed as such; the logarithm of a smaller one is that of the tail of a normal density.
+LEAST = 1e-300
+
+
+class TrialGroups(eqx.Module):
+    """Cases of trials by alternative: those whose session is known, and those whose session is integrated out.
+
+    Attributes
+    ----------
+    variance : (alternatives, n) of every trial relative to the usual one; its inverse is the weight of a trial
+    log_share : (alternatives,) logarithm of the prior probability within the setting
+    setting : (alternatives,) index of the setting, in ascending order
+    case : (k,) case of the trials, as in ``Sessions``; an alternative has all cases of its setting
+    trials, count, mean, spread : (k,) number of trials, sum of their weights, weighted mean, m, and sum of squares, m^2
+    measure : (k,) sum of the logarithms of ``variance``
+    known, filled : (alternatives, g) index of what is known of an alternative, and 1 where there is one; else any index
+    lone : index of the others: of those alone in their setting, apart from known ones, and of those that share it
+    of_alternative : for both, (k, alternatives) 1 where it belongs to an alternative
+    """
+
+    variance: np.ndarray
+    log_share: np.ndarray
+    setting: np.ndarray
+    case: np.ndarray
+    trials: np.ndarray
+    count: np.ndarray
+    mean: np.ndarray
+    spread: np.ndarray
+    measure: np.ndarray
+    known: np.ndarray
+    filled: np.ndarray
+    lone: tuple[np.ndarray, np.ndarray]
+    of_alternative: tuple[np.ndarray, np.ndarray]
+
+    def __init__(self, distance: Float[np.ndarray, " n"], sessions: Sessions, heavy: bool = False) -> None:
+        """Group trials by their distance, m."""
+        settings = 1 + int(np.max(sessions.setting))
+        membership = sessions.rows @ np.eye(settings)[sessions.setting]
+        self.variance, self.log_share, self.setting = alternatives(membership, heavy)
+        alternative, self.case = np.nonzero(self.setting[:, None] == sessions.setting)
+        rows, weight = sessions.rows.T[self.case], 1.0 / self.variance[alternative]
+        self.trials, self.count = np.sum(rows, axis=1), np.sum(rows * weight, axis=1)
+        self.mean = np.sum(rows * weight * distance, axis=1) / self.count
+        self.spread = np.sum(rows * weight * (distance - self.mean[:, None]) ** 2, axis=1)
+        self.measure = np.sum(rows * np.log(self.variance[alternative]), axis=1)
+        alone, shared = sessions.alone[self.case], sessions.shared[self.case]
+        each = np.arange(len(self.setting))
+        known = [np.flatnonzero((alternative == b) & (alone == 0.0)) for b in each]
+        self.filled = 1.0 * (np.arange(max(1, *map(len, known))) < np.array(list(map(len, known)))[:, None])
+        first = np.searchsorted(alternative, each)
+        self.known = np.repeat(first[:, None], self.filled.shape[1], axis=1)
+        self.known[self.filled > 0.0] = np.concatenate(known)
+        self.lone = np.flatnonzero(alone > shared), np.flatnonzero(shared)
+        lone, sharing = (1.0 * (alternative[own][:, None] == each) for own in self.lone)
+        self.of_alternative = lone, sharing
+
+
+@dataclass(frozen=True)
+class TrialMisfit:
+    """Trials against their model, at any value of ``trial_sd``.
+
+    Attributes
+    ----------
+    X2 : (cases, nodes) displacements at z = ``NODES``, m; where z is a parameter, the middle one counts
+    reading_variance, trial_scatter : variance of a reading, m^2, and relative scatter of a trial
+    discrepancy : (settings,) its standard deviation, m
+    """
+
+    groups: TrialGroups
+    X2: Any
+    reading_variance: float
+    trial_scatter: Any
+    discrepancy: Any
+
+    def log_density(self, scatter: Any, xp: ModuleType = jnp) -> Any:
+        """Natural, normalised log-density of the trials at ``scatter`` (...), m; (...)."""
+        return xp.sum(self.of_settings(scatter, xp), axis=-1)
+
+    def of_settings(self, scatter: Any, xp: ModuleType = jnp) -> Any:
+        """(..., settings) that of the trials of each setting, at ``scatter`` (...), m."""
+        scatter, groups = xp.asarray(scatter), self.groups
+        found = self.of_alternatives(scatter.reshape(-1), xp)
+        if len(groups.log_share) > len(self.discrepancy):
+            member = xp.arange(len(self.discrepancy))[:, None] == xp.asarray(groups.setting)[None]
+            special = scipy_special if xp is np else jax_special
+            found = special.logsumexp(xp.where(member[None], found[:, None], -xp.inf), axis=2)
+        return found.reshape(*scatter.shape, -1)
+
+    def of_alternatives(self, scatter: Any, xp: ModuleType = jnp) -> Any:
+        """(scatter, alternatives) density of the trials and prior probability of each, at ``scatter`` (scatter,), m."""
+        groups, flat = self.groups, scatter.reshape(-1, 1, 1)
+        # Axes: scatter, alternative, case.
+        X2, y, trials, count, spread, measure = self._cases(groups.known, xp)
+        v = self.reading_variance + (self.trial_scatter * X2[None, ..., MIDDLE]) ** 2 + flat**2
+        filled = xp.asarray(groups.filled)
+        weight, y = (filled * count)[None] / v, (y - X2[..., MIDDLE])[None]
+        inside = (
+            (filled * trials)[None] * (LOG_2PI + xp.log(v)) + (filled * spread)[None] / v + (filled * measure)[None]
+        )
+        # What the discrepancy explains of the trials of known friction, and its normal density given these.
+        of_setting = xp.asarray(groups.setting).astype(int)
+        prior, moment = (xp.asarray(self.discrepancy)[of_setting] ** 2)[None], xp.sum(weight * y, axis=2)
+        gain = 1.0 + prior * xp.sum(weight, axis=2)
+        variance = prior / gain
+        density = -0.5 * (xp.sum(inside + weight * y**2, axis=2) - variance * moment**2 + xp.log(gain))
+        for shared in np.flatnonzero([own.shape[0] > 0 for own in groups.lone]):
+            density = density + self._of_lone_sessions(int(shared), flat, (variance * moment, variance), xp)
+        return density + xp.asarray(groups.log_share)[None]
+
+    def _cases(self, index: Any, xp: ModuleType) -> tuple[Any, ...]:
+        """``X2`` (..., nodes), mean, number, sum of weights, spread and measure of ``index`` (...)."""
+        index = xp.asarray(index).astype(int)  # The log-posterior stores all numbers of experiments as floats.
+        groups = self.groups
+        of_cases = (groups.mean, groups.trials, groups.count, groups.spread, groups.measure)
+        return self.X2[xp.asarray(groups.case).astype(int)[index]], *(xp.asarray(x)[index] for x in of_cases)
+
+    def _of_lone_sessions(self, shared: int, scatter: Any, discrepancy: tuple[Any, Any], xp: ModuleType) -> Any:
+        """(scatter, alternatives) density of the trials whose z is integrated out.
+
+        The variance of a trial is taken where its line is nearest to the mean of the trials.
+
+        Parameters
+        ----------
+        shared : 0 for cases that have a setting for themselves, 1 for those that share it
+        scatter : (scatter, 1, 1) m
+        discrepancy : (scatter, alternatives) its mean, m, and variance, m^2, given the trials of known friction
+        """
+        special, owner = scipy_special if xp is np else jax_special, self.groups.of_alternative[shared]
+        nodes, chosen = (NODES, slice(None)) if shared else (NODES[INNER], INNER)
+        X2, y, trials, count, spread, measure = self._cases(self.groups.lone[shared], xp)
+        start, slope = lines(X2[:, chosen], nodes, xp)
+        low, high = (start + slope * np.clip(z, -FARTHEST_Z, FARTHEST_Z)[None] for z in edges(nodes))
+        nearest = xp.clip(y[:, None], xp.minimum(low, high), xp.maximum(low, high))
+        # Axes: scatter, case, line, discrepancy.
+        v = (self.reading_variance + (self.trial_scatter * nearest[None]) ** 2 + scatter**2)[..., None]
+        start, slope = (x[None, ..., None] for x in (start, slope))
+        y, trials, count, spread, measure = (x[None, :, None, None] for x in (y, trials, count, spread, measure))
+        mean, variance = ((x @ owner.T)[..., None, None] for x in discrepancy)
+        at, weights = hermegauss(DISCREPANCIES if shared else 1)
+        t, correction = xp.zeros((1, 1, 1, 1)), xp.zeros((1, 1, 1))
+        if shared:
+            t, correction = self._discrepancies(X2, scatter, discrepancy, at, xp)
+            t = xp.einsum("kbd,cb->kcd", t, owner)[:, :, None]
+        r = y - start - (mean + xp.sqrt(variance) * t)
+        # One case of a setting has the variance of the discrepancy in closed form.
+        w = v / count + (0.0 if shared else variance)
+        total = w + slope**2
+        inside = (trials - 1.0) * (LOG_2PI + xp.log(v)) + xp.log(count) + measure + spread / v
+        # Given the readings and its line, z is normal; the part of it that belongs to the line counts.
+        z, precision = slope * r / total, xp.sqrt(total / w)
+        lower, upper = ((edge.reshape(1, 1, -1, 1) - z) * precision for edge in edges(nodes))
+        part = _log_probability(lower, upper, special, xp)
+        cases = special.logsumexp(part - 0.5 * (inside + LOG_2PI + xp.log(total) + r**2 / total), axis=2)
+        log_weights = correction + np.log(weights / np.sum(weights)).reshape(1, 1, -1)
+        found = xp.einsum("kcd,cb->kbd", cases, owner)
+        return special.logsumexp(found + log_weights, axis=2)
+
+    def _discrepancies(
+        self, X2: Any, scatter: Any, discrepancy: tuple[Any, Any], at: np.ndarray, xp: ModuleType
+    ) -> tuple[Any, Any]:
+        """(scatter, alternatives, d) discrepancies in sds from their mean, and logarithms of the factors of their weights.
+
+        The nodes ``at`` lie about a normal approximation: each motion is taken as linear between the inner runs.
+        """
+        owner = self.groups.of_alternative[1]
+        _, y, _, count, *_ = self._cases(self.groups.lone[1], xp)
+        X2 = X2.reshape(1, *X2.shape)
+        slope = (X2[..., INNER][..., -1] - X2[..., INNER][..., 0]) / (NODES[INNER][-1] - NODES[INNER][0])
+        v = self.reading_variance + (self.trial_scatter * X2[..., MIDDLE]) ** 2 + scatter[..., 0] ** 2
+        q = 1.0 / (v / count[None] + slope**2)
+        mean, variance = discrepancy
+        r = y[None] - X2[..., MIDDLE] - mean @ owner.T
+        gain = 1.0 + variance * (q @ owner)
+        centre = xp.sqrt(variance) * ((q * r) @ owner) / gain
+        u = at.reshape(1, 1, -1)
+        t = centre[..., None] + u / xp.sqrt(gain)[..., None]
+        return t, 0.5 * (u**2 - t**2 - xp.log(gain)[..., None])
+
+
+def _log_probability(lower: Any, upper: Any, special: ModuleType, xp: ModuleType) -> Any:
+    """Logarithm of the standard normal probability between ``lower`` and ``upper``, which differ by 1 or more."""
+    right = lower > 0.0
+    near, far = xp.where(right, lower, -upper), xp.where(right, upper, -lower)
+    found = 0.5 * (special.erfc(near / np.sqrt(2.0)) - special.erfc(far / np.sqrt(2.0)))
+    tail = -0.5 * (near**2 + LOG_2PI) - xp.log(xp.maximum(near, 1.0))
+    return xp.where(found > LEAST, xp.log(xp.maximum(found, LEAST)), tail)

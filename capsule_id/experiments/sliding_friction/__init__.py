@@ -1,1 +1,0 @@
-"""Steady sliding: friction against speed, mu and v_s."""

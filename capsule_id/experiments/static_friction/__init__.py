@@ -1,1 +1,0 @@
-"""Tilt of the board until the capsule slips: mu."""

@@ -1,0 +1,166 @@
+"""Support spring: static force against deflection (paper, section 2.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from scipy import stats
+
+from capsule_id.experiments.checks import LEVEL, refit
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
+from capsule_id.experiments.line import MESSAGES as LINE_MESSAGES
+from capsule_id.experiments.line import Line, line_estimates, lint_line, refuse_idle_sd_ratio
+from capsule_id.parameters import parameter
+from capsule_id.rig.model import Quantity, Rig, Settings, Table
+from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
+from capsule_id.views import Finding, Message
+
+# declaration: Support spring: columns, settings, template and twin.
+
+
+#: Deflections of the twin and their reading error, m, and noise of the force relative to full scale.
+DEFLECTIONS, DEFLECTION_SD = np.linspace(0.0, 1e-3, 11), 1e-6
+SPRING_NOISE = 0.002
+#: Reference length, m, and its k2, N/m, for the cantilever law of the twin; sd of a measured length, m.
+LENGTH, LENGTH_OF, LENGTH_SD = 60e-3, 18960.0, 0.1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringSettings(Settings):
+    """Settings of a spring: name; free length, m; reading error of force / reading error of deflection, N/m."""
+
+    spring: Annotated[str, NameRule()]
+    length: Annotated[Quantity | None, QuantityRule("m", has_sd=True)] = None
+    sd_ratio: Annotated[float | None, QuantityRule("N/m")] = None
+
+
+def static_test(
+    rng: np.random.Generator, k2: float, deflections: np.ndarray, relative_sd: float
+) -> dict[str, np.ndarray]:
+    """Simulate a static test at ``deflections`` (n,) m; the force has noise ``relative_sd`` of full scale."""
+    force = k2 * deflections
+    noise = relative_sd * np.max(np.abs(force)) * rng.standard_normal(len(force))
+    return {"deflection [mm]": 1e3 * deflections, "force [N]": force + noise}
+
+
+def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
+    tables = []
+    # A generator of their own: the readings of the other tests do not depend on these errors.
+    errors = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**21,)))
+    for name, k2 in values.items():
+        if name.startswith("k2["):
+            spring = name[len("k2[") : -1]
+            length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
+            stated = f'length = {{ value = {1e3 * length:.2f}, sd = {1e3 * LENGTH_SD:g}, unit = "mm" }}'
+            columns = static_test(rng, k2, DEFLECTIONS, SPRING_NOISE)
+            columns["deflection [mm]"] += 1e3 * DEFLECTION_SD * errors.standard_normal(DEFLECTIONS.size)
+            known = (
+                f'deflection_sd = {{ value = {1e6 * DEFLECTION_SD:g}, unit = "um" }}',
+                f'force_sd = {{ value = {1e3 * SPRING_NOISE * k2 * DEFLECTIONS[-1]:.3g}, unit = "mN" }}',
+            )
+            settings = (f'spring = "{spring}"', stated, *known)
+            tables.append(TwinTable(f"support_spring_{spring}.csv", columns, settings))
+    return Twin(tuple(tables))
+
+
+TEMPLATE = """\
+#: Force of a support spring against its deflection: its k2. Columns: deflection [mm], force [N]; a file per spring.
+#: sd_ratio as above, in N/m.
+# [[experiment]]
+# kind = "support_spring"
+# file = "support_spring_L60.csv"
+# spring = "L60"
+# length = { value = 60, sd = 0.5, unit = "mm" }
+"""
+
+CANTILEVER = Message(
+    "cantilever law",
+    ok="k2 ~ L^({exponent:.3f} ± {sd:.3f}), {p:p} for the -3 of a cantilever",
+    warn=(
+        "expected k2 ~ L^-3, as a cantilever has; found L^({exponent:.3f} ± {sd:.3f}), {p:p}. Check the clamp and the "
+        "stated lengths; k2 of each spring stays a parameter of its own."
+    ),
+    fail=(
+        "a longer cantilever must be softer, but {longest} is stiffer than {shortest}: k2 ~ L^({exponent:.3f} ± {sd:.3f}), "
+        "{p:p} for the -3 of a cantilever. Check whether the files or the lengths of these two are exchanged."
+    ),
+)
+
+KIND = Kind(
+    name="support_spring",
+    columns={"deflection": ColumnRule("m", varies=True), "force": ColumnRule("N", varies=True)},
+    sets=(("deflection", "force"),),
+    settings=SpringSettings,
+    rules=(refuse_idle_sd_ratio,),
+    make=made_by("capsule_id.experiments.support_spring:SupportSpring"),
+    template=TEMPLATE,
+    informs="k2 of that spring",
+    captions={"support_spring": "The slope of the line is the stiffness of the support spring."},
+    messages={**LINE_MESSAGES, "springs.cantilever": CANTILEVER},
+    lint=(lint_line,),
+    paper=line_estimates,
+    twin=_measure,
+)
+
+
+# checks: Check of the cantilever law for support springs of stated length.
+
+
+def cantilever_exponent(
+    length: np.ndarray, length_sd: np.ndarray, k2: np.ndarray, log_k2_sd: np.ndarray
+) -> tuple[float, float, float]:
+    """Estimate the exponent of k2 ~ L^p by weighted least squares on logarithms, its sd, and the p-value of p = -3.
+
+    A cantilever has p = -3 (Euler–Bernoulli; clamped end, tip load). Arrays are (springs,). The error of the length
+    is propagated with the exponent -3 of the hypothesis.
+    """
+    weight = 1.0 / (log_k2_sd**2 + (3.0 * length_sd / length) ** 2)
+    x = np.log(length) - np.average(np.log(length), weights=weight)
+    exponent = float(np.sum(weight * x * np.log(k2)) / np.sum(weight * x**2))
+    sd = float(1.0 / np.sqrt(np.sum(weight * x**2)))
+    return exponent, sd, float(2.0 * stats.norm.sf(abs(exponent + 3.0) / sd))
+
+
+def check_cantilever(springs: "Sequence[SupportSpring]", fit: Fitted) -> list[Finding]:
+    """Check k2 ~ L^-3 over the springs, where lengths are stated."""
+    pairs = [(e, e.length) for e in springs if e.length is not None]
+    if len({e.slope.name for e, _ in pairs}) < 2:
+        return []
+    estimates = [refit(e, e.local(fit.values), fit.flagged.get(e.label, []))["k2"] for e, _ in pairs]
+    k2, sd = (np.array(column) for column in zip(*estimates, strict=True))
+    length, length_sd = np.array([(quantity.value, quantity.sd) for _, quantity in pairs]).T
+    exponent, error, p = cantilever_exponent(length, length_sd, k2, sd / k2)
+    facts = {"exponent": exponent, "sd": error, "p": p}
+    if p >= LEVEL or exponent <= 0.0:
+        return [Finding("springs.cantilever", "warn" if p < LEVEL else "ok", facts)]
+    order = [pairs[i][0] for i in np.argsort(length)]
+    facts |= {"shortest": order[0].label, "longest": order[-1].label}
+    names = dict.fromkeys(e.slope.name for e in order)
+    return [Finding("springs.cantilever", "fail", facts, parameters=tuple(names))]
+
+
+# experiment: Support spring: static force against deflection (paper, section 2.2).
+
+
+class SupportSpring(Line):
+    """F = F0 + k2[spring] x."""
+
+    checks = (*Line.checks, check_cantilever)
+
+    def __init__(self, table: Table, rig: Rig) -> None:
+        slope = parameter("k2", table.settings.spring)
+        super().__init__(table, rig, "deflection", "force", slope, table.settings.sd_ratio)
+
+    @property
+    def spring(self) -> str:
+        return self.table.settings.spring
+
+    @property
+    def length(self) -> Quantity | None:
+        """Free length of the cantilever, m, where stated."""
+        return self.table.settings.length
+
+    def table_extras(self) -> dict[str, float]:
+        return {} if self.length is None else {"length, m": self.length.value}

@@ -1,1 +1,0 @@
-"""Force of a support spring against its deflection: k2."""

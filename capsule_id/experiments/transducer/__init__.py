@@ -1,1 +1,0 @@
-"""Reading of a force transducer against a known force, which determines its sensitivity."""

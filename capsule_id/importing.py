@@ -1,0 +1,612 @@
+"""Describes an export, guesses its kind and columns, and writes the entry of ``rig.toml`` that reads it."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.kind import Kind, default_registry
+from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples, reading_step
+from capsule_id.records.release import find_free_decay
+from capsule_id.records.tones import estimate_clock
+from capsule_id.rig.filters import clock_starts, dominant_frequency
+from capsule_id.rig.formats.layouts import delimiter_of
+from capsule_id.rig.formats.text import TextFile
+from capsule_id.rig.guess import (
+    FEWEST_SAMPLES,
+    TIME,
+    Assignment,
+    ColumnGuess,
+    Confidence,
+    FoundLayout,
+    assignments,
+    find_layout,
+    fits_name,
+    increases,
+    is_constant,
+    name_and_unit,
+    readings_of,
+    score_of,
+    source_of,
+    times_of,
+    unit_of,
+    used_layout,
+)
+from capsule_id.rig.schema import QuantityRule
+from capsule_id.rig.units import UNKNOWN, factor_to_si
+from capsule_id.views import counted
+
+# guess: Guesses the kind of experiment of an export, and which of its columns and units are those of the kind.
+
+
+#: Smallest lead of the score of a kind that is sure, and number of columns that make it so whatever others there are.
+LEAD, MANY = 1.0, 3
+#: A record whose last fifth has less than this fraction of the amplitude of its largest part decays; above the second
+#: fraction it is driven.
+DECAYS, DRIVEN = 0.5, 0.8
+#: A record whose last part has at least this fraction of its largest one is no decay.
+STEADY = 0.97
+_PARTS = 5
+#: SI unit of a displacement, a velocity or an acceleration -> that of the same quantity of an angle.
+ANGULAR = {"m": "rad", "m/s": "rad/s", "m/s^2": "rad/s^2"}
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What an export holds.
+
+    Attributes
+    ----------
+    kind : name of the most probable kind
+    columns : by name of the kind's column
+    rate : sampling rate of a record without times, Hz
+    confidence, reason : of the kind, and of the rate where there is one
+    """
+
+    kind: str
+    columns: Mapping[str, ColumnGuess]
+    rate: float | None
+    confidence: Confidence
+    reason: str
+
+    @property
+    def unsure(self) -> bool:
+        """Whether the kind or any column is a guess without a reason."""
+        return "unsure" in (self.confidence, *(column.confidence for column in self.columns.values()))
+
+
+def guess(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
+    """The most probable kind and columns of an export; None where no kind fits."""
+    # Sets within larger ones need a line of [model].
+    candidates = [
+        one
+        for kind in kinds.values()
+        for one in assignments(found, kind)
+        if not one.missing
+        and not any(set(one.wanted) < set(larger) for larger in kind.sets)
+        and (TIME not in one.wanted or _is_record(found, one.columns[TIME].index if TIME in one.columns else None))
+    ]
+    if not any(TIME in candidate.kind.columns for candidate in candidates):
+        by_angle = _by_angle(found, kinds)
+        if by_angle is not None:
+            used = {column.index for column in by_angle.columns.values()}
+            beside = [one for one in candidates if not used >= {column.index for column in one.columns.values()}]
+            return replace(by_angle, confidence="unsure") if beside else by_angle
+    if not candidates:
+        return _without_names(found, kinds)
+    best = max(candidate.score for candidate in candidates)
+    leading = [candidate for candidate in candidates if candidate.score > best - LEAD]
+    names = sorted({candidate.kind.name for candidate in leading})
+    chosen = max(leading, key=lambda candidate: candidate.score)
+    confidence, reason = _doubt(found, chosen, leading, kinds)
+    if len(names) == 1:
+        return _guess(found, chosen, confidence, reason)
+    by_motion = _by_motion(found, leading)
+    if by_motion is not None:
+        return _guess(found, *(by_motion if confidence == "sure" else (by_motion[0], confidence, reason)))
+    return _guess(found, chosen, "unsure", f"the columns fit {' and '.join(names)}")
+
+
+def _doubt(
+    found: FoundLayout, chosen: Assignment, leading: list[Assignment], kinds: Mapping[str, Kind]
+) -> tuple[Confidence, str]:
+    """Whether other columns leave the kind of the chosen candidate sure, and why."""
+    used, kind = {column.index for column in chosen.columns.values()}, chosen.kind
+    if TIME not in kind.columns and any(_is_record(found, i) for i in times_of(found) if i not in used):
+        return "unsure", f"the file is a record in time, {kind.name} a table of trials"
+    own = [one.columns for one in leading if one.kind is kind]
+    if any(not used >= {column.index for column in one.values()} for one in own):
+        return "unsure", f"the columns fit {' and '.join(map(' with '.join, own))}"
+    # A column under an unknown name may make it another kind: a force and a current are no list of pulls.
+    known = {kind.columns[name].si for name in (kind.columns if TIME in kind.columns else chosen.columns)}
+    stated = {rule.si for rule in kind.setting_rules.values() if isinstance(rule, QuantityRule)}
+    dimensions = {rule.si for each in kinds.values() for rule in each.columns.values()} - known
+    for index in sorted(set(found.columns) - used) if len(chosen.columns) < MANY else ():
+        text = name_and_unit(found.names[index], sorted(dimensions))[1] or found.units[index]
+        others = sorted(dimensions - stated if is_constant(found, index) else dimensions)
+        # A number of a trial is no reading, nor is a mass, or a percentage.
+        label = found.columns[index] == np.clip(np.rint(found.columns[index]), 0, len(found.columns[index]))
+        unnamed = not text and len(chosen.columns) == 1 and not label.all()
+        if unnamed or (unit_of(text, others) not in (None, "%") and unit_of(text, ["kg"]) is None):
+            return "unsure", f"column {index + 1}, {found.names[index]!r}, is not used"
+    return "sure", "the columns fit no other kind as well"
+
+
+def _guess(found: FoundLayout, candidate: Assignment, confidence: Confidence, reason: str) -> Guess:
+    """The guess of a candidate; a missing time column needs a stated rate."""
+    needs_rate = TIME in candidate.kind.columns and TIME not in candidate.columns
+    if needs_rate and found.rate is None:
+        confidence, reason = "unsure", f"{reason}; the file states no times and no sampling rate"
+    return Guess(candidate.kind.name, candidate.columns, found.rate if needs_rate else None, confidence, reason)
+
+
+def _by_angle(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
+    """A guess for a record of an angle, its rate or its acceleration, as arm times angle; None for another file."""
+    times = [index for index in times_of(found) if len(found.columns[index]) >= FEWEST_SAMPLES]
+    candidates = []
+    for kind in (kind for kind in kinds.values() if times and TIME in kind.columns):
+        channel = next(filter(None, (_angle(found, kind, name) for name in kind.channels)), None)
+        time = score_of(found, times[0], TIME, kind)
+        columns = {} if time is None else {TIME: time[1]}
+        candidates += [] if channel is None else [Assignment(kind, {**columns, channel[0]: channel[1]})]
+    if not candidates:
+        return None
+    by_motion = _by_motion(found, candidates)
+    return _guess(found, *(by_motion or (candidates[0], "unsure", "the file is a record in time")))
+
+
+def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess] | None:
+    """The channel ``name`` of a kind with the column that holds it as an angle; None without such a column."""
+    si = kind.columns[name].si
+    if si not in ANGULAR:
+        return None
+    remedy = "multiply scale by the arm in m, or enter the moment of inertia in kg m^2 as the mass in kg"
+    for index in found.columns:
+        stem, text = name_and_unit(found.names[index], [*ANGULAR, *ANGULAR.values()])
+        text = (text if text is not None else found.units[index]).strip()
+        unit = unit_of(text, [ANGULAR[si]])
+        known = max(fits_name(stem, name), fits_name(stem, "angle") if name == "x_rel" else 0) > 0
+        if known and unit is not None:
+            reason = f"{found.names[index]!r} times an arm of 1 m; {remedy}"
+            return name, ColumnGuess(index, si, "unsure", reason, factor_to_si(unit, ANGULAR[si]))
+        if name == "x_rel" and not text and fits_name(stem, "angle") > 0:
+            reason = f"an angle without unit: write {si} and scale = 1 for rad, 0.01745329252 for degrees"
+            return name, ColumnGuess(index, UNKNOWN, "unsure", f"{reason}; {remedy}")
+    return None
+
+
+def _is_record(found: FoundLayout, time: int | None) -> bool:
+    """Whether a file is a record in time: long enough, with increasing times."""
+    rows = len(next(iter(found.columns.values())))
+    return rows >= FEWEST_SAMPLES if time is None else rows >= 8 and increases(found.columns[time])
+
+
+def _by_motion(found: FoundLayout, leading: list[Assignment]) -> tuple[Assignment, Confidence, str] | None:
+    """Of kinds with the same columns, the bench test where the record decays, the other where it is driven."""
+    records = [each for each in leading if TIME in each.kind.columns]
+    if {each.kind.bench for each in records} != {True, False} or len(records) < len(leading):
+        return None
+    sample = next(iter(records))
+    index = next(column.index for name, column in sample.columns.items() if name != TIME)
+    starts = clock_starts(found.columns[sample.columns[TIME].index]) if TIME in sample.columns else []
+    values = found.columns[index][: starts[0] if len(starts) else None]
+    parts = [np.ptp(part) for part in np.array_split(values[np.isfinite(values)], _PARTS)]
+    ratio = float(parts[-1] / max(*parts, 1e-300))
+    bench = ratio < 0.5 * (DECAYS + DRIVEN)
+    chosen = max((each for each in records if each.kind.bench == bench), key=lambda each: each.score)
+    # A push near the end of a decay makes its last part as large as the first ones.
+    least = float(np.min(parts[int(np.argmax(parts)) :]) / max(*parts, 1e-300))
+    # A lightly damped decay has lost little at its end, but each part is smaller than the one before.
+    falls = bool(np.all(np.diff(parts) < 0.0)) and ratio < STEADY
+    clear = ratio < DECAYS or (least > DRIVEN and not falls)
+    reason = f"the motion {'decays' if bench else 'is driven'}: its amplitude ends at {ratio:.0%} of its largest"
+    return chosen, "sure" if clear else "unsure", reason
+
+
+def _without_names(found: FoundLayout, kinds: Mapping[str, Kind]) -> Guess | None:
+    """A guess for a record whose headers say nothing: times that increase evenly, and one channel."""
+    rows = len(next(iter(found.columns.values()), ()))
+    steps = {index: np.diff(values) for index, values in found.columns.items()}
+    times = [index for index, each in steps.items() if np.all(each > 0.0) and np.all(each < 3.0 * np.median(each))]
+    channels = [index for index in found.columns if index not in times]
+    if rows < FEWEST_SAMPLES or len(times) > 1 or len(channels) != 1:
+        return None
+    reason = "no header names the column"
+    dimensions = sorted({rule.si for kind in kinds.values() for rule in kind.columns.values()})
+    candidates = []
+    for kind in (kind for kind in kinds.values() if TIME in kind.columns):
+        names = [name for name in (*kind.sets[0], *kind.channels) if name != TIME]
+        wanted = [(channels[0], names), *((index, [TIME]) for index in times)]
+        units = [_first_with_unit(found, index, names, kind, dimensions) for index, names in wanted]
+        columns = {
+            pair[0]: ColumnGuess(index, pair[1], "unsure", reason)
+            for (index, _), pair in zip(wanted, units, strict=True)
+            if pair is not None
+        }
+        if times and (named := score_of(found, times[0], TIME, kind)) is not None:
+            columns[TIME] = named[1]
+        if len(columns) == len(wanted):
+            candidates.append(Assignment(kind, columns))
+    by_motion = _by_motion(found, candidates)
+    return None if by_motion is None else _guess(found, by_motion[0], "unsure", f"{reason}; {by_motion[2]}")
+
+
+def _first_with_unit(
+    found: FoundLayout, index: int, names: list[str], kind: Kind, dimensions: list[str]
+) -> tuple[str, str] | None:
+    """The first of the ``names`` that the unit in the file allows, and that unit."""
+    text = name_and_unit(found.names[index], dimensions)[1] or found.units[index]
+    unknown = None if unit_of(text, dimensions) else UNKNOWN
+    units = ((name, unit_of(text, [kind.columns[name].si]) or unknown) for name in names)
+    return next(((name, unit) for name, unit in units if unit is not None), None)
+
+
+def disordered_times(found: FoundLayout) -> tuple[str, int] | None:
+    """Header of a column of times that do not increase, and the first line where they do not; None without one."""
+    for index, values in found.columns.items():
+        name, text = name_and_unit(found.names[index], ["s"])
+        if fits_name(name, TIME) > 0 and unit_of(text or found.units[index], ["s"]) is not None:
+            for row in np.flatnonzero(np.diff(values) <= 0.0):
+                return found.names[index], int(found.export.lines[row + 1])
+    return None
+
+
+def are_turning_points(values: np.ndarray) -> bool:
+    """Whether the few readings of a table can be the amplitudes of a decay, on one side or on both sides in turn."""
+    sizes, signs = np.abs(values), np.sign(values)
+    sides = signs[1:] * signs[:-1]
+    falls = bool(np.all(np.diff(sizes) <= 0.0)) and sizes[-1] < sizes[0]
+    return len(values) < FEWEST_SAMPLES and falls and bool(np.all(sides == sides[0])) and sides[0] != 0.0
+
+
+def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None] | None:
+    """Start and stop of the free decay in a record, s; None where all of it is free or nothing swings."""
+    try:
+        decay = find_free_decay(time, values)
+    except InputError:
+        return None
+    if decay is None or np.any(np.diff(time) <= 0.0) or (decay.rest == 0.0 and decay.stop is None):
+        return None
+    return decay.start, decay.end
+
+
+# entry: Writes the entry of ``rig.toml`` that reads an export, with a comment and a confidence at every guess.
+
+
+#: Columns of a tilt, which is its own slope.
+TILT = {"angle", "height"}
+_SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
+
+
+def dimensions_of(kinds: Mapping[str, Kind]) -> tuple[str, ...]:
+    """The SI units of all columns of all kinds."""
+    return tuple(sorted({rule.si for kind in kinds.values() for rule in kind.columns.values()}))
+
+
+def propose_entry(file: str | Path) -> str:
+    """The lines of ``rig.toml`` that read an export; a comment gives the confidence and the reason of each guess.
+
+    The lines name the file without its folder: put the file beside ``rig.toml``. ``capsule-id import`` prints them too.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    path = Path(file)
+    return entry_of(read_file(path), path, path.name, default_registry())[0]
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a regular file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        if not path.is_file():
+            found = "a directory" if path.is_dir() else "no such file"
+            raise InputError("FILE must be a regular file", found, "correct the name", path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None
+
+
+def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -> tuple[str, Guess | None]:
+    """The lines of ``[[experiment]]`` for one export, and the guess; without a guess the lines are comments.
+
+    Parameters
+    ----------
+    content, path : the bytes of the file, and its name for error lines
+    file : its name in ``rig.toml``
+    kinds : the kinds of experiments
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    found = find_layout(content, path, dimensions_of(kinds))
+    guessed, unread = guess(found, kinds), list(_unread_lines(found, dimensions_of(kinds)))
+    if guessed is None:
+        words = " ".join(kinds)
+        headers = ", ".join(name for name in found.names if name) or "none"
+        times = disordered_times(found)
+        lines = [
+            f"#: {file}: unsure. No kind fits its headers: {headers}.",
+            *(
+                [
+                    f"#: Times must increase; {times[0]!r} does not at line {times[1]}. "
+                    "Export times with more digits, or correct the headers."
+                ]
+                if times
+                else []
+            ),
+            *unread,
+            f"#: Write one of {words}, and the columns of that kind.",
+            "# [[experiment]]",
+            '# kind = "..."',
+            f"# file = {json.dumps(file)}",
+            *(f"# {line}" for line in _layout_lines(found, replace(found.layout, missing=()))),
+            '# columns = { ... = { from = 1, unit = "..." } }',
+        ]
+        return "\n".join(lines) + "\n", None
+    kind = kinds[guessed.kind]
+    lines = [*unread, "[[experiment]]", _commented(f'kind = "{guessed.kind}"', guessed.confidence, guessed.reason)]
+    lines += [_commented(f"file = {json.dumps(file)}", "sure", _description(found, content))]
+    lines += _layout_lines(found, used_layout(found, content, [column.index for column in guessed.columns.values()]))
+    lines += _setting_lines(found, guessed, kind, file)
+    lines += ["[experiment.columns]", *_column_lines(found, guessed)]
+    return "\n".join(lines) + "\n", guessed
+
+
+def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str]:
+    """A comment on every column with the unit of a reading, or the name of a time, whose cells are not all numbers."""
+    for index, error in found.unread.items():
+        name, text = name_and_unit(found.names[index], dimensions)
+        text = text or found.units[index]
+        if fits_name(name, TIME) <= 0 and (not text or unit_of(text, dimensions) is None):
+            continue
+        remedy = "Correct the cell or delete the row, or list its text in missing."
+        if ":" in error.value and fits_name(name, TIME) > 0:
+            remedy = "Export times as seconds, or state the sampling rate."
+        yield f"#: {found.names[index]!r} is not read: line {error.line} has {' '.join(error.value.split())}. {remedy}"
+
+
+def _commented(line: str, confidence: str, reason: str) -> str:
+    """A line with the confidence of its guess as a comment."""
+    return f"{line}  # {confidence}: {' '.join(reason.split())}"
+
+
+def _description(found: FoundLayout, content: bytes) -> str:
+    """Rows and separator of a file in words."""
+    rows = len(found.export.lines)
+    text = counted(rows, "row")
+    if found.path.suffix.lower() not in (".csv", ".txt", ".tsv", ".dat"):
+        return text
+    line = TextFile(content, found.path).line(int(found.export.lines[0]) - 1)
+    return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
+
+
+def _layout_lines(found: FoundLayout, used: Any) -> Iterable[str]:
+    """The keys of the layout that differ from the default."""
+    if used.data_from_line is not None:
+        yield _commented(f"data_from_line = {used.data_from_line}", "sure", "the first row of readings")
+    if used.data_to_line is not None:
+        reason = "the last row of readings"
+        if len(found.blocks) > 1:
+            blocks = ", ".join(f"{first} to {last}" for first, last in found.blocks)
+            reason = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
+        yield _commented(f"data_to_line = {used.data_to_line}", "likely", reason)
+    if used.decimal is not None:
+        reason = "one column with a comma in every number"
+        if used.decimal == ".":
+            reason = "the header has a name for every number between commas"
+        yield _commented(f'decimal = "{used.decimal}"', "likely", reason)
+    if used.missing:
+        texts = json.dumps(list(used.missing), ensure_ascii=False)
+        yield _commented(f"missing = {texts}", "likely", "texts of cells without a reading; their rows are not used")
+
+
+def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) -> Iterable[str]:
+    """Settings that the record or the name of the file suggests."""
+    for key in kind.required:
+        stem = "".join(mark if mark.isalnum() or mark in "._-" else "_" for mark in Path(file).name.split(".")[0])
+        yield _commented(f'{key} = "{stem}"', "unsure", "from the name of the file")
+    constant = _constant_settings(found, guessed, kind)
+    yield from constant.values()
+    channel = next((name for name in guessed.columns if name != TIME), None)
+    if TIME not in kind.columns or channel is None:
+        return
+    time, values = times_of_guess(found, guessed), found.columns[guessed.columns[channel].index]
+    here = np.isfinite(values) & np.isfinite(time)
+    time, values = time[here], values[here]
+    if "samples" in kind.setting_rules and are_turning_points(values):
+        reason = "each row is smaller than the one before; remove this line if the rows are a record of the motion"
+        yield _commented('samples = "turning_points"', "unsure", reason)
+        return
+    driven = "f" in kind.setting_rules and "f" not in constant
+    if guessed.columns[TIME].unit == UNKNOWN if TIME in guessed.columns else guessed.rate is None:
+        if driven:
+            yield _commented(f'f = {{ value = "{UNKNOWN}", unit = "Hz" }}', "unsure", "state the set value")
+        return
+    if isinstance(kind.setting_rules.get("start"), QuantityRule) and (part := free_part(time, values)) is not None:
+        start, stop = part
+        yield _commented(f'start = {{ value = {start:.6g}, unit = "s" }}', "likely", "the free decay begins here")
+        if stop is not None:
+            yield _commented(f'stop = {{ value = {stop:.6g}, unit = "s" }}', "likely", "another excitation begins here")
+    if driven:
+        even = np.linspace(time[0], time[-1], len(time))
+        try:
+            frequency = dominant_frequency(even, np.interp(even, time, values))
+        except InputError:
+            return
+        line = f'f = {{ value = {frequency:.4g}, unit = "Hz" }}'
+        yield _commented(line, "unsure", f"the strongest frequency of {channel}; state the set value")
+
+
+def _constant_settings(found: FoundLayout, guessed: Guess, kind: Kind) -> dict[str, str]:
+    """A line for each setting that a column outside the map holds, the same in every row."""
+    lines, free = dict[str, str](), set(found.columns) - {column.index for column in guessed.columns.values()}
+    for (key, rule), index in product(kind.setting_rules.items(), sorted(free)):
+        if (
+            isinstance(rule, QuantityRule)
+            and is_constant(found, index)
+            and not (key == "slope" and TILT & set(guessed.columns))
+        ):
+            name, text = name_and_unit(found.names[index], [rule.si])
+            unit = unit_of(text or found.units[index], [rule.si])
+            if unit is not None and fits_name(name, key) > 0:
+                lines[key] = _commented(
+                    f'{key} = {{ value = {np.nanmax(found.columns[index]):.10g}, unit = "{unit}" }}',
+                    "unsure",
+                    f"{found.names[index]!r} is the same in every row{'; + uphill' * (key == 'slope')}",
+                )
+    return lines
+
+
+def times_of_guess(found: FoundLayout, guessed: Guess) -> np.ndarray:
+    """The times of a record, (n,) s, or in the unit of the file; sample numbers where times and rate are unknown."""
+    if TIME in guessed.columns:
+        return readings_of(found, guessed.columns[TIME], "s")
+    return np.arange(len(next(iter(found.columns.values())))) / (guessed.rate or 1.0)
+
+
+def _column_lines(found: FoundLayout, guessed: Guess) -> Iterable[str]:
+    """A line for each column of the map; as comments, one for each column of the file, where the user must choose."""
+    if TIME not in guessed.columns and guessed.rate is not None:
+        line = f'{TIME} = {{ rate = {{ value = {guessed.rate:g}, unit = "Hz" }} }}'
+        yield _commented(line, "likely", "the file states this rate and no times")
+    elif TIME not in guessed.columns and guessed.confidence == "unsure" and "sampling rate" in guessed.reason:
+        yield _commented(
+            f'{TIME} = {{ rate = {{ value = "{UNKNOWN}", unit = "Hz" }} }}', "unsure", "the file states no rate"
+        )
+    for name, column in guessed.columns.items():
+        for each in (column, *column.rivals):
+            factor = "" if each.scale is None else f", scale = {each.scale:.10g}"
+            source = f'{{ from = {source_of(found, each.index)}, unit = "{each.unit}"{factor} }}'
+            reason = column.reason if each is column else "or this one"
+            yield _commented(f"{'# ' * column.asked}{name} = {source}", column.confidence, reason)
+
+
+# report: Describes an export before it is used: channels, units, sampling, gaps, clipping, drop-outs, first and last
+# rows.
+
+
+_SHOWN_ROWS = 3
+_SHOWN_COLUMNS = 20
+
+
+def import_report(content: bytes, path: Path, kinds: Mapping[str, Kind]) -> list[str]:
+    """The report of one file, line by line, the proposed entry of ``rig.toml`` last.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    dimensions = dimensions_of(kinds)
+    found = find_layout(content, path, dimensions)
+    rows = len(next(iter(found.columns.values())))
+    size = f"{counted(rows, 'row')} of {counted(found.export.width, 'column')}"
+    lines = [f"{path.name}: {size}, {len(found.columns)} with numbers"]
+    guessed = guess(found, kinds)
+    time = None
+    if guessed is not None and TIME in guessed.columns:
+        time = times_of_guess(found, guessed)
+        known = guessed.columns[TIME].unit != UNKNOWN
+        lines += _sampling(time[np.isfinite(time)]) if known else ["sampling: the file states no unit of its times"]
+    elif found.rate is not None:
+        lines.append(f"sampling: {found.rate:g} Hz, as the file states; it holds no times")
+    for index in list(found.columns)[:_SHOWN_COLUMNS]:
+        lines += _channel(found, index, dimensions, time is not None)
+    if len(found.columns) > _SHOWN_COLUMNS:
+        lines.append(counted(len(found.columns) - _SHOWN_COLUMNS, "more column"))
+    lines += _rows(found, rows)
+    text, _ = entry_of(content, path, path.name, kinds)
+    return [*lines, "", text.rstrip()]
+
+
+def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kind]) -> str:
+    """The line ``clock = ...`` with sds that puts the second of two files on the clock of the first one.
+
+    Parameters
+    ----------
+    files : two files with their bytes
+    common : header of the signal that both hold
+
+    Raises
+    ------
+    InputError
+        If a file has no times or no such header, or the signals are not the same.
+    """
+    if len(files) < 2:
+        rule, remedy = "--clock-of must name another file", "name the file of the other logger"
+        raise InputError(rule, "the same file twice", remedy, next(iter(files)))
+    records = []
+    for path, content in files.items():
+        found = find_layout(content, path, dimensions_of(kinds))
+        guessed = guess(found, kinds)
+        if guessed is None or TIME not in guessed.columns or guessed.columns[TIME].unit == UNKNOWN:
+            raise InputError("a file must hold times with their unit", "none", "head them `time [s]`", path)
+        index = next((index for index in found.columns if found.names[index] == common), None)
+        if index is None:
+            known = ", ".join(found.names[index] for index in found.columns)
+            raise InputError(f"a file must have the column {common}", known, "name a column of both files", path)
+        records += [times_of_guess(found, guessed), found.columns[index]]
+    clock = estimate_clock(*records)
+    offset = f'{{ value = {clock.offset:.9g}, sd = {clock.offset_sd:.2g}, unit = "s" }}'
+    drift = f'{{ value = {1e6 * clock.drift:.6g}, sd = {1e6 * clock.drift_sd:.2g}, unit = "ppm" }}'
+    return f"clock = {{ offset = {offset}, drift = {drift} }}  # {clock.explained:.1%} of the signal explained"
+
+
+def _sampling(time: np.ndarray) -> Iterable[str]:
+    """Rate, jitter and gaps of the times, (n,) s."""
+    steps = np.diff(time)
+    if len(steps) < 2 or not np.all(steps > 0.0):
+        yield f"sampling: the times do not increase at {counted(int(np.sum(steps <= 0.0)), 'row')}"
+        return
+    step = float(np.median(steps))
+    jitter = float(np.sqrt(np.mean((steps[steps < 1.5 * step] / step - 1.0) ** 2)))
+    yield f"sampling: {1.0 / step:.6g} Hz from {time[0]:.6g} to {time[-1]:.6g} s, jitter {jitter:.2%} of a step (rms)"
+    gaps = find_gaps(time)
+    if gaps is not None:
+        first = time[gaps.rows[0]]
+        yield f"gaps: {len(gaps.rows)}, {counted(int(gaps.lost.sum()), 'sample')} lost, the first after {first:.6g} s"
+
+
+def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record: bool) -> Iterable[str]:
+    """Range, reading step and faults of one column."""
+    values = found.columns[index]
+    missing, values = int(np.sum(np.isnan(values))), values[np.isfinite(values)]
+    name, text = name_and_unit(found.names[index], dimensions)
+    # A lone g is a mass, unless the header says acceleration.
+    masses = () if fits_name(name, "acceleration") > 0 else ("kg",)
+    unit = unit_of(text or found.units[index], (*masses, *dimensions, *ANGULAR.values())) or "unit unknown"
+    step = reading_step(values)
+    line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"
+    line += f", reading step {step:.3g}" if step else ""
+    line += f", {missing} missing" if missing else ""
+    faults = []
+    if record and len(values) > 2 and np.ptp(values) > 0.0:
+        for clipped in clipped_samples(values, np.inf):
+            faults.append(f"{counted(len(clipped.rows), 'sample')} clipped at {clipped.level:g}")
+        for what, rows in (("drop-out", dropouts(values)), ("frozen sample", frozen_samples(values))):
+            if len(rows):
+                faults.append(f"{counted(len(rows), what)}, the first in line {found.export.lines[rows[0]]}")
+    yield "; ".join([line, *faults])
+
+
+def _rows(found: FoundLayout, rows: int) -> Iterable[str]:
+    """The first and last rows of numbers."""
+    shown = [*range(min(_SHOWN_ROWS, rows)), *range(max(rows - _SHOWN_ROWS, _SHOWN_ROWS), rows)]
+    for row in shown:
+        cells = [f"{found.columns[index][row]:.6g}" for index in list(found.columns)[:_SHOWN_COLUMNS]]
+        yield f"line {found.export.lines[row]}: {'  '.join(cells)}"

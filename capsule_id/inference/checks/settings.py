@@ -1,0 +1,506 @@
+"""Checks of residuals against settings and order, outliers, and parameters that two groups share."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import optimize, stats
+from scipy.optimize import minimize
+
+from capsule_id.experiments.base import Experiment, ValuesBySymbol
+from capsule_id.experiments.checks import autocorrelation, estimate, refit
+from capsule_id.experiments.context import Tension
+from capsule_id.experiments.friction_experiment import varies
+from capsule_id.inference.curvature import jacobian
+from capsule_id.inference.joint_fit import BenchFit
+from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import is_stated
+from capsule_id.rig.model import Rig
+from capsule_id.views import Facts, Finding
+
+if TYPE_CHECKING:
+    from capsule_id.inference.checks.widening import Widening
+
+
+# tension: Likelihood-ratio test of a parameter that two groups of experiments share (friction: tilts and slides).
+
+
+def tension(rig: Rig, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
+    """Likelihood-ratio test that two groups of experiments share their parameters (one shared parameter: mu).
+
+    Priors regularise both fits (a scatter from four trials needs one). They enter without their normalisation, so that
+    a second copy of a vague prior does not change the statistic.
+    """
+    joint, *apart = (_maximum(LogPosterior(rig, group)) for group in ([*one, *other], one, other))
+    statistic = max(2.0 * (apart[0][0] + apart[1][0] - joint[0]), 0.0)
+    return Tension(statistic, float(stats.chi2.sf(statistic, 1)), apart[0][1], apart[1][1])
+
+
+def _maximum(target: LogPosterior) -> tuple[float, dict[str, float]]:
+    """Largest penalised log-likelihood and its parameters, by name; NumPy suffices for a few readings."""
+    proposed = target.starts()
+    start = target.unconstrain(np.array([proposed[name].centre for name in target.names]))
+    # The masses change only a steady force here, so they keep their measured values.
+    free = np.array([row.symbol not in ("m1", "m2") for row in target.parameters])
+
+    def objective(v: np.ndarray) -> float:
+        u = start.copy()
+        u[free] = v
+        values = target.mapping(target.theta(u))
+        likelihood = sum(float(e.log_likelihood(e.local(values), np)) for e in target.experiments)
+        penalty = 0.5 * float(np.sum(target.prior_residuals(u)[free] ** 2))
+        return penalty - likelihood
+
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        best = minimize(objective, start[free], method="BFGS", options={"gtol": 1e-6})
+    u = start.copy()
+    u[free] = best.x
+    return -float(best.fun), target.mapping(target.theta(u))
+
+
+# sampled fit: Data of a finished fit that checks and tables read.
+
+
+@dataclass(frozen=True)
+class SampledFit:
+    """A point fit, its sample (None where nothing was sampled) and its findings so far.
+
+    See ``capsule_id.experiments.base.Fitted``.
+
+    Attributes
+    ----------
+    bench : fit of the bench tests alone, where runs were fitted too
+    seed : seed of the starting points of further point fits
+    widened : error of the model by name of the parameter, where a check failed
+    """
+
+    target: LogPosterior
+    fit: PointFit
+    posterior: Posterior | None
+    values: Mapping[str, float]
+    draws: Sequence[Mapping[str, float]] = ()
+    seed: int = 0
+    flagged: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    findings: Sequence[Finding] = ()
+    bench: BenchFit = field(default_factory=BenchFit)
+    widened: Mapping[str, "Widening"] = field(default_factory=dict)
+
+    @property
+    def rig(self) -> Rig:
+        return self.target.rig
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        return self.target.experiments
+
+    def tension(self, one: Sequence[Experiment], other: Sequence[Experiment]) -> Tension:
+        return tension(self.rig, one, other)
+
+    def correlation(self, names: Sequence[str]) -> np.ndarray:
+        if self.draws:
+            return np.atleast_2d(np.corrcoef([[draw[name] for draw in self.draws] for name in names]))
+        chosen = [self.target.names.index(name) for name in names]
+        sd = np.sqrt(np.diag(self.fit.covariance))[chosen]
+        return self.fit.covariance[np.ix_(chosen, chosen)] / np.outer(sd, sd)
+
+
+# regression: Outliers by local regression diagnostics of one experiment at the point fit.
+#
+# The model is linearised at the point fit: r is the vector of residuals in units of the noise. J is its Jacobian with
+# respect to the experiment's own parameters and linear nuisances. The hat matrix J (J'J)^-1 J' gives the leverage of
+# each reading (Cook & Weisberg 1982, section 2.2).
+
+
+#: Relative step of difference quotients, dimensionless.
+DIFFERENCE = 1e-5
+#: Singular values below this part of the largest one are those of columns that depend on each other.
+DEPENDENT = 1e-8
+#: Largest number of flagged rows per experiment. More outliers indicate a wrong model, not wrong rows.
+MOST_FLAGGED = 3
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """An outlying reading: ``row`` index, ``score`` (studentised residual), corrected p-value ``p``."""
+
+    row: int
+    score: float
+    p: float
+
+
+def moving_symbols(experiment: Experiment) -> list[str]:
+    """Symbols of the parameters that change the experiment's prediction (scatters do not)."""
+    return [row.symbol for row in experiment.parameters if not row.scatter]
+
+
+def design(experiment: Experiment, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n,) in units of the noise at the conditional mean of the nuisances, and J (n, p)."""
+    symbols = moving_symbols(experiment)
+
+    def residuals(v: np.ndarray) -> np.ndarray:
+        moved = {**theta, **dict(zip(symbols, v, strict=True))}
+        return experiment.misfit(moved).raw
+
+    misfit = experiment.misfit(theta)
+    sd, at = misfit.sd, np.array([float(theta[s]) for s in symbols])
+    raw = jacobian(residuals, at, DIFFERENCE * np.maximum(np.abs(at), 1e-12)) / sd[:, None]
+    columns = np.concatenate([raw, misfit.design / sd[:, None]], axis=1)
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 0.0] / size[size > 0.0]
+    return np.asarray(experiment.residuals(theta, np))[: experiment.n], columns
+
+
+def outliers(experiment: Experiment, theta: ValuesBySymbol, level: float) -> list[Outlier]:
+    """Readings whose externally studentised residual is too large at family-wise ``level`` (Bonferroni over rows).
+
+    The largest is removed and the test repeats, up to ``MOST_FLAGGED`` rows. The score is standard normal where the
+    noise is known. Otherwise it follows Student's t with n - p - 1 degrees of freedom, the reading left out.
+    """
+    r, columns = design(experiment, theta)
+    known = None if experiment.scale_known else _known_share(experiment, theta)
+    keep = np.arange(len(r))
+    found: list[Outlier] = []
+    while len(found) < MOST_FLAGGED and len(keep) > (basis := _basis(columns[keep])).shape[1] + 2:
+        score, freedom = _studentised(r[keep], basis, None if known is None else known[keep])
+        worst = int(np.argmax(np.abs(score)))
+        tail = stats.norm.sf(abs(score[worst])) if freedom is None else stats.t.sf(abs(score[worst]), freedom)
+        p = min(1.0, 2.0 * float(tail) * len(keep))
+        if p > level:
+            break
+        found.append(Outlier(int(keep[worst]), float(score[worst]), p))
+        keep = np.delete(keep, worst)
+    return found
+
+
+def _basis(columns: np.ndarray) -> np.ndarray:
+    """(n, rank) orthonormal columns with the span of ``columns`` (n, p).
+
+    Columns of nuisances may span those of parameters, as discrepancies do that all trials of a setting share.
+    """
+    u, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, size > DEPENDENT * np.max(size, initial=0.0)]
+
+
+def _known_share(experiment: Experiment, theta: ValuesBySymbol) -> np.ndarray:
+    """(n,) variance of the stated errors, or of the step of the digits, in units of the noise of each reading."""
+    parts = [np.broadcast_to(one.fixed_variance, one.raw.shape) for one in experiment.misfits(theta, np)]
+    return np.concatenate(parts) / experiment.misfit(theta).sd ** 2
+
+
+def _studentised(r: np.ndarray, q: np.ndarray, known: np.ndarray | None) -> tuple[np.ndarray, int | None]:
+    """Studentised residuals about the local fit with the orthonormal columns q, and degrees of freedom (None: normal).
+
+    The scale of the noise is estimated where ``known`` (n,) is stated, and no less than it; else it is 1.
+    """
+    rest = r - q @ (q.T @ r)
+    free = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-9)
+    if known is None:
+        return rest / np.sqrt(free), None
+    freedom = len(r) - q.shape[1] - 1
+    variance = np.maximum((rest @ rest - rest**2 / free) / freedom, np.maximum(known, 1e-300))
+    return rest / np.sqrt(variance * free), freedom
+
+
+# order: Order of the trials: neighbouring rows, rows of one table or of one load whose residuals are alike are not
+# independent.
+
+
+#: Family-wise false-alarm rate over the tables, and smallest correlation that counts: it widens the sd by a fifth.
+ORDER_LEVEL, SMALLEST_CORRELATION = 0.005, 0.2
+#: Number of permutations; above so many rows the correlation is normal with variance 1/n.
+PERMUTATIONS, MANY_ROWS = 10_000, 200
+#: Fewest rows that can be judged: 6 rows have 720 orders.
+FEWEST_ROWS = 6
+#: Share of cases in which a check of a setting sees an error, and the largest error, in sd, that it may need for that: a
+#: constant force beside pulls at loads from 1 to 4 needs 32 of four rows and 11 of eight, another ratio of friction beside
+#: 4 tilts and 5 pushes up to 33. Smaller errors than ``LEAST_SHIFT`` are none. Level from which a load leaves doubt.
+POWER, LARGEST_UNSEEN, LEAST_SHIFT, DOUBTFUL_LEVEL = 0.8, 40.0, 1e-3, 0.05
+#: Residuals below this share of the noise, rms, are rounding, and their order means nothing.
+SMALLEST_SCATTER = 0.02
+#: Smallest factor of the sd by which tables of one kind disagree that counts, and fewest rows of a table.
+SMALLEST_FACTOR, FEWEST_TRIALS = 1.2, 2
+#: Rows of a load, on average, from which their own mean is taken.
+ROWS_OF_A_LOAD = 3
+
+
+def check_trials(s: SampledFit) -> list[Finding]:
+    """Check that residuals of trials depend neither on the load, nor on the order, nor on the table."""
+    settings = check_settings(s)
+    return [*check_order(s, {f.experiment for f in settings if f.level == "fail"}), *check_tables(s), *settings]
+
+
+def check_order(s: SampledFit, by_load: Collection[str] = ()) -> list[Finding]:
+    """Check that residuals of neighbouring rows are uncorrelated (permutation test of the lag-1 correlation).
+
+    Parameters
+    ----------
+    by_load : tables whose residuals depend on the load: the order within a load is judged
+    """
+    findings, tables = [], []
+    for e in s.experiments:
+        if e.time_series:
+            continue
+        residuals, columns = _unflagged(s, e)
+        # An outlier shifts the fit; without it the residuals are those of the local fit to the other rows.
+        if s.flagged.get(e.label):
+            residuals = residuals - columns @ np.linalg.lstsq(columns, residuals, rcond=None)[0]
+        if e.label in by_load:
+            residuals = _within_loads(residuals, _loads(s, e)[0])
+        if len(residuals) >= FEWEST_ROWS and np.std(residuals) > SMALLEST_SCATTER:
+            tables.append((e, residuals))
+    for e, residuals in tables:
+        correlation, p = lag_1(residuals)
+        if correlation > SMALLEST_CORRELATION and p * len(tables) < ORDER_LEVEL:
+            factor = np.sqrt((1.0 + correlation) / (1.0 - correlation))
+            facts = {"correlation": correlation, "rows": len(residuals), "p": p, "factor": float(factor)}
+            findings.append(Finding("trials.order", "fail", facts, e.label))
+    return findings or [Finding("trials.order", "ok", {"number": len(tables)})] * bool(tables)
+
+
+def lag_1(residuals: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """Lag-1 correlation of residuals (n,) and the probability that a random order gives as large a one."""
+    correlation = float(autocorrelation(residuals, 1)[0])
+    n = len(residuals)
+    if n > MANY_ROWS:
+        return correlation, float(stats.norm.sf(correlation * np.sqrt(n)))
+    shuffled = np.random.default_rng(seed).permuted(np.tile(residuals - np.mean(residuals), (PERMUTATIONS, 1)), axis=1)
+    random = np.sum(shuffled[:, 1:] * shuffled[:, :-1], axis=1) / np.sum(shuffled**2, axis=1)
+    return correlation, float((1 + np.sum(random >= correlation - 1e-12)) / (1 + PERMUTATIONS))
+
+
+def check_tables(s: SampledFit) -> list[Finding]:
+    """Check that tables with the same parameters agree: by their mean residuals, or, with offsets, by their slopes."""
+    findings, number = [], 0
+    for found, members in (tables_by_mean(s), tables_by_slope(s)):
+        findings, number = [*findings, *found], number + members
+    return findings or [Finding("trials.tables", "ok", {"number": number})] * bool(number)
+
+
+def tables_by_slope(s: SampledFit) -> tuple[list[Finding], int]:
+    """Findings on tables that each have an offset, such as calibrations of one spring, and the number of tables.
+
+    The test is that of Alexander and Govern (1994): each table has its own scatter and degrees of freedom.
+    """
+    alike: dict[tuple[str, ...], list[Experiment]] = {}
+    for e in s.experiments:
+        own = [row.name for row in e.parameters if row.physical and not is_stated(row.name)]
+        nuisances = e.misfit(e.local(s.values)).design.shape[1]
+        # Two rows of a line show nothing of their scatter.
+        enough = e.scale_known or e.n - len(s.flagged.get(e.label, [])) > len(own) + nuisances
+        if e.bench and not e.time_series and own and nuisances and enough:
+            alike.setdefault((e.kind, *own), []).append(e)
+    groups, findings = [members for members in alike.values() if len(members) > 1], []
+    for members in groups:
+        row = next(row for row in members[0].parameters if row.physical)
+        fits = [estimate(e, e.local(s.values), list(s.flagged.get(e.label, []))) for e in members]
+        pairs = [one.scaled(one.scale)[row.symbol] for one in fits]
+        freedom = [np.inf if e.scale_known else one.freedom for e, one in zip(members, fits, strict=True)]
+        factor, p = heterogeneity(pairs, freedom)
+        if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
+            estimates = [(e.label, value) for e, (value, _) in zip(members, pairs, strict=True)]
+            facts = {"name": row.name, "estimates": estimates, "unit": row.unit, "p": p, "factor": factor}
+            findings.append(Finding("trials.tables", "fail", facts, members[0].label))
+    return findings, sum(map(len, groups))
+
+
+def heterogeneity(pairs: Sequence[tuple[float, float]], freedom: Sequence[float]) -> tuple[float, float]:
+    """Factor by which estimates scatter more than their standard errors say (Birge), and its probability.
+
+    The t statistic of each estimate is converted to a normal one with its own degrees of freedom.
+    """
+    value, sd = np.array(pairs).T
+    sd = np.maximum(sd, 1e-12 * np.abs(value))
+    t = (value - np.average(value, weights=sd**-2.0)) / sd
+    z = stats.norm.isf(np.maximum(stats.t.sf(np.abs(t), freedom), 1e-300))
+    chi_square, more = float(np.sum(z**2)), len(value) - 1
+    return float(np.sqrt(chi_square / more)), float(stats.chi2.sf(chi_square, more))
+
+
+def tables_by_mean(s: SampledFit) -> tuple[list[Finding], int]:
+    """Findings on tables of trials without offset and with one scatter, and the number of tables.
+
+    A permutation test of the scatter between tables. Their common scatter otherwise absorbs what differs between them.
+    """
+    alike: dict[tuple[str, ...], list[Experiment]] = {}
+    for e in s.experiments:
+        if e.bench and not e.time_series and any(row.scatter for row in e.parameters) and _means_count(s, e):
+            alike.setdefault((e.kind, *(row.name for row in e.parameters)), []).append(e)
+    several = [(m, [_unflagged(s, e)[0] for e in m]) for m in alike.values() if len(m) > 1]
+    groups = [(m, residuals) for m, residuals in several if np.std(np.concatenate(residuals)) > SMALLEST_SCATTER]
+    findings = []
+    for members, residuals in groups:
+        factor, p = between(residuals)
+        if factor > SMALLEST_FACTOR and p * len(groups) < ORDER_LEVEL:
+            name = next(row for row in members[0].parameters if row.physical)
+            facts = {
+                "name": name.name,
+                "estimates": [
+                    (e.label, refit(e, e.local(s.values), list(s.flagged.get(e.label, [])))[name.symbol][0])
+                    for e in members
+                ],
+                "unit": name.unit,
+                "p": p,
+                "factor": factor,
+            }
+            findings.append(Finding("trials.tables", "fail", facts, members[0].label))
+    return findings, sum(len(members) for members, _ in groups)
+
+
+def check_settings(s: SampledFit) -> list[Finding]:
+    """Check what settings that vary can show beside the law: the loads of a table, the speeds of all friction tables.
+
+    A parameter is not judged where an error of more than ``LARGEST_UNSEEN`` sd may go unseen.
+    """
+    residuals, end, findings = s.target.plain_residuals(s.fit.u), 0, []
+    keep, effects = np.ones(len(residuals), dtype=bool), dict[tuple[str, str], np.ndarray]()
+    for e in s.experiments:
+        theta = e.local(s.values)
+        rows, end = np.arange(end, end + e.n), end + len(e.residuals(theta, np))
+        keep[rows[list(s.flagged.get(e.label, []))]] = False
+        for setting, raw in e.alternatives(theta).items():
+            effect = effects.setdefault((setting, e.label * (setting == "loads")), np.full(len(keep), np.nan))
+            effect[rows] = raw / e.misfit(theta).sd
+    varied = {key: effect[keep] for key, effect in effects.items() if np.nansum(np.abs(effect)) > 0.0}
+    jacobian = residual_jacobian(s.target, s.fit.u)[keep][:, s.target.located] if varied else np.zeros((0, 0))
+    physical = {row.name for row in s.target.parameters if row.physical and not is_stated(row.name)}
+    for (setting, label), effect in varied.items():
+        p, errors = added_effect(residuals[keep], jacobian, effect)
+        pairs = zip(np.array(s.target.names)[s.target.located].tolist(), errors.tolist(), strict=True)
+        unseen = {name: error for name, error in pairs if name in physical and error > LEAST_SHIFT}
+        facts = {"rows": int(np.sum(~np.isnan(effect))), "unseen": unseen, "p": p}
+        if setting == "loads":
+            facts |= _of_loads(s, next(e for e in s.experiments if e.label == label), p)
+        p = facts["p"] * len(varied)
+        found = p < (DOUBTFUL_LEVEL if setting == "loads" else ORDER_LEVEL)
+        # Loads that hardly differ are one load, and mu is the coefficient there.
+        wide = setting == "speeds" or varies(np.abs(effect[~np.isnan(effect)]))
+        doubtful = tuple(name for name, error in unseen.items() if found or (wide and error > LARGEST_UNSEEN))
+        level = "fail" if setting == "loads" and p < ORDER_LEVEL else "warn" if doubtful else "ok"
+        findings.append(Finding(f"trials.{setting}", level, facts, label, doubtful * (level == "warn")))
+    return findings
+
+
+def added_effect(residuals: np.ndarray, columns: np.ndarray, effect: np.ndarray) -> tuple[float, np.ndarray]:
+    """t test of an ``effect`` (n,) on residuals beside ``columns`` (n, p) of the parameters; NaN: rows of other tables.
+
+    Return its p-value, and the shift of every parameter, in sd, by the smallest effect that the test finds in ``POWER``
+    of all cases; 1 and inf where too few rows are free.
+    """
+    q, r = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))
+    used, effect = ~np.isnan(effect), np.nan_to_num(effect)
+    shift = np.abs(np.linalg.solve(r, q.T @ effect)) / np.linalg.norm(np.linalg.inv(r), axis=1)
+    rest, residuals = (x - q @ (q.T @ x) for x in (effect, residuals))
+    length, freedom = float(np.linalg.norm(rest)), float(np.sum(used) - np.sum(q[used] ** 2)) - 1.0
+    if not (freedom >= 1.0 and length >= SMALLEST_SCATTER * np.linalg.norm(effect)):
+        return 1.0, np.where(shift > LEAST_SHIFT * np.max(shift), np.inf, 0.0)
+    size = float(rest @ residuals) / length
+    left = max(float(np.sum((residuals - size / length * rest)[used] ** 2)) / freedom, SMALLEST_SCATTER**2)
+    p = 2.0 * float(stats.t.sf(abs(size) / np.sqrt(left), freedom))
+    critical = float(stats.t.isf(ORDER_LEVEL / 2.0, freedom))
+    seen = optimize.brentq(lambda x: float(stats.nct.sf(critical, freedom, x)) - POWER, 0.0, 60.0 * critical)
+    return p, shift * seen / length
+
+
+def _of_loads(s: SampledFit, e: Experiment, p: float) -> Facts:
+    """Coefficient at every load, and the probability of what three tests find, one of them with this ``p``.
+
+    The others are permutation tests of the scatter between loads, and of the correlation with the logarithm of the load.
+    """
+    residuals, (load, coefficient) = _unflagged(s, e)[0], _loads(s, e)
+    means = [(float(one), float(np.mean(coefficient[load == one]))) for one in np.unique(load)]
+    if len(residuals) >= FEWEST_ROWS:
+        levels = _of_levels([residuals[load == one] for one in np.unique(load)])
+        p = 3.0 * min(p, levels, trend(_standardised(residuals, load), load))
+    return {"means": means, "p": p}
+
+
+def _of_levels(groups: Sequence[np.ndarray]) -> float:
+    """Probability of as large a scatter between the loads; 1 where it is small.
+
+    Each load may have a scatter of its own (Alexander and Govern 1994). With few rows a test by permutations cannot reach
+    a small probability.
+    """
+    if sum(map(len, groups)) == len(groups) or between(groups)[0] <= SMALLEST_FACTOR:
+        return 1.0
+    scatters = [float(np.ptp(group)) for group in groups]
+    if min(map(len, groups)) < ROWS_OF_A_LOAD or max(scatters) == 0.0:
+        return between(groups)[1]
+    # Equal readings at one load give it no variance of its own to test with.
+    return float((stats.alexandergovern if min(scatters) > 0.0 else stats.f_oneway)(*groups).pvalue)
+
+
+def trend(residuals: np.ndarray, load: np.ndarray, seed: int = 0) -> float:
+    """Probability that a random order of residuals (n,) has as large a correlation with the logarithm of ``load`` (n,)."""
+    x, r = np.log(load) - np.mean(np.log(load)), residuals - np.mean(residuals)
+    shuffled = np.random.default_rng(seed).permuted(np.tile(r, (PERMUTATIONS, 1)), axis=1)
+    return float((1 + np.sum(np.abs(shuffled @ x) >= np.abs(r @ x) * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
+
+
+def _within_loads(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
+    """Residuals (n,) without their mean at each load, or, where loads have few rows, without a line in its logarithm."""
+    groups = np.unique(load, return_inverse=True)[1]
+    size = np.bincount(groups)
+    if len(load) >= ROWS_OF_A_LOAD * len(size):
+        return residuals - (np.bincount(groups, residuals) / size)[groups]
+    return residuals - np.polyval(np.polyfit(np.log(load), residuals, 1), np.log(load))
+
+
+def _standardised(residuals: np.ndarray, load: np.ndarray) -> np.ndarray:
+    """Residuals (n,) over their sd at each load, where every load has enough rows."""
+    groups = np.unique(load, return_inverse=True)[1]
+    if np.min(np.bincount(groups)) < ROWS_OF_A_LOAD:
+        return residuals
+    sd = np.array([np.std(residuals[groups == k], ddof=1) for k in range(np.max(groups) + 1)])
+    return residuals / np.maximum(sd, SMALLEST_SCATTER)[groups]
+
+
+def _loads(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
+    """Load, N, and coefficient of every row without the flagged ones."""
+    assert e.loads is not None, "the table has loads"
+    load, coefficient = (np.delete(x, list(s.flagged.get(e.label, []))) for x in e.loads)
+    return load, coefficient
+
+
+def _means_count(s: SampledFit, e: Experiment) -> bool:
+    """Whether an error of the parameters shifts the mean residual of a table: it has no offset, and several trials."""
+    residuals, _ = _unflagged(s, e)
+    own = e.misfit(e.local(s.values)).design.shape[1]
+    return own == 0 and len(residuals) >= FEWEST_TRIALS
+
+
+def _unflagged(s: SampledFit, e: Experiment) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals in units of the noise and their Jacobian, without flagged rows."""
+    flagged = list(s.flagged.get(e.label, []))
+    residuals, columns = design(e, e.local(s.values))
+    return np.delete(residuals, flagged), np.delete(columns, flagged, axis=0)
+
+
+def between(residuals: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float]:
+    """Factor of the sd by which tables disagree beyond their scatter, and the probability of as large a disagreement.
+
+    The factor is that of the design effect: sqrt(1 + (rows - 1) r), r the correlation of trials of one table.
+
+    Parameters
+    ----------
+    residuals : of each table (n_i,), with one scatter
+    """
+    sizes = np.array([len(each) for each in residuals])
+    values = np.concatenate(residuals)
+    values = values - np.mean(values)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+
+    def sum_between(r: np.ndarray) -> np.ndarray:
+        return np.sum(np.add.reduceat(r, starts, axis=-1) ** 2 / sizes, axis=-1)
+
+    total, found = float(values @ values), float(sum_between(values))
+    within = (total - found) / max(len(values) - len(sizes), 1)
+    # Mean number of rows for the variance between tables (Searle, Casella & McCulloch 1992, section 3.6).
+    rows = (len(values) - float(np.sum(sizes**2)) / len(values)) / (len(sizes) - 1)
+    variance = max(0.0, (found / (len(sizes) - 1) - within) / rows)
+    correlation = variance / (variance + within) if variance > 0.0 else 0.0
+    shuffled = np.random.default_rng(seed).permuted(np.tile(values, (PERMUTATIONS, 1)), axis=1)
+    p = float((1 + np.sum(sum_between(shuffled) >= found * (1.0 - 1e-12))) / (1 + PERMUTATIONS))
+    return float(np.sqrt(1.0 + (rows - 1.0) * correlation)), p

@@ -1,0 +1,717 @@
+"""Joint fit of all experiments: its starts, its second fits, and the stage of the pipeline that runs it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from capsule_id.console import stop_if_interrupted, threads
+from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments, paper_estimates, select_tables
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.checks import Whiteness, correlated_records
+from capsule_id.experiments.friction import FrictionModel, SurfaceExperiment, model_lines
+from capsule_id.experiments.kind import Registry
+from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.inference import least_squares as difference_descent
+from capsule_id.inference.curvature import BATCH, covariance, in_batches
+from capsule_id.inference.least_squares import LeastSquaresFit, Solver, least_squares, linearised
+from capsule_id.inference.marginal import MarginalPosterior, density_of
+from capsule_id.inference.point_fit import AGREEMENT, dispersed_starts, point_fit, variance_shares
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.sampling import sample
+from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.parameters import is_stated
+from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.views import Finding, counted
+
+# joint starts: Starting points of the joint fit: the bench estimates and the best of many candidates around them.
+#
+# The likelihood of a run has local maxima far from the truth. Where bench estimates are wrong by more than their stated
+# errors, a fit from them ends in one. Candidates differ from the bench estimates in some parameters, by 0.3 % to 30 %.
+# For runs alone, the estimates of the paper's protocol replace those of the bench. Log-posteriors come in batches.
+
+
+#: Number of starting points that are always tried (the bench estimate included), and the largest number.
+STARTS, MAX_STARTS = 3, 8
+#: Number of candidates.
+CANDIDATES = 1024
+#: Where motions have kinks: number of the best candidates, and of others, that descend before the starting points are
+#: chosen; and their steps.
+CONTENDERS, FIRST_STEPS = 16, 6
+#: Perturb a random half of the parameters, by a log-sd that is log-uniform between these two.
+PROBABILITY_TO_PERTURB, SMALLEST_LOG_SD, LARGEST_LOG_SD = 0.5, 3e-3, 0.3
+
+
+def choose_starts(
+    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float]
+) -> np.ndarray:
+    """(at most MAX_STARTS, d) in u: the bench's estimates and the candidates of largest log-posterior.
+
+    The largest come first. The bench estimate, with the values of ``first``, is one of the first ``STARTS``. Without
+    estimates, and where an amplitude has no sign, it is the centre of the priors and has no place of its own.
+    """
+    rng = np.random.default_rng(seed)
+    candidates = dispersed_starts(target, seed, CANDIDATES)
+    theta = target.theta(candidates[0])
+    estimates = {**dict(zip(target.names, theta, strict=True)), **known, **first}
+    centre = target.unconstrain(np.array([estimates[name] for name in target.names]))
+    of_runs = {row.name for e in target.experiments if e.event_driven for row in e.parameters}
+    has = np.array([name in known for name in target.names])
+    open_ = has & target.positive & ~target.scatter & np.array([name in of_runs for name in target.names])
+    width = np.exp(rng.uniform(np.log(SMALLEST_LOG_SD), np.log(LARGEST_LOG_SD), candidates.shape)) * open_
+    moved = np.where(has, width * rng.standard_normal(candidates.shape), candidates - candidates[0]) + centre
+    candidates = np.where((rng.random(candidates.shape) < PROBABILITY_TO_PERTURB) & ~target.scatter, moved, centre)
+    mirrored = np.isin(target.names, [name for e in target.experiments for name in e.mirrored])
+    candidates = np.where(mirrored & (rng.random((len(candidates), 1)) < 0.5), -candidates, candidates)
+    # Copies of the centre would agree with it without a proof.
+    candidates = np.concatenate([centre[None], candidates[np.any(candidates != centre, axis=1)]])
+    value = weigh(target, candidates)
+    if any(e.has_joint_scatters for e in target.experiments):
+        candidates[1:], value[1:] = _descended(target, candidates[1:], value[1:])
+    ranked = 1 + np.argsort(-value[1:])[: MAX_STARTS - 1]
+    ranked = ranked[np.isfinite(value[ranked])]
+    if not known and mirrored.any() and len(ranked) >= STARTS:
+        return candidates[ranked]
+    early = np.append(ranked[: STARTS - 1], 0)
+    return candidates[[*early[np.argsort(-value[early], kind="stable")], *ranked[STARTS - 1 :]]]
+
+
+def _descended(target: LogPosterior, candidates: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Candidates (m, d) and their log-posterior (m,), of which the best have descended a few steps.
+
+    A motion with kinks has narrow maxima: the best of random candidates often lie near a wrong one.
+    """
+    candidates, value = candidates.copy(), value.copy()
+    ranked = np.argsort(-value)
+    ranked = ranked[np.isfinite(value[ranked])]
+    # The best ones often lie near one maximum, so that worse ones descend too.
+    chosen = np.append(ranked[:CONTENDERS], ranked[CONTENDERS :: max(len(ranked) // CONTENDERS, 1)])
+    if len(chosen):
+        ends = candidates[chosen]
+        for u in ends:
+            u[target.located] = difference_descent.descend(target, u, FIRST_STEPS).x[0]
+        reached = weigh(target, ends)
+        # Squares may fall while the log-posterior does too, because the scatter of a trial depends on the motion.
+        higher = reached > value[chosen]
+        candidates[chosen[higher]], value[chosen[higher]] = ends[higher], reached[higher]
+    return candidates, value
+
+
+def weigh(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(n,) log-posterior of u (n, d), one compiled batch for any n; -inf where it is not finite."""
+    density = density_of(target)
+    # The first batch compiles the program that all threads then call.
+    first, rest = in_batches(density, u[:BATCH]), u[BATCH:]
+    return np.concatenate([first, in_batches(density, rest)]) if len(rest) else first
+
+
+# joint fit: Joint point fit of bench tests and forced runs.
+#
+#     bench tests -> bench point fit -> starting points around it (``joint_starts``), initial conditions from the
+# records
+#     -> alternate Levenberg–Marquardt on the located parameters and conditional maxima of the scatters until converged
+#     -> repeat from any better point that a change of one parameter reaches
+#
+# Derivatives of the event-driven model are exact, in forward mode. The Hessian is that of Gauss–Newton, because the
+# residuals are small. The likelihood has local maxima (one contact more or less), so the fit needs several starts.
+
+
+#: Tolerance, dimensionless, and largest number of solver steps of one descent.
+SOLVER = Solver(tolerance=1e-7, max_steps=80, heavy=True)
+#: Largest number of rounds of least squares and scatters. Convergence tolerance of a round, in standard deviations.
+ROUNDS, SMALL_MOVE_IN_SD = 8, 0.01
+#: Largest number of rounds where residuals have kinks: small moves go on there without an end.
+ROUNDS_WITH_KINKS = 3
+#: Single-parameter steps after a descent, in standard deviations. A point whose log-posterior is higher by more than
+#: ``LEAST_INCREASE`` starts another descent, at most ``MAX_RESTARTS`` times.
+MOVES_IN_SD, LEAST_INCREASE, MAX_RESTARTS = 2.0 ** np.arange(8), 1.0, 4
+#: Largest such step of a positive parameter, natural logarithm.
+FARTHEST = 2.0
+#: Differences in log-posterior below this count as equal. A contact that crosses a sample gives the likelihood a kink.
+#: Kinks produce local maxima less than a standard deviation apart, which count as one. The gradient does not vanish
+#: at a kink, so a descent ends where the predicted Gauss–Newton increase is below this.
+NEGLIGIBLE_INCREASE = 0.1
+#: Stop refining a start whose cost exceeds this many times the best.
+COST_RATIO_TO_ABANDON = 3.0
+#: Searches that run side by side; their number does not depend on the cores, nor do the results.
+TOGETHER = 2
+#: Try starts until two of them fit every channel within this many times its noise, or so many end at the same maximum.
+NOISE_RATIO_OF_A_GOOD_FIT, ENOUGH_THAT_AGREE = 1.2, 4
+#: Search range of a scatter's conditional maximum about its value, natural logarithm.
+SCATTER_SEARCH = 6.0
+#: Settings of the search over scatters that act together, natural logarithm.
+JOINT_SEARCH = {"xatol": 1e-3, "fatol": 1e-4, "maxiter": 2000}
+#: Factors by which a scatter moves together with what it multiplies.
+FACTORS = np.geomspace(0.1, 10.0, 32)
+
+
+@dataclass(frozen=True)
+class _End:
+    """End point of a descent: u (d,), the last least-squares fit, convergence, log-posterior."""
+
+    u: np.ndarray
+    fit: LeastSquaresFit
+    converged: bool
+    value: float
+
+
+def joint_fit(
+    target: LogPosterior,
+    known: Mapping[str, float],
+    seed: int,
+    first: Mapping[str, float] | None = None,
+    starts: np.ndarray | None = None,
+) -> PointFit:
+    """Fit ``target``, whose experiments include forced runs.
+
+    Parameters
+    ----------
+    known : previous estimates by name: a fit of the bench tests, or the paper's estimates
+    seed : seed of the candidates
+    first : values by name that replace those of ``known`` in the first starting point
+    starts : (s, d) u of the starting points, instead of the best candidates
+    """
+    starts = _choose_starts(target, known, seed, first or {}) if starts is None else starts
+    ends = _ends(target, starts)
+    u, value = np.stack([end.u for end in ends]), np.array([end.value for end in ends])
+    best = int(np.argmax(value))
+    if not np.isfinite(value[best]):
+        raise _not_finite(target, ends[best].fit, len(starts))
+    fit, located = ends[best].fit, target.located
+    matrix = np.zeros((target.dimension, target.dimension))
+    located_covariance = covariance(fit.jacobian[0], fit.residuals[0], residual_sd=1.0)
+    matrix[np.ix_(located, located)] = located_covariance.matrix
+    scatters = np.flatnonzero(target.scatter)
+    matrix[scatters, scatters] = _scatter_variances(target, u[best])
+    spread = np.sqrt(np.diag(matrix))
+    theta = target.theta(u[best])
+    errors = np.full(target.dimension, np.nan)
+    errors[located] = located_covariance.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    return PointFit(
+        names=target.names,
+        u=u[best],
+        values=dict(zip(target.names, (float(v) for v in theta), strict=True)),
+        covariance=matrix,
+        standard_errors=dict(zip(target.names, (float(e) for e in errors), strict=True)),
+        starts=starts[: len(ends)],
+        ends=u,
+        log_posterior=value,
+        at_other_maximum=_at_another_maximum(u, value, spread),
+        stalled=np.array([not end.converged for end in ends]),
+        shares=variance_shares(target, fit.jacobian[0], target.residual_owners(u[best])),
+    )
+
+
+def _not_finite(target: LogPosterior, fit: LeastSquaresFit, starts: int) -> InputError:
+    """The error where no start leads to a finite fit: the derivatives that are not finite where the motion is."""
+    columns = np.isfinite(fit.jacobian[0]).all(axis=0)
+    names = [target.names[i] for i, finite in zip(target.located, columns, strict=True) if not finite]
+    alone = "fit the bench alone (--experiments bench)"
+    if names and np.isfinite(fit.residuals).all():
+        rule, value = (
+            "every motion must have finite derivatives",
+            f"the motion is finite, its derivative is not: {', '.join(names)}",
+        )
+        return InputError(rule, value, f"state a prior of {' and '.join(names)} with another median, or {alone}")
+    rule = "bench and runs are fitted from a start at which every motion is finite"
+    return InputError(
+        rule, f"none in {counted(starts, 'start')}", f"check masses, gaps and settings of the runs, or {alone}"
+    )
+
+
+def _ends(target: LogPosterior, starts: np.ndarray) -> list[_End]:
+    """Search from the ``starts`` (s, d) until some suffice: alone until a motion is finite, then ``TOGETHER``."""
+    ends: list[_End] = []
+    with threads(TOGETHER) as workers:
+        while len(ends) < len(starts):
+            best = max(ends, key=lambda end: end.value, default=None)
+            if best is None or not np.isfinite(best.value):
+                ends.append(_search(target, starts[len(ends)], np.inf))
+                continue
+            if _suffice(target, ends, best.value):
+                break
+            # Reuse the noise levels of the best fit.
+            own = np.where(target.scatter, best.u, starts[len(ends) : len(ends) + TOGETHER])
+            limit = COST_RATIO_TO_ABANDON * float(best.fit.cost[0])
+            ends += workers.map(partial(_search, target, limit=limit), own)
+    return ends
+
+
+def _choose_starts(
+    target: LogPosterior, known: Mapping[str, float], seed: int, first: Mapping[str, float]
+) -> np.ndarray:
+    """``choose_starts``, while another thread compiles the derivatives; an error occurs again where they are used."""
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(_compile_descent, target)
+        return choose_starts(target, known, seed, first)
+
+
+def _compile_descent(target: LogPosterior) -> None:
+    """Compile what ``_descend`` computes at a point."""
+    u = dispersed_starts(target, 0, 1)
+    if any(e.has_joint_scatters for e in target.experiments):
+        difference_descent.rows_of(target, u)
+    else:
+        linearised(HeldResiduals(target, jnp.asarray(u[0])), u[0, target.located])
+
+
+def _at_another_maximum(u: np.ndarray, value: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(s,) whether each end u (s, d) differs from the best maximum; log-posterior (s,), posterior sd (d,)."""
+    best = int(np.argmax(value))
+    away = np.max(np.abs(u - u[best]) / spread, axis=1)
+    dent = (away < 1.0) & (value > value[best] - NEGLIGIBLE_INCREASE)
+    return ~((away <= AGREEMENT) | dent) | ~np.isfinite(value)
+
+
+def _suffice(target: LogPosterior, ends: list[_End], highest: float) -> bool:
+    """Whether further starts are not needed: two fit every channel, or many reach the ``highest`` log-posterior."""
+    if len(ends) < STARTS:
+        return False
+    if sum(end.value > highest - NEGLIGIBLE_INCREASE for end in ends) >= ENOUGH_THAT_AGREE:
+        return True
+    return sum(not _has_excess_noise(target, end.u) for end in ends) > 1
+
+
+def _has_excess_noise(target: LogPosterior, u: np.ndarray) -> bool:
+    """Whether the residuals of a record at u (d,) exceed its noise level: the model does not fit its motion."""
+    values = target.mapping(target.theta(u))
+    return any(e.excess_noise(e.local(values)) > NOISE_RATIO_OF_A_GOOD_FIT for e in target.experiments)
+
+
+def _search(target: LogPosterior, start: np.ndarray, limit: float) -> _End:
+    """Repeat ``_descend`` from any better point that a change of one parameter reaches."""
+    end = _descend(target, start, limit)
+    for _ in range(MAX_RESTARTS):
+        if not np.isfinite(end.value) or end.fit.cost[0] > limit:
+            break
+        better = _better_point(target, end)
+        if better is None:
+            break
+        other = _descend(target, better, limit)
+        if other.value <= end.value:
+            break
+        end = other
+    return end
+
+
+def _better_point(target: LogPosterior, end: _End) -> np.ndarray | None:
+    """(d,) best point that differs from ``end`` in one located parameter; None if none is clearly better."""
+    located = target.located
+    sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(end.fit.jacobian[0].T @ end.fit.jacobian[0])), 0.0))
+    farthest = np.where(target.positive[located], FARTHEST, np.inf)
+    sizes = np.minimum(MOVES_IN_SD[:, None] * sd, farthest)[:, None, :] * np.eye(len(located))
+    steps = np.concatenate([sizes, -sizes]).reshape(-1, len(located))
+    points = np.repeat(end.u[None], len(steps) + 1, axis=0)
+    points[1:, located] += steps
+    value = weigh(target, points)
+    best = int(np.argmax(value))
+    return points[best] if value[best] > value[0] + LEAST_INCREASE else None
+
+
+def _descend(target: LogPosterior, start: np.ndarray, limit: float = np.inf) -> _End:
+    """Descend from one start (d,); stop where the cost exceeds ``limit`` or a number is not finite."""
+    located = target.located
+    u, still, fit = start.copy(), False, None
+    kinked = any(e.has_joint_scatters for e in target.experiments)
+    for _ in range(ROUNDS_WITH_KINKS if kinked else ROUNDS):
+        stop_if_interrupted()
+        if kinked:
+            fit = difference_descent.descend(target, u)
+        else:
+            fit = least_squares(HeldResiduals(target, jnp.asarray(u)), u[located][None], SOLVER)
+        if not all(np.isfinite(part).all() for part in (fit.x, fit.residuals, fit.jacobian)):
+            return _End(u, fit, False, -np.inf)
+        sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jacobian[0].T @ fit.jacobian[0])), 0.0))
+        moved = np.max(np.abs(fit.x[0] - u[located]) / np.where(sd > 0, sd, 1.0))
+        u[located] = fit.x[0]
+        scatters = scatter_modes(target, u)
+        shift = max((abs(scatters[i] - u[i]) for i in scatters), default=0.0)
+        for i, value in scatters.items():
+            u[i] = value
+        before, u = u, _rescaled(target, u)
+        still = bool(moved < SMALL_MOVE_IN_SD and shift < SMALL_MOVE_IN_SD and np.array_equal(before, u))
+        if still or fit.cost[0] > limit:
+            break
+    assert fit is not None, "there is at least one round"
+    converged = (still or bool(fit.cost[0] > limit)) and _is_converged(fit)
+    return _End(u, fit, converged, float(weigh(target, u[None])[0]))
+
+
+def _rescaled(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """The best of u (d,) and of points with the same motion, at which a scatter and what it multiplies have changed.
+
+    The readings determine only their product, so that a change of one alone is always worse.
+    """
+    for scale, own, _ in target.scaled:
+        points = np.repeat(u[None], len(FACTORS), axis=0)
+        points[:, scale] += np.log(FACTORS)
+        points[:, own] /= FACTORS[:, None]
+        value = weigh(target, points)
+        u = points[np.argmax(value)] if np.max(value) > weigh(target, u[None])[0] else u
+    return u
+
+
+def _is_converged(fit: LeastSquaresFit) -> bool:
+    """Whether a fit from one start converged, or stopped where no step increases the log-posterior."""
+    step = np.linalg.lstsq(fit.jacobian[0], -fit.residuals[0])[0]
+    return not fit.stalled[0] or bool(0.5 * np.sum((fit.jacobian[0] @ step) ** 2) < NEGLIGIBLE_INCREASE)
+
+
+def scatter_modes(target: LogPosterior, u: np.ndarray) -> dict[int, float]:
+    """Conditional maximum, in u, of every scatter given the located entries of u (d,), by index."""
+    modes = {}
+    for i, terms in _scatter_terms(target, u).items():
+        bounds = (u[i] - SCATTER_SEARCH, u[i] + SCATTER_SEARCH)
+        found: Any = minimize_scalar(lambda t, terms=terms: -terms(t), bounds=bounds, options={"xatol": 1e-5})
+        modes[i] = float(found.x)
+    members, together = _joint_scatters(target, u)
+    if len(members):
+        at = minimize(lambda t: -together(t), u[members], method="Nelder-Mead", options=JOINT_SEARCH).x
+        modes |= dict(zip(members.tolist(), at.tolist(), strict=True))
+    return modes
+
+
+def _scatter_variances(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """Inverse curvature of every scatter's conditional density at u (d,), in the order of the scatters."""
+    h, variances = 0.05, {}
+    members, together = _joint_scatters(target, u)
+    terms = _scatter_terms(target, u)
+    for place, i in enumerate(members.tolist()):
+        unit = np.eye(len(members))[place]
+        terms[i] = lambda t, unit=unit, i=i: together(u[members] + (t - u[i]) * unit)
+    for i, own in terms.items():
+        bend = (2.0 * own(u[i]) - own(u[i] + h) - own(u[i] - h)) / h**2
+        variances[i] = 1.0 / max(bend, 0.1)
+    return np.array([variances[i] for i in np.flatnonzero(target.scatter).tolist()])
+
+
+def _joint_scatters(target: LogPosterior, u: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], float]]:
+    """Indices of the scatters that only act together, and their log-density in u, up to a constant."""
+    own = [e for e in target.experiments if e.has_joint_scatters]
+    values = target.mapping(target.theta(u))
+    names = dict.fromkeys(row.name for e in own for row in e.parameters if row.scatter)
+    members = np.array([target.names.index(name) for name in names], dtype=int)
+    profiles = [(e.profile(e.local(values)), {r.symbol: r.name for r in e.parameters if r.scatter}) for e in own]
+    priors = target.priors.at(members, np)
+
+    def together(t: np.ndarray) -> float:
+        sizes = dict(zip(names, np.exp(t), strict=True))
+        total = sum(profile({s: sizes[name] for s, name in rows.items()}) for profile, rows in profiles)
+        return float(total + np.sum(priors.terms(t, np.exp(t), np)))
+
+    return members, together
+
+
+def _scatter_terms(target: LogPosterior, u: np.ndarray) -> dict[int, Callable[[float], float]]:
+    """log-density of each scatter that acts alone, given the located entries of u (d,), up to a constant, by index."""
+    values = target.mapping(target.theta(u))
+    parts: dict[int, list[Misfit | Moments]] = {}
+    for experiment in target.experiments:
+        if experiment.has_joint_scatters:
+            continue
+        names = {row.symbol: row.name for row in experiment.parameters}
+        for part, symbol in zip(experiment.summaries(experiment.local(values), np), experiment.scatters, strict=True):
+            if symbol is not None:
+                parts.setdefault(target.names.index(names[symbol]), []).append(part)
+    priors = {i: target.priors.at(i, np) for i in parts}
+
+    def terms(i: int, t: float) -> float:
+        own = sum(part.log_density(np.exp(t), np) for part in parts[i])
+        return float(own + priors[i].terms(np.float64(t), np.exp(t), np))
+
+    return {i: partial(terms, i) for i in parts}
+
+
+# second fits: Further fits of runs whose residuals are correlated: coloured noise, then other friction laws.
+#
+# first joint fit -> residuals correlated -> joint fit with AR(1) noise, quoted where it explains more
+#     -> residuals still correlated -> joint fits with other friction laws, which are named and never quoted
+
+
+#: Friction laws that are compared, the simplest first.
+LAWS = (FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",)))
+#: Difference of penalised log-posteriors that rejects a simpler law: "strong" (Kass & Raftery 1995).
+STRONG = 3.0
+#: Standard errors of the difference that reject a simpler law where every law leaves correlated residuals.
+ERRORS = 2.0
+#: Parts of an excitation period.
+PHASES = 6
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A target and its point fit."""
+
+    target: LogPosterior
+    fit: PointFit
+
+    @classmethod
+    def of(
+        cls, other: LogPosterior, experiments: Sequence[Experiment], known: Mapping[str, float], seed: int
+    ) -> "_Fit":
+        """Fit other models of the same readings, from many starts about values by name."""
+        target = LogPosterior(other.rig, experiments)
+        return cls(target, joint_fit(target, known, seed))
+
+    def with_law(self, law: FrictionModel, seed: int) -> "_Fit":
+        """Fit another friction law from this fit alone: the motion is known, and only a comparison needs the result."""
+        experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in self.target.experiments]
+        target = LogPosterior(self.target.rig, experiments)
+        values = {**{name: start.centre for name, start in target.starts().items()}, **self.values}
+        start = target.unconstrain(np.array([values[name] for name in target.names]))
+        return _Fit(target, joint_fit(target, values, seed, starts=start[None]))
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Parameters and constants by name, SI."""
+        return self.target.mapping(self.target.theta(self.fit.u))
+
+    @property
+    def correlated(self) -> list[Whiteness]:
+        """Records whose residuals are not white."""
+        return correlated_records(self.target.experiments, self.values)[0]
+
+    @property
+    def height(self) -> float:
+        """Largest log-posterior, less Schwarz's penalty for the number of parameters."""
+        readings = sum(e.n for e in self.target.experiments)
+        return float(np.max(self.fit.log_posterior)) - 0.5 * self.target.dimension * float(np.log(readings))
+
+    @property
+    def physical(self) -> list[str]:
+        """Names of the physical parameters that are no stated values."""
+        return [row.name for row in self.target.parameters if row.physical and not is_stated(row.name)]
+
+    def row(self, name: str) -> dict[str, Any]:
+        """Row of a table that compares fits of the same readings."""
+        values, errors = self.fit.values, self.fit.standard_errors
+        return {
+            "fit": name,
+            "parameters": ", ".join(f"{own} = {values[own]:.5g} ± {errors[own]:.2g}" for own in self.physical),
+            "log-posterior": float(np.max(self.fit.log_posterior)),
+            "residuals white": "no" if self.correlated else "yes",
+        }
+
+    def densities(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Cycle, and log-density up to a constant, of every reading of each record (n,)."""
+        values, found = self.values, []
+        for e in self.target.experiments:
+            if e.cycles is not None:
+                misfit, channels = e.misfit(e.local(values)), e.n // len(e.cycles)
+                density = -0.5 * misfit.at_nuisance_mean(np)[0] ** 2 - np.log(misfit.sd)
+                found.append((np.tile(e.cycles, channels), density[: channels * len(e.cycles)]))
+        return found
+
+
+def fit_coloured(target: LogPosterior, first: PointFit, seed: int) -> tuple[LogPosterior, PointFit, list[Finding]]:
+    """Fit runs again with coloured noise where their residuals are correlated and the settings state no noise.
+
+    The second fit is returned where it explains the readings better, and a finding that shows both.
+    """
+    white = _Fit(target, first)
+    values, correlated = white.values, {one.experiment.shares_noise for one in white.correlated}
+    changed = [
+        e.with_coloured_noise(e.local(values)) if e.shares_noise in correlated else None for e in target.experiments
+    ]
+    if not any(changed):
+        return target, first, []
+    experiments = [e if new is None else new[0] for e, new in zip(target.experiments, changed, strict=True)]
+    starts = {name: value for new in changed if new is not None for name, value in new[1].items()}
+    coloured = _Fit.of(target, experiments, {**values, **starts}, seed)
+    if coloured.height < white.height:
+        return target, first, []
+    rows = [white.row("first, white noise"), coloured.row("quoted, AR(1) noise")]
+    records = list(dict.fromkeys(e.shares_noise for e, new in zip(target.experiments, changed, strict=True) if new))
+    finding = Finding("runs.second_fit", "warn", {"records": records, "fits": rows}, records[0])
+    return coloured.target, coloured.fit, [finding]
+
+
+def compare_laws(target: LogPosterior, fit: PointFit, seed: int) -> list[Finding]:
+    """Fit other friction laws to runs whose residuals are correlated; a finding names the simplest of the best ones.
+
+    Only where runs alone measure friction: friction tests compare the laws themselves.
+    """
+    quoted, own = _Fit(target, fit), law_of_runs(target.experiments)
+    correlated = [one.experiment for one in quoted.correlated if one.experiment.event_driven]
+    if own is None or not correlated:
+        return []
+    fits = {own: quoted}
+    for law in LAWS:
+        if law != own:
+            with suppress(InputError):  # no motion with this law is finite
+                fits[law] = quoted.with_law(law, seed)
+    best = max(fits.values(), key=lambda one: one.height)
+    behind = {law: _behind(one, best) for law, one in fits.items()}
+    close = [law for law, (difference, error) in behind.items() if difference <= max(STRONG, ERRORS * error)]
+    chosen = min(close, key=lambda law: (len(law.parameters), law != own))
+    new = fits[chosen].fit.values
+    facts = {
+        "own": own.name,
+        "law": chosen.name,
+        "line": model_lines(chosen),
+        "better": own not in close,
+        "gain": behind[own][0] - behind[chosen][0],
+        "moved": [(name, quoted.values[name], new[name]) for name in quoted.physical if name in new],
+        "laws": [
+            {**fits[law].row(law.name), "behind the best": f"{difference:.0f} ± {error:.0f}"}
+            for law, (difference, error) in sorted(behind.items(), key=lambda item: item[1][0])
+        ],
+    }
+    return [Finding("runs.laws", "ok" if chosen == own else "warn", facts, correlated[0].label)]
+
+
+def _behind(one: _Fit, best: _Fit) -> tuple[float, float]:
+    """Penalised log-posterior of the ``best`` fit less that of ``one``, and its standard error.
+
+    Where the best fit leaves white residuals, the standard error is 0. Else every model has an error, and likelihoods
+    count the readings as more than they are: the standard error is that of a sum over parts of the records, over whole
+    periods or over phases of the excitation, whichever is larger.
+    """
+    difference = best.height - one.height
+    if one is best or not best.correlated:
+        return difference, 0.0
+    by_period, by_phase = [], []
+    for (cycles, high), (_, low) in zip(best.densities(), one.densities(), strict=True):
+        by_period.append(np.bincount((cycles - cycles[0]).astype(int), high - low))
+        by_phase.append(np.bincount((cycles % 1.0 * PHASES).astype(int), high - low))
+    return difference, max(error_of_sum(np.concatenate(parts)) for parts in (by_period, by_phase))
+
+
+def error_of_sum(parts: np.ndarray) -> float:
+    """Standard error of the sum of independent ``parts`` (n,); 0 for a single one, which tells nothing of it."""
+    return float(np.sqrt(len(parts) * np.var(parts, ddof=1))) if len(parts) > 1 else 0.0
+
+
+def law_of_runs(experiments: Sequence[Experiment]) -> FrictionModel | None:
+    """The friction law of the runs; None where other tests measure friction, or the law is a user's own."""
+    symbols = {row.symbol for row in CoulombStribeck.parameters}
+    users = [e for e in experiments if symbols & {row.symbol for row in e.parameters}]
+    laws = [e.friction for e in users if isinstance(e, SurfaceExperiment) and e.event_driven and e.time_series]
+    return laws[0] if laws and len(laws) == len(users) and laws[0].law is CoulombStribeck else None
+
+
+# point stage: Stages of the point fit: bench tests in closed form, division of unpredictable runs, joint fit.
+#
+# experiments -> fit of the bench tests in closed form -> divide runs that amplify initial errors -> LogPosterior ->
+# joint fit
+#     -> where residuals of runs are correlated: second joint fit with coloured noise, and fits with other friction laws
+
+
+#: emcee steps of the bench sample, which measures the precision gained from runs and their agreement.
+BENCH_BUDGET = 1000
+#: Largest number of fits. Each fit follows a correction of the kinds of initial state that the last one contradicts.
+STAGE_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class BenchFit:
+    """Fit and sample of the bench tests in closed form alone, ``event_driven`` false.
+
+    Both are None where there are none; the sample is None where nothing was sampled.
+    """
+
+    fit: PointFit | None = None
+    sample: Posterior | None = None
+
+
+@dataclass(frozen=True)
+class PointStage:
+    """Result of the point fit; ``target`` holds the experiments as fitted, with divided records."""
+
+    target: LogPosterior
+    fit: PointFit
+    bench: BenchFit
+    seed: int
+    findings: tuple[Finding, ...] = ()
+
+
+def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: bool) -> PointStage:
+    """Fit the experiments of ``target``.
+
+    Parameters
+    ----------
+    registry : kinds of experiments of the rig, for rough values from bench tests that are not fitted
+    seed : seed of the starting points and of the bench sample
+    sampled : whether a sample follows: then sample the bench tests alone too
+    """
+    closed = [e for e in target.experiments if not e.event_driven]
+    if len(closed) == len(target.experiments):
+        return PointStage(target, point_fit(target, seed), BenchFit(), seed)
+    alone = LogPosterior(target.rig, closed) if closed else None
+    bench = None if alone is None else point_fit(alone, seed)
+    known = _paper_values(target, registry) if bench is None else dict(bench.values)
+    target, findings = cut_unpredictable(target, known)
+    # The joint fit takes one core most of the time: the bench is sampled on another one.
+    with threads(1) as beside:
+        own = None
+        if alone and bench and sampled:
+            own = beside.submit(sample, MarginalPosterior(alone, bench), seed, BENCH_BUDGET)
+        target, joint, wavering = _fit_with_right_starts(target, known, seed)
+        target, joint, second = fit_coloured(target, joint, seed)
+        second += compare_laws(target, joint, seed)
+        bench_fit = BenchFit(bench, None if own is None else own.result())
+    return PointStage(target, joint, bench_fit, seed, (*findings, *wavering, *second))
+
+
+def _fit_with_right_starts(
+    target: LogPosterior, known: Mapping[str, float], seed: int
+) -> tuple[LogPosterior, PointFit, list[Finding]]:
+    """Repeat the joint fit while it contradicts the kind of initial state of a run; report what remains."""
+    first = None
+    for remaining in reversed(range(STAGE_ROUNDS)):
+        joint = joint_fit(target, known, seed, first)
+        corrected = correct_starts(target, joint)
+        if corrected is None:
+            return target, joint, []
+        if remaining:
+            target, first = LogPosterior(target.rig, corrected[0]), corrected[1]
+    doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
+    facts = {"labels": ", ".join(doubtful), "rounds": STAGE_ROUNDS}
+    return target, joint, [Finding("runs.start", "fail", facts, doubtful[0])]
+
+
+def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:
+    """Return the paper's estimates from the rig's bench tests, including tests that ``target`` lacks."""
+    bench = [e for e in target.experiments if e.bench]
+    if not bench and select_tables(target.rig, "bench"):
+        bench = make_experiments(target.rig, "bench", registry)
+    return paper_estimates(bench, registry)
+
+
+def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple[LogPosterior, list[Finding]]:
+    """Divide every run that amplifies errors of its initial state too much; return findings too.
+
+    Parameters
+    ----------
+    known : estimates by name; a missing parameter takes the starting value of a fit
+    """
+    values = {**target.fixed, **{name: start.centre for name, start in target.starts().items()}, **known}
+    kept: list[Experiment] = []
+    findings: list[Finding] = []
+    for e in target.experiments:
+        parts, found = e.predictable_parts(e.local(values))
+        kept += parts
+        findings += found
+    return (LogPosterior(target.rig, kept) if len(kept) > len(target.experiments) else target), findings
+
+
+def correct_starts(target: LogPosterior, fit: PointFit) -> tuple[list[Experiment], dict[str, float]] | None:
+    """Replace initial conditions that the record contradicts at ``fit``; return experiments and starting values.
+
+    None: the record contradicts no initial condition.
+    """
+    values = target.mapping(target.theta(fit.u))
+    corrected = [e.corrected_start(e.local(values)) for e in target.experiments]
+    if not any(corrected):
+        return None
+    for found in corrected:
+        values |= {} if found is None else found[1]
+    pairs = zip(target.experiments, corrected, strict=True)
+    return [e if found is None else found[0] for e, found in pairs], values

@@ -1,0 +1,369 @@
+"""Nonlinear least squares from several starts, by derivatives or by differences."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+
+from capsule_id.console import stop_if_interrupted
+from capsule_id.inference.curvature import Covariance, Jacobian, Residuals, all_finite, column_space, covariance
+from capsule_id.inference.target import LogPosterior
+from capsule_id.physics.batches import pool
+from capsule_id.precision import COMPILE, COMPILE_QUICKLY, require_float64
+
+# least squares: Nonlinear least squares from several starts, with the covariance of the parameters.
+#
+# Residuals r(x), (d,) -> (n,); cost ½ Σ r²; J = ∂r/∂x, (n, d). At the minimum the covariance of the parameters is
+# σ² (JᵀJ)⁻¹ with σ² = Σ r² / (n − d) unless it is known (Seber & Wild, *Nonlinear Regression*, 1989, ch. 2).
+
+
+require_float64()
+
+Residual = Callable[[jax.Array], jax.Array]
+#: A point (d,) -> residuals (n,) and their Jacobian (n, d).
+Linearise = Callable[[np.ndarray], tuple[Residuals, Jacobian]]
+
+
+@runtime_checkable
+class HasJacobian(Protocol):
+    """Residuals with a Jacobian that needs fewer tangents than parameters."""
+
+    def linearised(self, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Residuals (n,) and Jacobian (n, d) at v (d,)."""
+        ...
+
+
+FIRST_DAMPING = 1e-6
+"""Dimensionless: the first step's damping beside the squared column norms of heavy residuals. Their parameters are
+strongly correlated. Heavy damping would stop a start near the minimum as if it had converged."""
+
+SMALLEST_EFFECT = 0.01
+"""Dimensionless. Smallest effect of a parameter on the residuals, relative to the strongest parameter, when it changes
+by 100 % of its start. Below it the scale is the step with this effect: a start at zero defines no scale."""
+
+LARGEST_OFFSET = 1e-3
+"""Largest distance of a converged end from a stationary point, in radii of the joint confidence region, dimensionless
+(relative offset; Bates & Watts, *Technometrics* 23, 1981, 179)."""
+
+
+@dataclass(frozen=True)
+class LeastSquaresFit:
+    """End point and convergence of each start.
+
+    Attributes
+    ----------
+    x : (s, d) end points, units of the parameters
+    cost : (s,) ½ Σ r², units of the residuals squared
+    stalled : (s,) bool, no convergence: too many steps, non-finite values, or vanishing steps away from a stationary
+        point
+    steps : (s,) solver steps, rejected ones included
+    message : (s,) the reason, "" where it converged
+    residuals : (s, n) at the end points
+    jacobian : (s, n, d) of the residuals at the end points
+    """
+
+    x: np.ndarray
+    cost: np.ndarray
+    stalled: np.ndarray
+    steps: np.ndarray
+    message: tuple[str, ...]
+    residuals: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def best(self) -> int:
+        """Index of the start with the smallest finite cost among those that converged, or among all if none did."""
+        candidates = self.stalled if self.stalled.all() else ~self.stalled
+        return int(np.argmin(np.where(candidates & np.isfinite(self.cost), self.cost, np.inf)))
+
+    def covariance(self, residual_sd: float | None = None, start: int | None = None) -> Covariance:
+        """Covariance at the end point of ``start`` (default: the best one); see the function ``covariance``."""
+        index = self.best if start is None else start
+        return covariance(self.jacobian[index], self.residuals[index], residual_sd)
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Settings of the least-squares solver for each start.
+
+    Attributes
+    ----------
+    tolerance : dimensionless; converged once a step changes every v_j and every divided residual by less than
+        tolerance (1 + its size)
+    max_steps : solver steps, rejected ones included, after which a start counts as stalled
+    heavy : residuals take milliseconds, so the code is optimised and parameters are scaled by effect (Marquardt 1963)
+    """
+
+    tolerance: float = 1e-9
+    max_steps: int = 1024
+    heavy: bool = False
+
+
+#: Default solver settings.
+SOLVER = Solver()
+
+
+def least_squares(residual: Residual, starts: np.ndarray, solver: Solver = SOLVER) -> LeastSquaresFit:
+    """Minimise ½ Σ r(x)² by Levenberg-Marquardt, forward-mode Jacobian, compiled once for all starts.
+
+    Residuals and Jacobian are one compiled program, and Optimistix' step is another. A program that held both would
+    compile the residuals a second time, which takes longer than the fit.
+
+    Damping and tolerance of Levenberg-Marquardt require parameters of comparable size. Each start is therefore solved
+    in v_j = x_j / scale_j with scale_j = |start_j| (at zero: ``SMALLEST_EFFECT``). The residuals are divided by the
+    largest column norm of the Jacobian in v at the start. The result depends on no units.
+
+    Parameters
+    ----------
+    residual : (d,) -> (n,), a JAX function; it may close over arrays. A ``jax.tree_util.Partial`` or ``equinox.Module``
+        passes its arrays as arguments: other values of the same shapes then need no new compilation
+    starts : (s, d), units of the parameters
+    solver : tolerance and linear algebra of each start
+
+    Raises
+    ------
+    ValueError
+        If ``starts`` is not (s, d) with s ≥ 1, or not finite.
+    """
+    starts = np.asarray(starts, dtype=float)
+    if starts.ndim != 2 or starts.size == 0 or not np.isfinite(starts).all():
+        raise ValueError(f"starts must be (s, d) and finite, got shape {starts.shape}: give one row per start")
+    descend = partial(_descend, partial(_linearised, residual, solver.heavy), solver=solver)
+    # The first start compiles the programs that all threads then call.
+    ends = [descend(starts[0]), *pool().map(descend, starts[1:])]
+    x, residuals, jacobian, steps, message = zip(*ends, strict=True)
+    return LeastSquaresFit(
+        x=np.stack(x),
+        cost=0.5 * np.sum(np.stack(residuals) ** 2, axis=1),
+        stalled=np.array([reason != "" for reason in message]),
+        steps=np.array(steps),
+        message=message,
+        residuals=np.stack(residuals),
+        jacobian=np.stack(jacobian),
+    )
+
+
+class _End(NamedTuple):
+    """Where one start ended: x (d,), residuals (n,) and Jacobian (n, d) there, steps, reason for no convergence."""
+
+    x: np.ndarray
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    steps: int
+    message: str
+
+
+def _descend(linearise: Linearise, start: np.ndarray, solver: Solver) -> _End:
+    """Levenberg-Marquardt from one start (d,)."""
+    residuals, jacobian = linearise(start)
+    if not all_finite(jacobian, residuals):
+        return _End(start, residuals, jacobian, 1, "The residuals or their Jacobian are not finite: try another start.")
+    scale, unit = (_effects if solver.heavy else _scales)(jacobian, start)
+    method = optx.LevenbergMarquardt(rtol=solver.tolerance, atol=solver.tolerance, linear_solver=lx.QR())
+    known, v = _Known(residuals / unit, jacobian * scale / unit), jnp.asarray(start / scale)
+    state, steps, converged = _FIRST(method, known, v), 0, False
+    while not converged and steps < solver.max_steps:
+        stop_if_interrupted()
+        v, state, trial, converged = _STEP(method, known, v, state)
+        steps += 1
+        # A move that vanishes in rounding never converges.
+        if np.array_equal(trial, v):
+            break
+        at_trial, slopes = linearise(np.asarray(trial) * scale)
+        with np.errstate(over="ignore", invalid="ignore"):
+            known = _Known(at_trial / unit, slopes * scale / unit)
+        if not all_finite(known.jacobian, known.residuals):
+            # Infinite residuals make the solver reject the trial.
+            known = _Known(np.full_like(at_trial, np.inf), np.zeros_like(slopes))
+    x = np.asarray(v) * scale
+    residuals, jacobian = linearise(x)
+    if not converged and steps == solver.max_steps:
+        return _End(x, residuals, jacobian, steps, "The maximum number of steps was reached: try another start.")
+    # The solver tests step sizes only, and heavy damping makes steps small far from a minimum.
+    stationary = _stationary(jacobian, residuals, solver.tolerance * unit)
+    reason = "The steps became tiny before the residuals were orthogonal to the Jacobian: try another start."
+    return _End(x, residuals, jacobian, steps, "" if stationary else reason)
+
+
+class _Known(eqx.Module):
+    """Residuals (n,) whose value and Jacobian (n, d) are known at the only point where a solver's step asks for them."""
+
+    residuals: Any
+    jacobian: Any
+
+    def __call__(self, v: jax.Array, args: None) -> tuple[jax.Array, None]:
+        del args
+        value = jax.custom_jvp(lambda v: self.residuals + jnp.zeros_like(self.residuals, shape=()) * v[0])
+        value.defjvp(lambda primals, tangents: (self.residuals, self.jacobian @ tangents[0]))
+        return value(v), None
+
+
+def _state(method: optx.LevenbergMarquardt, known: _Known, v: jax.Array) -> Any:
+    """First state of the solver: arrays, and descriptions of functions that are new in every trace."""
+    return method.init(known, v, None, {}, jax.eval_shape(lambda: known.residuals), None, frozenset())
+
+
+def _first(method: optx.LevenbergMarquardt, known: _Known, v: jax.Array) -> list[jax.Array]:
+    """Arrays of the first state."""
+    return jax.tree.leaves(eqx.filter(_state(method, known, v), eqx.is_array))
+
+
+def _step(
+    method: optx.LevenbergMarquardt, known: _Known, v: jax.Array, state: list[jax.Array]
+) -> tuple[jax.Array, list[jax.Array], jax.Array, jax.Array]:
+    """One step: return v, the arrays of the state, the next trial and whether v is the minimum."""
+    arrays, rest = eqx.partition(_state(method, known, v), eqx.is_array)
+    whole = eqx.combine(jax.tree.unflatten(jax.tree.structure(arrays), state), rest)
+    v, whole, _ = method.step(known, v, None, {}, whole, frozenset())
+    converged, _ = method.terminate(known, v, None, {}, whole, frozenset())
+    return v, jax.tree.leaves(eqx.filter(whole, eqx.is_array)), whole.y_eval, converged
+
+
+def _stationary(jacobian: Jacobian, residuals: Residuals, rounding: float) -> bool:
+    """Whether the residuals (n,) projected on the range of J (n, d) are small against the rest or ``rounding``."""
+    left = column_space(jacobian)[0]
+    tangential = float(np.linalg.norm(left.T @ residuals))
+    normal = float(np.linalg.norm(residuals - left @ (left.T @ residuals)))
+    freedom = max(len(residuals) - left.shape[1], 1)
+    # Bates & Watts divide both parts by their degrees of freedom.
+    radius = normal * np.sqrt(max(left.shape[1], 1) / freedom)
+    return tangential <= max(LARGEST_OFFSET * radius, rounding)
+
+
+def linearised(residual: Residual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n,) and Jacobian (n, d) of heavy residuals at x (d,)."""
+    return _linearised(residual, True, x)
+
+
+def _linearised(residual: Residual, heavy: bool, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    residuals, jacobian = _PROGRAMS[heavy](residual, jnp.asarray(x))
+    return np.asarray(residuals), np.asarray(jacobian)
+
+
+def _linearise(residual: Residual, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Residuals (n,) and Jacobian (n, d) at x (d,), in one pass: the residual's own ``linearised``, or forward mode."""
+    if isinstance(residual, HasJacobian):
+        return residual.linearised(x)
+
+    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value = residual(x)
+        return value, value
+
+    jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
+    return value, jacobian
+
+
+#: Compiled first state and step of the solver.
+_FIRST, _STEP = (
+    eqx.filter_jit(function, compiler_options=dict(COMPILE_QUICKLY))  # pyright: ignore[reportCallIssue]
+    for function in (_first, _step)
+)
+#: Compiled ``_linearise``, indexed by whether the residuals are heavy.
+_PROGRAMS: dict[bool, Callable[..., Any]] = {
+    # Equinox passes the options to jax.jit, but its annotations omit them.
+    heavy: eqx.filter_jit(_linearise, compiler_options=dict(options))  # pyright: ignore[reportCallIssue]
+    for heavy, options in ((True, COMPILE), (False, COMPILE_QUICKLY))
+}
+
+
+def _effects(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Scale as ``_scales`` does, but give every column of the Jacobian the same norm, the unit of the residuals."""
+    column_norm = np.linalg.norm(jacobian, axis=0)
+    unit = float(np.max(column_norm)) or 1.0
+    scale = np.where(column_norm > 0, unit / np.where(column_norm > 0, column_norm, 1.0), np.ones_like(start))
+    # The solver's initial damping is 1. Larger residual units reduce its effect by their square.
+    return scale, float(np.sqrt(FIRST_DAMPING)) * unit
+
+
+def _scales(jacobian: Jacobian, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Scale of each parameter (d,) and unit of the residuals: the largest column norm in the scaled parameters."""
+    column_norm, size = np.linalg.norm(jacobian, axis=0), np.abs(start)
+    strongest = np.max(column_norm * size)
+    # With all starts at zero no scale exists, so every parameter counts as equally strong.
+    step = SMALLEST_EFFECT * strongest if strongest > 0 else 1.0
+    scale = np.maximum(size, np.divide(step, column_norm, out=np.zeros_like(size), where=column_norm > 0))
+    # A parameter with zero start and zero effect does not change: any scale is valid.
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = float(np.max(column_norm * scale))
+    return scale, unit if unit > 0 else 1.0
+
+
+# difference descent: Levenberg-Marquardt by differences, for models whose residuals have kinks in the parameters.
+#
+# Derivatives at a point say little about a motion that sticks a step later on its other side. Differences over a finite
+# step smooth the kinks, and the log-posterior of many damped steps is computed in one batch.
+
+
+#: Rows of a batch of residuals.
+ROWS = 8
+#: Step of the differences: relative, or part of the prior's sd where u is not a logarithm.
+DIFFERENCE = 2e-3
+#: Dampings that one batch tries, relative to the diagonal of J'J.
+DAMPINGS = np.geomspace(1e-5, 1e3, 16)
+#: Largest change of a logarithm in one step, and of another parameter in prior sds.
+LONGEST_STEP = 0.7
+#: A step that lowers the cost by less than this part of it is the last one; largest number of steps.
+LEAST_DECREASE, MAX_STEPS = 3e-3, 10
+
+
+def descend(target: LogPosterior, u: np.ndarray, most: int = MAX_STEPS) -> LeastSquaresFit:
+    """Minimise half the squared residuals over the located parameters from u (d,) in ``most`` steps; the scatters stay."""
+    located = target.located
+    scale = np.where(target.positive, 1.0, target.prior_sd)[located]
+    step, u = DIFFERENCE * scale, u.copy()
+    steps = 0
+    while steps < most:
+        steps += 1
+        stop_if_interrupted()
+        points = np.repeat(u[None], len(located) + 1, axis=0)
+        points[1:, located] += np.diag(step)
+        residuals = rows_of(target, points)
+        jacobian = (residuals[1:] - residuals[0]).T / step
+        cost = 0.5 * float(residuals[0] @ residuals[0])
+        if not (np.isfinite(jacobian).all() and np.isfinite(cost)):
+            break
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residuals[0]
+        damped = normal + DAMPINGS[:, None, None] * np.diag(np.diag(normal))
+        moves = -np.linalg.solve(damped, np.broadcast_to(gradient, (len(damped), len(step)))[..., None])[..., 0]
+        moves /= np.maximum(1.0, np.max(np.abs(moves / scale), axis=1, keepdims=True) / LONGEST_STEP)
+        trials = np.repeat(u[None], len(moves), axis=0)
+        trials[:, located] += moves
+        costs = 0.5 * np.sum(rows_of(target, trials) ** 2, axis=1)
+        best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+        if costs[best] < cost:
+            u = trials[best]
+        if not costs[best] < (1.0 - LEAST_DECREASE) * cost:
+            break
+    return LeastSquaresFit(
+        x=u[located][None],
+        cost=np.array([cost]),
+        stalled=np.array([not np.isfinite(cost)]),
+        steps=np.array([steps]),
+        message=("",),
+        residuals=residuals[:1],
+        jacobian=jacobian[None],
+    )
+
+
+def rows_of(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(m, n) residuals at u (m, d)."""
+    padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % ROWS, axis=0)])
+    first, *rest = np.split(padded, len(padded) // ROWS)
+    # The first batch compiles the program that all threads then call.
+    parts = [
+        np.asarray(_residuals(target, first)),
+        *pool().map(lambda part: np.asarray(_residuals(target, part)), rest),
+    ]
+    return np.concatenate(parts)[: len(u)]
+
+
+@partial(jax.jit, compiler_options=COMPILE)
+def _residuals(target: LogPosterior, u: jax.Array) -> jax.Array:
+    return jax.vmap(target.residuals)(u)

@@ -1,0 +1,346 @@
+"""Moves of the sampler, and the diagnostics of its chains."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import emcee
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtri
+from scipy.stats import rankdata
+
+from capsule_id.inference.proposal import BlockProposal
+from capsule_id.inference.target import Scale
+
+# diagnostics: Convergence diagnostics of ensemble samplers. Independent chains are whole ensembles, not the walkers
+# of one.
+
+
+#: Stored draws of independent ensembles.
+Draws = Float[np.ndarray, "ensemble draw walker d"]
+
+#: Summation window of autocovariances, in autocorrelation times (Sokal 1997, section 3); beyond it they are noise.
+WINDOW = 5.0
+#: Probabilities of the quantiles whose effective sample size is that of the tails (Vehtari et al. 2021, section 4.3).
+TAILS = (0.05, 0.95)
+
+
+def integrated_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
+    """(ensemble, d) integrated autocorrelation time of every ensemble, in draws, by emcee's estimator, for the ESS.
+
+    NaN where a walker never moved (after a few draws only).
+    """
+    with np.errstate(invalid="ignore"):
+        return np.stack([emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in draws])
+
+
+def ensemble_time(draws: Draws) -> Float[np.ndarray, "ensemble d"]:
+    """(ensemble, d) integrated autocorrelation time without emcee's bias in short chains, for the stopping rule.
+
+    Autocovariances are about the mean of the whole ensemble and averaged over its walkers. emcee takes each walker's
+    own mean, which underestimates tau by a fraction 10 tau/N: by 20 % at N = 50 tau (tested). The sum stops at the
+    first lag above ``WINDOW`` tau (Sokal 1997, section 3).
+
+    Parameters
+    ----------
+    draws : (ensemble, draw, walker, d)
+    """
+    n = draws.shape[1]
+    centred = draws - np.mean(draws, axis=(1, 2), keepdims=True)
+    spectrum = np.abs(np.fft.rfft(centred, n=2 * n, axis=1)) ** 2
+    covariance = np.mean(np.fft.irfft(spectrum, n=2 * n, axis=1)[:, :n], axis=2) / np.arange(n, 0, -1)[:, None]
+    # Draws that never change have the longest time.
+    first = np.broadcast_to(covariance[:, :1], covariance.shape)
+    share = np.divide(covariance, first, out=np.ones_like(covariance), where=first > 0.0)
+    sums = 2.0 * np.cumsum(share, axis=1) - 1.0
+    enough = np.arange(n)[:, None] >= WINDOW * sums
+    enough[:, -1] = True
+    return np.take_along_axis(sums, np.argmax(enough, axis=1)[:, None], axis=1)[:, 0]
+
+
+def pooled_time(draws: Draws) -> Float[np.ndarray, " d"]:
+    """(d,) integrated autocorrelation time of the normal scores, over the walkers of all ensembles together.
+
+    Covariances are about the mean of all ensembles: where they disagree, the time is long. Of values themselves a single
+    walker far out in a tail would decide the time.
+    """
+    ensembles, number, walkers, d = draws.shape
+    return ensemble_time(np.moveaxis(normal_scores(draws), 0, 1).reshape(1, number, ensembles * walkers, d))[0]
+
+
+def normal_scores(draws: Draws) -> Draws:
+    """Normal scores of the ranks of every parameter over all ensembles (Vehtari et al. 2021, section 4.1)."""
+    flat = draws.reshape(-1, draws.shape[-1])
+    return ndtri((rankdata(flat, axis=0) - 0.375) / (len(flat) + 0.25)).reshape(draws.shape)
+
+
+def split_rhat(draws: Draws) -> Float[np.ndarray, " d"]:
+    """(d,) split R-hat (Gelman et al., Bayesian Data Analysis, section 11.4) across independent ensembles.
+
+    Each half of an ensemble, its walkers pooled, is one chain; ``draws`` (ensemble, draw, walker, d).
+    """
+    half = draws.shape[1] // 2
+    halves = np.concatenate([draws[:, :half], draws[:, draws.shape[1] - half :]])
+    chains = halves.reshape(len(halves), -1, draws.shape[-1])
+    n = chains.shape[1]
+    within = np.mean(np.var(chains, axis=1, ddof=1), axis=0)
+    between = n * np.var(np.mean(chains, axis=1), axis=0, ddof=1)
+    return np.sqrt(((n - 1) / n * within + between / n) / within)
+
+
+def effective_sample_size(draws: Draws, tau: Float[np.ndarray, "ensemble d"]) -> Float[np.ndarray, " d"]:
+    """(d,) draws divided by the integrated autocorrelation time ``tau`` (ensemble, d), summed over ensembles.
+
+    It never exceeds the number of draws, because the estimate of tau from a few draws may be 0.
+    """
+    return np.sum(draws.shape[1] * draws.shape[2] / np.maximum(tau, 1.0), axis=0)
+
+
+def bulk_and_tail_size(draws: Draws) -> Float[np.ndarray, "2 d"]:
+    """(2, d) effective sample sizes of the bulk and of the tails (Vehtari et al. 2021, sections 4.1 and 4.3).
+
+    Bulk: of the normal scores of the ranks over all ensembles. Tails: the smaller one of the two indicators that a
+    draw lies below the 5 % or the 95 % quantile. Both use ``ensemble_time``, which holds for short chains.
+    """
+    flat = draws.reshape(-1, draws.shape[-1])
+    tails = [np.asarray(draws <= edge, dtype=float) for edge in np.quantile(flat, TAILS, axis=0)]
+    bulk, *ends = (effective_sample_size(x, ensemble_time(x)) for x in (normal_scores(draws), *tails))
+    return np.stack([bulk, np.min(ends, axis=0)])
+
+
+# moves: Ensemble moves; a pilot run chooses among them by measured autocorrelation time.
+
+
+#: Share of the delayed moves whose inner chain is a random walk, its number of steps, and a step in sds of the posterior.
+LOCAL, WALK, SHORT = 0.3, 5, 0.15
+#: Share of the delayed moves whose inner chain rescales, and the sd of the logarithm of a factor.
+RESCALED, FACTOR = 0.2, 0.7
+#: emcee's moves with their weights.
+Moves = list[tuple[Any, float]]
+#: (w, d) -> (w, blocks), log-density of each block; or (w, blocks, k), log-density and what else is kept of each block.
+Parts = Callable[[np.ndarray], np.ndarray]
+
+
+class Walkers(NamedTuple):
+    """Walkers at coords (w, d), with their ``Parts``, and the log-density of each block in the proposal, (w, blocks)."""
+
+    coords: np.ndarray
+    parts: np.ndarray
+    proposed: np.ndarray
+
+
+class BlockMove(emcee.moves.Move):
+    """Independence Metropolis–Hastings of all blocks of parameters in every step, each accepted separately.
+
+    The posterior is a product over blocks. emcee stores its factors as blobs, so that one evaluation suffices for all
+    blocks. Each block has its own proposal. It is fixed before the recorded chain starts, so that detailed balance holds.
+
+    Parameters
+    ----------
+    proposal : density of every block, in the order of the factors
+    """
+
+    def __init__(self, proposal: BlockProposal) -> None:
+        self.proposal, self.blocks = proposal, proposal.blocks
+
+    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
+        return Walkers(coords, log_density(coords), self.proposal.log_density(coords))
+
+    def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
+        """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
+        parts = _parts(state.blobs, self.blocks)
+        before = Walkers(state.coords, parts, self.proposal.log_density(state.coords))
+        after, accepted = self.step(_exact(model, self.blocks), before, model.random)
+        return _state(state, after.coords, after.parts), np.mean(accepted, axis=1)
+
+    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
+        proposal = self.proposal
+        drawn = proposal.draw(random, len(before.coords))
+        new = np.where(np.isfinite(drawn), drawn, before.coords)
+        proposed = proposal.log_density(new)
+        # A draw outside the domain has the density 0.
+        inside = np.stack([np.all(np.isfinite(drawn[:, block]), axis=1) for block in proposal.blocks], axis=1)
+        factors = np.where(inside, before.proposed - proposed, -np.inf)
+        coords, parts, accepted = accept(random, before, new, log_density(new), factors, proposal.blocks)
+        return Walkers(coords, parts, np.where(accepted, proposed, before.proposed)), accepted
+
+
+class RandomWalk:
+    """Metropolis steps of all blocks of parameters, each accepted separately.
+
+    Parameters
+    ----------
+    blocks : indices of the parameters of each block
+    covariance : (d, d) of a step; only the blocks are used
+    """
+
+    def __init__(self, blocks: Sequence[np.ndarray], covariance: np.ndarray) -> None:
+        self.blocks = blocks
+        self._roots = [np.linalg.cholesky(covariance[np.ix_(block, block)]) for block in blocks]
+
+    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
+        parts = log_density(coords)
+        return Walkers(coords, parts, np.zeros_like(parts))
+
+    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
+        new = before.coords.copy()
+        for block, root in zip(self.blocks, self._roots, strict=True):
+            new[:, block] += random.standard_normal((len(new), len(block))) @ root.T
+        coords, parts, moved = accept(random, before, new, log_density(new), before.proposed, self.blocks)
+        return Walkers(coords, parts, before.proposed), moved
+
+
+class Rescaling:
+    """Metropolis steps along which the products of a scale and its factors, or what balances them, keep the motion.
+
+    A step multiplies the scale and divides its factors by the same number; or it adds a number to all factors, and
+    divides what they balance by the exponential of its product with the scale. Where readings determine only products,
+    no other step goes far along the hyperbola on which one is constant.
+
+    Parameters
+    ----------
+    blocks : indices of the parameters of each block
+    scaled : each in one block
+    """
+
+    def __init__(self, blocks: Sequence[np.ndarray], scaled: Sequence[Scale]) -> None:
+        self.blocks = blocks
+        self._scaled = [(next(i for i, block in enumerate(blocks) if one.scatter in block), one) for one in scaled]
+
+    def begin(self, log_density: Parts, coords: np.ndarray) -> Walkers:
+        parts = log_density(coords)
+        return Walkers(coords, parts, np.zeros_like(parts))
+
+    def step(self, log_density: Parts, before: Walkers, random: np.random.RandomState) -> tuple[Walkers, np.ndarray]:
+        """One step on ``log_density``: the new places, and which blocks have moved, (w, blocks)."""
+        new, factors = before.coords.copy(), np.zeros_like(before.proposed)
+        rescales = random.uniform() < 0.5
+        for block, (scale, own, balanced) in self._scaled:
+            t = random.standard_normal(len(new))
+            if rescales:
+                new[:, scale] += FACTOR * t
+                new[:, own] *= np.exp(-FACTOR * t)[:, None]
+                factors[:, block] -= len(own) * FACTOR * t  # the Jacobian
+            else:
+                new[:, own] += t[:, None]
+                new[:, balanced] -= (np.exp(new[:, scale]) * t)[:, None]
+        coords, parts, moved = accept(random, before, new, log_density(new), factors, self.blocks)
+        return Walkers(coords, parts, before.proposed), moved
+
+
+class DelayedMove(emcee.moves.Move):
+    """Delayed acceptance of all blocks of parameters (Christen & Fox 2005): proposals from an emulated posterior.
+
+    A step is a chain of ``steps`` inner steps on the emulated posterior. The exact posterior accepts its end, or not.
+    An error of the emulator costs acceptance only: the chain converges to the exact posterior.
+
+    Parameters
+    ----------
+    emulated : (w, d) -> (w, blocks), emulated log-density of each block
+    inner : steps that leave the emulated posterior unchanged
+    """
+
+    def __init__(self, emulated: Parts, inner: BlockMove | RandomWalk | Rescaling, steps: int) -> None:
+        self.emulated, self.inner, self.steps = emulated, inner, steps
+
+    def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
+        """Make one emcee step: return the new state and the share of accepted blocks, (w,)."""
+        blocks = self.inner.blocks
+        begin = self.inner.begin(self.emulated, state.coords)
+        with np.errstate(invalid="ignore"):  # a walker at the emulated density 0 stays, until another move takes it on
+            end = begin
+            for _ in range(self.steps):
+                end, _ = self.inner.step(self.emulated, end, model.random)
+            factors = begin.parts - end.parts
+            before = Walkers(state.coords, _parts(state.blobs, blocks), begin.proposed)
+            found = _exact(model, blocks)(end.coords)
+            coords, parts, accepted = accept(model.random, before, end.coords, found, factors, blocks)
+        moved = [np.any(end.coords[:, block] != begin.coords[:, block], axis=1) for block in blocks]
+        return _state(state, coords, parts), np.mean(accepted & np.stack(moved, axis=1), axis=1)
+
+
+def accept(
+    random: np.random.RandomState,
+    before: Walkers,
+    new: np.ndarray,
+    new_parts: np.ndarray,
+    factors: np.ndarray,
+    blocks: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Accept or refuse each block of the proposals ``new`` (w, d) by Metropolis–Hastings.
+
+    Return coordinates (w, d) and ``Parts`` after it, and which blocks are accepted, (w, blocks).
+
+    Parameters
+    ----------
+    new_parts : ``Parts`` at ``new``
+    factors : (w, blocks) log of the proposal density of the old place over that of the new one
+    """
+    old, found = (np.reshape(parts, (*factors.shape, -1)) for parts in (before.parts, new_parts))
+    accepted = np.log(random.uniform(size=factors.shape)) < found[..., 0] - old[..., 0] + factors
+    coords = before.coords.copy()
+    for i, block in enumerate(blocks):
+        coords[:, block] = np.where(accepted[:, i, None], new[:, block], coords[:, block])
+    parts = np.where(accepted[..., None], found, old)
+    return coords, parts.reshape(np.shape(new_parts)), accepted
+
+
+def _exact(model: Any, blocks: Sequence[np.ndarray]) -> Parts:
+    """The density that emcee samples, block by block, with what is kept."""
+    return lambda v: _parts(model.compute_log_prob_fn(v)[1], blocks)
+
+
+def _parts(blobs: Any, blocks: Sequence[np.ndarray]) -> np.ndarray:
+    """(w, blocks, k) from the form in which emcee stores it."""
+    return np.reshape(blobs, (len(blobs), len(blocks), -1))
+
+
+def _state(before: emcee.State, coords: np.ndarray, parts: np.ndarray) -> emcee.State:
+    log_prob = np.sum(parts[..., 0], axis=1)
+    return emcee.State(coords, log_prob=log_prob, blobs=parts.reshape(np.asarray(before.blobs).shape))
+
+
+def block_move(proposal: BlockProposal) -> Moves:
+    """Block moves, with one step in ten by differential evolution, which needs no covariance."""
+    return [(BlockMove(proposal), 0.9), (emcee.moves.DEMove(), 0.1)]
+
+
+def delayed_moves(
+    emulated: Parts,
+    proposal: BlockProposal,
+    near: np.ndarray,
+    steps: int,
+    scaled: Sequence[Scale] = (),
+    other: float = 0.1,
+) -> Moves:
+    """Delayed acceptance by chains of ``steps`` block moves, and of short random walks, with some differential evolution.
+
+    A walker where the emulated density is too small rejects almost every distant proposal. The error of an emulator is
+    nearly the same at a place nearby, so that a short walk is accepted.
+
+    Parameters
+    ----------
+    near : (n, d) draws; the steps of a walk have a share of their covariance
+    scaled : see ``Rescaling``; some chains rescale these
+    other : share of steps by differential evolution, which needs no emulator
+    """
+    walk = RandomWalk(proposal.blocks, SHORT**2 * np.atleast_2d(np.cov(near.T)))
+    share = RESCALED if scaled else 0.0
+    rescaling = [(DelayedMove(emulated, Rescaling(proposal.blocks, scaled), WALK), share * (1.0 - other))]
+    return [
+        (DelayedMove(emulated, BlockMove(proposal), steps), (1.0 - LOCAL - share) * (1.0 - other)),
+        (DelayedMove(emulated, walk, WALK), LOCAL * (1.0 - other)),
+        *(rescaling if scaled else []),
+        (emcee.moves.DEMove(), other),
+    ]
+
+
+def other_moves() -> dict[str, Moves]:
+    """Return the moves that need no proposal density."""
+    return {
+        # One snooker step in ten (ter Braak & Vrugt 2008).
+        "differential evolution + snooker": [(emcee.moves.DEMove(), 0.9), (emcee.moves.DESnookerMove(), 0.1)],
+        "stretch": [(emcee.moves.StretchMove(), 1.0)],
+    }

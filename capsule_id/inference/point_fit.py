@@ -1,0 +1,259 @@
+"""Point fit of the parameters, and what each experiment contributes to their variances."""
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import optimize
+from scipy.linalg import solve_triangular
+
+from capsule_id.console import stop_if_interrupted
+from capsule_id.experiments.base import Experiment
+from capsule_id.inference.curvature import (
+    BATCH,
+    Jacobian,
+    covariance,
+    hessian,
+    in_batches,
+    jacobian,
+    value_and_gradient,
+)
+from capsule_id.inference.least_squares import Solver, least_squares
+from capsule_id.inference.marginal import density_of
+from capsule_id.inference.result import STATED, PointFit
+from capsule_id.inference.target import HeldResiduals, LogPosterior, prior_of
+from capsule_id.parameters import is_stated
+
+# variance shares: Uncertainty budget of a point fit: how much every table and every prior contributes to the sd of a
+# parameter.
+#
+# At the maximum an error e of the residuals moves the estimate by C Jᵀ e, with C = (Jᵀ J)⁻¹ and unit variance of every
+# entry of e. The entries of one input, rows i of J, therefore contribute diag(C J_iᵀ J_i C) to the variance diag(C),
+# and
+# the contributions of all inputs add up to it (JCGM 100:2008, *Guide to the expression of uncertainty*, 5.1.2).
+
+
+def variance_shares(
+    target: LogPosterior, jacobian: Jacobian, owners: Sequence[Experiment | None]
+) -> dict[str, dict[str, float]]:
+    """Share of every input in the variance of every located parameter; {} where the Jacobian is rank deficient.
+
+    Parameters
+    ----------
+    jacobian : (n, located) of the standardised residuals, priors last
+    owners : (n,) experiment of every residual; None: a prior
+
+    Returns
+    -------
+    By parameter, then by input: the label of a table, ``prior of c``, ``stated value of m1``.
+    """
+    found = covariance(jacobian, np.zeros(len(jacobian)), residual_sd=1.0)
+    if found.rank_deficient:
+        return {}
+    effect = (jacobian @ found.matrix) ** 2 / np.diag(found.matrix)
+    inputs = [e.table.label for e in owners if e is not None]
+    stated = [is_stated(row.name) or prior_of(row).kind == "positive_normal" for row in target.parameters]
+    inputs += [f"{STATED if own else 'prior of '}{name}" for name, own in zip(target.names, stated, strict=True)]
+    names = list(dict.fromkeys(inputs))
+    number = np.array([names.index(name) for name in inputs])
+    shares = np.stack([np.bincount(number, column, len(names)) for column in effect.T])
+    located = [target.names[i] for i in target.located]
+    return {
+        name: dict(zip(names, (float(s) for s in row), strict=True)) for name, row in zip(located, shares, strict=True)
+    }
+
+
+# point fit: Maximum of the joint log-posterior from several starts.
+#
+# Least squares finds the basin, with the scatters fixed at their starting values. Quasi-Newton then maximises the joint
+# log-posterior, scatters included. Its coordinates are whitened by the curvature at the best least-squares end. Its
+# gradients are differences of batched log-posteriors, which the Hessian needs anyway. A gradient by reverse mode takes
+# seconds to compile and only milliseconds to run.
+
+
+#: Default number of starting points.
+STARTS = 5
+#: Ends that differ by less than this many posterior standard deviations count as the same maximum.
+AGREEMENT = 0.05
+#: Smallest curvature that counts, relative to Gauss-Newton's.
+FLATTEST = 1e-4
+#: An end of least squares this near to a maximum, in posterior standard deviations, belongs to it.
+SAME_BASIN = 0.3
+#: Gradients per posterior standard deviation: quasi-Newton stops below the first, and its end counts as a maximum
+#: below the second. Rounding of the log-posterior may stop it in between.
+TOLERANCE, MAXIMUM = 1e-4, 1e-3
+#: Largest number of quasi-Newton steps.
+MAX_STEPS = 400
+#: Replaces a log-posterior that is not finite, because line searches need a finite number.
+LOG_POSTERIOR_FLOOR = -1e12
+#: Solver settings to find the basin. Few steps suffice: the logarithm of an absent damping term decreases
+#: until the prior stops it. Quasi-Newton reaches that point in fewer steps.
+BASIN_SOLVER = Solver(tolerance=1e-6, max_steps=40)
+#: Relative step of the difference quotients of residuals; their relative error is about 1e-10.
+DIFFERENCE = 1e-5
+
+
+def point_fit(
+    target: LogPosterior, seed: int, number_of_starts: int = STARTS, further: np.ndarray | None = None
+) -> PointFit:
+    """Maximise the log-posterior from ``number_of_starts`` dispersed starting points.
+
+    Parameters
+    ----------
+    seed : seed of the dispersed starting points
+    further : (d,) u of one more starting point
+
+    Starts at fits of simpler models come on top. They are reported only where one of them leads to the highest maximum.
+    """
+    starts = dispersed_starts(target, seed, number_of_starts)
+    if further is not None:
+        starts = np.concatenate([starts, further[None]])
+    reported = len(starts)
+    starts = np.concatenate([starts, target.nested_starts()])
+    located = target.located
+    u, value, converged = _maxima(target, starts)
+    best = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
+    kept = np.union1d(np.arange(reported), best)
+    starts, u, value, converged = (each[kept] for each in (starts, u, value, converged))
+    best = int(np.searchsorted(kept, best))
+    at_fit = residual_jacobian(target, u[best])
+    root = _root_of_covariance(target, u[best], at_fit)
+    spread = np.sqrt(np.sum(root**2, axis=1))
+    theta, at_fit = target.theta(u[best]), at_fit[:, located]
+    return PointFit(
+        names=target.names,
+        u=u[best],
+        values=dict(zip(target.names, (float(v) for v in theta), strict=True)),
+        covariance=root @ root.T,
+        standard_errors=_standard_errors(target, at_fit, theta),
+        starts=starts,
+        ends=u,
+        log_posterior=value,
+        at_other_maximum=~np.all(np.abs(u - u[best]) < AGREEMENT * spread, axis=1),
+        stalled=~converged | ~np.isfinite(value),
+        shares=variance_shares(target, at_fit, _owners(target, theta)),
+    )
+
+
+def _maxima(target: LogPosterior, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Maxima (s, d) from ``starts`` (s, d), log-posteriors there, and whether each has converged, (s,) each."""
+    located, density = target.located, density_of(target)
+    # Compile the log-posterior at the same time as least squares, to save time.
+    with ThreadPoolExecutor(1) as pool:
+        compiled = pool.submit(density, np.repeat(starts[:1], BATCH, axis=0))
+        rough = least_squares(HeldResiduals(target, jnp.asarray(starts[0])), starts[:, located], BASIN_SOLVER)
+        compiled.result()
+    ends = starts.copy()
+    ends[:, located] = np.where(np.isfinite(rough.x), rough.x, starts[:, located])
+    # Least squares knows no scatter: it may end at a lower density than it began with.
+    before, after = in_batches(density, starts), in_batches(density, ends)
+    ends = np.where((after >= before)[:, None], ends, starts)
+    best = int(np.argmax(np.nan_to_num(np.fmax(before, after), nan=-np.inf)))
+    whitening = _root_of_covariance(target, ends[best], residual_jacobian(target, ends[best]))
+    # Every batch runs in the pool of threads, so the starts need their own.
+    with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as threads:
+        # SciPy hides this warning itself, but its way is not safe in threads.
+        warnings.filterwarnings("ignore", "The line search algorithm did not converge", RuntimeWarning)
+        highest = _polish(density, ends[best], whitening)
+        if not highest[2]:
+            # The best end of least squares may lie far from the maximum, where the curvature is another one.
+            whitening = _root_of_covariance(target, highest[0], residual_jacobian(target, highest[0]))
+            highest = _polish(density, highest[0], whitening)
+        # An end of least squares within a fraction of a standard deviation leads to the same maximum.
+        spread = np.sqrt(np.sum(whitening**2, axis=1))
+        away = np.any(np.abs(ends - highest[0])[:, located] > SAME_BASIN * spread[located], axis=1)
+        away[best] = False
+        others = list(threads.map(lambda end: _polish(density, end, whitening), ends[away]))
+    polished = [others.pop(0) if own else highest for own in away]
+    u, value, converged = (np.stack(part) for part in zip(*polished, strict=True))
+    return u, value, converged
+
+
+def dispersed_starts(target: LogPosterior, seed: int, number: int) -> np.ndarray:
+    """(number, d) in u: the proposed centre, then normal draws about it with the spread of each parameter."""
+    by_name = target.starts()
+    proposed = [by_name[name] for name in target.names]
+    centre = target.unconstrain(np.array([start.centre for start in proposed]))
+    spread = np.array([start.spread for start in proposed])
+    z = np.random.default_rng(seed).standard_normal((number, target.dimension))
+    # The first start is the paper's estimate. The others differ from it by at least a third of their spread.
+    z = np.where(np.abs(z) < 1.0 / 3.0, np.copysign(1.0 / 3.0, z), z)
+    z[0] = 0.0
+    return centre + spread * z
+
+
+def _polish(
+    density: Callable[[np.ndarray], np.ndarray], end: np.ndarray, whitening: np.ndarray
+) -> tuple[np.ndarray, float, bool]:
+    """BFGS from ``end`` (d,) in coordinates whitened by (d, d): maximum (d,), log-posterior there, converged."""
+
+    def negative(v: np.ndarray) -> np.ndarray:
+        """Negative log-posterior (m,) at whitened v (m, d)."""
+        value = in_batches(density, end + v @ whitening.T)
+        return -np.where(np.isfinite(value), value, LOG_POSTERIOR_FLOOR)
+
+    stop_if_interrupted()
+    solution = optimize.minimize(
+        lambda v: value_and_gradient(negative, v),  # one batch for both, up to 15 parameters
+        np.zeros(len(end)),
+        jac=True,
+        method="BFGS",
+        options={"gtol": TOLERANCE, "maxiter": MAX_STEPS},
+    )
+    value = -float(solution.fun)
+    return (
+        end + whitening @ solution.x,
+        value,
+        value > LOG_POSTERIOR_FLOOR and bool(np.max(np.abs(solution.jac)) < MAXIMUM),
+    )
+
+
+def _root_of_covariance(target: LogPosterior, u: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """R (d, d) with R R' the inverse Hessian of -log-posterior at u (d,), from the ``jacobian`` (n, d) of the residuals.
+
+    The Hessian is taken in coordinates that are whitened by Gauss-Newton's approximation, by an orthogonal factor. Where
+    the readings determine k1/m1 to six digits and m1 to two, no digit of the Hessian in u itself would be left.
+    """
+    located = target.located
+    count = np.zeros(target.dimension)
+    for experiment in target.experiments:
+        for row in experiment.parameters:
+            if row.scatter:
+                count[target.names.index(row.name)] += 2.0 * experiment.n
+    whitening = np.diag(np.maximum(count, 1e-2) ** -0.5)
+    triangle = np.linalg.qr(np.nan_to_num(jacobian[:, located], posinf=0.0, neginf=0.0), mode="r")
+    whitening[np.ix_(located, located)] = solve_triangular(triangle, np.eye(len(located)))
+    density = density_of(target)
+    curvature = hessian(lambda w: density(u + w @ whitening.T), np.zeros(len(u)), np.ones(len(u)))
+    # Away from a maximum a direction may have no positive curvature; there Gauss-Newton's stands.
+    values, vectors = np.linalg.eigh(np.nan_to_num(-curvature, nan=0.0, posinf=0.0, neginf=0.0))
+    return whitening @ (vectors / np.sqrt(np.where(values > FLATTEST, values, 1.0)))
+
+
+def residual_jacobian(target: LogPosterior, u: np.ndarray) -> np.ndarray:
+    """(n, d) Jacobian of the standardised residuals, scatters in the denominator included."""
+    # Steps are relative, or fractions of the prior's sd where u is not a logarithm.
+    return jacobian(target.plain_residuals, u, DIFFERENCE * np.where(target.positive, 1.0, target.prior_sd))
+
+
+def _owners(target: LogPosterior, theta: np.ndarray) -> list[Experiment | None]:
+    """Experiment of every entry of ``plain_residuals`` at theta (d,); None: a prior."""
+    values = target.mapping(theta)
+    sizes = [np.size(e.residuals(e.local(values), np)) for e in target.experiments]
+    owners = [e for e, size in zip(target.experiments, sizes, strict=True) for _ in range(size)]
+    return [*owners, *[None] * target.dimension]
+
+
+def _standard_errors(target: LogPosterior, at_fit: np.ndarray, theta: np.ndarray) -> dict[str, float]:
+    """Standard errors from the Jacobian ``at_fit`` (n, located) of the residuals; NaN for scatters; SI.
+
+    The error of a parameter sampled through its logarithm is its relative error times its value.
+    """
+    located = ~target.scatter
+    errors = np.full(len(theta), np.nan)
+    matrix = covariance(at_fit, np.zeros(len(at_fit)), residual_sd=1.0)
+    errors[located] = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    return dict(zip(target.names, (float(e) for e in errors), strict=True))

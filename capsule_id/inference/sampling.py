@@ -1,0 +1,723 @@
+"""Sample of the posterior: ensembles, emulation, and the chain on disk."""
+
+import hashlib
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from copy import copy
+from dataclasses import dataclass
+from itertools import compress
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
+
+import emcee
+import h5py
+import numpy as np
+from emcee import State
+
+from capsule_id.console import OnProgress, stop_if_interrupted
+from capsule_id.inference.moves import (
+    Moves,
+    Parts,
+    block_move,
+    bulk_and_tail_size,
+    delayed_moves,
+    effective_sample_size,
+    ensemble_time,
+    integrated_time,
+    other_moves,
+    pooled_time,
+    split_rhat,
+)
+from capsule_id.inference.proposal import (
+    LARGEST_MAP,
+    NO_MASS,
+    BlockProposal,
+    Transported,
+    block_proposal,
+    effective_size,
+    refined,
+)
+from capsule_id.inference.result import Posterior
+from capsule_id.inference.target import Scale
+
+# ensemble: One emcee ensemble that stores its own state and advances draw by draw.
+#
+# emcee keeps the state of a run only in ``run_mcmc``. Saving after every draw requires iteration, and an iterated run
+# must keep its own state between calls.
+
+
+class Ensemble:
+    """Walkers that sample one log-density with given moves.
+
+    Parameters
+    ----------
+    parts : log-density of each block, and what else is kept of it; the log-density is the sum over the blocks
+    state : positions of the walkers and state of their random numbers
+    moves : see ``capsule_id.inference.moves``
+    backend : storage of the draws; None: in memory
+    """
+
+    def __init__(self, parts: Parts, state: emcee.State, moves: Moves, backend: Any = None) -> None:
+        def log_density(v: np.ndarray) -> np.ndarray:
+            """(w, 1 + blocks k): log-density, then the parts, which emcee stores as blobs for ``BlockMove``."""
+            found = np.atleast_3d(parts(v))
+            return np.concatenate([np.sum(found[..., 0], axis=1, keepdims=True), found.reshape(len(v), -1)], axis=1)
+
+        walkers, dimension = state.coords.shape
+        self.state = state
+        # Ensembles run side by side, and emcee's moves keep numbers of the ensemble that they work for.
+        own = [(copy(move), weight) for move, weight in moves]
+        self._sampler = emcee.EnsembleSampler(
+            walkers, dimension, log_density, vectorize=True, moves=own, backend=backend
+        )
+
+    @property
+    def stored(self) -> int:
+        """Number of stored draws."""
+        return self._sampler.iteration
+
+    @property
+    def chain(self) -> np.ndarray:
+        """(draw, walker, d) stored draws."""
+        return np.asarray(self._sampler.get_chain())
+
+    @property
+    def parts(self) -> np.ndarray:
+        """(draw, walker, blocks k) parts of the stored draws, in one axis."""
+        blobs = np.asarray(self._sampler.get_blobs())
+        return blobs.reshape(*blobs.shape[:2], -1)
+
+    @property
+    def acceptance(self) -> np.ndarray:
+        """(walker,) share of accepted proposals among the stored draws."""
+        return self._sampler.backend.accepted / self._sampler.iteration
+
+    def run(self, draws: int, thin: int = 1, store: bool = True) -> "Ensemble":
+        """Make ``draws`` more draws of ``thin`` steps each and return the ensemble itself."""
+        if draws > 0:
+            for state in self._sampler.sample(self.state, iterations=draws, thin_by=thin, store=store):
+                self.state = state
+                stop_if_interrupted()
+        return self
+
+
+def initial_state(positions: np.ndarray, random: np.random.RandomState) -> emcee.State:
+    """State of walkers at ``positions`` (w, d), with the current state of ``random``."""
+    return emcee.State(positions, random_state=random.get_state())
+
+
+class OpenBackend(emcee.backends.HDFBackend):
+    """emcee's HDF5 backend on a file that stays open; emcee's own backend opens the file six times a step."""
+
+    def __init__(self, file: h5py.File, name: str) -> None:
+        super().__init__(file.filename, name)
+        self._file = file
+
+    def open(self, mode: str = "r") -> AbstractContextManager[h5py.File]:
+        del mode
+        return nullcontext(self._file)
+
+    def last_state(self) -> emcee.State | None:
+        """State after the last stored draw; None if there is no draw."""
+        return self.get_last_sample() if self.initialized and self.iteration else None
+
+
+# chain store: Storage of chains on disk that survives termination of the process at any moment.
+#
+# emcee writes every draw into an HDF5 file in several steps (coordinates, random state, counter). A process killed
+# between two steps leaves an inconsistent file. A resumed run therefore starts from a copy made between draws, which
+# stores its own digest. The file that emcee writes is never read after an interruption.
+
+
+#: Time between two copies, s.
+SAVE_EVERY = 5.0
+#: Length of the digest of a copy, bytes.
+_DIGEST = hashlib.sha256().digest_size
+
+
+def saved_copy(store: Path) -> Path:
+    """Path of the copy of ``store`` from which an interrupted run resumes."""
+    return store.with_suffix(".saved")
+
+
+class ChainStore:
+    """Context manager of the open HDF5 file that emcee writes, and of its copy.
+
+    Parameters
+    ----------
+    store : the file; the last copy replaces it, or it is removed if no copy has a valid digest
+    fingerprint : of the sampled density and the seed; a copy with another one is discarded
+    """
+
+    def __init__(self, store: Path, fingerprint: str) -> None:
+        self._store, self._copy, self._next = store, saved_copy(store), time.monotonic() + SAVE_EVERY
+        store.unlink(missing_ok=True)
+        saved = self._copy.read_bytes() if self._copy.exists() else b""
+        content = saved[_DIGEST:]
+        if content and hashlib.sha256(content).digest() == saved[:_DIGEST]:
+            store.write_bytes(content)
+        self._file = h5py.File(store, "a")
+        if self._file.attrs.setdefault("fingerprint", fingerprint) != fingerprint:
+            self._file.close()
+            store.unlink()
+            self._file = h5py.File(store, "w")
+            self._file.attrs["fingerprint"] = fingerprint
+
+    def __enter__(self) -> "ChainStore":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def backend(self, name: str) -> OpenBackend:
+        """emcee backend for the draws of one ensemble."""
+        return OpenBackend(self._file, name)
+
+    def between_draws(self) -> None:
+        """Copy the file if the last copy is old enough; call this only while emcee is not writing."""
+        if time.monotonic() >= self._next:
+            self.save()
+
+    def save(self) -> None:
+        """Copy the file now; a single rename makes the copy atomic."""
+        self._file.flush()
+        content = self._store.read_bytes()
+        temporary = self._copy.with_suffix(".saved-new")
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
+        temporary.replace(self._copy)
+        self._next = time.monotonic() + SAVE_EVERY
+
+
+# emulation: Emulation of a posterior whose motions take long: exact motions near the posterior, and emulators fitted
+# to them.
+#
+# Each round adds exact motions about draws of the emulated posterior of the round before, so that the emulators learn
+# where
+# the posterior is. An emulator whose density is far too small in some region gets no draws there, so that these
+# rounds do not
+# correct it. The last rounds therefore use walkers of delayed acceptance, which can enter such regions, and draws of
+# the
+# proposal, which has heavier tails. (J. A. Christen, C. Fox, *Markov
+# chain Monte Carlo using an approximation*, Journal of Computational and Graphical Statistics 14, 2005, 795.) Where the
+# sampler's pilot shows that walkers stay somewhere, ``corrected`` adds exact motions about them.
+
+
+#: Draws of the first round and of each later one, largest number of rounds.
+FIRST_DRAWS, DRAWS, ROUNDS = 2048, 1024, 6
+#: Steps of the chains that draw from an emulated posterior.
+STEPS = 40
+#: Rounds end where the effective share of so many draws, weighted by exact over emulated posterior, is this large.
+CHECKED, ENOUGH = 256, 0.6
+#: New places of exact motions near each draw of a round, and their distance from it in standard deviations of the draws.
+PLACES, NOISE = 2, 0.4
+#: Rounds of delayed acceptance, their walkers, their steps, and the share of steps by differential evolution.
+DELAYED_ROUNDS, WALKERS, EXACT_STEPS, OTHER = 2, 128, 20, 0.5
+#: Draws of the proposal are kept if their emulated log-posterior is at most this far below the median of the walkers.
+FAR = 15.0
+#: Rounds that adapt the proposal to the emulated posterior of a later round, and maps that follow each of the last ones.
+AGAIN, MAPS = 3, 2
+
+
+class Emulable(Protocol):
+    """A density whose motions can be emulated; see ``capsule_id.inference.marginal.MarginalPosterior``."""
+
+    normal_priors: np.ndarray
+    scaled: list[Scale]
+
+    def parts(self, v: np.ndarray) -> np.ndarray: ...
+
+    def motions(self, v: np.ndarray) -> list[np.ndarray]: ...
+
+    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
+
+
+class Places(NamedTuple):
+    """Draws v (n, d) of a chain, from which walkers begin."""
+
+    v: np.ndarray
+
+    def draw(self, random: np.random.RandomState, size: int) -> np.ndarray:
+        """(size, d)"""
+        return self.v[random.choice(len(self.v), size, replace=size > len(self.v))]
+
+
+class ExactMotions(NamedTuple):
+    """Exact motions (w, k) of every experiment with trials at v (w, d)."""
+
+    v: np.ndarray
+    motions: list[np.ndarray]
+
+    def more(self, target: Emulable, v: np.ndarray) -> "ExactMotions":
+        """With the motions at further v (w, d)."""
+        pairs = zip(self.motions, target.motions(v), strict=True)
+        return ExactMotions(np.concatenate([self.v, v]), [np.concatenate(pair) for pair in pairs])
+
+
+class Emulation(NamedTuple):
+    """An emulated posterior, the motions that it knows, the proposal that is adapted to it, and draws of it."""
+
+    target: Emulable
+    known: ExactMotions
+    proposal: BlockProposal
+    start: Places
+
+    def draw(self, number: int, random: np.random.RandomState) -> np.ndarray:
+        """``number`` draws (w, d) of the emulated posterior, by chains that go on from ``start``."""
+        found = [self.start.v]
+        while sum(map(len, found)) < number:
+            chain = _chain(self.target, found[-1], block_move(self.proposal), random)
+            found.append(chain.run(STEPS, store=False).state.coords)
+        return np.concatenate(found)[:number]
+
+
+def emulation(
+    target: Emulable,
+    first: BlockProposal,
+    large: list[bool],
+    random: np.random.RandomState,
+    known: ExactMotions | None = None,
+) -> Emulation:
+    """Emulate ``target``.
+
+    Parameters
+    ----------
+    first : proposal of the first round; without ``known`` the Laplace approximation, at draws of which the rounds begin
+    large : see ``refined``
+    known : motions near the posterior; ``first`` is then adapted to a similar posterior, and there are no last rounds
+
+    Raises
+    ------
+    RuntimeError
+        If hardly any draw has finite motions, or a finite log-density.
+    """
+    adaptations, last_rounds = (None, DELAYED_ROUNDS) if known is None else (AGAIN, 0)
+    known, proposal = known or _first_motions(target, first, random), first
+    for _ in range(ROUNDS):
+        emulated = target.emulated(*known)
+        proposal = refined(emulated.parts, proposal, target.normal_priors, random, large, adaptations)
+        drawn, adaptations = _draws(emulated, proposal, random), AGAIN
+        checked = drawn[:CHECKED]
+        log_weight = np.sum(target.parts(checked), axis=1) - np.sum(emulated.parts(checked), axis=1)
+        known = known.more(target, np.concatenate([_around(drawn, random) for _ in range(PLACES)]))
+        if np.any(np.isfinite(log_weight)) and effective_size(log_weight) >= ENOUGH * len(checked):
+            break
+    walkers = _inside(target, drawn)[: max(WALKERS, 2 * drawn.shape[1])] if last_rounds else drawn
+    found = _adapted(target, known, proposal, drawn, large, random)
+    for _ in range(last_rounds):
+        moves = delayed_moves(found.target.parts, found.proposal, found.start.v, STEPS, target.scaled, OTHER)
+        walkers = _chain(target, walkers, moves, random).run(EXACT_STEPS, store=False).state.coords
+        found = corrected(target, found, walkers, large, random)
+    return found
+
+
+def corrected(
+    target: Emulable, before: Emulation, walkers: np.ndarray, large: list[bool], random: np.random.RandomState
+) -> Emulation:
+    """Emulate ``target`` with further exact motions about ``walkers`` (w, d) of delayed acceptance by ``before``.
+
+    Walkers stay where the emulated density is far too small, so that the motions added there correct it.
+    """
+    known = before.known.more(target, _last_places(before.target, before.proposal, walkers, random))
+    return _adapted(target, known, before.proposal, before.start.v, large, random)
+
+
+def _adapted(
+    target: Emulable,
+    known: ExactMotions,
+    proposal: BlockProposal,
+    v: np.ndarray,
+    large: list[bool],
+    random: np.random.RandomState,
+) -> Emulation:
+    """Emulator of ``known``, with the proposal and the draws of a chain from v (w, d) that follow it."""
+    emulated = target.emulated(*known)
+    proposal, drawn = _follow(emulated, proposal, v, large, random)
+    return Emulation(emulated, known, proposal, Places(drawn))
+
+
+def _first_motions(target: Emulable, first: BlockProposal, random: np.random.RandomState) -> ExactMotions:
+    v = first.draw(random, FIRST_DRAWS)
+    v = v[np.all(np.isfinite(v), axis=1)]
+    motions = target.motions(v)
+    if any(np.sum(np.all(np.isfinite(own), axis=1)) < 2 * v.shape[1] for own in motions):
+        raise RuntimeError(NO_MASS)
+    return ExactMotions(v, motions)
+
+
+def _draws(target: Emulable, proposal: BlockProposal, random: np.random.RandomState) -> np.ndarray:
+    """``DRAWS`` draws of ``target``: the last places of as many walkers that begin with draws of ``proposal``."""
+    v = proposal.draw(random, 2 * DRAWS)
+    v = _inside(target, v[np.all(np.isfinite(v), axis=1)])[:DRAWS]
+    return _chain(target, v, block_move(proposal), random).run(STEPS, store=False).state.coords
+
+
+def _inside(target: Emulable, v: np.ndarray) -> np.ndarray:
+    """Those of v (w, d) where the density of ``target`` is not 0, enough for the walkers of a chain."""
+    v = v[np.all(np.isfinite(target.parts(v)), axis=1)]
+    if len(v) < 2 * v.shape[1]:
+        raise RuntimeError(NO_MASS)
+    return v
+
+
+def _chain(target: Emulable, v: np.ndarray, moves: Moves, random: np.random.RandomState) -> Ensemble:
+    """Walkers at v (w, d). Each chain gets random numbers of its own: chains with the same ones come together."""
+    own = np.random.RandomState(random.randint(2**32, dtype=np.uint64))
+    return Ensemble(target.parts, initial_state(v, own), moves)
+
+
+def _around(v: np.ndarray, random: np.random.RandomState) -> np.ndarray:
+    """Draws v (w, d) with normal noise: the emulator needs motions around the posterior too, not only inside it."""
+    return v + NOISE * random.multivariate_normal(np.zeros(v.shape[1]), np.atleast_2d(np.cov(v.T)), len(v))
+
+
+def _last_places(
+    emulated: Emulable, proposal: BlockProposal, walkers: np.ndarray, random: np.random.RandomState
+) -> np.ndarray:
+    """Places about ``walkers`` (w, d) of delayed acceptance, and draws of the wide proposal."""
+    wide = proposal.draw(random, 2 * DRAWS)
+    wide = wide[np.all(np.isfinite(wide), axis=1)]
+    least = np.median(np.sum(emulated.parts(walkers), axis=1)) - FAR
+    wide = wide[np.sum(emulated.parts(wide), axis=1) > least][:DRAWS]
+    return np.concatenate([wide, *(_around(walkers, random) for _ in range(max(1, DRAWS // len(walkers))))])
+
+
+def _follow(
+    target: Emulable, proposal: BlockProposal, v: np.ndarray, large: list[bool], random: np.random.RandomState
+) -> tuple[BlockProposal, np.ndarray]:
+    """Proposal with maps of the large blocks that follow a chain of ``target`` from draws v (w, d), and its last places.
+
+    Draws of a chain determine a map better than weighted draws: few of these hold most of the weight.
+    """
+    for _ in range(MAPS):
+        ensemble = _chain(target, v, block_move(proposal), random).run(STEPS)
+        v = ensemble.state.coords
+        drawn = np.concatenate([v, ensemble.chain[STEPS // 2]])
+        equal = np.full(len(drawn), 1.0 / len(drawn))
+        pairs = zip(proposal.blocks, proposal.densities, large, strict=True)
+        maps = [Transported(drawn[:, b], equal) if own and len(b) <= LARGEST_MAP else q for b, q, own in pairs]
+        proposal = BlockProposal(proposal.blocks, maps)
+    return proposal, v
+
+
+# ensembles: Sampling by independent emcee ensembles until convergence or a step limit, with regular saving.
+
+
+#: Number of independent ensembles, enough for a split R-hat.
+ENSEMBLES = 4
+#: Smallest number of walkers of an ensemble: one batch of the log-posterior. There are at least two per parameter.
+MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
+#: Convergence requires more draws than this many autocorrelation times for every parameter. The time is an average
+#: over the walkers of all ensembles, 128 or more. Its standard error at this length is 10 % or less (Sokal 1997,
+#: eq. 3.19).
+LENGTH_IN_TAU = 20.0
+#: Convergence requires this bulk and tail effective sample size for every parameter, unless stated.
+DEFAULT_ESS = 4000.0
+#: Convergence requires a split R-hat of at most this for every parameter.
+MAX_RHAT = 1.01
+#: Stored draws of an ensemble before the first convergence check, and between later checks: so many, or this part of all.
+FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 60, 20, 5
+#: Work of all evaluations of the default budget, at most, in readings: some 20 s on two cores.
+MOST_WORK = 1e9
+#: Parameters of the smallest large block among those with a motion of the capsule: a forced run correlates all its
+#: parameters and determines them well, so that the Laplace approximation is tried as it is.
+LARGE = 9
+#: Rounds of adaptation that begin with a proposal adapted to a similar density.
+NEAR = 2
+#: Burn-in of every ensemble before its first stored draw, in autocorrelation times of the pilot. The first walkers come
+#: from a proposal that is close to the posterior already.
+BURN_IN_IN_TAU = 4.0
+#: Spread of the first draws of other blocks relative to the Laplace approximation, dimensionless.
+OVERDISPERSION = 1.2
+#: Ensembles that advance side by side.
+CORES = min(ENSEMBLES, os.cpu_count() or 1)
+#: Time after which ensembles wait for each other, s.
+ROUND = 1.0
+#: Largest number of emcee steps of an ensemble after burn-in, unless stated.
+DEFAULT_BUDGET = 20_000
+#: Stored draws per autocorrelation time of the pilot, and the largest number of steps per stored draw. The limit is
+#: needed because a short pilot estimates the autocorrelation time only roughly.
+DRAWS_PER_TAU, MAX_THIN = 5.0, 15
+#: Steps of each measured move (short, long).
+PILOT_STEPS, LONG_PILOT_STEPS = 60, 300
+#: Name of the first move, and of that of an emulated posterior with its number of steps.
+FIRST = "block independence + differential evolution"
+DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
+#: Largest number of corrections of an emulator, and states of the pilot that each of them learns from.
+CORRECTIONS, STATES = 3, 3
+#: The pilot of an adapted proposal stops, and an emulator is not corrected, at autocorrelation times below this, in steps.
+GOOD_TAU = 10.0
+#: Delayed acceptance is not measured again, and other kinds of moves are not tried, below this, in steps.
+FAIR_TAU = 100.0
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Density of the first walkers, move, thinning and burn-in of the recorded run, chosen by the pilot run."""
+
+    start: BlockProposal | Places
+    move: str
+    moves: Moves
+    measured: Mapping[str, float]
+    thin: int
+    burn_in: int
+
+
+class Target(Protocol):
+    """A density to sample; see ``capsule_id.inference.marginal.MarginalPosterior``."""
+
+    names: tuple[str, ...]
+    dimension: int
+    blocks: list[np.ndarray]
+    centre: np.ndarray
+    covariance: np.ndarray
+    normal_priors: np.ndarray
+    scaled: list[Scale]
+    event_driven: list[bool]
+
+    @property
+    def work(self) -> int:
+        """Time of an evaluation, see ``MarginalPosterior``."""
+        ...
+
+    @property
+    def can_be_emulated(self) -> bool: ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Equal for equal densities: saved draws of another density are not resumed."""
+        ...
+
+    def parts(self, v: np.ndarray) -> np.ndarray: ...
+
+    def motions(self, v: np.ndarray) -> list[np.ndarray]: ...
+
+    def emulated(self, v: np.ndarray, motions: list[np.ndarray]) -> Self: ...
+
+    def factors(self, v: np.ndarray) -> np.ndarray: ...
+
+    def whole(self, located: np.ndarray, factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def theta(self, u: np.ndarray) -> np.ndarray: ...
+
+
+def sample(
+    target: Target,
+    seed: int,
+    budget: int = DEFAULT_BUDGET,
+    store: Path | None = None,
+    progress: OnProgress | None = None,
+    ess: float = DEFAULT_ESS,
+) -> Posterior:
+    """Sample the posterior with ``ENSEMBLES`` independent ensembles.
+
+    Parameters
+    ----------
+    seed : the same seed gives the same draws, also when an interrupted run resumes from ``store``
+    budget : emcee steps of an ensemble after burn-in; fewer in proportion where an evaluation is slow
+    store : HDF5 file for the chains during the run; sampling resumes from the draws in its saved copy
+    progress : called with (draws done, draws until the next check, name of the stage)
+    ess : bulk and tail effective sample size of every parameter at which the sampling stops
+    """
+    report = progress or (lambda done, total, text: None)
+    report(0, 1, "pilot")
+    pilot_seed, *seeds = (int(s) for s in np.random.SeedSequence(seed).generate_state(ENSEMBLES + 1))
+    schedule = pilot(target, pilot_seed)
+    with nullcontext() if store is None else ChainStore(store, f"{target.fingerprint} {seed}") as chains:
+        backends = [None if chains is None else chains.backend(f"ensemble_{i}") for i in range(ENSEMBLES)]
+        with ThreadPoolExecutor(CORES) as threads:
+            samplers = list(threads.map(lambda *one: _sampler(target, schedule, *one), seeds, backends))
+        draws = lp = np.empty((ENSEMBLES, 0, 0, 0))
+        walkers = ENSEMBLES * len(samplers[0].state.coords)
+        share = min(1.0, MOST_WORK / (DEFAULT_BUDGET * walkers * target.work))
+        last = max(int(budget * share) // schedule.thin, 2)
+        for goal in _checks(min(sampler.stored for sampler in samplers), last):
+            for done in _advance(samplers, goal, schedule.thin):
+                if chains is not None:
+                    chains.between_draws()
+                report(done, ENSEMBLES * goal, schedule.move)
+            draws, lp = _completed(target, samplers, goal)
+            if _converged(draws, ess):
+                break
+        if chains is not None:
+            chains.save()
+        acceptance = np.stack([sampler.acceptance for sampler in samplers])
+    theta, (bulk, tail) = target.theta(draws), bulk_and_tail_size(draws)
+    return Posterior(
+        names=target.names,
+        draws=theta,
+        lp=lp,
+        acceptance=acceptance,
+        tau=pooled_time(draws),
+        rhat=split_rhat(theta),
+        ess=effective_sample_size(draws, integrated_time(theta)),
+        ess_bulk=bulk,
+        ess_tail=tail,
+        ess_wanted=ess,
+        converged=_converged(draws, ess),
+        moves={schedule.move: schedule.measured[schedule.move], **schedule.measured},
+        steps=draws.shape[1] * schedule.thin,
+        thin=schedule.thin,
+    )
+
+
+def _completed(target: Target, samplers: Sequence[Ensemble], goal: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first ``goal`` draws (ensemble, draw, walker, d) with scatters, and their log-posterior.
+
+    Each proposal brings a draw of its scatters, which is accepted without regard to it.
+    """
+    located = np.stack([sampler.chain[:goal] for sampler in samplers])
+    factors = np.stack([sampler.parts[:goal] for sampler in samplers])
+    return target.whole(located, factors.reshape(*factors.shape[:3], len(target.blocks), -1))
+
+
+def _converged(draws: np.ndarray, ess: float) -> bool:
+    """Whether draws (ensemble, draw, walker, d) are long enough and their ensembles agree."""
+    if not np.all(split_rhat(draws) <= MAX_RHAT) or not np.all(bulk_and_tail_size(draws) >= ess):
+        return False
+    return bool(np.all(draws.shape[1] > LENGTH_IN_TAU * pooled_time(draws)))
+
+
+def pilot(target: Target, seed: int) -> Schedule:
+    """Find a proposal, then measure autocorrelation times of moves until one is short enough."""
+    random = np.random.RandomState(seed)
+    begin, name, first, ensemble = (_emulated if target.can_be_emulated else _proposed)(target, random)
+    moves, measured = {name: first, **other_moves()}, {name: _longest_time(ensemble)}
+    # The first move runs longer where that was not enough. The other moves come last, because they are slow.
+    for other in moves:
+        # A longer measurement of delayed acceptance, or of a slow move, takes longer than what it could save.
+        if min(measured.values()) < (GOOD_TAU if other == FIRST else FAIR_TAU):
+            break
+        ensemble = Ensemble(target.parts, ensemble.state, moves[other]).run(LONG_PILOT_STEPS)
+        measured[other] = _longest_time(ensemble)
+    best = min(measured, key=lambda name: measured[name])
+    tau = measured[best]
+    thin = int(np.clip(tau / DRAWS_PER_TAU, 1, MAX_THIN))
+    return Schedule(begin, best, moves[best], measured, thin, int(np.ceil(BURN_IN_IN_TAU * tau)))
+
+
+class _Pilot(NamedTuple):
+    """Density of the first walkers, name of a move and the move, and walkers that it has moved for ``PILOT_STEPS``."""
+
+    start: BlockProposal | Places
+    name: str
+    moves: Moves
+    ensemble: Ensemble
+
+
+def _proposed(target: Target, random: np.random.RandomState) -> _Pilot:
+    """Moves by an adapted proposal."""
+    proposal = adapted_proposal(target, random)
+    moves = block_move(proposal)
+    walkers = Ensemble(target.parts, _initial(target, proposal, random), moves)
+    return _Pilot(proposal, FIRST, moves, walkers.run(PILOT_STEPS))
+
+
+def _emulated(target: Target, random: np.random.RandomState) -> _Pilot:
+    """Moves of delayed acceptance by an emulated posterior.
+
+    A long autocorrelation time may mean that walkers stay where the emulator is wrong: it learns the motions there. The
+    same walkers then go on, because new ones would seldom begin there.
+    """
+    laplace, large = laplace_proposal(target)
+    found = emulation(target, laplace, large, random)
+    first = _delayed(target, found, _initial(target, found.start, random))
+    for _ in range(CORRECTIONS):
+        if _longest_time(first.ensemble) < GOOD_TAU:
+            break
+        walkers = np.concatenate(first.ensemble.chain[:: -(PILOT_STEPS // STATES)])
+        found = corrected(target, found, walkers, large, random)
+        first = _delayed(target, found, first.ensemble.state)
+    return first
+
+
+def _delayed(target: Target, found: Emulation, state: State) -> _Pilot:
+    """Moves of delayed acceptance by the emulated posterior ``found``, and walkers that they move from ``state`` on."""
+    moves = delayed_moves(found.target.parts, found.proposal, found.start.v, DELAYED_STEPS, target.scaled)
+    return _Pilot(found.start, DELAYED, moves, Ensemble(target.parts, state, moves).run(PILOT_STEPS))
+
+
+def _longest_time(ensemble: Ensemble) -> float:
+    """Largest autocorrelation time of a parameter, in steps."""
+    return float(np.max(ensemble_time(ensemble.chain[None])))
+
+
+def adapted_proposal(
+    target: Target, random: np.random.RandomState, first: BlockProposal | None = None
+) -> BlockProposal:
+    """Proposal adapted to the density of ``target``, from the Laplace approximation.
+
+    A proposal ``first`` that is adapted to a similar density takes its place, and needs ``NEAR`` rounds only.
+    """
+    laplace, large = laplace_proposal(target)
+    if first is not None:
+        return refined(target.parts, first, target.normal_priors, random, large, NEAR)
+    return refined(target.parts, laplace, target.normal_priors, random, large)
+
+
+def laplace_proposal(target: Target) -> tuple[BlockProposal, list[bool]]:
+    """The Laplace approximation as a proposal, and for each block whether it is large.
+
+    A bench test is not: terms of a decay that may be absent need components that draw them from their priors.
+    """
+    pairs = zip(target.blocks, target.event_driven, strict=True)
+    large = [len(block) >= LARGE and event_driven for block, event_driven in pairs]
+    narrow = np.isin(np.arange(target.dimension), np.concatenate([[], *compress(target.blocks, large)]))
+    laplace = np.where(np.outer(narrow, narrow), target.covariance, OVERDISPERSION**2 * target.covariance)
+    return block_proposal(target.blocks, target.centre, laplace, large), large
+
+
+def _checks(done: int, last: int) -> Iterator[int]:
+    """Numbers of stored draws at which convergence is checked, from ``done`` on: a check reads all draws."""
+    goal = FIRST_CHECK
+    while goal < last:
+        if goal >= done:
+            yield goal
+        goal += max(CHECK_EVERY, goal // CHECK_SHARE)
+    yield last
+
+
+def _advance(samplers: Sequence[Ensemble], goal: int, thin: int) -> Iterator[int]:
+    """Advance all ensembles to ``goal`` stored draws, side by side; yield their total about every ``ROUND`` seconds.
+
+    No ensemble is moving while the generator waits, so that their file can be copied.
+    """
+    number = 1
+    with ThreadPoolExecutor(CORES) as threads:
+        while any(sampler.stored < goal for sampler in samplers):
+            started = time.monotonic()
+            runs = [threads.submit(one.run, min(number, goal - one.stored), thin) for one in samplers]
+            for run in runs:
+                run.result()
+            number = max(int(number * ROUND / max(time.monotonic() - started, 1e-9)), 1)
+            yield sum(sampler.stored for sampler in samplers)
+
+
+def _sampler(target: Target, schedule: Schedule, seed: int, backend: OpenBackend | None) -> Ensemble:
+    """Return one ensemble: burnt in from its own start, or resumed from ``backend``.
+
+    The starts are draws of the adapted proposal, or of the emulated posterior.
+    """
+    last = None if backend is None else backend.last_state()
+    if last is not None:
+        return Ensemble(target.factors, last, schedule.moves, backend)
+    start = _initial(target, schedule.start, np.random.RandomState(seed))
+    burnt_in = Ensemble(target.factors, start, schedule.moves).run(schedule.burn_in, store=False).state
+    if backend is not None:
+        backend.reset(*start.coords.shape)
+    return Ensemble(target.factors, burnt_in, schedule.moves, backend)
+
+
+def _initial(target: Target, density: BlockProposal | Places, random: np.random.RandomState) -> State:
+    """Walkers drawn from ``density``, each at a finite log-posterior."""
+    walkers = max(MIN_WALKERS, 2 * ((WALKERS_PER_PARAMETER * target.dimension + 1) // 2))
+    u = np.empty((0, target.dimension))
+    for _ in range(100):
+        drawn = density.draw(random, walkers)
+        drawn = drawn[np.all(np.isfinite(drawn), axis=1)]
+        u = np.concatenate([u, drawn[np.all(np.isfinite(target.parts(drawn)), axis=1)]])
+        if len(u) >= walkers:
+            return initial_state(u[:walkers], random)
+    raise RuntimeError(NO_MASS)

@@ -1,1 +1,0 @@
-"""Posterior sampling: ensembles of walkers, their moves, their storage and convergence diagnostics."""

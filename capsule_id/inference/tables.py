@@ -1,0 +1,297 @@
+"""Tables of a fit: parameters, notes on them, notes on runs."""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from capsule_id.experiments import paper_estimates
+from capsule_id.experiments.kind import Registry
+from capsule_id.inference.checks.posterior import runs_alone
+from capsule_id.inference.checks.settings import SampledFit
+from capsule_id.inference.checks.verdict import declared, informed, trust_words
+from capsule_id.inference.checks.widening import Widening
+from capsule_id.inference.curvature import covariance
+from capsule_id.inference.joint_fit import BenchFit
+from capsule_id.inference.least_squares import linearised
+from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.parameters import Parameter, parameter
+from capsule_id.physics.smooth.engine import Smoothing
+from capsule_id.views import ResultTable
+
+# run notes: Tables for bench tests and forced runs together: precision gained from the runs, effect of smoothing.
+
+
+def precision_gained(target: LogPosterior, joint: PointFit, sample: Posterior | None, bench: BenchFit) -> ResultTable:
+    """Posterior sd from bench only, runs only, and both; from samples where they exist, else from point fits."""
+    shared, known = shared_symbols(target), run_parameters(target)
+    alone = runs_alone(target, joint)
+    sds = dict(zip(alone.names, np.sqrt(np.diag(alone.covariance)), strict=True))
+    runs = {name: float(sd * abs(joint.values[name])) if name in known else np.nan for name, sd in sds.items()}
+    rows = {}
+    for name in (row.name for row in target.parameters if row.symbol in shared):
+        rows[name] = [_sd(bench.fit, bench.sample, name), runs[name], _sd(joint, sample, name)]
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["bench only", "runs only", "both"])
+    frame["bench only / both"] = frame["bench only"] / frame["both"]
+    return ResultTable("runs.precision", frame.rename_axis("parameter"))
+
+
+def run_parameters(target: LogPosterior) -> set[str]:
+    """Names of the physical parameters of forced runs, masses included."""
+    return {row.name for e in target.experiments if not e.bench for row in e.parameters if row.physical} | {"m1", "m2"}
+
+
+def shared_symbols(target: LogPosterior) -> set[str]:
+    """Symbols of run parameters that a bench test may measure too: those that belong to no single run."""
+    runs = {e.label for e in target.experiments if not e.bench}
+    known = run_parameters(target)
+    return {row.symbol for row in target.parameters if row.name in known and row.of not in runs}
+
+
+def _sd(fit: PointFit | None, sample: Posterior | None, name: str) -> float:
+    if sample is not None and name in sample.names:
+        return float(np.std(sample.draws[..., sample.names.index(name)], ddof=1))
+    if fit is None or name not in fit.names:
+        return float("nan")
+    return fit.standard_errors[name]
+
+
+def smoothing_certificate(target: LogPosterior, fit: PointFit, widths: Smoothing | None = None) -> ResultTable:
+    """Difference between a fit of the smoothed model with ``widths`` and this fit, in posterior sd.
+
+    One Gauss–Newton step maps the difference of the residuals of both models through the exact model's Jacobian.
+    ``widths`` None: the certified ones.
+    """
+    widths = widths or Smoothing()
+    shift, sd = smoothing_shift(target, fit, widths)
+    located = target.located
+    rows = {target.names[i]: [d, s, d / s] for i, d, s in zip(located, shift, sd, strict=True)}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["shift of u", "sd of u", "shift / sd"])
+    frame = frame.loc[[name for name in frame.index if target.parameters[target.names.index(name)].physical]]
+    facts = {"velocity": widths.velocity, "penetration": widths.penetration}
+    return ResultTable("runs.smoothing", frame.rename_axis("parameter"), facts)
+
+
+@eqx.filter_jit
+def _evaluate(residual: HeldResiduals, v: Any) -> Any:
+    return residual(v)
+
+
+def smoothing_shift(target: LogPosterior, fit: PointFit, widths: Smoothing) -> tuple[np.ndarray, np.ndarray]:
+    """(d_located,) shift of u between a fit with the smoothed model of ``widths`` and the exact one, and the sd of u."""
+    located = target.located
+    smoothed = [e.with_smoothing(widths) for e in target.experiments]
+    centre = jnp.asarray(fit.u)
+    misses = _evaluate(HeldResiduals(LogPosterior(target.rig, smoothed), centre), centre[located])
+    exact, jacobian = linearised(HeldResiduals(target, centre), fit.u[located])
+    normal = jacobian.T @ jacobian
+    step = -np.linalg.solve(normal, jacobian.T @ (np.asarray(misses) - exact))
+    return step, np.sqrt(np.diag(np.linalg.inv(normal)))
+
+
+# notes: Tables of the report: those of the experiments and those of the whole fit.
+
+
+def make_notes(sampled: SampledFit, predictive: Mapping[str, float | None]) -> list[ResultTable]:
+    """Return all tables; those that compare bench tests and runs only where there are runs.
+
+    They need derivatives, which say little where residuals have kinks: then they are left out.
+
+    Parameters
+    ----------
+    predictive : posterior predictive p-values by label; without a sample there is no such table
+    """
+    target, fit = sampled.target, sampled.fit
+    of_runs, of_bench = (
+        [table for maker in declared(sampled.experiments, "tables", bench) for table in maker(sampled)]
+        for bench in (False, True)
+    )
+    kinked = any(e.has_joint_scatters for e in sampled.experiments)
+    if any(not e.bench for e in sampled.experiments) and not kinked:
+        gained = precision_gained(target, fit, sampled.posterior, sampled.bench)
+        of_runs = [gained, *of_runs, smoothing_certificate(target, fit)]
+    tables = [*of_runs, *of_bench, *([] if kinked else share_table(target, fit)), prior_table(target)]
+    return [*tables, predictive_table(sampled, predictive)] if sampled.draws else tables
+
+
+def share_table(target: LogPosterior, fit: PointFit) -> list[ResultTable]:
+    """The two largest inputs of the variance of every physical parameter; [] for a fit without shares."""
+    rows = {}
+    for name in (row.name for row in target.parameters if row.physical and row.name in fit.shares):
+        (first, share), (second, other), *_ = sorted(fit.shares[name].items(), key=lambda item: -item[1])
+        rows[name] = [first, share, second, other]
+    frame = pd.DataFrame.from_dict(
+        rows, orient="index", columns=["largest input", "share", "second input", "share of it"]
+    )
+    return [ResultTable("parameters.shares", frame.round(3).rename_axis("parameter"))] * bool(rows)
+
+
+def prior_table(target: LogPosterior) -> ResultTable:
+    """Every parameter with its prior, SI."""
+    rows = [
+        {"parameter": row.name, "unit": row.unit, "meaning": row.meaning, "prior (SI)": row.prior.describe()}
+        for row in target.parameters
+        if row.prior is not None
+    ]
+    return ResultTable("parameters.priors", pd.DataFrame(rows).set_index("parameter"))
+
+
+def predictive_table(sampled: SampledFit, predictive: Mapping[str, float | None]) -> ResultTable:
+    """Posterior predictive p-value of every experiment, those on the shared friction panel included."""
+    rows = {e.label: (e.kind, e.n, predictive[e.label]) for e in sampled.experiments}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "readings", "p"])
+    return ResultTable("readings.predictive", frame.rename_axis("experiment"))
+
+
+# parameter table: The parameter table and the nuisance table of a result.
+
+
+SUMMARY_COLUMNS = (
+    "unit", "meaning", "value", "sd", "quote", "basis", "trust", "paper", "map", "standard_error", "mean", "median", "lower",
+    "upper", "ess", "ess_bulk", "ess_tail", "rhat", "informed", "widening", "sd_unwidened", "lower_unwidened",
+    "upper_unwidened",
+)  # fmt: skip
+#: Ratio of the arms of a 95 % interval about the median above which value ± sd does not describe it. A log-normal
+#: distribution has it at a relative sd of 0.35.
+LARGEST_SKEW = 2.0
+#: Of a positive parameter whose 95 % interval ends differ by more than this factor, the readings give an upper limit alone:
+#: the lower end is that of the prior, which cannot reach 0. An undamped record gives c such an interval.
+UPPER_LIMIT = 30.0
+#: Nodes of the average over a scatter: the inverse hyperbolic sine of their distance from the fit, in u, is even. Tables
+#: with more rows show their scatter.
+NODES, REACH = 400, 4.0
+
+
+def parameter_tables(sampled: SampledFit, registry: Registry) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the tables of physical parameters and of nuisances; see ``Result``."""
+    target, point, posterior = sampled.target, sampled.fit, sampled.posterior
+    masses = {"m1": sampled.rig.m1, "m2": sampled.rig.m2}
+    at_point = errors_over_scatters(target, point) if posterior is None else point.standard_errors
+    paper = paper_estimates(target.experiments, registry)
+    paper |= {name: mass.value for name, mass in masses.items() if mass is not None}
+    known = informed(target, posterior, point)
+    words = trust_words(sampled, known)
+    rows: list[tuple[Parameter, dict[str, object]]] = []
+    for i, row in enumerate(target.parameters):
+        entry: dict[str, object] = {
+            "unit": row.unit,
+            "meaning": row.meaning,
+            "paper": paper.get(row.name, np.nan),
+            "value": point.values[row.name],
+            "sd": at_point[row.name],
+            "basis": "point",
+            "trust": words[row.name],
+            "map": point.values[row.name],
+            "standard_error": at_point[row.name],
+            "informed": bool(known[i]),
+        }
+        entry |= {} if posterior is None else _sample_columns(posterior, i)
+        entry |= _widened(entry, sampled.widened.get(row.name), row.positive)
+        entry |= _limited(entry) if row.positive else {}
+        rows.append((row, {**entry, "quote": quote(entry, row.positive)}))
+    for symbol in (symbol for symbol in masses if symbol in target.fixed):
+        row, value = parameter(symbol), target.fixed[symbol]
+        exact = dict.fromkeys(("value", "paper", "map", "mean", "median", "lower", "upper"), value)
+        errors = {"standard_error": 0.0, "sd": 0.0}
+        said = {
+            "basis": "point" if posterior is None else "sample",
+            "quote": "sd",
+            "trust": "not judged" if posterior is None else "trusted",
+        }
+        entry = {"unit": row.unit, "meaning": f"{row.meaning} (exact)", "informed": True, **exact, **errors, **said}
+        rows.append((row, entry))
+    physical, nuisances = (
+        pd.DataFrame.from_dict({row.name: entry for row, entry in rows if row.physical == chosen}, orient="index")
+        .reindex(columns=list(SUMMARY_COLUMNS))
+        .rename_axis("name")
+        for chosen in (True, False)
+    )
+    return physical, nuisances
+
+
+def errors_over_scatters(target: LogPosterior, fit: PointFit) -> Mapping[str, float]:
+    """Standard errors of ``fit``, with the variance of the rows of every table averaged over the posterior of its scatter.
+
+    The most probable scatter of a few rows is too small: one row alone has none. Beside the likelihood at the fit, its
+    posterior counts the degrees of freedom that the located parameters take: the trace of the table's hat matrix.
+    """
+    located, theta, end = target.located, target.theta(fit.u), 0
+    jacobian, x = residual_jacobian(target, fit.u)[:, located], np.linspace(-REACH, REACH, NODES)
+    hat = np.sum(np.linalg.qr(jacobian)[0] ** 2, axis=1)
+    for e in target.experiments:
+        own = e.local(target.mapping(theta))
+        rows, end = slice(end, end + e.n), end + np.size(e.residuals(own, np))
+        symbol, *further = e.scatters
+        if e.time_series or further or symbol is None or e.n > NODES:
+            continue
+        (misfit,) = e.misfits(own, np)
+        index = target.names.index(next(row.name for row in e.parameters if row.symbol == symbol))
+        u = fit.u[index] + np.sinh(x)
+        variance = misfit.fixed_variance + (misfit.scale * np.exp(u)[:, None]) ** 2 * np.ones(e.n)
+        density = misfit.log_density(np.exp(u), np) + target.priors.at(index, np).terms(u, np.exp(u), np)
+        density += np.log(np.cosh(x)) + np.mean(0.5 * np.log(variance), axis=1) * np.sum(hat[rows])
+        weight = np.exp(density - np.max(density))
+        jacobian[rows] *= (misfit.at(own[symbol], np).sd / np.sqrt(weight @ variance / np.sum(weight)))[:, None]
+    matrix = covariance(jacobian, np.zeros(len(jacobian)), residual_sd=1.0)
+    errors = matrix.standard_errors * np.where(target.positive, theta, 1.0)[located]
+    return {**fit.standard_errors, **{target.names[i]: float(sd) for i, sd in zip(located, errors, strict=True)}}
+
+
+def _widened(entry: Mapping[str, Any], widening: Widening | None, positive: bool) -> dict[str, object]:
+    """Columns with the error of the model; the ends of an interval move in u, so that they keep their sign."""
+    if widening is None:
+        return {}
+    if widening.no_number:
+        return {"widening": widening.factor, **dict.fromkeys(("value", "sd", "lower", "upper"), np.nan)}
+    found: dict[str, object] = {
+        "widening": widening.factor,
+        "sd": widening.factor * entry["sd"],
+        "sd_unwidened": entry["sd"],
+    }
+    for end in ("lower", "upper"):
+        if end in entry:
+            value, limit, stretch = entry["value"], entry[end], widening.stretch
+            moved = value * (limit / value) ** stretch if positive else value + stretch * (limit - value)
+            found |= {end: moved, f"{end}_unwidened": limit}
+    return found
+
+
+def _limited(entry: Mapping[str, Any]) -> dict[str, object]:
+    """The lower end 0 where the readings give an upper limit alone."""
+    return {"lower": 0.0} if "lower" in entry and entry["lower"] * UPPER_LIMIT < entry["upper"] else {}
+
+
+def quote(entry: Mapping[str, Any], positive: bool) -> Literal["sd", "interval"]:
+    """What describes a value beside it: its sd, or the 95 % interval of a skewed posterior.
+
+    ± describes no posterior where 2 sd below a positive value are not positive, or where one arm of the interval is
+    more than ``LARGEST_SKEW`` times as long as the other. Without a sample there is no interval to quote.
+    """
+    if "lower" not in entry or not np.isfinite(entry["value"]):
+        return "sd"
+    short, long = sorted((entry["value"] - entry["lower"], entry["upper"] - entry["value"]))
+    outside = positive and entry["value"] <= 2.0 * entry["sd"]
+    return "interval" if outside or long > LARGEST_SKEW * short else "sd"
+
+
+def _sample_columns(posterior: Posterior, i: int) -> dict[str, object]:
+    draws = posterior.draws[..., i].ravel()
+    lower, median, upper = np.quantile(draws, [0.025, 0.5, 0.975])
+    return {
+        "value": median,
+        "sd": np.std(draws, ddof=1),
+        "basis": "sample",
+        "mean": np.mean(draws),
+        "median": median,
+        "lower": lower,
+        "upper": upper,
+        "ess": posterior.ess[i],
+        "ess_bulk": posterior.ess_bulk[i],
+        "ess_tail": posterior.ess_tail[i],
+        "rhat": posterior.rhat[i],
+    }

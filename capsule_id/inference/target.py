@@ -1,0 +1,528 @@
+"""Joint log-posterior of all experiments in an unconstrained space."""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+from scipy.sparse.csgraph import connected_components
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import Experiment, Start, Unavailable, ValuesBySymbol
+from capsule_id.experiments.misfit import LOG_2PI
+from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
+from capsule_id.precision import COMPILE
+from capsule_id.rig.model import PriorOverride, Rig
+
+# scales: Scatters of which only the product with other parameters changes the motion.
+
+
+class Scale(NamedTuple):
+    """Indices of the scatter, of the parameters that it multiplies, and of those that balance a shift of all of these.
+
+    The motion depends on scatter times factor, and on balance times exp(scatter times factor).
+    """
+
+    scatter: int
+    factors: np.ndarray
+    balance: np.ndarray
+
+
+# priors: Prior densities of all parameters as arrays, so that their density is one expression.
+
+
+class Priors(eqx.Module):
+    """Normal densities of z = (value - centre)/width, one per parameter; every array is (d,).
+
+    Attributes
+    ----------
+    lognormal : whether the value is u = log(theta); else it is theta
+    centre, width : of the normal density
+    constant : log of the normalisation factor of a truncated density
+    jacobian : whether theta is sampled through its logarithm and has a prior density in theta: log |d theta/du| = u
+    """
+
+    lognormal: Any
+    centre: Any
+    width: Any
+    constant: Any
+    jacobian: Any
+
+    def __init__(self, parameters: Sequence[Parameter]) -> None:
+        priors = [prior_of(row) for row in parameters]
+        kinds = np.array([prior.kind for prior in priors])
+        location = np.array([prior.location for prior in priors])
+        spread = np.array([prior.spread for prior in priors])
+        lognormal = kinds == "lognormal"
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # The log-normal is a normal density of u; the others are normal densities of theta.
+            centre = np.where(lognormal, np.log(location), location)
+            width = np.where(lognormal, np.log(spread) / QUANTILE_975, spread)
+        mass = np.where(kinds == "positive_normal", location / spread, 0.0)
+        constant = np.where(kinds == "halfnormal", np.log(2.0), 0.0)
+        self.lognormal, self.centre, self.width = jnp.asarray(lognormal), jnp.asarray(centre), jnp.asarray(width)
+        self.constant = jnp.asarray(constant - np.where(kinds == "positive_normal", stats.norm.logcdf(mass), 0.0))
+        self.jacobian = jnp.asarray(np.array([row.positive for row in parameters]) & ~lognormal)
+
+    def at(self, index: Any, xp: ModuleType = jnp) -> "Priors":
+        """Return the priors at ``index``: arrays of the shape of ``index``, of ``xp``."""
+        return jax.tree.map(lambda array: xp.asarray(array)[index], self)
+
+    def terms(self, u: Any, value: Any, xp: ModuleType = jnp) -> Any:
+        """Log-density of u for each parameter, Jacobian included; ``value`` is the constrained u."""
+        z = self.residuals(u, value, xp)
+        density = -0.5 * (z**2 + LOG_2PI) - xp.log(self.width) + self.constant
+        return density + xp.where(self.jacobian, u, 0.0)
+
+    def residuals(self, u: Any, value: Any, xp: ModuleType = jnp) -> Any:
+        """(value - centre)/width for each parameter."""
+        return (xp.where(self.lognormal, u, value) - self.centre) / self.width
+
+    def rates(self, value_rates: Any, xp: ModuleType = jnp) -> Any:
+        """Derivative of each of ``residuals`` with respect to u, from those of the values."""
+        return xp.where(self.lognormal, 1.0, value_rates) / self.width
+
+
+def prior_of(row: Parameter) -> Prior:
+    """Return the prior of ``row``.
+
+    Raises
+    ------
+    ValueError
+        If the row has no prior.
+    """
+    if row.prior is None:
+        raise ValueError(f"parameter {row.name} has no prior: the experiment that names it must supply one")
+    return row.prior
+
+
+def prior_sd(row: Parameter) -> float:
+    """Standard deviation of u under the row's prior (half-normal: pi/sqrt(8), that of its logarithm)."""
+    prior = prior_of(row)
+    if prior.kind == "lognormal":
+        return float(np.log(prior.spread) / QUANTILE_975)
+    if prior.kind == "halfnormal":
+        return float(np.pi / np.sqrt(8.0))
+    if prior.kind == "positive_normal":
+        return prior.spread / prior.location
+    return prior.spread
+
+
+def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
+    """Return the row with the prior of ``rig.toml``, where one is stated."""
+    return row if stated is None else row.named(row.of, stated.prior)
+
+
+def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:
+    """Return the prior of a parameter that several experiments share, whatever their order.
+
+    Log-normal priors: the narrowest one whose central 95 % contain those of all. Normal priors about one mean: the widest.
+
+    Raises
+    ------
+    InputError
+        If experiments state other priors that differ.
+    """
+    kinds, locations = {prior.kind for prior in priors}, {prior.location for prior in priors}
+    if len(set(priors)) == 1:
+        return priors[0]
+    if kinds == {"lognormal"}:
+        low = min(np.log(prior.location) - np.log(prior.spread) for prior in priors)
+        high = max(np.log(prior.location) + np.log(prior.spread) for prior in priors)
+        return Prior("lognormal", float(np.exp(0.5 * (low + high))), float(np.exp(0.5 * (high - low))))
+    if kinds == {"normal"} and len(locations) == 1:
+        return max(priors, key=lambda prior: prior.spread)
+    stated = " and ".join(dict.fromkeys(f"{prior.kind} {prior.location:g}, {prior.spread:g}" for prior in priors))
+    rule = f"experiments that share {name} must state one prior for it"
+    raise InputError(rule, f"{stated} (SI)", f"state the same in each of them, or state {name} in [prior]")
+
+
+# groups: Groups of stacked experiments that differ only in numbers; each group is evaluated in one batch.
+
+
+class Group(eqx.Module):
+    """Stacked experiments of equal tree structure.
+
+    Attributes
+    ----------
+    experiments : one experiment whose leaves have a leading axis (members, ...), on the device
+    members : indices of these experiments in the log-posterior
+    entries : symbol and, for every member, its index in u (d: the member lacks it, its value is 0)
+    """
+
+    experiments: Experiment
+    members: tuple[int, ...] = eqx.field(static=True)
+    entries: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+
+    def local(self, values: Any, without: Sequence[str | None] = ()) -> dict[str, Any]:
+        """Values (members,) by symbol, from the constrained values (d,); symbols in ``without`` are omitted."""
+        padded = jnp.concatenate([values, jnp.zeros(1)])
+        return {symbol: padded[jnp.array(entry)] for symbol, entry in self.entries if symbol not in without}
+
+    def linearised(
+        self, residuals: Callable[..., Any], values: Any, rates: Any, located: np.ndarray
+    ) -> tuple[Any, Any]:
+        """Residuals (members, n) and their Jacobian (members, n, l) with respect to the ``located`` entries of u (l,).
+
+        A tangent per symbol moves that parameter of all members at once: one member reads few of the entries.
+
+        Parameters
+        ----------
+        residuals : (experiment, values by symbol) -> (n,)
+        values, rates : (d,) constrained values and their derivatives with respect to u
+        """
+        column = np.full(len(rates) + 1, len(located))
+        column[located] = np.arange(len(located))
+        entries = {symbol: np.array(entry) for symbol, entry in self.entries}
+        moved = [symbol for symbol, entry in entries.items() if np.any(column[entry] < len(located))]
+        at = self.local(values)
+
+        def along(direction: Any) -> tuple[Any, Any]:
+            """Residuals, and their derivative along ``direction`` (symbols,)."""
+            tangents = {s: jnp.broadcast_to(x, (len(self.members),)) for s, x in zip(moved, direction, strict=True)}
+
+            def of_moved(own: dict[str, Any]) -> Any:
+                return jax.vmap(residuals)(self.experiments, {**at, **own})
+
+            return jax.jvp(of_moved, ({symbol: at[symbol] for symbol in moved},), (tangents,))
+
+        found, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(moved)))
+        index = np.stack([entries[symbol] for symbol in moved])
+        slopes = slopes * jnp.concatenate([rates, jnp.zeros(1)])[index][:, :, None]
+        jacobian = jnp.zeros((*found.shape, len(located) + 1))
+        jacobian = jacobian.at[np.arange(len(self.members)), :, column[index]].add(slopes)
+        return found, jacobian[..., :-1]
+
+
+def make_groups(experiments: Sequence[Experiment], names: Sequence[str]) -> tuple[Group, ...]:
+    """Groups of ``experiments`` in the order of their first members; ``names`` (d,) of the entries of u."""
+    members: dict[Hashable, list[int]] = {}
+    for i, experiment in enumerate(experiments):
+        _check_leaves(experiment)
+        leaves, structure = jax.tree.flatten(experiment)
+        members.setdefault((structure, *(np.shape(leaf) for leaf in leaves)), []).append(i)
+    place = {name: i for i, name in enumerate(names)}
+    return tuple(_group([experiments[i] for i in own], own, place) for own in members.values())
+
+
+def _group(experiments: Sequence[Experiment], members: Sequence[int], place: Mapping[str, int]) -> Group:
+    """One group; ``place`` of every name among the entries of u."""
+    first = experiments[0]
+    own = [{row.symbol: row.name for row in e.parameters} for e in experiments]
+    sampled = [*dict.fromkeys(s for table in own for s in table), *(m for m in first.masses if m in place)]
+    entries = tuple((s, tuple(place.get(table.get(s, s), len(place)) for table in own)) for s in sampled)
+    stacked = jax.tree.map(_stack, *experiments)
+    # The stack has the static fields of its first member; no likelihood may read its table.
+    object.__setattr__(stacked, "about", Unavailable())
+    return Group(stacked, tuple(members), entries)
+
+
+def _check_leaves(experiment: Experiment) -> None:
+    """Refuse a leaf that is no number: a kind from another package may lack a static field.
+
+    Raises
+    ------
+    TypeError
+        At the first such field.
+    """
+    for path, leaf in jax.tree_util.tree_flatten_with_path(experiment)[0]:
+        if np.asarray(leaf).dtype.kind not in "fiu":
+            field = f"{type(experiment).__name__}{jax.tree_util.keystr(path)}"
+            raise TypeError(f"{field} must be a number, found {leaf!r}: declare it with eqx.field(static=True)")
+
+
+def _stack(*leaves: Any) -> jax.Array:
+    return jnp.asarray(np.stack([np.asarray(leaf, dtype=float) for leaf in leaves]))
+
+
+# log posterior: Joint log-posterior of all experiments in an unconstrained space.
+#
+# u = log(theta) for positive parameters, theta otherwise. log p(u | data) = sum of log-likelihoods + log prior density
+# of theta + log |d theta / du|. All densities are natural and normalised; linear nuisances are integrated out.
+
+
+#: Largest dispersion of starts that come from a prior alone, natural-log units.
+WIDEST_START = 0.3
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Inputs of a log-posterior that no compiled program reads; all instances compare as equal.
+
+    Attributes
+    ----------
+    rig, experiments : as given
+    parameters : (d,) sampled parameters, masses first, then in the order of the experiments
+    fixed : constants by name: g and the masses stated without an sd
+    """
+
+    rig: Rig = field(compare=False)
+    experiments: tuple[Experiment, ...] = field(compare=False)
+    parameters: tuple[Parameter, ...] = field(compare=False)
+    fixed: Mapping[str, float] = field(compare=False)
+
+
+class LogPosterior(eqx.Module):
+    """Log-posterior of experiments and priors, as a frozen tree of arrays.
+
+    Log-posteriors of equal structure share compiled methods, for instance in a calibration study over many rigs.
+
+    Attributes
+    ----------
+    names : (d,) of the sampled parameters
+    groups : the experiments, stacked
+    priors : of the parameters
+    constants : by name, () each
+    """
+
+    origin: Origin = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    are_positive: tuple[bool, ...] = eqx.field(static=True)
+    are_scatters: tuple[bool, ...] = eqx.field(static=True)
+    groups: tuple[Group, ...]
+    priors: Priors
+    constants: dict[str, jax.Array]
+
+    def __init__(self, rig: Rig, experiments: Sequence[Experiment]) -> None:
+        fixed = {"g": rig.g.value}
+        rows: dict[str, Parameter] = {}
+        for symbol, mass in (("m1", rig.m1), ("m2", rig.m2)):
+            if mass is not None and mass.sd > 0.0:
+                rows[symbol] = parameter(symbol, prior=Prior("positive_normal", mass.value, mass.sd))
+            elif mass is not None:
+                fixed[symbol] = mass.value
+        offered: dict[str, list[Parameter]] = {}
+        for experiment in experiments:
+            for row in experiment.parameters:
+                offered.setdefault(row.name, []).append(row)
+        for name, (row, *others) in offered.items():
+            if others and name not in rig.priors:
+                row = row.named(row.of, covering_prior(name, [prior_of(one) for one in (row, *others)]))
+            rows.setdefault(name, override(row, rig.priors.get(name)))
+        self.origin = Origin(rig, tuple(experiments), tuple(rows.values()), fixed)
+        self.names = tuple(rows)
+        self.are_positive = tuple(row.positive for row in rows.values())
+        self.are_scatters = tuple(row.scatter for row in rows.values())
+        self.groups = make_groups(experiments, self.names)
+        self.priors = Priors(self.parameters)
+        self.constants = {name: jnp.asarray(value) for name, value in fixed.items()}
+
+    # -- parameters -------------------------------------------------------------------------------------------------
+
+    @property
+    def rig(self) -> Rig:
+        return self.origin.rig
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        return self.origin.experiments
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.origin.parameters
+
+    @property
+    def fixed(self) -> Mapping[str, float]:
+        return self.origin.fixed
+
+    @property
+    def dimension(self) -> int:
+        return len(self.names)
+
+    @property
+    def positive(self) -> np.ndarray:
+        """(d,) whether each parameter is sampled through its logarithm."""
+        return np.array(self.are_positive, dtype=bool)
+
+    @property
+    def scatter(self) -> np.ndarray:
+        """(d,) whether each parameter is a standard deviation, which scales residuals but changes no prediction."""
+        return np.array(self.are_scatters, dtype=bool)
+
+    @property
+    def integrated(self) -> np.ndarray:
+        """(d,) whether each parameter is the one scatter of some readings, which the sampler integrates out."""
+        alone = {row.name for e in self.experiments for row in e.parameters if row.scatter and row.symbol in e.scatters}
+        return np.array([name in alone for name in self.names])
+
+    @property
+    def located(self) -> np.ndarray:
+        """Indices of the parameters that change a prediction."""
+        return np.flatnonzero(~self.scatter)
+
+    @property
+    def scaled(self) -> list[Scale]:
+        """Each scatter of which only the product with other parameters changes the motion."""
+        scaled, balanced = dict[str, set[str]](), dict[str, set[str]]()
+        for e in self.experiments:
+            for name, own in e.scaled_by.items():
+                scaled.setdefault(name, set()).update(own)
+                balanced.setdefault(name, set()).update(e.balanced)
+
+        def indices(names: set[str]) -> np.ndarray:
+            return np.flatnonzero(np.isin(self.names, sorted(names)))
+
+        return [
+            Scale(self.names.index(name), indices(own), indices(balanced[name])) for name, own in scaled.items() if own
+        ]
+
+    @property
+    def prior_sd(self) -> np.ndarray:
+        """(d,) sd of u under the prior."""
+        return np.array([prior_sd(row) for row in self.parameters])
+
+    @property
+    def blocks(self) -> list[np.ndarray]:
+        """Indices of the parameters of each block; the posterior is a product over blocks without common data."""
+        adjacent = np.eye(self.dimension, dtype=bool)
+        for experiment in self.experiments:
+            own = {row.name for row in experiment.parameters} | set(experiment.masses)
+            member = np.array([name in own for name in self.names])
+            adjacent |= np.outer(member, member)
+        count, label = connected_components(adjacent, directed=False)
+        return [np.flatnonzero(label == i) for i in range(count)]
+
+    def constrain(self, u: Any, xp: ModuleType = jnp) -> Any:
+        """(..., d) values from u (..., d)."""
+        # The unused branch must stay finite: an infinite derivative makes the gradient NaN.
+        return xp.where(self.positive, xp.exp(xp.where(self.positive, u, 0.0)), u)
+
+    def theta(self, u: np.ndarray) -> np.ndarray:
+        """(..., d) constrained values from u (..., d), NumPy."""
+        return self.constrain(u, np)
+
+    def unconstrain(self, theta: np.ndarray) -> np.ndarray:
+        """(..., d) u from constrained values (..., d), NumPy."""
+        return np.where(self.positive, np.log(np.where(self.positive, theta, 1.0)), theta)
+
+    def mapping(self, theta: np.ndarray) -> dict[str, float]:
+        """Constrained values (d,) by name, constants included."""
+        return {**self.fixed, **dict(zip(self.names, (float(v) for v in theta), strict=True))}
+
+    # -- densities and residuals --------------------------------------------------------------------------------------
+
+    def log_prior(self, u: Any) -> Any:
+        """Normalised log prior density of u (d,), Jacobian included; scalar."""
+        return jnp.sum(self.priors.terms(u, self.constrain(u)))
+
+    def log_likelihood(self, u: Any) -> Any:
+        """Sum of the log-likelihoods of the experiments at u (d,); scalar."""
+        return sum(jnp.sum(part) for part in self._per_group(lambda e, theta: e.log_likelihood(theta), u))
+
+    def __call__(self, u: Any) -> Any:
+        """log p(u | data) up to the evidence, u (d,); -inf where it is not finite (an overdamped decay)."""
+        value = self.log_prior(u) + self.log_likelihood(u)
+        return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+
+    def batch(self, u: Any) -> Any:
+        """Compiled log-posterior of a batch, (w, d) -> (w,). Fits use ``marginal.density_of``."""
+        return _batch(self, u)
+
+    def residuals(self, u: Any) -> Any:
+        """Residuals (n,) of all experiments and priors: the least-squares part of -log posterior."""
+        parts = self._per_group(lambda e, theta: e.residuals(theta), u)
+        return jnp.concatenate([*(jnp.ravel(part) for part in parts), self.priors.residuals(u, self.constrain(u))])
+
+    def linearised(self, u: Any) -> tuple[Any, Any]:
+        """Residuals (n,) as in ``residuals``, and their Jacobian (n, l) with respect to the l located entries of u."""
+        values, located = self.constrain(u), self.located
+        rates = jnp.where(self.positive, values, 1.0)
+
+        def one(experiment: Experiment, theta: ValuesBySymbol) -> Any:
+            return experiment.residuals({**theta, **self.constants})
+
+        parts = [group.linearised(one, values, rates, located) for group in self.groups]
+        slopes = jnp.diag(self.priors.rates(rates))[:, located]
+        residuals = [*(jnp.ravel(part) for part, _ in parts), self.priors.residuals(u, values)]
+        return jnp.concatenate(residuals), jnp.concatenate([*(j.reshape(-1, len(located)) for _, j in parts), slopes])
+
+    def residual_owners(self, u: np.ndarray) -> list[Experiment | None]:
+        """(n,) experiment of every entry of ``residuals`` at u (d,); None: a prior."""
+        values, owners = self.mapping(self.theta(u)), []
+        for group in self.groups:
+            first = self.experiments[group.members[0]]
+            size = len(first.residuals(first.local(values), np))
+            owners += [self.experiments[i] for i in group.members for _ in range(size)]
+        return [*owners, *[None] * self.dimension]
+
+    def prior_residuals(self, u: np.ndarray) -> np.ndarray:
+        """(d,) (value - centre)/width: half their sum of squares is the parameter-dependent part of -log prior."""
+        return self.priors.at(slice(None), np).residuals(u, self.theta(u), np)
+
+    def plain_residuals(self, u: np.ndarray) -> np.ndarray:
+        """Residuals as in ``residuals``, by NumPy without compilation, in the order of the experiments."""
+        values = self.mapping(self.theta(u))
+        parts = [np.asarray(e.residuals(e.local(values), np)) for e in self.experiments]
+        return np.concatenate([*parts, self.prior_residuals(u)])
+
+    def _per_group(self, function: Callable[[Experiment, ValuesBySymbol], Any], u: Any) -> list[Any]:
+        """Evaluate ``function`` for every experiment, batched: one array (members, ...) per group."""
+        values = self.constrain(u)
+
+        def one(experiment: Experiment, theta: ValuesBySymbol) -> Any:
+            return function(experiment, {**theta, **self.constants})
+
+        return [jax.vmap(one)(group.experiments, group.local(values)) for group in self.groups]
+
+    # -- starts and prior samples ---------------------------------------------------------------------------------
+
+    def starts(self) -> Mapping[str, Start]:
+        """Start of every parameter: the mean (geometric where positive) of the starts of the experiments."""
+        proposed: dict[str, list[Start]] = {}
+        for experiment in self.experiments:
+            for name, start in experiment.starts().items():
+                proposed.setdefault(name, []).append(start)
+        merged = {}
+        for row in self.parameters:
+            if row.name in proposed:
+                starts = proposed[row.name]
+                centres = np.array([s.centre for s in starts])
+                centre = np.exp(np.mean(np.log(centres))) if row.positive else np.mean(centres)
+                merged[row.name] = Start(float(centre), min(s.spread for s in starts))
+            else:  # masses: the measured value; others: the prior median
+                prior = prior_of(row)
+                spread = np.log(prior.spread) if prior.kind == "lognormal" else prior_sd(row)
+                merged[row.name] = Start(prior.median, float(min(spread, WIDEST_START)))
+        return merged
+
+    def nested_starts(self) -> np.ndarray:
+        """(k, d) u of starts at fits of simpler models of the readings; a parameter without one has its usual start."""
+        own = [experiment.nested_starts() for experiment in self.experiments]
+        usual = {name: start.centre for name, start in self.starts().items()}
+        found = []
+        for k in range(max(map(len, own), default=0)):
+            values = {name: value for starts in own for name, value in (starts[k : k + 1] or [{}])[0].items()}
+            found.append(self.unconstrain(np.array([values.get(name, usual[name]) for name in self.names])))
+        return np.reshape(found, (-1, self.dimension))
+
+    def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, np.ndarray]:
+        """Return ``size`` prior draws of every parameter, SI."""
+        return {row.name: prior_of(row).sample(rng, size) for row in self.parameters}
+
+
+@partial(jax.jit, compiler_options=COMPILE)
+def _batch(target: LogPosterior, u: Any) -> Any:
+    return jax.vmap(target)(u)
+
+
+class HeldResiduals(eqx.Module):
+    """``LogPosterior.residuals`` as a function of the located entries of u; the others are fixed at ``centre``."""
+
+    target: LogPosterior
+    centre: Any
+
+    def __call__(self, v: Any) -> Any:
+        return self.target.residuals(self._whole(v))
+
+    def linearised(self, v: Any) -> tuple[Any, Any]:
+        """Residuals (n,) and their Jacobian (n, l) at v (l,)."""
+        return self.target.linearised(self._whole(v))
+
+    def _whole(self, v: Any) -> Any:
+        return self.centre.at[jnp.array(self.target.located)].set(v)

@@ -1,1 +1,0 @@
-"""Log-posterior of all parameters (``log_posterior``), and with noise levels integrated out (``marginal``)."""

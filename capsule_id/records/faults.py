@@ -1,0 +1,746 @@
+"""Finds faults of a record: aliasing, bursts, mislabelled channels, clipping, copies, lost samples, bad times."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import ndimage, signal
+from scipy.optimize import minimize
+
+from capsule_id.records.tones import noise_level
+from capsule_id.rig.filters import PIECE, largest_offset, median_step, thinned
+
+# aliasing: Finds frequencies that a sampled oscillation cannot tell from each other.
+#
+# Even sampling at f_s maps f and |f ± n f_s| to the same readings (Nyquist-Shannon). Uneven sampling tells them apart.
+
+
+#: Fewest and most multiples of the sampling rate that are tried; damping rates that are tried, per sampled period.
+MULTIPLES, MOST_MULTIPLES, RATES = 5, 200, np.geomspace(1e-3, 1.0, 13)
+#: Another frequency fits as well where its sum of squares is below this multiple.
+AS_WELL = 1.5
+#: Steps of the time that differ less than this from the median, relative, are usual ones.
+USUAL_STEP = 0.2
+#: Most decimal places, and most significant digits, of rounded times. Samples that are looked at: they show as much as a
+#: longer record does.
+MOST_DIGITS, SAMPLES = 9, 4096
+#: Step of a frequency, periods over the record, and steps about an alias; options of the search for the least misfit, and
+#: number of the aliases that it refines.
+PHASE, NEAR, REFINEMENT, REFINED = 0.05, range(-5, 6), {"maxiter": 100}, 3
+
+
+def aliases(time: np.ndarray, values: np.ndarray, frequency: float, highest: float = 0.0) -> np.ndarray:
+    """Return (k,) other frequencies, Hz, that fit a free decay as well as ``frequency`` does; of uneven times, best first.
+
+    Parameters
+    ----------
+    time : (n,) s, increasing
+    values : (n,) free decay
+    frequency : found, Hz
+    highest : frequency, Hz, up to which more than ``MULTIPLES`` are tried
+    """
+    time, values = time[:SAMPLES], values[:SAMPLES]
+    (rate, even), elapsed = sampling(time), time - time[0]
+    number = np.clip(int((highest + frequency) / rate) + 2, MULTIPLES, MOST_MULTIPLES)
+    multiples = np.arange(1, number + 1) * rate
+    if even:
+        return np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
+
+    def misfit(f: float, damping: float) -> float:
+        """Sum of squares beside a tone of this frequency, Hz, with this damping rate, 1/s."""
+        angle, decay = 2.0 * np.pi * f * elapsed, np.exp(-damping * elapsed)
+        design = np.stack([decay * np.cos(angle), decay * np.sin(angle), np.ones_like(angle)], axis=1)
+        rest = values - design @ np.linalg.lstsq(design, values)[0]
+        return float(rest @ rest)
+
+    def best(f: float, damping: float) -> tuple[float, float, float]:
+        """Least misfit about a frequency and a damping rate, and both there."""
+        found = minimize(
+            lambda x: misfit(f + x[0] * step, damping * float(np.exp(x[1]))),
+            np.zeros(2),
+            method="Nelder-Mead",
+            options=REFINEMENT,
+        )
+        return float(found.fun), f + found.x[0] * step, damping * float(np.exp(found.x[1]))
+
+    # The best of the steps leaves a misfit that hides what another frequency does not explain.
+    step = PHASE / elapsed[-1]
+    least, frequency, damping = best(frequency, min(RATES * frequency, key=lambda rate: misfit(frequency, rate)))
+    candidates = np.unique(np.abs(np.concatenate([multiples - frequency, multiples + frequency])))
+    # The jitter of the times leaves an error of the sampling rate.
+    others = np.array([min(misfit(other + k * step, damping) for k in NEAR) for other in candidates])
+    candidates, others = candidates[order := np.argsort(others)], others[order]
+    others[:REFINED] = [best(other, damping)[0] for other in candidates[:REFINED]]
+    return candidates[others <= AS_WELL * least + 1e-12 * float(np.sum(values**2))]
+
+
+def sampling(time: np.ndarray) -> tuple[float, bool]:
+    """Sampling rate of times (n,), Hz, and whether they are even but for their rounding; samples may be missing."""
+    time = time[:SAMPLES]
+    unit, steps = _rounding(time), np.diff(time)
+    step, line, off = np.median(steps), np.zeros(2), time
+    for index in (np.arange(len(time)), np.concatenate([[0.0], np.cumsum(np.round(steps / step))])):
+        line = np.polyfit(index, time, 1, w=1.0 / unit)
+        off = np.abs(np.polyval(line, index) - time)
+        if np.all(off <= unit):
+            return 1.0 / float(line[0]), True
+    usual = np.mean(steps[np.abs(steps / step - 1.0) < USUAL_STEP])
+    return 1.0 / float(line[0] if np.max(off) < 0.5 * step else usual), False
+
+
+def _rounding(time: np.ndarray) -> np.ndarray:
+    """(n,) unit of the last decimal place, or of the last significant digit, of each time, s; at least 1e-9 of the record."""
+    magnitude = 10.0 ** np.floor(np.log10(np.maximum(np.abs(time), np.finfo(float).tiny)))
+    unit = np.full(len(time), max(1e-9 * np.ptp(time), np.spacing(np.max(np.abs(time)))))
+    for first in (np.ones(len(time)), magnitude):
+        units = (first * 10.0**-k for k in range(MOST_DIGITS))
+        rounded = (one for one in units if np.all(np.abs(np.round(time / one) * one - time) <= 1e-6 * one + unit))
+        unit = np.maximum(unit, next(rounded, 0.0))
+    return unit
+
+
+# bursts: Finds stretches of a record with far more noise than the rest, as where a hand still moves the rig.
+
+
+#: Windows in a period, and fewest samples of one.
+WINDOWS, SHORTEST = 8, 8
+#: Noise of a burst, relative to that of the middle window, and fewest windows that it fills.
+LOUD, FEWEST_WINDOWS = 3.0, 3
+#: Quiet windows within a burst.
+GAP = 1
+#: Order of the differences that remove the oscillation.
+ORDER = 3
+
+
+def noisy_stretch(values: np.ndarray, period: float, row: int) -> slice | None:
+    """Return the rows of the burst of noise around ``row``; None where there is none.
+
+    Parameters
+    ----------
+    values : (n,) evenly sampled oscillation
+    period : samples
+    """
+    width = max(SHORTEST, round(period / WINDOWS))
+    number = len(values) // width
+    if number <= 2 * FEWEST_WINDOWS:
+        return None
+    differences = np.diff(values, ORDER, prepend=values[:1], append=values[-1:].repeat(ORDER - 1))
+    squares = (differences[: number * width] ** 2).reshape(number, width)
+    noise = np.sqrt(np.mean(squares, axis=1) / math.comb(2 * ORDER, ORDER))
+    loud = np.flatnonzero(noise > LOUD * max(float(np.median(noise)), 1e-300))
+    if not len(loud):
+        return None
+    for chain in np.split(loud, np.flatnonzero(np.diff(loud) > GAP + 1) + 1):
+        first, last = int(chain[0]), int(chain[-1])
+        if len(chain) >= FEWEST_WINDOWS and first - GAP <= row // width <= last + GAP:
+            return slice(first * width, min((last + 1) * width, len(values)))
+    return None
+
+
+# channels: Finds mislabelled columns by what holds for any motion: kinematics, and the sign of the power of the drive.
+
+
+#: Shortest record for these checks, in periods of the drive.
+FEWEST_PERIODS = 3.0
+#: Standard errors beyond which a sign counts as wrong.
+SIGN_ERRORS = 6.0
+
+
+@dataclass(frozen=True)
+class Phasor:
+    """Complex amplitude at one frequency, in the unit of the channel, and its standard error."""
+
+    value: complex
+    sd: float
+
+
+def phasor(time: np.ndarray, values: np.ndarray, Omega: float) -> Phasor:
+    """Amplitude of the tone at ``Omega``, rad/s, over whole periods at the end of a record, beside a linear trend.
+
+    Parameters
+    ----------
+    time, values : (n,) s, and any unit
+    """
+    period = 2.0 * np.pi / Omega
+    whole = np.floor((time[-1] - time[0]) / period) * period
+    last = time >= time[-1] - whole
+    t, x = time[last], values[last]
+    design = np.stack([np.cos(Omega * t), np.sin(Omega * t), np.ones_like(t), t - t[0]], axis=1)
+    cosine, sine, *_ = np.linalg.lstsq(design, x)[0]
+    noise = noise_level(x, 6) if len(x) > 50 else float(np.std(x))
+    return Phasor(complex(cosine, -sine), noise * float(np.sqrt(2.0 / len(x))))
+
+
+def derivative_ratio(position: Phasor, derivative: Phasor, Omega: float, order: int) -> complex:
+    """Ratio of a recorded derivative to that of the recorded position; 1 where both show one motion."""
+    return derivative.value / ((1j * Omega) ** order * position.value)
+
+
+def drive_power(force: Phasor, position: Phasor, Omega: float) -> tuple[float, float]:
+    """Mean power of ``force`` on the moving ``position`` and its standard error, in the product of their units per s.
+
+    A drive supplies the energy that damping and friction take, so the power is positive.
+    """
+    power = 0.5 * float(np.real(force.value * np.conj(1j * Omega * position.value)))
+    error = 0.5 * Omega * float(np.hypot(abs(force.value) * position.sd, abs(position.value) * force.sd))
+    return power, error
+
+
+# duplicates: Finds readings that occur twice: equal tables, and equal blocks of rows within or across tables.
+#
+# Two independent readings agree by chance with probability q/s: q is the reading step, s the width of the scatter. A
+# block
+# counts as repeated where agreement by chance is practically impossible, so coarse readings that agree are no
+# duplicates.
+
+
+#: Expected number of blocks that agree by chance, below which a block counts as repeated.
+CHANCE = 1e-6
+#: Shortest block of a record, samples; shortest record whose noise level is estimated.
+SHORTEST_BLOCK, SHORTEST_RECORD = 8, 50
+#: Width of a scatter, in standard deviations; scatter of a table of single readings, relative to its range.
+WIDTH, TABLE_SCATTER = 3.5, 0.01
+#: Rows that are compared at a time.
+COMPARED = 4096
+#: Most decimal places of a reading step.
+MOST_DECIMALS = 15
+#: Distance of a level from an even spacing, in spacings; share of the levels that must be within it.
+LEVEL_TOLERANCE, REGULAR_LEVELS = 0.2, 0.9
+#: A gap between levels is large beyond so many steps; levels are uneven where this share of the gaps is large.
+LARGE_GAP, MANY_LARGE_GAPS = 3.0, 0.3
+#: Largest number of levels per reading of a table and of a record: at a high amplitude most levels are read once.
+MOST_LEVELS, MOST_LEVELS_OF_RECORD = 0.5, 0.9
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of one table without time.
+
+    Attributes
+    ----------
+    values : (n, columns), in units that are the same in all tables
+    record : a time series
+    to_display : (columns,) factors to the units in which the readings were written; (): 1
+    """
+
+    label: str
+    values: np.ndarray
+    record: bool
+    to_display: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """``count`` rows of ``label`` from index ``row`` equal those of ``first`` from index ``first_row``."""
+
+    label: str
+    row: int
+    first: str
+    first_row: int
+    count: int
+
+
+def reading_step(values: np.ndarray) -> float:
+    """Reading step of ``values`` (n,), in their unit: a power of ten, or the spacing of their levels; 0 without one."""
+    scale = _largest(values)
+    if scale == 0.0:
+        return 0.0
+    values = thinned(values)
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > 1e-9 * scale]
+    most = MOST_LEVELS if len(values) < SHORTEST_RECORD else MOST_LEVELS_OF_RECORD
+    if 2 < len(gaps) < most * len(values):
+        spacing = float(np.median(gaps[gaps < 1.5 * np.min(gaps)]))
+        if np.mean(np.abs(gaps / spacing - np.round(gaps / spacing)) < LEVEL_TOLERANCE) > REGULAR_LEVELS:
+            return spacing
+    first = -int(np.floor(np.log10(scale)))
+    for decimals in range(first, first + MOST_DECIMALS):
+        if np.allclose(np.round(values, decimals), values, rtol=0.0, atol=1e-9 * 10.0**-decimals + 4e-16 * scale):
+            return 10.0**-decimals
+    return 0.0
+
+
+def _largest(values: np.ndarray) -> float:
+    """Largest magnitude; 0 without values."""
+    return max(float(np.max(values)), -float(np.min(values))) if len(values) else 0.0
+
+
+def chance_of_equality(readings: Readings) -> float:
+    """Probability that two independent rows agree in all columns; 1 where the reading step hides the scatter."""
+    chance = 1.0
+    factors = readings.to_display or (1.0,) * readings.values.shape[1]
+    for values, factor in zip(readings.values.T, factors, strict=True):
+        # A step of 0.1 deg is a decimal one in deg alone.
+        step, width = reading_step(factor * thinned(values)) / factor, TABLE_SCATTER * float(np.ptp(values))
+        if readings.record and len(values) >= SHORTEST_RECORD:
+            step, width = max(step, _uneven_spacing(values, step)), WIDTH * noise_level(values)
+        # A step of 0 is that of float64.
+        own = min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
+        chance *= own if readings.record else max(own, _set_share(values, readings.values))
+    return chance
+
+
+def _uneven_spacing(values: np.ndarray, step: float) -> float:
+    """Mean gap between the levels of a record (n,) where many are far larger than the reading step; else 0.
+
+    An encoder may read on several grids that are shifted against each other. A few large gaps are jumps of the motion.
+    """
+    thin = thinned(values)
+    gaps = np.diff(np.unique(thin))
+    several = 1 < len(gaps) < MOST_LEVELS * len(thin)
+    uneven = several and np.mean(gaps > LARGE_GAP * step) > MANY_LARGE_GAPS
+    return float(np.mean(gaps[gaps <= LARGE_GAP * np.quantile(gaps, 0.75)])) if uneven else 0.0
+
+
+def _set_share(column: np.ndarray, rows: np.ndarray) -> float:
+    """Share of the pairs of rows that agree in one column (n,) but not in all: a setting such as a load recurs."""
+    counts = [np.unique(each, axis=0, return_counts=True)[1] for each in (column, rows)]
+    alike, equal = (int(np.sum(n * (n - 1))) for n in counts)
+    return (alike - equal) / max(len(column) * (len(column) - 1), 1)
+
+
+def repeated_blocks(tables: Sequence[Readings]) -> list[Repeated]:
+    """Return the longest repeated block of each pair of tables, and of each table with itself.
+
+    Parameters
+    ----------
+    tables : readings with the same columns, so that their rows can be compared
+    """
+    found = []
+    for index, later in enumerate(tables):
+        for earlier in tables[: index + 1]:
+            block = _longest_block(earlier, later)
+            if block is not None:
+                found.append(block)
+    return found
+
+
+def _longest_block(earlier: Readings, later: Readings) -> Repeated | None:
+    """The longest run of consecutive rows of ``later`` that are rows of ``earlier``; None where chance explains it."""
+    chance = max(chance_of_equality(earlier), chance_of_equality(later))
+    pairs = len(earlier.values) * len(later.values)
+    if chance >= 0.5:
+        # The readings are too coarse for blocks; equal tables of several rows remain.
+        if earlier is not later and len(later.values) > 2 and np.array_equal(earlier.values, later.values):
+            return Repeated(later.label, 0, earlier.label, 0, len(later.values))
+        return None
+    # With ``shortest`` rows the expected number of chance agreements is below CHANCE.
+    shortest = int(np.ceil(np.log(CHANCE / pairs) / np.log(chance)))
+    shortest = max(shortest, SHORTEST_BLOCK if later.record else 1)
+    if min(len(earlier.values), len(later.values)) < shortest + (earlier is later):
+        return None
+    best: Repeated | None = None
+    ends: dict[int, int] = {}  # by distance of the two blocks: the end of the last one
+    for where, start in _equal_windows(earlier.values, later.values, shortest, earlier is later):
+        if start < ends.get(start - where, 0):
+            continue
+        # Samples of a channel at rest repeat anyway.
+        window = later.values[start : start + shortest]
+        if later.record and np.sum(np.any(window[1:] != window[:-1], axis=1)) < shortest // 2:
+            continue
+        if len(earlier.values) >= 2 * PIECE:  # the block may begin before a window that was compared
+            back = _equal_rows(earlier.values[:where][::-1], later.values[:start][::-1])
+            where, start = where - back, start - back
+        count = _equal_rows(earlier.values[where:], later.values[start:])
+        ends[start - where] = start + count
+        if not later.record and pairs * _chance_within(later.values[start : start + count]) > CHANCE:
+            continue
+        if count >= shortest and (best is None or count > best.count):
+            best = Repeated(later.label, start, earlier.label, where, count)
+    return best
+
+
+def _chance_within(block: np.ndarray) -> float:
+    """Probability that a block (n, columns) of single readings recurs, if its own rows show how often rows are equal.
+
+    Trials of one load that are read in coarse steps agree, even where the coefficients of the whole table look fine.
+    """
+    _, sizes = np.unique(block, axis=0, return_counts=True)
+    rows = len(block)
+    return float(np.sum(sizes * (sizes - 1)) / max(rows * (rows - 1), 1)) ** rows
+
+
+def _equal_rows(one: np.ndarray, other: np.ndarray) -> int:
+    """Number of rows at the beginning of both tables that are equal."""
+    most = min(len(one), len(other))
+    for first in range(0, most, COMPARED):
+        last = min(first + COMPARED, most)
+        equal = np.all(one[first:last] == other[first:last], axis=1)
+        if not equal.all():
+            return first + int(np.argmin(equal))
+    return most
+
+
+def _equal_windows(earlier: np.ndarray, later: np.ndarray, length: int, same: bool) -> Iterable[tuple[int, int]]:
+    """First rows of windows of ``length`` rows with equal hashes: in ``earlier``, the first such one, and in ``later``.
+
+    Of a long table only every ``length``-th window of ``earlier`` is compared, which finds blocks twice as long.
+    """
+    stride = 1 if len(earlier) < 2 * PIECE else length
+    # The first window of a piece whose row is a multiple of the stride is -begin % stride rows after its first one.
+    hashes = np.concatenate([found[-begin % stride :: stride] for begin, found in _hashes(earlier, length)])
+    index = np.argsort(hashes, kind="stable")
+    known = hashes[index]
+    for begin, found in _hashes(later, length):
+        place = np.minimum(np.searchsorted(known, found), len(known) - 1)
+        where, start = stride * index[place], begin + np.arange(len(found))
+        equal = (known[place] == found) & ((where < start) if same else True)
+        yield from zip(where[equal].tolist(), start[equal].tolist(), strict=True)
+
+
+def _hashes(values: np.ndarray, length: int) -> Iterable[tuple[int, np.ndarray]]:
+    """Hashes of all windows of ``length`` rows, piece by piece, each with the row of its first window."""
+    factors = np.random.default_rng(0).integers(1, 1 << 62, (length, values.shape[1]), dtype=np.uint64)
+    for begin in range(0, len(values) - length + 1, PIECE):
+        rows = (values[begin : begin + PIECE + length - 1] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
+        rows ^= rows >> np.uint64(29)
+        total = np.zeros(len(rows) - length + 1, np.uint64)
+        for offset, factor in enumerate(factors):
+            for column, each in enumerate(factor):
+                total += rows[offset : offset + len(total), column] * (each | np.uint64(1))
+        yield begin, total
+
+
+# clipping: Finds clipped records: flat tops, samples that share exactly the largest or smallest value.
+
+
+#: Fewest samples at the limit; how many times as many as at the neighbouring values.
+FEWEST_CLIPPED, EXCESS = 3, 5.0
+#: Number of neighbouring values. The peak of a sine that is read in steps has 3.4 times their mean number.
+NEIGHBOURS = 5
+#: Readings of at least this part of a limit have its step, where there are so many.
+LARGE_JUMP, FEWEST_LARGE = 0.3, 20
+#: A record held at its limit for longer than this fraction of a period before its release is not clipped.
+LONGEST_HOLD = 0.2
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """``rows`` (k,) of the samples at ``level``, in the unit of the record; ``side`` of the limit."""
+
+    side: Literal["upper", "lower"]
+    level: float
+    rows: np.ndarray
+
+
+def clipped_samples(values: np.ndarray, period: float) -> list[Clipped]:
+    """Return the clipped samples of a record at its upper and lower limit.
+
+    Parameters
+    ----------
+    values : (n,) readings in the unit of the file
+    period : of the oscillation, samples; infinite where it is unknown
+    """
+    if np.ptp(values) == 0.0:
+        return []
+    few = thinned(values)
+    sides: tuple[tuple[Literal["upper", "lower"], float], ...] = (("upper", 1.0), ("lower", -1.0))
+    limits = float(np.max(values)), float(np.min(values))
+    found = []
+    for (side, sign), limit in zip(sides, limits, strict=True):
+        # Readings with so many significant digits have finer steps near zero than at a limit.
+        large = few[few / limit >= LARGE_JUMP] if limit else few
+        step = reading_step(large if len(large) >= FEWEST_LARGE else few)
+        tolerance = max(0.25 * step, 4e-16 * max(abs(limit) for limit in limits))
+        rows = _at_limit(values, (limit, sign), (tolerance, step), period)
+        if len(rows):
+            found.append(Clipped(side, limit, rows))
+    return found
+
+
+def _at_limit(
+    values: np.ndarray, limit: tuple[float, float], resolution: tuple[float, float], period: float
+) -> np.ndarray:
+    """Indices of the samples at a limit, () where a smooth peak has as many.
+
+    Parameters
+    ----------
+    limit : largest value and 1, or smallest value and -1
+    resolution : distance at which values count as equal, and reading step
+    """
+    (level, sign), (tolerance, step) = limit, resolution
+
+    depth = sign * (level - values)
+    rows = np.flatnonzero(depth <= tolerance)
+    near = np.flatnonzero((depth > tolerance) & (depth <= (NEIGHBOURS + 0.25) * step))
+    if len(rows) < FEWEST_CLIPPED + EXCESS * (len(near) + _one_sided(near, rows)) / NEIGHBOURS:
+        return rows[:0]
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    if runs[0][0] == 0 and len(runs[0]) > LONGEST_HOLD * period:
+        runs = runs[1:]
+    # Noise makes single samples equal to the limit by rounding; a clipped peak gives neighbours.
+    runs = [run for run in runs if len(run) > 1]
+    return np.concatenate(runs) if sum(map(len, runs)) >= FEWEST_CLIPPED else rows[:0]
+
+
+def _one_sided(near: np.ndarray, rows: np.ndarray) -> int:
+    """Surplus of samples ``near`` the limit on one side of the peaks with samples at it, ``rows``; indices.
+
+    A clipped peak begins and ends abruptly. A peak that sticks, or begins the record, has one gradual side.
+    """
+    together = np.concatenate([near, rows])
+    order = np.argsort(together, kind="stable")
+    surplus = 0
+    for peak in np.split(order, np.flatnonzero(np.diff(together[order]) > 1) + 1):
+        at_limit = np.flatnonzero(peak >= len(near))
+        surplus += len(peak) - 1 - at_limit[-1] - at_limit[0] if len(at_limit) else 0
+    return abs(int(surplus))
+
+
+# phase: Finds samples lost without a gap in the time column: jumps of an evenly sampled smooth oscillation.
+
+
+#: Order of the polynomials on both sides of a sample; their length, periods, with the smallest jump, rad, that they show
+#: beyond their own error. Long ones see through noise, short ones show small jumps of quiet records. A jump above LARGE
+#: may be one of the slope alone.
+PHASE_ORDER, SIDES, LARGE = 3, ((0.25, 0.3), (0.125, 0.06)), 0.2
+#: Smallest jump: standard deviations of the noise, and sampling steps.
+JUMP_SDS, JUMP_STEPS = 6.0, 0.7
+#: Median of the deviation under white noise: that of a Rayleigh variable.
+MEDIAN = np.sqrt(2.0 * np.log(2.0))
+#: The oscillation must be at least this many times the noise.
+AMPLITUDE_NOISE = 4.0
+#: A jump recurs where half a period away, give or take this part of a period, one of opposite sign has this part of it.
+SLACK, RECURRING = 0.1, 0.5
+#: Periods after a jump for which the oscillation must go on, else dry friction may have ended it before a jump recurs.
+GOES_ON = 1.5
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump before the sample ``row``; ``size`` relative to the amplitude there.
+
+    ``noisy``: the noise around it is so large that it may be no jump.
+    """
+
+    row: int
+    size: float
+    noisy: bool = False
+
+
+def jump_or_noise(values: np.ndarray, period: float, alone: bool = False) -> Jump | None:
+    """Return the largest jump of a smooth oscillation, else the largest one that is ``noisy``; None without both.
+
+    Polynomials through the samples before and after a place agree in value and slope where no sample is lost.
+
+    Parameters
+    ----------
+    values : (n,) evenly sampled, free oscillation or forced tone
+    period : samples
+    alone : leave out jumps that recur every half period with opposite sign, as those of an acceleration by dry friction
+    """
+    # Errors of reading in steps are correlated in a slow record, so they do not average out.
+    noise = max(noise_level(values), reading_step(values))
+    noisy: list[Jump] = []
+    for share, smallest in SIDES:
+        side = round(share * period)
+        jump = _jump(values, period, side, smallest, noise, alone)
+        if jump is not None and not jump.noisy:
+            return jump
+        noisy += [] if jump is None else [jump]
+    return max(noisy, key=lambda jump: jump.size, default=None)
+
+
+def _jump(values: np.ndarray, period: float, side: int, smallest: float, noise: float, alone: bool) -> Jump | None:
+    """The most significant jump by polynomials over ``side`` samples."""
+    if side < PHASE_ORDER + 3 or len(values) < 2 * side:
+        return None
+    # Value and slope half a sample beyond the end of ``side`` samples, as weights of the samples.
+    design = polynomial.polyvander(np.arange(side) + 0.5, PHASE_ORDER)
+    value, slope = np.linalg.pinv(design)[:2]
+    # By FFT where the sides are long. A constant has no effect on the jumps, and would only add rounding.
+    centred = values - np.mean(values)
+    after = [signal.correlate(centred, weights, "valid")[side:] for weights in (value, slope)]
+    before = [signal.correlate(centred, weights[::-1], "valid")[:-side] for weights in (value, -slope)]
+    jumps = np.stack([one - other for one, other in zip(after, before, strict=True)])
+    weights = np.stack([np.concatenate([value, -value[::-1]]), np.concatenate([slope, slope[::-1]])])
+    precision = np.linalg.inv(weights @ weights.T * max(noise, 1e-300) ** 2)
+    deviation = np.sqrt(np.einsum("in,ij,jn->n", jumps, precision, jumps))
+    # Coloured noise deviates everywhere, not at one place.
+    excess = max(1.0, float(np.median(deviation)) / MEDIAN)
+    deviation, noise = deviation / excess, noise * excess
+    width = round(period)
+    high, low = (f(values, width, mode="nearest") for f in (ndimage.maximum_filter1d, ndimage.minimum_filter1d))
+    amplitude = 0.5 * (high - low)[side : side + len(deviation)]
+    step = 2.0 * np.pi / period
+    # Kinks of real records, as of a sensor's scale, are small; a small jump must show in the value.
+    size = np.hypot(jumps[0], jumps[1] / step) if smallest > LARGE else np.abs(jumps[0])
+    phase = size / np.maximum(amplitude, 1e-300)
+    large = (deviation > JUMP_SDS) & (phase > max(smallest, JUMP_STEPS * step)) & (amplitude > AMPLITUDE_NOISE * noise)
+    if alone:
+        later = np.minimum(np.arange(len(deviation)) + round(GOES_ON * period), len(deviation) - 1)
+        large &= amplitude[later] > AMPLITUDE_NOISE * noise
+    noisy = None
+    while large.any():
+        worst = int(np.argmax(np.where(large, deviation, 0.0)))
+        # The record may be noisier here than elsewhere.
+        if deviation[worst] * noise <= JUMP_SDS * _local_noise(values[worst : worst + 2 * side]):
+            noisy = noisy or Jump(worst + side, float(phase[worst]), noisy=True)
+            large[max(0, worst - side) : worst + side] = False
+            continue
+        if not alone or not _recurs(jumps, precision, worst, period):
+            return Jump(worst + side, float(phase[worst]))
+        large[max(0, worst - side) : worst + side] = False
+    return noisy
+
+
+def _local_noise(values: np.ndarray) -> float:
+    """Noise level of a few samples with a jump in their middle: the smaller one of two estimates.
+
+    One wrong sample does not change the median of the differences. The residuals of the polynomials on both sides vary
+    less by chance, and the jump does not enter them.
+    """
+    sides = values.reshape(2, -1).T
+    place = np.arange(len(sides)) - 0.5 * (len(sides) - 1)
+    squares = polynomial.polyfit(place, sides, PHASE_ORDER, full=True)[1][0]
+    residual = float(np.sqrt(np.sum(squares) / (2 * (len(sides) - PHASE_ORDER - 1))))
+    return min(noise_level(values), residual)
+
+
+def _recurs(jumps: np.ndarray, precision: np.ndarray, place: int, period: float) -> bool:
+    """Whether the jump at ``place`` recurs with opposite sign half a period before or after; True where neither is known.
+
+    Parameters
+    ----------
+    jumps : (2, n) of value and slope
+    precision : (2, 2) inverse covariance of a jump
+    """
+    one = jumps[:, place] @ precision
+    part = -(one @ jumps) / (one @ jumps[:, place])
+    near, far = round((0.5 - SLACK) * period), round((0.5 + SLACK) * period)
+    before, after = part[max(0, place - far) : max(0, place - near + 1)], part[place + near : place + far + 1]
+    beside = np.concatenate([before, after])
+    return beside.size == 0 or bool(np.max(beside) >= RECURRING)
+
+
+# timing: Finds gaps and rounded times in the time column, and drop-outs in a channel.
+
+
+#: Share of steps that must equal the sampling step before a longer one counts as a gap.
+REGULAR_SHARE = 0.9
+#: Largest distance of a step from a multiple of the sampling step, in sampling steps.
+STEP_TOLERANCE = 0.1
+#: Smallest and largest rounding of times, in sampling steps: below it is harmless.
+ROUNDING = (0.02, 1.01)
+#: A drop-out departs from both neighbours by this fraction of the range of the other samples.
+DROPOUT_RANGE = 0.5
+#: In coarse steps a smooth top is a short run too. A drop-out departs by more than this many reading steps, and than this
+#: many times the change of the readings beside it.
+DROPOUT_STEPS, DROPOUT_CHANGES = 3.0, 2.0
+#: Noise levels that count as that range where the motion is a small part of the record, and their largest share of the
+#: whole range: of coarse samples the noise level shows the motion.
+DROPOUT_NOISE, LARGEST_SHARE = 20.0, 0.5
+#: A single value this many ranges away is a drop-out by itself.
+EXTREME = 50.0
+#: Most samples of one drop-out; fewest equal values of a frozen sensor.
+LONGEST_DROPOUT, FROZEN = 3, 6
+#: Samples from which a record shows its noise level.
+FEWEST_OF_NOISE = 20
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Gaps after the samples ``rows`` (k,); ``lost`` (k,) samples in each by the sampling step ``step``, s."""
+
+    rows: np.ndarray
+    lost: np.ndarray
+    step: float
+
+
+def find_gaps(time: np.ndarray) -> Gaps | None:
+    """Return gaps of an otherwise even record: steps of two or more sampling steps; None where there are none.
+
+    Parameters
+    ----------
+    time : (n,) s, increasing
+    """
+    if len(time) < 9:
+        return None
+    step = median_step(time)
+    steps = np.diff(time) / step
+    multiple = np.round(steps)
+    rows = np.flatnonzero((multiple >= 2) & (np.abs(steps - multiple) <= STEP_TOLERANCE * np.sqrt(multiple)))
+    regular = float(np.mean(np.abs(steps - 1.0) <= STEP_TOLERANCE))
+    return Gaps(rows, multiple[rows].astype(int) - 1, step) if len(rows) and regular >= REGULAR_SHARE else None
+
+
+def time_rounding(time: np.ndarray) -> float | None:
+    """Return the step to which the times of an even record were rounded, s; None where it is harmless.
+
+    Parameters
+    ----------
+    time : (n,) s, increasing
+    """
+    if len(time) < 8:
+        return None
+    step, written = median_step(time), reading_step(time)
+    off = largest_offset(time, (time[-1] - time[0]) / (len(time) - 1))
+    rounded = ROUNDING[0] * step <= written <= ROUNDING[1] * step
+    # Rounding moves a time by half the written step, and the ends of the even grid by as much again.
+    return written if rounded and ROUNDING[0] * step / 2.0 < off <= 1.01 * written else None
+
+
+def dropouts(values: np.ndarray) -> np.ndarray:
+    """Return indices of drop-outs: short runs of one exact value, far away from the samples on both sides.
+
+    Parameters
+    ----------
+    values : (n,) readings of one channel
+    """
+    # Nine in ten samples hold no drop-out, so their range is that of the motion, or of the noise of a long rest.
+    low, high = np.quantile(thinned(values), [0.05, 0.95])
+    noise = DROPOUT_NOISE * noise_level(values) if len(values) > FEWEST_OF_NOISE else 0.0
+    spread = max(high - low, min(noise, LARGEST_SHARE * float(np.ptp(values))))
+    starts, ends = _far_runs(values, spread).T
+    own = values[starts]
+    # An impact is a short peak too, but its height differs each time. A drop-out repeats one value.
+    levels, counts = np.unique(own, return_counts=True)
+    repeated = np.isin(own, levels[counts > 1])
+    extreme = np.maximum(low - own, own - high) > EXTREME * spread
+    chosen = repeated | extreme | (own == 0.0)
+    pairs = zip(starts[chosen], ends[chosen], strict=True)
+    return np.concatenate([np.arange(s, e) for s, e in pairs]) if chosen.any() else np.arange(0)
+
+
+def _far_runs(values: np.ndarray, spread: float) -> np.ndarray:
+    """First sample and end, (k, 2), of short runs of one value that stand far off the samples on both sides."""
+    starts = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1])
+    lengths = np.diff(np.concatenate([starts, [len(values)]]))
+    inside = (starts > 0) & (starts + lengths < len(values)) & (lengths <= LONGEST_DROPOUT)
+    starts, lengths = starts[inside], lengths[inside]
+    before, after, own = values[starts - 1], values[starts + lengths], values[starts]
+    jump = np.minimum(np.abs(own - before), np.abs(own - after))
+    far = (jump > DROPOUT_RANGE * spread) & (np.abs(after - before) < 0.5 * jump)
+    far &= np.sign(own - before) == np.sign(own - after)
+    ends = starts + lengths
+    change = [
+        np.abs(values[np.maximum(starts - 2, 0)] - before),
+        np.abs(values[np.minimum(ends + 1, len(values) - 1)] - after),
+    ]
+    far &= jump > np.maximum(DROPOUT_CHANGES * np.minimum(*change), DROPOUT_STEPS * reading_step(values))
+    return np.stack([starts, starts + lengths], axis=1)[far]
+
+
+def frozen_samples(values: np.ndarray) -> np.ndarray:
+    """Return indices of samples of a frozen channel: equal values in sequence where the record otherwise never repeats.
+
+    Runs at the limits of the record belong to clipping and to rest, and are left out.
+    """
+    repeats = np.concatenate([[False], values[1:] == values[:-1], [False]])
+    edges = np.flatnonzero(repeats[1:] != repeats[:-1]) + 1
+    starts, ends = edges[::2], edges[1::2]
+    if len(starts) == 0 or len(values) < 50:
+        return np.arange(0)
+    long = ends - starts + 1 >= FROZEN
+    inside = (values[starts] < np.max(values)) & (values[starts] > np.min(values)) & (starts > 1) & (ends < len(values))
+    chosen = long & inside
+    # A channel read in coarse steps, or at rest, repeats its values anyway.
+    others = np.sum(repeats) - np.sum((ends - starts)[chosen])
+    if others > 0.01 * len(values):
+        return np.arange(0)
+    spans = [np.arange(s - 1, e) for s, e in zip(starts[chosen], ends[chosen], strict=True)]
+    return np.concatenate(spans) if spans else np.arange(0)

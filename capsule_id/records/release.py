@@ -1,0 +1,456 @@
+"""Finds the release of a free decay, whatever comes before it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from capsule_id.records.tones import noise_level
+from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part
+
+#: Turning points differ by this fraction of the record's range, and by so many standard deviations of the noise.
+TURN, TURN_SDS = 0.12, 5.0
+#: The last leg between turning points that has this fraction of the largest one belongs to the free decay.
+LEG = 0.3
+#: The part of a leg whose steepest place gives the period, and the time that a cosine takes for it, in periods.
+STEEP, STEEP_TIME = 0.3, 0.097
+#: Where the leg has passed this fraction of its height, the release is past.
+PAST = 0.8
+#: Samples in a period that suffice; of more, means are taken. Fewest of them, and fewest in a window.
+SAMPLES, FEWEST, WINDOW = 100, 4.0, 28
+#: The motion ends where it stays so close to its last value: fraction of the range, standard deviations of the noise.
+STILL, STILL_SDS = 0.015, 4.0
+#: Prior sds of dry friction, quadratic damping and a cubic spring, relative to the spring force at the amplitude.
+FURTHER = np.array([0.1, 0.2, 0.1])
+#: Error of the model relative to the amplitude, and what it gains with the sum of the further forces, up to a largest sum.
+MODEL, MODEL_FURTHER, LARGEST_FURTHER = 0.003, 0.04, 0.3
+#: Cost of a sample before the release, and least evidence of a release, in variances of the noise.
+SAMPLE_COST, EVIDENCE = 6.0, 15.0
+#: Residuals of a window that are this many times those of the windows within a period behind it show another motion.
+MISFIT = 1.5
+#: A decay with less damping oscillates; its windows grow by half a period, others by an eighth.
+OSCILLATES = 0.3
+#: The cut lies so much later than the release found, in periods; at least one sample.
+MARGIN = 0.04
+#: An earlier part of the same oscillation, this many periods long, is no motion before the release.
+EARLIER = 1.5
+#: Largest error of an earlier part of the same oscillation relative to its amplitude.
+SAME = 0.2
+#: A release changes the motion by this part of the sum of squares by which a hold would change it.
+CHANGE = 0.1
+#: Legs that last as long, and poles that are as large, up to these differences belong to one decay; legs from its first
+#: one to where the search for the release begins.
+REGULAR, ALIKE, LEGS = 0.3, 0.15, 3
+#: A second excitation makes the amplitude this many times as large.
+GROWTH = 1.15
+#: A push moves the rod by this fraction of the range, and takes this many times as long as the free rod takes back.
+SMALLEST_PUSH, PUSHED = 0.05, 1.3
+#: Time constants after which a decay has died out.
+DIED_OUT = 4.0
+
+Poles = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FreeDecay:
+    """The part of a record that is free decay.
+
+    Attributes
+    ----------
+    start : of the free decay, s; the first sample where the record begins with it
+    stop : time at which another excitation begins, s; before ``start`` where it ends an earlier decay; None: none
+    rest : duration of what comes before ``start``, s; 0 where the record begins with the free decay
+    period : of the oscillation, s; that without damping where the decay does not oscillate
+    pushed : whether the record begins with a push, within a period before ``start``
+    """
+
+    start: float
+    stop: float | None
+    rest: float
+    period: float
+    pushed: bool = False
+
+    @property
+    def end(self) -> float | None:
+        """Time at which another excitation ends the free decay, s; None: none does."""
+        return self.stop if self.stop is not None and self.stop > self.start else None
+
+
+def find_free_decay(time: np.ndarray, values: np.ndarray, displacement: bool = False) -> FreeDecay | None:
+    """Return the free decay inside a record; None where no motion exceeds the noise, or it is sampled too slowly.
+
+    Parameters
+    ----------
+    time : (n,) s, increasing, evenly or unevenly spaced
+    values : (n,) displacement, velocity or acceleration
+    displacement : whether they are displacements; only these show a push before the release, and cannot jump
+    """
+    whole, (time, values) = time, shortened(time, values)
+    if len(time) < len(whole):
+        time[[0, -1]] = whole[[0, -1]]
+    return _find(*(np.asarray(a, float).tobytes() for a in (time, values)), displacement)
+
+
+@lru_cache(maxsize=8)
+def _find(time_bytes: bytes, values_bytes: bytes, displacement: bool, smooth: bool = False) -> FreeDecay | None:
+    """As ``find_free_decay``, for bytes of float64: the checks and the fit of a record all call it.
+
+    ``smooth``: without fast modes, which a blow excites too.
+    """
+    time, values = np.frombuffer(time_bytes), np.frombuffer(values_bytes)
+    turns = _turning_points(values) if len(values) >= WINDOW // 2 else np.zeros(0, int)
+    if len(turns) < 2:
+        return None
+    sizes = np.abs(np.diff(values[turns]))
+    last = int(np.flatnonzero(sizes >= LEG * np.max(sizes))[-1])
+    period, past = _scale(time, values, int(turns[last]), int(turns[last + 1]))
+    decay, over = None, float(time[turns[last + 1]])
+    if period >= FEWEST * np.median(np.diff(time)):
+        lengths, first = np.diff(time[turns]), last
+        while (
+            first
+            and sizes[first - 1] > 0.95 * sizes[first]
+            and abs(lengths[first - 1] / lengths[first] - 1.0) < REGULAR
+        ):
+            first -= 1
+        record, anchor = _Record.of(time, values, period, past)
+        early = (
+            min(record.at(float(time[turns[min(first + LEGS, len(turns) - 1)]])), anchor)
+            if first + LEGS < last
+            else anchor
+        )
+        begin, fit, stop = _release(record, anchor, early)
+        over = float(record.time[begin]) + DIED_OUT / max(fit.poles[0] * fit.poles[1], 1e-9)
+        start, pushed = float(time[0]), False
+        if begin > 0 and np.sum(time >= record.time[begin]) > WINDOW // 4:
+            free = float(record.time[begin])
+            cut = max(int(np.searchsorted(time, free + MARGIN * period)), int(np.searchsorted(time, free, "right")))
+            start, pushed = _push(time, values, free, period) if displacement else (free, False)
+            start = start if start < free else max(start, float(time[min(cut, len(time) - 1)]))
+        after = turns[time[turns] > start + 0.15 * period]  # the first leg of a record is not whole
+        stop = _growth(time, values, after) if stop is None and len(after) > 4 else stop
+        own, halves = 2.0 * np.pi / (fit.poles[0] * np.sqrt(max(1.0 - fit.poles[1] ** 2, 0.1))), np.diff(time[after])
+        if len(after) > 4:
+            own = 2.0 * float(np.mean(halves[np.abs(halves / np.median(halves) - 1.0) < REGULAR]))
+        decay = FreeDecay(start, stop, start - float(time[0]), own, pushed)
+    slow = int(np.searchsorted(time, over, "right"))
+    later = time[slow + _turning_points(values[slow:])] if len(time) - slow > WINDOW else time[:0]
+    if len(later) > 6 and not smooth and later[-1] - later[0] > 1.5 * period * (len(later) - 1):
+        width = int((later[-1] - later[0]) / (len(later) - 1) / 4.0 / np.median(np.diff(time)))
+        padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
+        values = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+        decay = _find(time_bytes, values.tobytes(), displacement, smooth=True)
+    return decay
+
+
+def _push(time: np.ndarray, values: np.ndarray, start: float, period: float) -> tuple[float, bool]:
+    """Start of the free decay of a record that is cut at ``start``, s, and whether a push lies before it.
+
+    A push leads to a turning point. At every displacement a free rod has more kinetic energy before a turning point than
+    after it, whatever its spring and its damping: a rod that approaches the turning point no more slowly is free.
+    """
+    row, near = (int(np.searchsorted(time, start + part * period)) for part in (0.0, 0.2))
+    away = values[:near] - values[min(int(np.searchsorted(time, start + 0.5 * period)), len(values) - 1)]
+    top = int(np.argmax(np.abs(away)))
+    height = np.sign(away[top]) * (values - values[0])
+    climbs = height[top] > SMALLEST_PUSH * np.ptp(values[row:]) and height[row - 1] > 0.5 * height[top]
+    if not climbs or time[top] - time[0] > 0.5 * period:
+        return start, False
+    high = np.flatnonzero(height[: top + 1] < PAST * height[top])[-1]
+    falls = [top + np.flatnonzero(height[top:] < part * height[top]) for part in (PAST, 0.0)]
+    if len(falls[1]) and time[high] - time[0] < PUSHED * (time[falls[1][0]] - time[falls[0][0]]):
+        return float(time[0]), False
+    return max(start, float(time[top])), True
+
+
+def _turning_points(values: np.ndarray) -> np.ndarray:
+    """Indices of the turning points that differ by more than noise, and of the ends of the first and the last leg."""
+    levels = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
+    limit = max(TURN * float(np.ptp(levels)), TURN_SDS * noise_level(values))
+    turns, side, turn, other = list[int](), 0, 0, 0
+    levels = levels.tolist()
+    for i, level in enumerate(levels):
+        if side == 0:  # turn is the highest place, other the lowest one
+            turn, other = (i if level > levels[turn] else turn), (i if level < levels[other] else other)
+            if levels[turn] - levels[other] > limit:
+                side = 1 if turn > other else -1
+                turns.append(min(turn, other))
+                turn = i
+        elif side * (level - levels[turn]) > 0.0:
+            turn = i
+        elif side * (levels[turn] - level) > limit:
+            turns.append(turn)
+            side, turn = -side, i
+    return np.array([*turns, turn]) + 1
+
+
+def _scale(time: np.ndarray, values: np.ndarray, begin: int, end: int) -> tuple[float, float]:
+    """Period of the oscillation to a factor of two, from the steepest part of a leg, and a time behind its release."""
+    passed = np.maximum.accumulate((values[begin : end + 1] - values[begin]) / (values[end] - values[begin]))
+    levels = np.linspace(0.0, 1.0, 41)
+    place = np.clip(np.searchsorted(passed, levels), 1, len(passed) - 1)
+    low, high = passed[place - 1], passed[place]
+    part = np.where(high > low, (levels - low) / np.where(high > low, high - low, 1.0), 1.0)
+    times = time[begin + place - 1] + np.clip(part, 0.0, 1.0) * (time[begin + place] - time[begin + place - 1])
+    steep = round(STEEP * 40)
+    return float(np.min(times[steep:] - times[:-steep])) / STEEP_TIME, float(times[round(PAST * 40)])
+
+
+def _growth(time: np.ndarray, values: np.ndarray, turns: np.ndarray) -> float | None:
+    """Time before legs between ``turns`` that grow; None where none does. Two of them grow, and three were lower."""
+    sizes = np.abs(np.diff(values[turns]))
+    highest = np.max(np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (2, 0), mode="edge"), 3), axis=1)
+    grown = sizes > GROWTH * np.minimum.accumulate(
+        np.concatenate([highest[:1], highest[:-1]])
+    ) + SMALLEST_PUSH * np.max(sizes)
+    twice = 1 + np.flatnonzero(grown[1:-1] & grown[2:])
+    return float(time[turns[twice[0]]]) if len(twice) else None
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A free decay fitted to a window: ``poles`` (angular frequency, damping ratio), the sum of squares, the sd of the
+    residuals, that of the errors of the model, and the rest position."""
+
+    poles: Poles
+    cost: float
+    sd: float
+    model: float
+    level: float
+
+
+@dataclass(frozen=True)
+class _Record:
+    """Samples (n,) up to the end of the motion, an estimate of the period, and the sd of the noise."""
+
+    time: np.ndarray
+    values: np.ndarray
+    period: float
+    noise: float
+
+    @classmethod
+    def of(cls, time: np.ndarray, values: np.ndarray, period: float, past: float) -> tuple["_Record", int]:
+        """The record of block means without the rest after the motion, and the index of the time ``past``."""
+        size = max(min(int(period / np.median(np.diff(time)) / SAMPLES), len(time) // WINDOW), 1)
+        time, values = (a[: len(a) // size * size].reshape(-1, size).mean(axis=1) for a in (time, values))
+        noise, last = noise_level(values), np.median(values[-max(5, len(values) // 20) :])
+        far = np.flatnonzero(np.abs(values - last) > max(STILL_SDS * noise, STILL * float(np.ptp(values))))
+        anchor = min(int(np.searchsorted(time, past)), max(len(time) - 10, 0))
+        end = max(far[-1] + 1 if len(far) else 0, anchor + 12)
+        return cls(time[:end], values[:end], period, noise), anchor
+
+    def at(self, time: float) -> int:
+        """Index of the first sample at ``time`` or later."""
+        return int(np.searchsorted(self.time, time))
+
+    def end(self, begin: int) -> int:
+        """End of the window that begins at a sample: a period, and ``WINDOW`` samples, later."""
+        return min(max(self.at(self.time[begin] + self.period), begin + WINDOW), len(self.time))
+
+    def starts(self) -> list[Poles]:
+        """Poles from which a fit begins."""
+        return [(2.0 * np.pi / self.period * a, zeta) for a, zeta in ((1.0, 0.05), (1.0, 0.5), (1.5, 1.0), (2.5, 1.6))]
+
+    def fit(self, begin: int, end: int, starts: Iterable[Poles], steps: int) -> _Fit:
+        """The best decay of samples ``begin`` to ``end`` from the ``starts``, by Gauss-Newton on the poles."""
+        time, values = self.time[begin:end] - self.time[begin], self.values[begin:end]
+        size = 0.5 * float(np.ptp(values))
+        noise, found = max(self.noise, MODEL * size), list(starts)
+        if len(found) > 1:
+            found = [min((_fit(time, values, poles, noise, 4) for poles in found), key=lambda fit: fit[0])[1]]
+        best = _fit(time, values, found[0], noise, steps)
+        model = max((MODEL + MODEL_FURTHER * min(best[2], LARGEST_FURTHER)) * size, 1e-15)
+        return _Fit(best[1], best[0], max(np.sqrt(best[0] / max(len(time) - 5, 1)), self.noise, model), model, best[3])
+
+
+def _fit(
+    time: np.ndarray, values: np.ndarray, poles: Poles, sd: float, steps: int
+) -> tuple[float, Poles, float, float]:
+    """Sum of squares, poles, sum of the further forces, and rest position of a decay; ``sd`` of the readings."""
+    prior = np.zeros((3, 8))
+    prior[[0, 1, 2], [5, 6, 7]] = sd / FURTHER
+    wanted, step = np.concatenate([values, np.zeros(3)]), np.zeros(2)
+    best = np.inf, poles, 0.0, 0.0
+    for _ in range(steps + 1):
+        columns = np.vstack([_columns(poles[0] * time, poles[1], values, sd), prior])
+        linear = np.delete(columns, [3, 4], axis=1)
+        found = np.linalg.lstsq(linear, wanted, rcond=1e-10)[0]
+        cost = float(np.sum((wanted - linear @ found) ** 2))
+        if cost < best[0]:
+            converged = best[0] - cost < 1e-3 * cost
+            best = cost, poles, float(np.sum(np.abs(found[3:]))), float(found[0])
+            if converged:
+                break
+            step = np.clip(np.linalg.lstsq(columns, wanted, rcond=1e-10)[0][3:5], -0.4, 0.4)
+        else:
+            step = step / 3.0
+        poles = best[1][0] * float(np.exp(step[0])), float(np.clip(best[1][1] + step[1], 0.0, 2.5))
+    return best
+
+
+def _motions(phase: np.ndarray, zeta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Offset and two free motions, their rates, (n, 3) each, the poles (2,) and the waves (n, 2) of a linear decay."""
+    root = np.sqrt(complex(zeta**2 - 1.0))
+    root = root if abs(root) > 1e-3 else 1e-3
+    poles = np.array([-zeta + root, -zeta - root])
+    exponents = poles * phase[:, None]
+    waves = np.exp(np.clip(np.real(exponents), -60.0, 60.0) + 1j * np.imag(exponents))
+    first = ((poles[0] * waves[:, 1] - poles[1] * waves[:, 0]) / (poles[0] - poles[1])).real
+    second = ((waves[:, 0] - waves[:, 1]) / (poles[0] - poles[1])).real
+    motions = np.column_stack([np.ones_like(phase), first, second])
+    return motions, np.column_stack([np.zeros_like(phase), -second, first - 2.0 * zeta * second]), poles, waves
+
+
+def _columns(phase: np.ndarray, zeta: float, values: np.ndarray, sd: float) -> np.ndarray:
+    """Offset, two free motions, derivatives by the poles, and responses to three further forces, (n, 8).
+
+    The further forces are those along the decay that they cause: dry friction, quadratic damping and a cubic spring, each
+    with the size of the spring force at the amplitude.
+
+    Parameters
+    ----------
+    phase : (n,) time times angular frequency
+    zeta : damping ratio
+    values : (n,) readings; ``sd`` of their errors
+    """
+    motions, rates, poles, waves = _motions(phase, zeta)
+    half = 0.5 * np.diff(phase)[:, None, None]
+
+    def response(forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Displacement and rate, (n, k) each, from rest by forces (n, k)."""
+        pulled = forces[:, None, :] / waves[:, :, None]
+        sums = np.concatenate([np.zeros((1, *pulled.shape[1:])), np.cumsum((pulled[1:] + pulled[:-1]) * half, axis=0)])
+        parts = sums * waves[:, :, None] * np.array([1.0, -1.0])[:, None] / (poles[0] - poles[1])
+        return parts.sum(axis=1).real, (parts * poles[:, None]).sum(axis=1).real
+
+    found = np.linalg.lstsq(motions, values, rcond=1e-9)[0]
+    x, v = motions[:, 1:] @ found[1:], rates @ found
+    size = float(np.max(np.abs(x))) + 1e-300
+    further = rate = np.zeros((len(phase), 3))
+    for turn in range(3):
+        a, b = np.clip(x / size, -3.0, 3.0), np.clip(v / size, -3.0, 3.0)
+        further, rate = response(-size * np.column_stack([np.sign(b), b * np.abs(b), a**3]))
+        if turn < 2:
+            columns = np.vstack([np.hstack([motions, further]), np.hstack([np.zeros((3, 3)), np.diag(sd / FURTHER)])])
+            found = np.linalg.lstsq(columns, np.concatenate([values, np.zeros(3)]), rcond=1e-10)[0]
+            x, v = columns[: len(phase), 1:] @ found[1:], rates @ found[:3] + rate @ found[3:]
+    return np.column_stack([motions, phase * v, response(-2.0 * v[:, None])[0], further])
+
+
+def _release(record: _Record, begin: int, early: int) -> tuple[int, _Fit, float | None]:
+    """First sample of the free decay around sample ``begin``, its fit, and the end of an earlier decay, s.
+
+    The search begins at the sample ``early`` where the same oscillation is there already.
+    """
+    fit = record.fit(begin, record.end(begin), record.starts(), 15)
+    one = record.fit(early, record.end(early), [fit.poles], 8) if early < begin else fit
+    if abs(np.log(one.poles[0] / fit.poles[0])) < ALIKE and abs(one.poles[1] - fit.poles[1]) < ALIKE:
+        begin, fit = early, one
+    seen = [(begin, fit.sd)]
+    while begin > 0:
+        time, span = record.time, record.period * (0.5 if fit.poles[1] < OSCILLATES else 0.125)
+        low = max(min(record.at(time[begin] - span), begin - 2), 0)
+        sd = max(min((sd for i, sd in seen if time[i] <= time[begin] + record.period), default=fit.sd), fit.model)
+        wider = record.fit(low, record.end(begin), [fit.poles], 4)
+        later = record.fit(low, record.end(low), [wider.poles], 3)
+        doubtful = wider.cost - fit.cost > sd**2 * (2.0 * (begin - low) + EVIDENCE) or later.sd > MISFIT * max(
+            sd, later.model
+        )
+        if doubtful or low == 0:
+            inside = max(min(record.at(time[begin] + max(span, 0.25 * record.period)), len(time) - 10), begin)
+            inner = record.fit(inside, record.end(inside), [fit.poles, *record.starts()], 10)
+            found, evidence = _border(record, low, inside, replace(inner, sd=max(min(inner.sd, sd), inner.model)))
+            if found > low and evidence > EVIDENCE:
+                inner = record.fit(found, record.end(found), [inner.poles, *record.starts()], 10)
+                if _changes(record, found, inner):
+                    growth, stop = _earlier(record, found, inner)
+                    if growth > GROWTH:
+                        return found, inner, stop
+                    # Samples are lost or wrong here: the search goes on in front of them.
+                    last = max(record.at(time[found] - 0.125 * record.period), min(WINDOW, found))
+                    record, low = replace(record, time=time[:last], values=record.values[:last]), max(last - WINDOW, 0)
+                seen = []
+            later = record.fit(low, record.end(low), [fit.poles, *record.starts()], 10) if low else fit
+        begin, fit = low, later
+        seen.append((begin, fit.sd))
+    return 0, fit, None
+
+
+def _changes(record: _Record, row: int, fit: _Fit) -> bool:
+    """Whether the motion before a sample is as far from the free decay behind it as that of a release."""
+    first, end = record.at(record.time[row] - 0.25 * record.period), record.end(row)
+    held = record.values.copy()
+    held[first:row] = np.mean(held[row : row + 2])
+    costs = [one.fit(first, end, [fit.poles], 4).cost - fit.cost for one in (record, replace(record, values=held))]
+    noise = noise_level(record.values[first:row]) ** 2 * (row - first) if row - first > 8 else 0.0
+    return costs[0] - noise > CHANGE * costs[1]
+
+
+def _border(record: _Record, low: int, inside: int, fit: _Fit) -> tuple[int, float]:
+    """Sample from ``low`` to ``inside`` from which one decay lasts to the end of the window, and the evidence for it."""
+    cost, end = np.full(inside - low + 1, np.inf), record.end(inside)
+    stride = max(1, inside - record.at(record.time[inside] - record.period / 32.0))
+    best, poles = inside, fit.poles
+    while True:
+        if best < inside:
+            poles = record.fit(best, end, [poles, *record.starts()], 12).poles
+        for step, first, last in ((stride, best, low), (1, min(best + stride, inside), max(best - stride, low))):
+            near = poles
+            for i in range(first, last - 1, -step):
+                one = record.fit(i, end, [near], 4)
+                near = one.poles
+                cost[i - low] = min(cost[i - low], one.cost / fit.sd**2 + SAMPLE_COST * (i - low))
+                if cost[i - low] > np.min(cost) + 500.0:
+                    break
+        # What follows the release may be one exponential, whose poles lead to no fit of the whole.
+        cost[0] = min(cost[0], record.fit(low, end, [poles, *record.starts()], 12).cost / fit.sd**2)
+        again = low + int(np.argmin(cost))
+        if again >= best:
+            return again, float(cost[np.isfinite(cost)][0] - np.min(cost))
+        best = again
+
+
+def _earlier(record: _Record, row: int, fit: _Fit) -> tuple[float, float | None]:
+    """Growth of the amplitude at a sample before which the same oscillation goes on, and the end of an earlier decay, s.
+
+    Infinite where no such oscillation ends at this sample; None where none before it lasts ``EARLIER`` periods.
+    """
+    time, period = record.time, record.period
+    if fit.poles[1] > 2.0 * OSCILLATES:
+        return np.inf, None
+    for end in np.arange(time[row] - period / 16.0, time[0] + 0.25 * period, -period):
+        part = slice(record.at(end - 2.0 * period), record.at(end))
+        values, stays = record.values[part], end - time[part.start] > EARLIER * period
+        ends_here = end > time[row] - period
+        if len(values) < 6 or np.ptp(values) < 2.0 * STILL_SDS * record.noise or not (stays or ends_here):
+            continue
+        poles = record.fit(part.start, part.stop, [fit.poles], 4).poles if stays else fit.poles
+        columns = _motions(poles[0] * (time[part] - end), poles[1])[0]
+        found = np.linalg.lstsq(columns, values, rcond=1e-9)[0]
+        size, error = float(np.hypot(found[1], found[2])), np.mean((values - columns @ found) ** 2) - record.noise**2
+        same = error < (SAME * max(size, 0.5 * float(np.ptp(values)))) ** 2 and abs(found[0] - fit.level) < LEG * size
+        if same and abs(np.log(poles[0] / fit.poles[0])) < ALIKE:
+            grown = 0.5 * float(np.ptp(record.values[row : record.end(row)])) / size if ends_here else np.inf
+            return grown, (float(time[row]) if ends_here else float(end)) if stays else None
+    return np.inf, None
+
+
+def shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of blocks of a long record, about ``PIECE`` of them and 32 or more in a period; a short record itself.
+
+    Parameters
+    ----------
+    time, values : (n,) s, increasing, and readings
+    """
+    if len(time) < 2 * PIECE:
+        return time, values
+    part = loudest_part(values)
+    grid = np.linspace(time[part][0], time[part][-1], len(time[part]))
+    period = 1.0 / dominant_frequency(grid, np.interp(grid, time[part], values[part]))
+    size = max(1, min(len(time) // PIECE, int(period / (grid[1] - grid[0]) / 32.0)))
+    count = len(time) // size
+    means = []
+    for column in (time, values):
+        means.append(column[: count * size].reshape(count, size).mean(axis=1))
+    return means[0], means[1]

@@ -1,0 +1,659 @@
+"""Figures of a rig and its fit: readings, recorded runs, comparisons, corner plot, traces."""
+
+import math
+from collections.abc import Sequence
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from capsule_id.inference.result import PointFit, Result
+from capsule_id.records.view import RecordView
+from capsule_id.report.columns import SampledParameters, fixed, plain_symbol, sampled_parameters
+from capsule_id.report.figures.style import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PALE_BLUE,
+    PURPLE,
+    SKY,
+    SMALL,
+    TEXT,
+    VERMILION,
+    figure_of,
+    make_room,
+    new_figure,
+    own_axes,
+    set_legend,
+    set_text,
+    subfigure_at,
+)
+from capsule_id.rig.model import Table
+from capsule_id.views import Comparison, Curve, Finding, Points
+
+# comparisons: Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
+#
+# Every panel is ``(thing, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own; labels are plain text.
+
+
+# Beyond this many points a record is a cloud of dots, not single readings with bars.
+_MANY = 100
+TWO_SIDED_95 = 1.96
+
+_POINT_STYLES: dict[str, dict[str, Any]] = {
+    "static": {"marker": "o", "mfc": "none", "color": BLACK},
+    "dynamic": {"marker": "x", "color": VERMILION},
+    "sliding": {"marker": "^", "mfc": "none", "color": GREEN},
+    "data": {"marker": "o", "mfc": "none", "color": BLACK},
+}
+_CURVE_STYLES: dict[str, dict[str, Any]] = {
+    "ours": {"color": BLUE, "ls": "-", "lw": 1.8},
+    "paper": {"color": VERMILION, "ls": "--", "lw": 1.6},
+    "predictive": {"color": GREEN, "ls": "-.", "lw": 1.6},
+    "alternative": {"color": PURPLE, "ls": ":", "lw": 2.0},
+}
+
+
+def comparison(item: Comparison, ax: Axes | None = None) -> Axes:
+    """Measured points with the predicted curves and their 95 % bands."""
+    ax = own_axes(ax)
+    banded = [curve for curve in item.curves if curve.lower is not None and curve.upper is not None]
+    long = any(points.x.size > _MANY for points in item.points)
+    for curve in item.curves:
+        _draw_curve(ax, curve, "95 % band" if banded and curve is banded[0] else None, over_cloud=long)
+    for points in item.points:
+        _draw_points(ax, points)
+    set_text(ax, item.x_label, item.y_label, item.title)
+    # Finding the best place means testing every point: for a record that takes longer than drawing it.
+    if long:
+        make_room(ax)
+    set_legend(ax, place="upper right" if long else "best")
+    return ax
+
+
+def residuals(item: Comparison, ax: Axes | None = None) -> Axes:
+    """Residuals at the point fit in units of the noise sd, with the band that holds 95 % of a good fit's.
+
+    Raises
+    ------
+    ValueError
+        If the comparison has no residuals.
+    """
+    if item.residuals is None or item.residual_x is None:
+        raise ValueError(f"{item.label} has no residuals")
+    ax = own_axes(ax, height=2.2)
+    ax.axhspan(-TWO_SIDED_95, TWO_SIDED_95, color=BLUE, alpha=0.13, lw=0)
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    many = item.residuals.size > _MANY
+    ax.plot(item.residual_x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
+    limit = 1.1 * max(3.0, float(np.max(np.abs(item.residuals), initial=0.0, where=np.isfinite(item.residuals))))
+    ax.set_ylim(-limit, limit)
+    set_text(ax, item.x_label, "residual / sd [1]")
+    return ax
+
+
+def autocorrelation(item: Comparison, ax: Axes | None = None) -> Axes:
+    """Autocorrelation of the residuals from lag 1, with the 95 % band of a white record.
+
+    Raises
+    ------
+    ValueError
+        If the comparison has no autocorrelation.
+    """
+    if item.autocorrelation is None:
+        raise ValueError(f"{item.label} has no autocorrelation")
+    ax = own_axes(ax, height=2.2)
+    lags = np.arange(1, item.autocorrelation.size + 1)
+    bound = item.autocorrelation_bound
+    if bound is not None:
+        ax.axhspan(-bound, bound, color=BLUE, alpha=0.13, lw=0, label="95 % of white records")
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    ax.vlines(lags, 0.0, item.autocorrelation, color=BLACK, lw=1.3)
+    largest = float(np.max(np.abs(item.autocorrelation), initial=0.0, where=np.isfinite(item.autocorrelation)))
+    limit = 1.25 * max(largest, 2.0 * (bound or 0.0), 0.05)
+    ax.set_ylim(-limit, limit)
+    set_text(ax, "lag [samples]", "autocorrelation [1]")
+    set_legend(ax, place="above")  # bars of a coloured record reach everywhere
+    return ax
+
+
+def comparison_figure(item: Comparison) -> Figure:
+    """The panel of a comparison with the residual and autocorrelation panels that it has."""
+    if item.autocorrelation is not None and item.residuals is not None:
+        figure = new_figure(9.0, 5.6)
+        grid = figure.add_gridspec(2, 2, height_ratios=(1.7, 1.0), hspace=0.38, wspace=0.25)
+        comparison(item, figure.add_subplot(grid[0, :]))
+        residuals(item, figure.add_subplot(grid[1, 0]))
+        autocorrelation(item, figure.add_subplot(grid[1, 1]))
+        figure.subplots_adjust(left=0.09, right=0.98, bottom=0.1, top=0.93)
+        return figure
+    if item.residuals is None:
+        return figure_of(comparison(item, own_axes(None, height=5.6)))
+    figure = new_figure(6.4, 5.6)
+    top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (2.4, 1.0), "hspace": 0.12})
+    comparison(item, top)
+    residuals(item, bottom)
+    top.set_xlabel("")
+    top.tick_params(labelbottom=False)
+    figure.subplots_adjust(left=0.14, right=0.97, bottom=0.11, top=0.93)
+    figure.align_ylabels([top, bottom])
+    return figure
+
+
+def side_by_side(items: Sequence[Comparison]) -> Figure:
+    """All panels in one figure, two in a row."""
+    columns = min(len(items), 2)
+    rows = -(-len(items) // columns)
+    figure = new_figure(6.4 * columns, 4.4 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for ax, item in zip_longest(grid.flat, items):
+        if item is None:
+            ax.set_axis_off()
+        else:
+            comparison(item, ax)
+    figure.subplots_adjust(
+        left=0.9 / (6.4 * columns),
+        right=1 - 0.2 / (6.4 * columns),
+        bottom=0.62 / (4.4 * rows),
+        top=1 - 0.39 / (4.4 * rows),
+        wspace=0.2,
+        hspace=0.3,
+    )
+    return figure
+
+
+def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
+    """Where each start of the point fit began and ended, per parameter, in standard deviations from the best maximum.
+
+    The standard deviation is that of the Laplace approximation in the unconstrained space; a parameter for which it is
+    not a positive number is shown in the bare unconstrained unit. Starts that stalled end in a cross.
+    """
+    d, height = len(fit.names), 1.5 + 0.25 * len(fit.names)
+    if ax is None:
+        ax = own_axes(None, 7.2, height)
+        figure_of(ax).subplots_adjust(left=0.36, right=0.97, bottom=0.7 / height, top=1 - 0.6 / height)
+    variance = np.diag(fit.covariance)
+    sd = np.sqrt(np.where(np.isfinite(variance) & (variance > 0), variance, 1.0))
+    rows = np.arange(d)[::-1]
+    shifts = np.linspace(0.25, -0.25, len(fit.starts))
+    stalled = np.asarray(fit.stalled, dtype=bool)
+    ax.set_xscale("symlog", linthresh=1.0)
+    ax.xaxis.set_major_formatter("{x:g}")
+    for i, (start, end, shift) in enumerate(zip(fit.starts, fit.ends, shifts, strict=True)):
+        marker, size, text = ("x", 7, "end, stalled") if stalled[i] else ("o", 4, "end")
+        first = not np.any(stalled[:i] == stalled[i])
+        style: dict[str, Any] = {"ls": "", "color": CYCLE[i % len(CYCLE)]}
+        ax.plot((start - fit.u) / sd, rows + shift, marker="o", mfc="none", ms=5, label="" if i else "start", **style)
+        ax.plot((end - fit.u) / sd, rows + shift, marker=marker, ms=size, label=text if first else "", **style)
+    ax.axvline(0.0, color=GREY, lw=0.8, zorder=0)
+    ax.set_yticks(rows, [plain_symbol(name) for name in fit.names], parse_math=False)
+    ax.set_ylim(-0.8, d - 0.2)
+    set_text(ax, "distance from the best maximum [posterior sd]", "", "Starts of the point fit")
+    set_legend(ax, place="above")
+    return ax
+
+
+def _draw_curve(ax: Axes, curve: Curve, band_label: str | None, over_cloud: bool) -> None:
+    style = dict(_CURVE_STYLES[curve.role])
+    if over_cloud:  # a line as wide as the dots would hide a record that leaves it by less than that
+        style["lw"] *= 0.5
+    if curve.lower is not None and curve.upper is not None:
+        if curve.x.size == 1:
+            reach = [curve.y - curve.lower, curve.upper - curve.y]
+            ax.errorbar(curve.x, curve.y, reach, capsize=4.0, marker="D", label=curve.label, zorder=3, **style)
+            return
+        ax.fill_between(
+            curve.x, curve.lower, curve.upper, color=style["color"], alpha=0.22, lw=0, zorder=1, label=band_label
+        )
+    ax.plot(curve.x, curve.y, label=curve.label, zorder=3, **style)
+
+
+def _draw_points(ax: Axes, points: Points) -> None:
+    style = _POINT_STYLES[points.role]
+    if points.x.size > _MANY:
+        ax.plot(points.x, points.y, ls="", marker=".", ms=3.5, color=GREY, label=points.label, zorder=2)
+    else:
+        ax.errorbar(
+            points.x,
+            points.y,
+            points.y_error,
+            ls="",
+            ms=6.5,
+            mew=1.4,
+            elinewidth=1.1,
+            label=points.label,
+            zorder=4,
+            **style,
+        )
+    if points.flagged is not None and np.any(points.flagged):
+        ax.plot(
+            points.x[points.flagged], points.y[points.flagged], ls="", marker="s", ms=13, mfc="none", mew=1.6,
+            color=VERMILION, label="flagged by a check, kept", zorder=5,
+        )  # fmt: skip
+
+
+# readings: Figures of the readings of one experiment with what ``capsule-id check`` found in them.
+
+
+#: A record with more samples than this is a line without markers.
+MOST_MARKERS = 200
+#: Marks of rows that findings name: code, words of the legend, marker, colour.
+_MARKS = (
+    ("readings.clipped", "clipped", "v", VERMILION),
+    ("readings.dropouts", "drop-out", "X", PURPLE),
+    ("readings.frozen", "frozen", "s", ORANGE),
+    ("readings.repeated", "repeated", "D", ORANGE),
+    ("readings.repeated_file", "repeated", "D", ORANGE),
+    ("readings.jump", "jump", "P", PURPLE),
+    ("readings.burst", "burst of noise", "P", PURPLE),
+    ("readings.spike", "spike", "P", PURPLE),
+)
+#: Times that findings propose: fact, words of the legend, line style.
+_TIMES = (("start", "release found", "--"), ("stop", "end found", ":"))
+
+
+def readings_figure(table: Table[Any], findings: Sequence[Finding]) -> Figure:
+    """Draw the channels of a record against time, or the columns of a table against the first one.
+
+    Parameters
+    ----------
+    findings : on this table; their facts name rows and times
+    """
+    names = list(table.columns)
+    across, channels = (names[0], names[1:]) if len(names) > 1 else ("", names)
+    figure = new_figure(8.0, 0.9 + 2.1 * len(channels))
+    axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    figure.subplots_adjust(
+        left=0.12, right=0.97, bottom=0.62 / figure.get_figheight(), top=1 - 0.4 / figure.get_figheight()
+    )
+    for index, (ax, name) in enumerate(zip(axes, channels, strict=True)):
+        channel_with_findings(table, name, findings, ax, across)
+        ax.set_title(f"{table.kind} {table.label}" if index == 0 else "", loc="left", parse_math=False)
+        if index + 1 < len(channels):
+            ax.set_xlabel("")
+    return figure
+
+
+def channel_with_findings(
+    table: Table[Any], name: str, findings: Sequence[Finding], ax: Axes | None = None, across: str = "time"
+) -> Axes:
+    """Draw one column against the column ``across`` ("": row numbers), in the units of the file, with marked findings."""
+    ax = own_axes(ax)
+    y = _displayed(table, name)
+    x = _displayed(table, across) if across else np.arange(1.0, len(y) + 1.0)
+    record = "time" in table.columns
+    marker = "" if record and len(y) > MOST_MARKERS else "o"
+    ax.plot(x, y, color=BLUE, lw=0.8 if record else 0.0, marker=marker, ms=3.5, label="readings")
+    if record:
+        _mark_times(table, findings, ax)
+    for code, words, marker, color in _MARKS:
+        rows = [
+            row
+            for found in findings
+            if found.code == code and found.facts.get("column", name) == name
+            for row in found.facts["rows"]
+        ]
+        if rows:
+            ax.plot(x[rows], y[rows], ls="none", marker=marker, ms=5.0, color=color, label=words, zorder=3)
+    set_text(ax, _label(table, across) if across else "row", _label(table, name))
+    set_legend(ax, place="above")
+    return ax
+
+
+def _mark_times(table: Table[Any], findings: Sequence[Finding], ax: Axes) -> None:
+    """Shade gaps and the part outside the stated window; draw lines at the times that findings propose."""
+    time = [float(value) for value in _displayed(table, "time")]
+    scale = table.columns["time"].to_display
+    for found in findings:
+        if found.code == "readings.gaps":
+            for index, row in enumerate(found.facts["rows"]):
+                label = "gap" if index == 0 else None
+                ax.axvspan(time[row], time[row + 1], color=ORANGE, alpha=0.6, lw=1.5, label=label)
+        for fact, words, line in _TIMES:
+            if isinstance(found.facts.get(fact), float) and found.code.startswith("decays."):
+                ax.axvline(scale * found.facts[fact], color=VERMILION, ls=line, lw=1.4, label=words)
+    stated = [getattr(table.settings, key, None) for key in ("start", "stop")]
+    for edge, outside in zip(stated, (time[0], time[-1]), strict=True):
+        if isinstance(edge, float):
+            ax.axvspan(min(scale * edge, outside), max(scale * edge, outside), color=GREY, alpha=0.2, lw=0.0)
+            ax.axvline(scale * edge, color=SKY, lw=1.2)
+
+
+def _displayed(table: Table[Any], name: str) -> np.ndarray:
+    """Values of a column in the unit of the file, (n,)."""
+    return table[name] * table.columns[name].to_display
+
+
+def _label(table: Table[Any], name: str) -> str:
+    return f"{name}, {table.columns[name].unit}"
+
+
+# runs: Figures of recorded runs, as the paper draws them: time histories (Fig. 4), phase plane (Figs. 9, 12), force
+# (4d).
+#
+# Every figure is ``(view, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own.
+
+
+_MM = 1e3
+# Channels in the order of the panels: axis label, display per SI, colour.
+_CHANNELS = {
+    "x_capsule": ("X2, mm", _MM, BLACK),
+    "x_rel": ("X1 - X2, mm", _MM, BLUE),
+    "acceleration_rod": ("acceleration\nof the rod, m/s²", 1.0, GREY),
+    "current": ("current, A", 1.0, PURPLE),
+}
+
+
+def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
+    """Rate against x_rel, both filtered, with the impact line and the Poincaré points at the drive's phase."""
+    ax = own_axes(ax)
+    # At the ends of the record the derivative is that of a polynomial's edge, and mostly noise.
+    inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
+    ax.plot(_MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
+    lines = []
+    if np.isfinite(view.gap):
+        lines.append(ax.axvline(_MM * view.gap, color=VERMILION, ls="--", lw=1.2, label="gap as stated"))
+    if view.gap_seen is not None:
+        lines.append(ax.axvline(_MM * view.gap_seen, color=VERMILION, ls=":", lw=1.6, label="contacts begin"))
+    ax.plot(
+        _MM * view.section_x_rel,
+        view.section_rate,
+        ls="none",
+        marker="o",
+        ms=4.5,
+        color=GREEN,
+        zorder=3,
+        label="once a period",
+    )
+    set_text(ax, "X1 - X2, mm", "rate of X1 - X2, m/s", f"motion: {view.label}")
+    below_legend = make_room(ax)
+    for line in lines:
+        line.set_ydata([0.0, below_legend])
+    set_legend(ax, place="upper right")
+    return ax
+
+
+def force_on_rod(view: RecordView, ax: Axes | None = None, model: tuple[np.ndarray, np.ndarray] | None = None) -> Axes:
+    """K times the current against time, and beside it a model's (times, force) where given, s and N.
+
+    Raises
+    ------
+    ValueError
+        If the view has no force: it was made without K, or from a table without current.
+    """
+    if view.force is None:
+        raise ValueError("this view has no force: give view_record a K and a table with current")
+    ax = own_axes(ax)
+    ax.plot(view.time, view.force, color=PURPLE, lw=1.0, label="K times current")
+    if model is not None:
+        ax.plot(*model, color=BLACK, ls="--", lw=1.2, label="model")
+    set_text(ax, "time, s", "force on the rod, N", f"motion: {view.label}")
+    make_room(ax)
+    set_legend(ax, place="upper right")
+    return ax
+
+
+def channel_history(view: RecordView, name: str, ax: Axes | None = None) -> Axes:
+    """One raw channel against time; x_rel with the gap."""
+    ax = own_axes(ax)
+    label, scale, color = _CHANNELS[name]
+    ax.plot(view.time, scale * view.channels[name], color=color, lw=0.7)
+    if name == "x_rel" and np.isfinite(view.gap):
+        ax.axhline(scale * view.gap, color=VERMILION, ls="--", lw=1.2)
+    set_text(ax, "time, s", label)
+    return ax
+
+
+def overview_size(view: RecordView) -> tuple[float, float]:
+    """Width and height of ``run_overview``, inches."""
+    return 10.0, 1.2 + 1.25 * max(sum(name in view.channels for name in _CHANNELS), 3)
+
+
+def run_overview(view: RecordView, ax: Axes | None = None) -> Axes:
+    """Every recorded channel above each other, the phase plane beside them. Returns the phase plane."""
+    names = [name for name in _CHANNELS if name in view.channels]
+    figure = new_figure(*overview_size(view)) if ax is None else subfigure_at(ax)
+    grid = figure.add_gridspec(len(names), 2, left=0.1, right=0.98, bottom=0.11, top=0.93, wspace=0.24, hspace=0.3)
+    for row, name in enumerate(names):
+        history = channel_history(view, name, figure.add_subplot(grid[row, 0]))
+        if row + 1 < len(names):
+            history.set_xlabel("")
+            history.tick_params(labelbottom=False)
+    return phase_plane_of_run(view, figure.add_subplot(grid[:, 1]))
+
+
+# corner: Corner plot: a histogram of every parameter, contours of every pair.
+#
+# All panels lie in one ``Axes`` and all contours are those of one field: with an ``Axes`` a panel, ten parameters would
+# cost more time than all other figures of the report together.
+
+
+_BINS = 40
+# Shares of the draws inside the contours, from outside in.
+_SHARES = (0.95, 0.68)
+# A panel shows the central 99.8 %: one stray walker must not shrink everything else to a dot.
+_TAILS = (0.1, 99.9)
+# Panels are squares of this side on a grid of unit cells.
+_SIDE = 0.94
+# No tick in the outer tenths of a side: its label would run into the neighbour's.
+_TICK_MARGIN = 0.1
+
+
+def corner_size(n: int) -> tuple[float, float, float]:
+    """Width of a panel, width and height of the figure of ``n`` parameters, inches."""
+    panel = 2.6 if n <= 2 else 1.9 if n <= 4 else min(1.25, max(0.9, 15 / n))
+    # The key stands in the empty upper triangle, or above the panels where that is too small.
+    return panel, 1.25 + panel * n, 1.25 + panel * n + (0.8 if n <= 2 else 0.0)
+
+
+def corner(result: Result, ax: Axes | None = None) -> Axes:
+    """Histogram of every sampled physical parameter and contours (68 %, 95 %) of every pair.
+
+    The point fit is marked in black, the paper's estimate, where it lies in the picture, in vermilion.
+
+    Raises
+    ------
+    ValueError
+        If nothing was sampled.
+    """
+    columns = sampled_parameters(result)
+    n = len(columns.names)
+    panel, width, height = corner_size(n)
+    if ax is None:
+        ax = new_figure(width, height).add_axes(
+            (1.1 / width, 1.0 / height, panel * n / width, panel * n / height), frameon=False
+        )
+    else:
+        ax.set_frame_on(False)
+        panel = ax.get_window_extent().width / figure_of(ax).dpi / n
+    ax.set(xlim=(0, n), ylim=(0, n), xticks=[], yticks=[])
+    low, high = _limits(columns)
+    flat = columns.draws.reshape(-1, n)
+    place = (flat - low) / (high - low) * _BINS
+    inside = (place >= 0) & (place < _BINS)
+    bins = np.clip(place, 0, _BINS - 1).astype(np.int64)
+    _contours(ax, bins, inside)
+    _histograms(ax, bins, inside)
+    _frames(ax, n)
+    _marks(ax, (columns.map - low) / (high - low), BLACK, "+", "-")
+    _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
+    _axes(ax, columns, low, high, panel)
+    above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)} if n <= 2 else {"loc": "upper right"}
+    ax.legend(handles=_key(), fontsize=TEXT, frameon=False, borderaxespad=0.2, **above)
+    return ax
+
+
+def _limits(columns: SampledParameters) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of every panel's axis, (n,) each."""
+    low, high = np.percentile(columns.draws.reshape(-1, len(columns.names)), _TAILS, axis=0)
+    # A parameter that never moved (a frozen chain) still gets a panel of some width.
+    width = np.where(high > low, high - low, np.where(high == 0, 1.0, np.abs(high)))
+    return low - 0.02 * width, low + 1.02 * width
+
+
+def _contours(ax: Axes, bins: np.ndarray, inside: np.ndarray) -> None:
+    """Filled contours of every pair at once: a field over the whole picture, zero between the panels.
+
+    The field is the share of the draws at lower density, so that the same two levels hold in every panel.
+    """
+    n = bins.shape[1]
+    field = np.zeros((n, _BINS + 2, n, _BINS + 2))
+    for i in range(1, n):
+        for j in range(i):
+            both = inside[:, i] & inside[:, j]
+            counts = np.bincount(bins[both, i] * _BINS + bins[both, j], minlength=_BINS * _BINS)
+            density = _smoothed(counts.reshape(_BINS, _BINS).astype(float))
+            order = np.argsort(density, axis=None, kind="stable")
+            share = np.empty(order.size)
+            share[order] = np.cumsum(density.flat[order]) / max(density.sum(), 1.0)
+            field[n - 1 - i, 1:-1, j, 1:-1] = share.reshape(_BINS, _BINS)
+    edge = np.concatenate([[0.0], (np.arange(_BINS) + 0.5) / _BINS, [1.0]]) * _SIDE
+    centres = (np.arange(n)[:, np.newaxis] + edge).ravel()
+    levels = [1 - share for share in _SHARES] + [1.0]
+    size = n * (_BINS + 2)
+    ax.contourf(centres, centres, field.reshape(size, size), levels=levels, colors=[PALE_BLUE, BLUE])
+
+
+def _smoothed(counts: np.ndarray) -> np.ndarray:
+    """Binomial smoothing over five bins each way, so that contours follow the density and not the counting noise."""
+    kernel = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
+    padded = np.pad(counts, 2)
+    rows = np.sum([weight * padded[k : k + _BINS] for k, weight in enumerate(kernel)], axis=0)
+    return np.sum([weight * rows[:, k : k + _BINS] for k, weight in enumerate(kernel)], axis=0)
+
+
+def _histograms(ax: Axes, bins: np.ndarray, inside: np.ndarray) -> None:
+    n = bins.shape[1]
+    for i in range(n):
+        counts = np.bincount(bins[inside[:, i], i], minlength=_BINS)
+        base = n - 1 - i
+        heights = base + 0.92 * _SIDE * counts / max(counts.max(), 1)
+        edges = i + np.linspace(0.0, _SIDE, _BINS + 1)
+        ax.stairs(heights, edges, baseline=base, color=PALE_BLUE, fill=True)
+        ax.stairs(heights, edges, baseline=base, color=BLUE, lw=1.2)
+
+
+def _frames(ax: Axes, n: int) -> None:
+    square = np.array([(0.0, 0.0), (_SIDE, 0.0), (_SIDE, _SIDE), (0.0, _SIDE), (0.0, 0.0)])
+    corners = [np.array([j, n - 1 - i]) for i in range(n) for j in range(i + 1)]
+    ax.add_collection(LineCollection([square + corner for corner in corners], colors=BLACK, lw=0.9, clip_on=False))
+
+
+def _marks(ax: Axes, place: np.ndarray, color: str, marker: str, line: str) -> None:
+    """A point in every pair and a line in every histogram; ``place`` (n,) counts from 0 to 1 along a panel's side."""
+    n = place.size
+    shown = np.flatnonzero((place > 0) & (place < 1))
+    pairs = [(j + _SIDE * place[j], n - 1 - i + _SIDE * place[i]) for i in shown for j in shown if j < i]
+    if pairs:
+        ax.plot(*np.transpose(pairs), ls="", marker=marker, color=color, ms=7, mew=1.4, zorder=4)
+    x = shown + _SIDE * place[shown]
+    ax.vlines(x, n - 1.0 - shown, n - 1.0 - shown + _SIDE, color=color, ls=line, lw=1.3, zorder=4)
+
+
+def _axes(ax: Axes, columns: SampledParameters, low: np.ndarray, high: np.ndarray, panel: float) -> None:
+    """Ticks and labels along the bottom, and on the left from the second row on (a histogram has no y-axis).
+
+    ``panel`` is the width of a cell in inches: text keeps its distance in inches whatever the size of the cells.
+    """
+    n = len(columns.names)
+    length, gap, away = 0.035 / panel, 0.06 / panel, 0.6 / panel
+    ticks: list[tuple[tuple[float, float], tuple[float, float]]] = []
+    small: dict[str, Any] = {"fontsize": SMALL - 0.5}
+    label: dict[str, Any] = {"fontsize": TEXT * min(1.0, panel), "parse_math": False}
+    for i in range(n):
+        for value, text in _ticks(low[i], high[i]):
+            place = _SIDE * (value - low[i]) / (high[i] - low[i])
+            ticks.append(((i + place, 0.0), (i + place, -length)))
+            ax.text(i + place + gap, -gap, text, rotation=40, ha="right", va="top", rotation_mode="anchor", **small)
+            if i > 0:
+                y = n - 1 - i + place
+                ticks.append(((0.0, y), (-length, y)))
+                ax.text(-gap, y, text, ha="right", va="center", **small)
+        name = f"{columns.symbols[i]}\n[{columns.units[i]}]"
+        ax.text(i + _SIDE / 2, -away, name, ha="center", va="top", **label)
+        if i > 0:
+            y = n - 1 - i + _SIDE / 2
+            ax.text(-away, y, name, ha="right", va="center", rotation=90, multialignment="center", **label)
+    ax.add_collection(LineCollection(ticks, colors=GREY, lw=0.8, clip_on=False))
+
+
+def _ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Two to four round values inside the panel, with the decimals that tell them apart."""
+    start, stop = low + _TICK_MARGIN * (high - low), high - _TICK_MARGIN * (high - low)
+    power = math.floor(math.log10(high - low))
+    steps = ((exponent, digit * 10.0**exponent) for exponent in (power, power - 1) for digit in (5, 2, 1))
+    exponent, step = next((e, step) for e, step in steps if math.floor(stop / step) > math.ceil(start / step))
+    multiples = range(math.ceil(start / step), math.floor(stop / step) + 1)
+    return [(k * step, fixed(k * step, max(-exponent, 0))) for k in multiples]
+
+
+def _key() -> tuple[Patch | Line2D, ...]:
+    return (
+        Patch(color=BLUE, label="68 % of the draws"),
+        Patch(color=PALE_BLUE, label="95 % of the draws"),
+        Line2D([], [], color=BLACK, marker="+", ms=9, mew=1.4, label="point fit (MAP)"),
+        Line2D([], [], color=VERMILION, ls="--", marker="x", label="the paper's estimate, where in range"),
+    )
+
+
+# traces: Traces of the sample: they show drift, and ensembles that disagree.
+
+
+# Enough to see drift, few enough to see lines.
+_POINTS, _WALKERS = 120, 2
+
+
+def traces_size(n: int) -> tuple[float, float]:
+    """Width and height of the figure of ``n`` parameters, inches."""
+    return 9.0, 0.8 + 1.15 * ((n + 1) // 2)
+
+
+def traces(result: Result, ax: Axes | None = None) -> Axes:
+    """A panel per physical parameter: a few walkers of each ensemble against the step, one colour per ensemble.
+
+    Returns the first panel.
+
+    Raises
+    ------
+    ValueError
+        If nothing was sampled.
+    """
+    columns = sampled_parameters(result)
+    n = len(columns.names)
+    rows = (n + 1) // 2
+    width, height = traces_size(n)
+    figure = new_figure(width, height) if ax is None else subfigure_at(ax)
+    axes: Any = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    every = max(1, columns.draws.shape[1] // _POINTS)
+    shown = columns.draws[:, ::every, :_WALKERS]
+    step = np.arange(shown.shape[1]) * every * columns.posterior.thin
+    for i, panel in enumerate(axes.flat):
+        if i >= n:
+            panel.remove()
+            continue
+        for e, ensemble in enumerate(shown[..., i]):
+            panel.plot(step, ensemble, color=CYCLE[e % len(CYCLE)], lw=0.6, alpha=0.8)
+        panel.set_ylabel(f"{columns.symbols[i]} [{columns.units[i]}]", fontsize=SMALL, parse_math=False)
+        panel.tick_params(labelsize=SMALL, length=3)
+        panel.yaxis.set_major_locator(MaxNLocator(3))
+        panel.ticklabel_format(axis="y", useOffset=False, style="plain")
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.margins(x=0.01)
+    for panel in axes[-1]:
+        panel.set_xlabel("step after burn-in [1]", fontsize=TEXT)
+    if n % 2 and n > 1:
+        # The last panel on the right is empty: the axis above it takes its place at the foot of the column.
+        axes[-2, -1].tick_params(labelbottom=True)
+        axes[-2, -1].set_xlabel("step after burn-in [1]", fontsize=TEXT)
+    figure.subplots_adjust(left=0.1, right=0.975, bottom=0.6 / height, top=1 - 0.25 / height, wspace=0.28, hspace=0.18)
+    figure.align_ylabels()
+    return axes[0, 0]

@@ -1,0 +1,663 @@
+"""The words of the report for checks and tables, by code; kinds of experiments declare those of their own."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.free_vibration.lint import TONE
+from capsule_id.experiments.kind import Registry
+from capsule_id.views import Facts, Finding, Level, Message, ResultTable, counted, filled_in, stated_p
+
+# terms: The statistical terms of the report, each in one sentence.
+
+
+TERMS: Mapping[str, str] = {
+    "posterior": "Distribution of the parameters that follows from the readings and the priors.",
+    "sd": "Standard deviation. About 68 % of a normal distribution lies within ± 1 sd, and 95 % within ± 2 sd.",
+    "95 % interval": "Range that holds the parameter with probability 0.95, with 0.025 on either side.",
+    "prior": "What is assumed of a parameter before the readings: a weighing with its sd, or a wide default.",
+    "scatter": "Standard deviation between repeated readings. It is estimated where rig.toml states no reading error.",
+    "residual": "Measured value minus value of the model, in units of its sd.",
+    "white": "Residuals are white where neighbours in time are not correlated. Coloured noise is not white.",
+    "AR(1), ARMA": "Models of coloured noise. AR(1): the correlation of two samples falls exponentially with their distance.",
+    "p": "Probability of a deviation at least as large by chance alone. If p is small, chance is an unlikely cause.",
+    "point fit, MAP": "Parameters at the maximum of the posterior.",
+    "log-posterior": "Logarithm of the posterior density. A difference of 3 means that a point is 20 times less probable.",
+    "R-hat": "Compares independent runs of the sampler. 1 is perfect; above 1.01 they do not agree yet.",
+    "ESS": "Effective sample size: number of independent draws that are as informative as the sample.",
+}
+#: Terms that appear only where there is a sample.
+OF_A_SAMPLE = frozenset({"95 % interval", "R-hat", "ESS"})
+
+
+# posterior: Texts of findings on the maximum, the sample and the priors of a fit, by code.
+
+
+#: A larger difference in log-posterior is not printed: it may be that of a place which the model excludes.
+FAR_BELOW = 1000
+
+
+_DECISIVE = (
+    "{far} of {number:# reading} or stretches decide a parameter almost alone, so that the sample cannot tell how well the "
+    "others predict them (Pareto shape above {limit:g}; a stretch is named by its first reading): {rows}"
+)
+_NOT_DECISIVE = "each of {number:# reading} or stretches can be left out: the sample predicts it from the others"
+
+
+def _disagreeing_starts(facts: Facts) -> str:
+    seen = (
+        f"expected {facts['starts']} starts to end at the same maximum; {facts['stalled']} stalled, {facts['elsewhere']} "
+        "ended elsewhere"
+    )
+    if "name" not in facts:
+        return f"{seen}. Look at the residuals, and at parameters that the data hardly determine."
+    return f"{seen}, the furthest {facts['distance']:.2g} posterior sd away in {facts['name']}"
+
+
+def _maxima_without_mass(facts: Facts) -> str:
+    below, places = facts["below"], "lie within the sample"
+    if below >= 1.0:
+        lower = f"{below:.0f}" if below < FAR_BELOW else f"more than {FAR_BELOW}"
+        places = f"are lower by {lower} in log-posterior or {places}"
+    return f"{_disagreeing_starts(facts)}. Those ends {places}, so they change no number."
+
+
+def _maxima_with_mass(facts: Facts) -> str:
+    if "name" not in facts:
+        return _disagreeing_starts(facts)
+    return (
+        f"{_disagreeing_starts(facts)}. Look for a second explanation of the records, or narrow the prior of that parameter "
+        "in rig.toml."
+    )
+
+
+def _conflict(facts: Facts) -> str:
+    """The prior, what the rest of the data give, and which entry to look at."""
+    name, unit, experiments = facts["name"], facts["unit"], facts["experiments"]
+    key, scale = facts["key"], f'scale = {facts["fitted"]:.2g}, unit = "{unit.strip() or 1}"'
+    default = f'median = {facts["fitted"]:.3g}, factor = 10, unit = "{unit.strip() or 1}"'
+    source, remedy = {
+        "rig": (
+            f"{name} of rig.toml" if "[" in name else f"[rig] {name}",
+            f"Check value, sd and unit of {name} in rig.toml, and the units in {experiments}.",
+        ),
+        "prior": (
+            f"[prior] {name}",
+            f"Check value and unit of [prior] {name} in rig.toml and the units in {experiments}"
+            + ("; remove a guessed prior." if key else "."),
+        ),
+        "": (
+            f"the default prior of {name}",
+            f"Check the units in {experiments}"
+            + (f"; if they are right, write in [prior] {key} = {{ {default} }}." if key else "."),
+        ),
+        "scatter": (
+            f"the default prior of {name}",
+            f"The model does not follow {experiments}, or the readings scatter this much: look at the curve and the residuals"
+            + (f". If the model is right, write in [prior] {key} = {{ {scale} }}." if key else "."),
+        ),
+    }[facts["stated"]]
+    if facts["informed"] > 0.5:
+        found = f"{experiments} and the other priors give {facts['value']:.5g} ± {facts['sd']:.2g}{unit}"
+    else:
+        found = f"{experiments} and the other priors pull it to {facts['fitted']:.5g}{unit}"
+    remedy = f"They differ about 1000 times, as units do. {remedy}" if facts.get("is_unit") else remedy
+    return (
+        f"{source} ({facts['prior']}, SI) contradicts the rest of the data: {found}, {abs(facts['z']):.1f} sd away "
+        f"({stated_p(facts['p'])}). {remedy}"
+    )
+
+
+def _modes(facts: Facts) -> str:
+    """The modes of a parameter with their weights, or how far its maximum lies from the sample."""
+    name, unit = facts["name"], "" if facts["unit"] == "1" else f" {facts['unit']}"
+    prior = f", or state what you know of the rig as a prior of {facts['key']} in [prior]" if facts["key"] else ""
+    if "modes" in facts:
+        seen = " and ".join(f"{value:.4g}{unit} with weight {weight:.2f}" for value, weight in facts["modes"])
+        return (
+            f"expected one mode of the posterior of {name}; found {seen}. Median and sd describe none of them. Add a test "
+            f"that tells them apart{prior}."
+        )
+    return (
+        f"expected the maximum of the posterior within 3 sd of its sample; {name} = {facts['maximum']:.4g}{unit} at the "
+        f"maximum, {facts['median']:.4g} ± {facts['sd']:.2g}{unit} in the sample ({facts['distance']:.1f} sd apart). The "
+        f"residuals and curves are those of the maximum, so no check covers the quoted number. Add readings that determine "
+        f"{name}{prior}."
+    )
+
+
+def _tails(facts: Facts) -> str:
+    """The parameters whose priors pull, and those of them whose prior can be stated."""
+    seen = f"{facts['names']} ended in the tail of the prior, which pulls the estimate."
+    if not facts["keys"]:
+        return f"{seen} Check the values and units of the readings and of rig.toml."
+    return f"{seen} In [prior] state a wider or better placed prior of {facts['keys']}."
+
+
+_CHAINS = (
+    "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, smallest effective sample size "
+    "{size:.0f} ({smallest}), largest split R-hat {rhat:.4f} ({worst})"
+)
+
+
+def _chains(facts: Facts) -> str:
+    """The parameters whose sample is too short, or that there is no sample."""
+    if not facts:
+        return "no sample was drawn: there are no intervals"
+    return filled_in(
+        "the steps were used up before the sample of {names} was long enough, so these numbers are not judged. Expected more "
+        "than {length_wanted:.0f} autocorrelation times, bulk and tail effective sample sizes of {size_wanted:.0f}, and R-hat "
+        f"<= {{rhat_wanted}}; found {_CHAINS}. Raise --max-steps, or look for a parameter that the data do not inform.",
+        facts,
+    )
+
+
+POSTERIOR_MESSAGES: Mapping[str, Message] = {
+    "starts.agree": Message(
+        "starts agree",
+        ok="all {starts} starts of the point fit ended at the same maximum",
+        warn=_maxima_without_mass,
+        fail=_maxima_with_mass,
+    ),
+    "chains.converged": Message(
+        "chains converged",
+        ok=_CHAINS,
+        warn=_chains,
+    ),
+    "readings.decisive": Message(
+        "readings left out",
+        ok=lambda facts: filled_in(_DECISIVE if facts["far"] else _NOT_DECISIVE, facts),
+    ),
+    "sample.unfinished": Message(
+        "sample", warn="the sample is still to be drawn: this is the point fit alone, without intervals and figures"
+    ),
+    "sample.maximum": Message(
+        "maximum and sample", ok="the sample of every physical parameter has one mode, at the maximum", fail=_modes
+    ),
+    "sample.modes": Message("maximum and sample", fail=_modes),
+    "parameters.informed": Message(
+        "parameters informed",
+        ok="the data narrow the prior of every physical parameter",
+        warn="the data hardly narrow the prior of {names}: the printed interval is that of the prior. Add a test.",
+    ),
+    "priors.conflict": Message(
+        "priors and data", ok="priors and weighings, {number} in all, agree with the rest of the data", fail=_conflict
+    ),
+    "priors.tails": Message(
+        "boundary effects",
+        ok="no parameter ends in the tail of its prior",
+        warn=_tails,
+    ),
+}
+
+
+# readings: Texts of findings on the readings of a rig, by code.
+
+
+def _unusual(facts: Facts) -> str:
+    """The number, the usual interval, the unit that was probably meant, and the line that confirms the number."""
+    of, unit = "times are" if "period" in facts["name"] else "number is", "" if facts["unit"] == "1" else facts["unit"]
+    meant = f" If the {of} in {facts['meant']}, write that unit." if facts["meant"] else ""
+    scales = " and ".join(facts.get("scales", [facts["name"]]))
+    line = f" If it is right, write this line in [rig] of rig.toml: {facts['line']}" if "line" in facts else ""
+    return (
+        f"{facts['name']} is {facts['value']:.4g} {unit}; {facts['low']:.3g} to {facts['high']:.3g} {unit} is usual. Check "
+        f"the unit of {scales}.{meant} What it scales is not judged.{line}"
+    )
+
+
+def _repeated(facts: Facts) -> str:
+    """The rows that stand twice."""
+    line, last, first, end = (facts[key] for key in ("line", "last", "first_line", "first_last"))
+    later, earlier = f"lines {line} to {last} repeat lines", f"{first} to {end}"
+    if line == last:
+        later, earlier = f"line {line} repeats line", f"{first}"
+    if (facts["file"], line, last) == (facts["first"], first, end):
+        return (
+            f"{facts['file']}:{line}: each reading must stand once; two experiments use {later.partition(' repeat')[0]}. Let "
+            "their where select different rows (both ends of a range count), or remove one experiment."
+        )
+    return (
+        f"{facts['file']}:{line}: each reading must stand once; {later} {earlier} of {facts['first']}. "
+        f"Delete the repeated {'row' if line == last else 'rows'}."
+    )
+
+
+def _spikes(facts: Facts) -> str:
+    """The samples that stand off, and what drops them."""
+    number, place = len(facts["rows"]), f"{facts['file']}:{facts['line']}: {facts['column']} must be smooth;"
+    if number == 1:
+        size = f"at {facts['time']:.5g} s stands off by {facts['size']:.2g} of the amplitude"
+        return f"{place} one sample {size}. Delete its row."
+    return (
+        f"{place} {counted(number, 'single sample')} stand off (lines {facts['lines']}). Add this line to the experiment in "
+        f"rig.toml, which drops them: reject = {facts['rule']}"
+    )
+
+
+DATA_MESSAGES: Mapping[str, Message] = {
+    "masses.exact": Message(
+        "masses", warn="{name}: no sd stated, so its value counts as exact. State the weighing error."
+    ),
+    "readings.few": Message(
+        "number of readings",
+        warn="too few rows to estimate the scatter: {rows} instead of {wanted}. Measure more rows.",
+    ),
+    "readings.encoding": Message(
+        "encoding", ok="{file} is read as {encoding}, because it is no UTF-8. Check letters such as µ in its headers."
+    ),
+    "readings.missing": Message(
+        "missing readings",
+        warn=(
+            "{file}: the fit drops {rows:# row} with a missing reading and uses {used}. Check that the losses do not depend on "
+            "the reading."
+        ),
+    ),
+    "readings.rejected": Message(
+        "outliers",
+        warn=(
+            "{file}: the rule reject drops {rows:# row} as outliers, the fit uses {used}. Check with --figures that no impact "
+            "or step is among them."
+        ),
+    ),
+    "readings.errors": Message(
+        "reading errors", warn="no reading error is stated for {names}. Add {first}_sd to the experiment."
+    ),
+    "readings.repeated_file": Message(
+        "repeated readings",
+        fail=(
+            "{file} has the same content as the file of {first}, so each reading counts more than once. Remove one of "
+            "the two experiments."
+        ),
+    ),
+    "readings.repeated": Message(
+        "repeated readings",
+        fail=_repeated,
+    ),
+    "readings.magnitude": Message("magnitudes", warn=_unusual, on_console=True),
+    "decays.magnitude": Message("magnitudes", warn=_unusual, on_console=True),
+    "settings.sd": Message(
+        "stated sd",
+        warn="{name} is {value:.4g} ± {sd:.4g} in SI units: its prior reaches below 0. State the sd of a measurement.",
+    ),
+    "readings.gaps": Message(
+        "gaps in a record",
+        warn=(
+            "{file}:{line}: the times must be evenly spaced; found {lost:# missing sample} of {step:.4g} s, the first after "
+            "{time:.6g} s. The fit uses the times as recorded. Record without gaps."
+        ),
+    ),
+    "readings.rounded_times": Message(
+        "rounded times",
+        warn="{file}: the times are rounded to {step:g} s, a large part of a sampling step. Export more digits.",
+    ),
+    "readings.clipped": Message(
+        "clipped samples",
+        fail=(
+            "{file}:{line}: {column} is clipped at its {side} limit {level:.5g} {unit}: {samples:# sample} "
+            "({share:.2g} of the record), the last at {time:.5g} s. Use the record after the clipped part only, or "
+            "repeat with a wider range of the sensor. {cut}"
+        ),
+    ),
+    "readings.dropouts": Message(
+        "drop-outs",
+        fail=(
+            "{file}:{line}: {column} drops out: {samples:# sample} far from both neighbours, the first "
+            "{value:.6g} {unit} at {time:.5g} s. Delete these rows: lines {lines}."
+        ),
+    ),
+    "readings.frozen": Message(
+        "frozen channel",
+        fail=(
+            "{file}:{line}: {column} freezes: {samples:# sample} with the value before, the first {value:.6g} {unit} at "
+            "{time:.5g} s. Delete these rows: lines {lines}."
+        ),
+    ),
+    "readings.jump": Message(
+        "lost samples",
+        fail=(
+            "{file}:{line}: {column} must be smooth; it jumps at {time:.5g} s by {size:.2g} of its amplitude, and the times "
+            "are even. Samples may be lost, or the rig was struck or moved. Use the record on one side of the jump only, "
+            "or repeat it. {cut}"
+        ),
+    ),
+    "readings.burst": Message(
+        "bursts of noise",
+        fail=(
+            "{file}:{line}: {column} must have the same noise throughout; from {begin:.5g} to {end:.5g} s it has more than "
+            "three times the usual noise. {cut}"
+        ),
+    ),
+    "readings.spike": Message(
+        "spikes",
+        fail=_spikes,
+    ),
+}
+
+
+# messages: The words of the report for the checks and tables of a fit, by code; kinds of experiments declare those of
+# their own.
+
+
+#: Errors of a text that does not match its facts.
+TEXT_ERRORS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
+
+
+def messages_of(registry: Registry) -> Mapping[str, Message]:
+    """The words of every code: those of the fit, of the readings, and those that the kinds of ``registry`` declare.
+
+    Raises
+    ------
+    InputError
+        If a kind declares a code of the fit as a whole.
+    """
+    for kind in registry.kinds:
+        if own := sorted((FIT_MESSAGES.keys() | DATA_MESSAGES.keys()) & kind.messages.keys()):
+            rule = f"the kind {kind.name} must not declare messages of the whole fit"
+            raise InputError(rule, ", ".join(own), "rename these codes in the kind's messages")
+    return {**FIT_MESSAGES, **DATA_MESSAGES, **registry.messages}
+
+
+def title_of(code: str, messages: Mapping[str, Message]) -> str:
+    """The title of a check or a table; the code itself where no kind declares words for it."""
+    return messages[code].title if code in messages else code
+
+
+def finding_text(finding: Finding, messages: Mapping[str, Message]) -> str:
+    """The text of a finding, with its experiment in front where the text does not name it itself.
+
+    A finding whose code has no words, or faulty ones, is given by its facts.
+    """
+    if finding.code in messages:
+        text = _filled_in(finding.code, finding.level, finding.facts, messages)
+    else:
+        text = _listed(finding.facts)
+    if not finding.experiment or finding.experiment in text:
+        return text
+    return f"{finding.experiment}: {text}"
+
+
+def caption_of(table: ResultTable, messages: Mapping[str, Message]) -> str:
+    """The caption of a table; its facts where the caption is faulty, "" where no kind declares words for it."""
+    return _filled_in(table.code, "caption", table.facts, messages) if table.code in messages else ""
+
+
+def _filled_in(code: str, part: Level | Literal["caption"], facts: Facts, messages: Mapping[str, Message]) -> str:
+    """The text of a code; where the text is faulty, the error and the facts. A faulty text must not end a fit."""
+    try:
+        return messages[code].text(part, facts)
+    except TEXT_ERRORS as error:
+        return (
+            f"the words of {code} are faulty ({type(error).__name__}: {error}); the facts: {_listed(facts) or 'none'}"
+        )
+
+
+def _listed(facts: Facts) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in facts.items())
+
+
+def _coloured_residuals(facts: Facts) -> str:
+    """The statistic, what drifts in the record, and the remedy of the model that predicts it."""
+    seen = (
+        f"{facts['record']}: expected residuals without correlation in time (white); found Ljung–Box "
+        f"Q = {facts['Q']:.0f} over {facts['lags']} lags "
+        f"({stated_p(facts['p'])}). The model lacks an effect or the noise is coloured, and the intervals are not to be "
+        "trusted."
+    )
+    remedy = {"capsule": _capsule_remedy(facts), "decay": _decay_remedy(facts)}.get(
+        facts.get("model", ""), "Look at the residuals."
+    )
+    return " ".join(filter(None, [seen, _drift(facts), remedy]))
+
+
+def _capsule_remedy(facts: Facts) -> str:
+    """What to compare: the friction law, of which the fit knows one alone, and the noise."""
+    advice = "Look at the residuals and the phase portrait."
+    if facts.get("spring"):
+        advice += " Check the support spring and the gap."
+    if laws := facts.get("other_laws", ()):
+        advice += f" The fit has {facts['law']}; compare it with {' or '.join(laws)} in [model]."
+    if facts.get("noise") == "white":
+        advice += (
+            ' Where the sensor filters, remove noise = "white" from the entry: a second fit then has coloured noise.'
+        )
+    return advice
+
+
+def _decay_remedy(facts: Facts) -> str:
+    """What the fitted model of a free decay contains, and what is left to do."""
+    if facts.get("model") != "decay":
+        return ""
+    present = f"Present in the fitted model: {', '.join(facts['present'])}. " if facts["present"] else ""
+    if facts.get("tone"):
+        return present + filled_in(TONE, facts)
+    cut = "Cut the record to free decay with start and stop"
+    if (start := facts.get("start")) is not None:
+        cut = f'Leave out the larger half of the amplitudes: write start = {{ value = {start:.10g}, unit = "s" }} in its entry'
+    if facts["second"]:
+        return f"{present}No model that a second fit offers passes. {cut}, or record again with less disturbance."
+    if not facts.get("stated"):
+        return f"{present}{cut}, or record again with less disturbance."
+    words = facts["stated"]
+    listed = " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    them = "them" if len(words) > 1 else "it"
+    return f"{present}{cut}, or remove {listed} from its entry: a second fit then chooses {them}."
+
+
+def _drift(facts: Facts) -> str:
+    """What drifts while a decay dies away."""
+    parts = []
+    if "decrement" in facts:
+        first, last = facts["decrement"]
+        law = "the damping grows with amplitude" if first > last else "the damping grows as the amplitude falls"
+        parts.append(f"its logarithmic decrement goes from {first:.3g} to {last:.3g} ({law})")
+    if "frequency" in facts:
+        first, last = facts["frequency"]
+        law = "the stiffness falls with amplitude" if first < last else "the stiffness grows with amplitude"
+        parts.append(f"its frequency goes from {first:.4g} to {last:.4g} rad/s ({law})")
+    if not parts:
+        return ""
+    large, small = facts["amplitude"]
+    return f"While the amplitude falls from {large:.2g} to {small:.2g} m, {' and '.join(parts)}."
+
+
+def _after_number(unit: str) -> str:
+    """A unit behind a number; nothing for a number without unit."""
+    return "" if unit == "1" else f" {unit}"
+
+
+def _outliers(facts: Facts) -> str:
+    """The lines of the file, how far they stand off, and what they do to the estimates."""
+    lines = [str(line) for line in facts["lines"]]
+    several = len(lines) > 1
+    where = f"lines {', '.join(lines[:-1])} and {lines[-1]} stand up to" if several else f"line {lines[0]} stands"
+    more = f" At most {facts['most']} rows are named: look at the whole table." if len(lines) == facts["most"] else ""
+    change = "; ".join(
+        f"{name} = {value:.5g}{_after_number(unit)} with {'them' if several else 'it'}, {without:.5g} without"
+        for name, unit, value, without in facts["estimates"]
+    )
+    return (
+        f"{facts['file']} {where} {facts['score']:.3g} standard deviations off the others ({stated_p(facts['p'])}).{more} "
+        f"{change}. Nothing was dropped: check the reading, then correct it or remove it yourself."
+    )
+
+
+def _tables_disagree(facts: Facts) -> str:
+    """The estimate of each table, and what to do."""
+    unit = _after_number(facts["unit"])
+    estimates = ", ".join(f"{value:.4g}{unit} by {label}" for label, value in facts["estimates"])
+    return (
+        f"expected tables that agree; found {facts['name']} = {estimates} ({stated_p(facts['p'])}). It depends on "
+        f"what differs between them, such as load, day or speed; an sd of independent trials is too small by a factor of about "
+        f"{facts['factor']:.1f}. Find the cause, or fit each table in a folder of its own."
+    )
+
+
+def _loads_differ(facts: Facts) -> str:
+    """The coefficient at the loads, the lowest and the highest where there are many."""
+    means = facts["means"]
+    shown = means if len(means) <= 6 else [means[0], means[len(means) // 2], means[-1]]
+    values = ", ".join(f"{coefficient:.3g} at {load:.3g} N" for load, coefficient in shown)
+    return (
+        f"expected friction in proportion to the normal force; found a coefficient of {values} ({stated_p(facts['p'])}). One "
+        "coefficient does not hold for all loads. Fit the rows of similar loads in a folder of their own, and use the load "
+        "that is nearest to the weight of the capsule. Where the speed changes with the load, look first at the friction law."
+    )
+
+
+def _unseen(facts: Facts) -> str:
+    """The smallest error that a check of a setting sees in 8 of 10 cases, by parameter."""
+    errors = ", ".join(f"{name} by {sd:.3g} sd" for name, sd in facts["unseen"].items() if sd < float("inf"))
+    return f"the check sees it in 8 of 10 cases where it shifts {errors}" if errors else "too few rows to see it"
+
+
+#: What a statistic of the residuals that is too large means.
+_STATISTICS: Mapping[str, str] = {
+    "sign runs": "too many neighbours have the same sign",
+    "largest": "one of them is too large",
+    "trend": "they change slowly from the first reading to the last",
+}
+
+
+def _unlike_noise(facts: Facts) -> str:
+    return (
+        f"expected residuals like random noise; {_STATISTICS[facts['statistic']]} ({stated_p(facts['p'])}). A larger scatter "
+        "does not explain this. Look at the residuals: a bend, a wrong model or a wrong reading."
+    )
+
+
+def _largest_disagreement(facts: Facts) -> str:
+    (name, sd, p), *_ = facts["distances"]
+    judge = " by the bench's sample" if facts["sampled"] else ""
+    return (
+        f"largest disagreement in {name} ({sd:+.1f} sd of the curvature, {stated_p(p)}{judge} over "
+        f"{counted(facts['shared'], 'shared parameter')})"
+    )
+
+
+def _inconsistent(facts: Facts) -> str:
+    (name, *_), *others = facts["distances"]
+    further = "".join(f", then {other} ({sd:+.1f} sd, {stated_p(p)})" for other, sd, p in others)
+    return (
+        f"bench tests and forced runs are inconsistent: {_largest_disagreement(facts)}{further}. The bench's {name} does "
+        f"not fit the recorded motion. Check units, clock and calibration of {facts['tests'] or 'its bench test'} and repeat "
+        "it, or find what differs in the runs."
+    )
+
+
+FIT_MESSAGES: Mapping[str, Message] = {
+    **POSTERIOR_MESSAGES,
+    "residuals.white": Message(
+        "residuals white",
+        ok="residuals of {records:# record} are white (Ljung–Box, {lags} lags)",
+        fail=_coloured_residuals,
+    ),
+    "trials.order": Message(
+        "order of trials",
+        ok="residuals of neighbouring rows are uncorrelated in {number:# table}",
+        fail=(
+            "expected residuals without order; those of neighbouring rows have correlation {correlation:.2f} over {rows} rows "
+            "({p:p}). The trials drift or come in sessions: an sd of independent trials is too small by a factor "
+            "of about {factor:.1f}. Repeat the trials in random order, with the test set up anew between them."
+        ),
+    ),
+    "trials.tables": Message(
+        "agreement of tables",
+        ok="{number:# table} of equal tests agree within their scatter",
+        fail=_tables_disagree,
+    ),
+    "trials.loads": Message(
+        "friction against load",
+        ok=lambda facts: f"no constant force beside the friction; {_unseen(facts)}",
+        warn=lambda facts: (
+            f"{counted(facts['rows'], 'row')} cannot show whether friction is in proportion to the normal force: a constant "
+            f"force beside it may be there, and {_unseen(facts)}. Repeat the trials, at loads further apart, or fit the rows "
+            "of one load in a folder of their own."
+        ),
+        fail=_loads_differ,
+    ),
+    "trials.speeds": Message(
+        "friction against speed",
+        ok=lambda facts: f"no other fall of the friction with the speed; {_unseen(facts)}",
+        warn=lambda facts: (
+            f"expected friction that falls with the speed as the law says; another fall, as with a constant force, has "
+            f"{stated_p(facts['p'])} in {counted(facts['rows'], 'row')}, and {_unseen(facts)}. Repeat the trials, at speeds "
+            "further apart, or compare the friction laws in the report."
+        ),
+    ),
+    "residuals.statistics": Message(
+        "residuals like noise",
+        ok="signs, largest residual and trend of {number:# bench test} are those of random noise",
+        warn=_unlike_noise,
+        fail=_unlike_noise,
+    ),
+    "model.error": Message(
+        "model error",
+        warn=lambda facts: (
+            "estimates from parts of the data scatter more than their sds say, so the quoted sd is multiplied by "
+            + ", ".join(f"{factor:.3g} for {name} ({parts} parts)" for name, factor, parts in facts["factors"])
+            + ". It is an estimate of the model's error; find its cause before you use the number."
+        ),
+        fail=lambda facts: (
+            "parts of the data contradict each other, so there is no number for "
+            + ", ".join(f"{name} (its sd would be multiplied by {factor:.3g})" for name, factor, _ in facts["factors"])
+            + ". The model does not describe these readings: find the cause that the other failed checks name."
+        ),
+    ),
+    "outliers": Message("outliers", ok="no reading stands apart from the others of its table", fail=_outliers),
+    "errors.stated": Message(
+        "stated errors",
+        ok="stated reading errors explain the scatter",
+        fail=(
+            "expected a chi-square of about {freedom} from the stated reading errors; found {chi_square:.0f} "
+            "({p:p}). The errors are larger than stated, or the line is not straight."
+        ),
+    ),
+    "bench_and_runs.agree": Message(
+        "bench and runs agree", ok=_largest_disagreement, warn=_inconsistent, fail=_inconsistent
+    ),
+    "bench_and_runs.estimates": Message(
+        "bench and runs agree",
+        warn=lambda facts: (
+            f"expected finite estimates of {counted(facts['shared'], 'shared parameter')} from bench and runs; "
+            f"there is none of {', '.join(facts['missing'])}, so nothing was compared. "
+            "Look at what the records and tests determine."
+        ),
+    ),
+    "runs.precision": Message(
+        "Precision gained from forced runs",
+        caption=(
+            "Posterior standard deviation, SI. Runs only: from the curvature of their likelihood and the priors at the joint "
+            "point fit. Bench and both: from the samples, where they were drawn."
+        ),
+    ),
+    "runs.smoothing": Message(
+        "Effect of smoothing",
+        caption=(
+            "The posterior is that of the exact model. A fit of the smoothed model (velocity {velocity:g} m/s, penetration "
+            "{penetration:g} m) would shift the estimates by this much (u: logarithm)."
+        ),
+    ),
+    "parameters.shares": Message(
+        "Where the sd comes from",
+        caption=(
+            "Share of the two largest inputs in the variance of each parameter, from the curvature at the maximum: a table, a "
+            "stated value with its sd (a weighing), or a prior."
+        ),
+    ),
+    "parameters.priors": Message(
+        "Priors",
+        caption=(
+            "Every prior is proper; a factor f holds 95 % within median/f to median×f. Amplitudes, offsets and intercepts "
+            "have normal priors ten times as wide as their record and are integrated out in closed form."
+        ),
+    ),
+    "readings.predictive": Message(
+        "Posterior predictive checks",
+        caption=(
+            "Probability that a replicate misses the model by more than the readings do (chi-square discrepancy). Near 0: "
+            "the readings scatter more than the fit allows. Where the scatter itself is estimated, it is near 0.5 by "
+            "construction."
+        ),
+    ),
+}

@@ -1,1 +1,0 @@
-"""Texts of findings and captions of tables, by code."""

@@ -1,0 +1,437 @@
+"""Readers of binary files: HDF5, MATLAB, NumPy, Parquet, TDMS, Excel."""
+
+import io
+import logging
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.rig.formats.layouts import read_text
+from capsule_id.rig.formats.raw import (
+    LARGEST_CONTENT,
+    Export,
+    Layout,
+    complete,
+    export_of_arrays,
+    installed,
+    refuse_large,
+)
+from capsule_id.views import counted
+
+# hdf5: Reads HDF5 files, among them MATLAB files of version 7.3: every real numeric data set is a column, or a matrix.
+#
+# pyfive reads them. It is written in Python; h5py's C library never returns from some damaged files. A file
+# with links to other files is refused: only its own bytes count.
+
+
+#: Fewest bytes of a chunk with its entry in the index.
+SMALLEST_CHUNK = 16
+
+
+def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read the data sets of an HDF5 file; their names are paths such as ``group/x``.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : ``missing`` may hold "NaN"
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, too large, or has no numeric data set.
+    """
+    with installed("pyfive", path):
+        import pyfive
+
+    arrays: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    # MATLAB stores the columns of a matrix one after the other, which HDF5 sees as rows.
+    by_columns = content.startswith(b"MATLAB 7.3")
+
+    def visit(name: str, found: object) -> None:
+        if not isinstance(found, pyfive.Dataset) or found.ndim not in (1, 2):
+            return
+        if getattr(found.dtype, "kind", "") not in ("f", "i", "u"):
+            return
+        # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
+        text = found.attrs.get("MATLAB_class") == b"char" or name.startswith("#") or "MATLAB_empty" in found.attrs
+        if not text:
+            refuse_large(found.size * found.dtype.itemsize + sum(array.nbytes for array in arrays.values()), path)
+            chunks = prod(-(-size // step) for size, step in zip(found.shape, found.chunks or found.shape, strict=True))
+            if chunks > max(len(content) // SMALLEST_CHUNK, 1):  # pyfive looks for every one of them
+                raise ValueError(f"{name} states {chunks} chunks in a file of {len(content)} bytes")
+            array = np.asarray(found[()])
+            arrays[name] = array.T if by_columns else array
+            unit = found.attrs.get("units", found.attrs.get("unit"))
+            if isinstance(unit, str):
+                units[name] = unit
+
+    with complete(path, "export it again"), pyfive.File(io.BytesIO(content)) as file:
+        file.visititems(visit)
+    return export_of_arrays(arrays, path, layout, units)
+
+
+# mat: Reads MATLAB files: every real numeric variable is a column, of a matrix every column; so is a field of a struct.
+#
+# Files of version 7.3 are HDF5 files. The format of versions 5 to 7 is that of "MAT-File Format", The MathWorks,
+# level 5.
+# SciPy's reader ends the process by a segmentation fault on files with one changed byte, so this one checks every
+# tag; the
+# tests compare the two on intact files.
+
+
+_MATRIX, _COMPRESSED = 14, 15  # types of data elements
+_STRUCT = 2  # class of arrays with fields
+_DEEPEST = 16  # struct in a struct
+_NUMERIC_CLASSES = range(6, 16)  # of arrays: double, single, and integers of 8 to 64 bits
+_COMPLEX = 0x0800  # flag of an array
+#: NumPy's types by the number of the format.
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+
+
+def read_mat(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read the vectors of a MATLAB file by name; column 2 of a matrix ``data`` is called ``data(:,2)``.
+
+    Fields of structs have names such as ``run.time``, or ``run(2).time`` in an array of structs.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : ``missing`` may hold "NaN"; the rest does not apply
+
+    Raises
+    ------
+    InputError
+        If it is no MATLAB file, is damaged, or has no numeric variable.
+    """
+    if content.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF")):
+        return read_hdf5(content, path, layout)
+    return export_of_arrays(_variables(content, path), path, layout)
+
+
+def _variables(content: bytes, path: Path) -> dict[str, np.ndarray]:
+    """The real numeric arrays by name; other variables are left out."""
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    try:
+        if order is None:
+            raise ValueError("no header of a MATLAB file")
+        variables: dict[str, np.ndarray] = {}
+        for kind, element in _elements(content[128:], order):
+            if kind == _COMPRESSED:
+                unpacked = zlib.decompressobj().decompress(element, LARGEST_CONTENT)
+                kind, element = next(_elements(unpacked, order), (0, b""))
+            for name, values in _arrays(kind, element, order):
+                variables[name] = values
+                refuse_large(sum(values.nbytes for values in variables.values()), path)
+        return variables
+    except InputError:
+        raise
+    except (ValueError, struct.error, zlib.error) as error:
+        remedy = "save it again by save(..., '-v7')"
+        raise InputError("a MATLAB file must be complete", str(error), remedy, path) from None
+
+
+def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Type and bytes of every data element."""
+    position = 0
+    while position < len(content):
+        kind, size = struct.unpack_from(order + "II", content, position)
+        start = position + 8
+        if kind >> 16:  # a small element: type, size and at most 4 bytes in the place of the tag
+            kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
+            position += 8
+        else:
+            position = start + size + (-size % 8 if kind != _COMPRESSED else 0)
+        element = content[start : start + size]
+        if len(element) != size:
+            raise ValueError("an element is longer than the file")
+        yield kind, element
+
+
+def _arrays(
+    kind: int, element: bytes, order: str, own: str | None = None, depth: int = 0
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and values of the real numeric arrays of an element: one, none, or those of the fields of a struct.
+
+    ``own`` is the name of a field, which its element does not hold.
+    """
+    if kind != _MATRIX or not element:  # an empty field
+        return
+    parts = _elements(element, order)
+    (flags,) = struct.unpack_from(order + "I", next(parts, (0, b""))[1])
+    (_, sizes), (_, stated) = (next(parts, (0, b"")) for _ in range(2))
+    shape = [int(size) for size in np.frombuffer(sizes, order + "i4")]
+    name = stated.decode("ascii", "replace") if own is None else own
+    if flags & 0xFF == _STRUCT and depth < _DEEPEST:
+        yield from _fields(parts, name, int(np.prod(shape)), order, depth)
+    elif flags & 0xFF in _NUMERIC_CLASSES and not flags & _COMPLEX:
+        number, data = next(parts, (0, b""))
+        if number not in _NUMBERS:
+            raise ValueError(f"an array of type {number}")
+        values = np.frombuffer(data, order + _NUMBERS[number]).astype(np.float64)
+        if len(shape) == 2:
+            if min(shape) < 0 or values.size != shape[0] * shape[1]:
+                raise ValueError(f"{values.size} values in an array of {shape}")
+            yield name, values.reshape(shape, order="F")
+
+
+def _fields(
+    parts: Iterator[tuple[int, bytes]], name: str, number: int, order: str, depth: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of ``number`` structs ``name``: ``parts`` are the length of a field's name, all names, all fields."""
+    (length,) = struct.unpack_from(order + "i", next(parts, (0, b""))[1])
+    names = next(parts, (0, b""))[1]
+    if length < 1:
+        raise ValueError("a struct with fields without names")
+    fields = [names[i : i + length].split(b"\0")[0].decode("ascii", "replace") for i in range(0, len(names), length)]
+    for k in range(number if fields else 0):
+        index = f"({k + 1})" if number > 1 else ""
+        for field in fields:
+            kind, element = next(parts, (-1, b""))
+            if kind < 0:
+                raise ValueError(f"a struct without some of its {counted(number * len(fields), 'field')}")
+            yield from _arrays(kind, element, order, f"{name}{index}.{field}", depth + 1)
+
+
+# npz: Reads NumPy archives: every real numeric array is a column, or a matrix. Pickled objects are never loaded.
+
+
+def read_npz(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read the arrays of an archive by name.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : ``missing`` may hold "NaN"
+
+    Raises
+    ------
+    InputError
+        If the archive is damaged, too large, or has no numeric array.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    with complete(path, "write it again by numpy.savez"), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+        refuse_large(sum(member.file_size for member in members), path)
+        for member in members:
+            # ``read`` returns at most the stated size of the member.
+            array = _numbers(archive.read(member))
+            if array is not None:
+                arrays[member.filename.removesuffix(".npy")] = array
+    return export_of_arrays(arrays, path, layout)
+
+
+def _numbers(content: bytes) -> np.ndarray | None:
+    """The array of a member, None if it holds no real numbers."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(stream)
+    if dtype.kind not in "fiu" or len(shape) not in (1, 2):
+        return None
+    if prod(shape) * dtype.itemsize != len(content) - stream.tell():
+        raise ValueError(f"an array of {shape} in {len(content)} bytes")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+# parquet: Reads Parquet files: every column of real numbers. pyarrow, the reference implementation, decodes them.
+
+
+def read_parquet(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read the columns of a Parquet file by name; empty cells are NaN.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : ``missing`` may hold "NaN"
+
+    Raises
+    ------
+    InputError
+        If pyarrow is not installed, or the file is damaged, too large, or has no column of numbers.
+    """
+    with installed("pyarrow", path):
+        import pyarrow as pa
+        from pyarrow import parquet
+
+    with complete(path, "write it again"):
+        file = parquet.ParquetFile(pa.BufferReader(content))
+        schema = file.schema_arrow
+        numeric = [
+            field.name for field in schema if pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
+        ]
+        # pyarrow makes room for the rows that a row group states.
+        rows = [file.metadata.row_group(k).num_rows for k in range(file.metadata.num_row_groups)]
+        if min(rows, default=0) < 0 or sum(rows) != file.metadata.num_rows:
+            value = f"row groups of {sum(rows)} rows in a table of {file.metadata.num_rows}"
+            raise InputError("a .parquet file must be complete", value, "write it again", path)
+        refuse_large(8 * file.metadata.num_rows * len(numeric), path)
+        table = file.read(columns=numeric, use_threads=False)
+        arrays = {name: table.column(name).to_numpy() for name in table.column_names}
+    return export_of_arrays(arrays, path, layout)
+
+
+# tdms: Reads TDMS files of LabVIEW by npTDMS: every channel of numbers, scaled, and the times of waveforms.
+
+
+#: Name of the column of times of a waveform, which the file holds as an offset and an increment.
+TIME = "wf_time"
+#: Most scales of a channel.
+MOST_SCALES = 1000
+_SCALES = "NI_Number_Of_Scales"
+
+
+def read_tdms(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read the channels of a TDMS file by name, ``group/channel`` where two groups have a channel of that name.
+
+    ``wf_time`` holds the times of waveforms, s, from their offset and increment; ``wf_time(<channel>)`` those of
+    each channel where channels have different clocks. Without these properties there is no such column.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : ``missing`` may hold "NaN"
+
+    Raises
+    ------
+    InputError
+        If npTDMS is not installed, or the file is damaged, too large, or has no channel of numbers.
+    """
+    with installed("npTDMS", path):
+        import nptdms
+        from nptdms.log import log_manager
+
+    log_manager.set_level(logging.CRITICAL)  # its remarks on damaged files go to standard error otherwise
+    arrays: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    clocks: dict[str, tuple[float, float, int]] = {}
+    with complete(path, "export it again, or as text"), nptdms.TdmsFile.open(io.BytesIO(content)) as file:
+        groups = file.groups()
+        everything = [channel for group in groups for channel in group.channels()]
+        for properties in (file.properties, *(each.properties for each in (*groups, *everything))):
+            scales: Any = properties.get(_SCALES, 0)
+            if not 0 <= scales <= MOST_SCALES:  # npTDMS makes a list of so many elements
+                raise ValueError(f"{scales} scales of a channel")
+        channels = [channel for channel in everything if channel.dtype.kind in "fiu"]
+        refuse_large(8 * sum(len(channel) for channel in channels), path)
+        names = [channel.name for channel in channels]
+        for channel in channels:
+            unique = names.count(channel.name) == 1
+            name = channel.name if unique else f"{channel.group_name}/{channel.name}"
+            arrays[name] = np.asarray(channel[:])
+            units[name] = str(channel.properties.get("unit_string", ""))
+            if (clock := _clock(channel)) is not None:
+                clocks[name] = (*clock, len(channel))
+    common = len(set(clocks.values())) == 1
+    for name, (offset, increment, samples) in clocks.items():
+        times = TIME if common else f"{TIME}({name})"
+        arrays[times], units[times] = offset + increment * np.arange(samples), "s"
+    return export_of_arrays(arrays, path, layout, units)
+
+
+def _clock(channel: Any) -> tuple[float, float] | None:
+    """Offset and increment of a waveform, s; None where the file states none."""
+    increment, offset = (channel.properties.get(key) for key in ("wf_increment", "wf_start_offset"))
+    if not isinstance(increment, int | float) or not np.isfinite(increment) or increment <= 0.0:
+        return None
+    return (float(offset) if isinstance(offset, int | float) and np.isfinite(offset) else 0.0), float(increment)
+
+
+# xlsx: Reads Excel workbooks: the first sheet with numbers, as the text table that it would be saved to.
+
+
+#: Most cells of a sheet; one takes 50 bytes in the file, and a few hundred while it is read.
+MOST_CELLS = 2_000_000
+
+
+def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
+    """Read a sheet with titles, headers and rows of units in the same way as a text export.
+
+    Places are the row and the column of the sheet. A formula counts by the value that the workbook holds for it.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name, for error lines
+    layout : as for text; ``data_from_line`` and ``data_to_line`` are rows of the sheet
+
+    Raises
+    ------
+    InputError
+        If openpyxl is not installed, the file is damaged or too large, or the rows of numbers are not found.
+    """
+    with installed("openpyxl", path):
+        import openpyxl
+
+    with complete(path, "save it again"):
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            refuse_large(sum(member.file_size for member in archive.infolist()), path)
+        book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
+        sheets = (_rows(sheet, path) for sheet in book.worksheets)
+        rows = next((rows for rows in sheets if any(isinstance(cell, float) for row in rows for cell in row)), [])
+    width = max((k + 1 for row in rows for k, cell in enumerate(row) if cell != ""), default=0)
+    lines = ["" if not any(row) else "\t".join((*_texts(row, width), "")) for row in rows]
+    try:
+        export = read_text("\n".join(lines).encode(), path, layout)
+    except InputError as error:
+        raise _in_sheet(error, lines) from None
+
+    def values(column: int) -> np.ndarray:
+        try:
+            return export.values(column)
+        except InputError as error:
+            raise _in_sheet(error, lines) from None
+
+    return replace(export, values=values, place=lambda row, column: (export.place(row, column)[0], column + 1))
+
+
+def _rows(sheet: Any, path: Path) -> list[list[float | str]]:
+    """The cells of a sheet; numbers as float, empty cells as ""."""
+    if not hasattr(sheet, "reset_dimensions"):  # a sheet that holds only a chart
+        return []
+    sheet.reset_dimensions()  # the stated size of a sheet can be far larger than the sheet
+    rows, cells = [], 0
+    for row in sheet.iter_rows(values_only=True):
+        cells += len(row)
+        if cells > MOST_CELLS:
+            raise InputError(
+                f"a sheet must have at most {MOST_CELLS} cells", "more", "export the record as CSV or Parquet", path
+            )
+        rows.append([_cell(cell) for cell in row])
+    return rows
+
+
+def _cell(cell: object) -> float | str:
+    """A number as float; anything else as one line of text."""
+    if isinstance(cell, int | float) and not isinstance(cell, bool):
+        return float(cell)
+    return "" if cell is None else " ".join(str(cell).split())
+
+
+def _texts(row: list[float | str], width: int) -> list[str]:
+    """The cells of a row as text, ``width`` of them."""
+    texts = [repr(cell) if isinstance(cell, float) else str(cell) for cell in row[:width]]
+    return texts + [""] * (width - len(texts))
+
+
+def _in_sheet(error: InputError, lines: list[str]) -> InputError:
+    """The error with the column of the sheet instead of the character of the line."""
+    if error.line is None or error.line > len(lines):
+        return error
+    column = lines[error.line - 1][: (error.column or 1) - 1].count("\t") + 1
+    return InputError(error.rule, error.value, error.remedy, error.file, error.line, column)

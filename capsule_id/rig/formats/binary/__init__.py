@@ -1,1 +1,0 @@
-"""Readers of binary tables: of arrays or sheets with names."""

@@ -1,0 +1,477 @@
+"""Readers of text exports of any layout, and of LabVIEW measurement files."""
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.rig.formats.raw import Export, Layout, refuse_line
+from capsule_id.rig.formats.text import (
+    BLANKS,
+    COMMENTS,
+    Content,
+    Rows,
+    Shape,
+    TextFile,
+    any_rows,
+    bare,
+    cells_of,
+    is_comment,
+    is_row,
+    number_in,
+    occurrences,
+    place_of_cell,
+    plain_rows,
+    read_column,
+    shown_cell,
+)
+
+# any layout: Reads text exports of any layout: titles, headers, rows of units, comments, and any separator.
+#
+# Headers are found in the lines above the numbers that have as many cells as the rows. Lines that begin with # or % are
+# comments; above the numbers they may hold the headers.
+
+
+_MANY_ROWS = 50  # whose whole parts do not increase by chance
+_COMMA_BETWEEN_DIGITS = re.compile(r"\s*([+-]?[0-9]+),[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
+
+
+def read_text(content: Content, path: Path, layout: Layout) -> Export:
+    """Read a text export.
+
+    Parameters
+    ----------
+    content : the bytes of the file, or where they lie
+    path : its name, for error lines
+    layout : what ``rig.toml`` states about it
+
+    Raises
+    ------
+    InputError
+        If the rows of numbers are not found, or a row has another number of cells than the first one.
+    """
+    file = _file(content, path, layout)
+    head = _head(file, layout)
+    first, row = len(head) - 1, head.pop()
+    delimiter = delimiter_of(row, layout)
+    _refuse_ambiguous_comma(file, first, delimiter, layout)
+    _refuse_separator_in_quotes(file, first, row, delimiter)
+    *cells, last = (cell for cell, _ in cells_of(row, delimiter))
+    blank = bool(cells) and not last
+    trailing = blank and all(not cells_of(line, delimiter)[-1][0] for line in file.lines(first) if is_row(line))
+    width = len(cells) + (not trailing)
+    above = range((layout.data_from_line or first + 1) - 2, -1, -1)
+    found = [(i, names) for i in above if (names := _headers(head[i], delimiter, width, layout))]
+    headers = tuple(names for _, names in found)
+    wanted = [k for k in range(width) if layout.columns is None or is_wanted(k, headers, layout.columns)]
+    decimal = "." if delimiter == "," else layout.decimal
+    shape = Shape(first, delimiter, width, decimal or ("," if "," in row else "."), trailing)
+    words = [k for k in wanted if is_wanted(k, headers, layout.words)]
+    rows = None if words else plain_rows(file, shape, wanted)
+    rows = rows or any_rows(file, replace(shape, decimal=decimal), wanted, layout.missing, words)
+
+    lines = rows.lines
+
+    def values(column: int) -> np.ndarray:
+        return rows.column(column)
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
+        return line + 1, place_of_cell(file.line(line), delimiter, column)
+
+    return Export(path, headers, width, lines, values, place, file.encoding, rows.words)
+
+
+def _file(content: Content, path: Path, layout: Layout) -> TextFile:
+    """The text down to ``data_to_line``, where that is stated."""
+    whole, last = TextFile(content, path), layout.data_to_line
+    if last is None:
+        return whole
+    number = sum(occurrences("\n", text) for _, text in whole.blocks())
+    if last > number:
+        rule, remedy = (
+            f"data_to_line must be a line of the file, which has {number}",
+            "state the line of the last reading",
+        )
+        raise InputError(rule, str(last), remedy, path, max(number, 1), 1)
+    return TextFile(content, path, last)
+
+
+def is_wanted(column: int, headers: tuple[tuple[str, ...], ...], wanted: tuple[str | int, ...]) -> bool:
+    """Whether a column is named by its number or by a header."""
+    return column + 1 in wanted or any(names[column] in wanted for names in headers)
+
+
+def _head(file: TextFile, layout: Layout) -> list[str]:
+    """The lines up to the first row of numbers, that row included.
+
+    Raises
+    ------
+    InputError
+        If there is none, or the first line with a number is no row of readings.
+    """
+    lines: list[str] = []
+    begun = None
+    for i, line in enumerate(file.lines()):
+        lines.append(line)
+        if is_comment(line):
+            continue
+        if layout.data_from_line is not None:
+            if i + 1 >= layout.data_from_line and line.strip():
+                return lines
+            continue
+        cells = _split(line, delimiter_of(line, layout))
+        if begun is None and any(is_number(cell) for cell in cells):
+            begun, cells = i, _mapped(cells, lines, layout)
+        if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
+            if i == begun:
+                return lines
+            remedy = f"state data_from_line = {i + 1}, or the line of the first reading"
+            rule = "the first line with a number must be a row of readings"
+            raise InputError(rule, shown_cell(lines[begun].strip()), remedy, file.path, begun + 1, 1)
+    if layout.data_from_line is not None and layout.data_from_line > len(lines):
+        rule = f"data_from_line must be a line of the file, which has {len(lines)}"
+        remedy = "state the line of the first reading"
+        raise InputError(rule, str(layout.data_from_line), remedy, file.path, max(len(lines), 1), 1)
+    if begun is None:
+        line = 1 if layout.data_from_line is None else len(lines)
+        remedy = "export the readings as text"
+        raise InputError("a table must have rows of numbers", "none", remedy, file.path, line, 1)
+    remedy = f"state data_from_line = {begun + 1}, or the line of the first reading"
+    rule = "data_from_line must be stated where no row has numbers only"
+    raise InputError(rule, shown_cell(lines[begun].strip()), remedy, file.path, begun + 1, 1)
+
+
+def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
+    """The cells of the first row with a number, the last of ``lines``, that are read as numbers; all without a map."""
+    *above, row = lines
+    found = (_headers(line, delimiter_of(row, layout), len(cells), layout) for line in above)
+    headers = tuple(names for names in found if names)
+    wanted = [k for k in range(len(cells)) if is_wanted(k, headers, layout.columns or ())]
+    return [cells[k] for k in wanted if not is_wanted(k, headers, layout.words)] or cells
+
+
+def _headers(line: str, delimiter: str | None, width: int, layout: Layout) -> tuple[str, ...]:
+    """The headers in a line above the numbers; () if it holds none."""
+    bare = line.lstrip(" " if delimiter == "\t" else BLANKS).lstrip("".join(COMMENTS))  # a first cell may be empty
+    for cells in _header_cells(bare, delimiter):
+        if len(cells) == width + 1 and not cells[-1]:
+            cells.pop()
+        if len(cells) == width and any(cells) and not any(is_number(cell) for cell in cells):
+            return tuple(" ".join(cell.split()) for cell in cells)
+    return ()
+
+
+def _header_cells(line: str, delimiter: str | None) -> Iterator[list[str]]:
+    """Ways to split a line of headers: as the readings, else with quotation marks, or with another separator."""
+    yield _split(line, delimiter)
+    if delimiter is None:  # headers of several words, two spaces or more between them
+        yield re.split(r"\s{2,}", line.strip())
+    for mark in (delimiter, "\t", ";", ","):
+        if mark is not None and mark in line and (mark == delimiter or delimiter is None or delimiter not in line):
+            with suppress(csv.Error):
+                (cells,) = csv.reader([line], delimiter=mark, skipinitialspace=True)
+                yield [bare(cell) for cell in cells]
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    """The cells of a line without blanks and quotation marks around them."""
+    return [bare(cell) for cell, _ in cells_of(line, delimiter)]
+
+
+def delimiter_of(line: str, layout: Layout) -> str | None:
+    """The separator of a row: tab, semicolon, comma, or None for spaces; a comma may be the decimal mark."""
+    for mark in "\t;":
+        if mark in line:
+            return mark
+    words = [word for word, _ in cells_of(line, None)]
+    if layout.decimal == ",":  # a tab separates nothing in a line with one cell
+        return None if len(words) > 1 else "\t"
+    if "," not in line:
+        return None if len(words) > 1 else ","
+    if all(_is_reading(cell, layout) for cell in _split(line, ",")):
+        return ","
+    return None if len(words) > 1 and all(_is_reading(word, layout) for word in words) else ","
+
+
+def _refuse_separator_in_quotes(file: TextFile, first: int, row: str, delimiter: str | None) -> None:
+    """Refuse rows such as ``"10,2","1,5"``: the separator would cut quoted numbers in two."""
+    for cell, position in cells_of(row, delimiter):
+        if cell.count('"') % 2:
+            rule = "a cell in quotation marks must not hold the separator of the cells"
+            remedy = "export with a decimal point, or with semicolons between the cells"
+            raise InputError(rule, shown_cell(row.strip()), remedy, file.path, first + 1, position)
+
+
+def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, layout: Layout) -> None:
+    """Refuse rows such as ``1,25``: two whole numbers, or one number with a decimal comma.
+
+    Many rows whose whole parts increase from row to row are times and a reading.
+    """
+    if delimiter != "," or layout.decimal is not None:
+        return
+    rows, before, increasing = 0, -math.inf, True
+    for line in file.lines(first):
+        if not is_row(line):
+            continue
+        found = _COMMA_BETWEEN_DIGITS.fullmatch(line)
+        if found is None:
+            return
+        whole = int(found[1][:18])
+        rows, before, increasing = rows + 1, whole, increasing and before < whole
+    if rows >= _MANY_ROWS and increasing:
+        return
+    rule = "a comma between digits must be stated as a separator or a decimal mark"
+    remedy = 'state decimal = "," for one column of numbers, decimal = "." for two'
+    raise InputError(rule, shown_cell(file.line(first).strip()), remedy, file.path, first + 1, 1)
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number with either decimal mark."""
+    return number_in(cell, ".") is not None or number_in(cell, ",") is not None
+
+
+def _is_reading(cell: str, layout: Layout) -> bool:
+    """Whether a cell is a number or a stated missing marker."""
+    return is_number(cell) or cell in layout.missing
+
+
+# lvm: Reads LabVIEW measurement files (``.lvm``): a header of the file, then segments with a header and rows of
+# numbers.
+#
+# The layout is that of "LabVIEW Measurement File", National Instruments. The package lvm_read reads a damaged cell as
+# NaN
+# and loads pickled copies that lie beside a file, so this reader is the package's own.
+
+
+_END = "***End_of_Header***"
+_SPECIAL, _END_SPECIAL = "***Start_Special***", "***End_Special***"
+_TIMES, _COMMENT = "X_Value", "Comment"
+_REMEDY = "export the record again"
+#: Lines in which the headers of a record of one segment end.
+_HEAD = 10_000
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """One segment: cells of its header by key, names of the columns, 0-based lines of its rows, and their cells."""
+
+    keys: dict[str, list[str]]
+    names: tuple[str, ...]
+    lines: list[int]
+    rows: list[list[str]]
+
+
+@dataclass(frozen=True)
+class _File:
+    """A file taken apart; ``times_computed``: its rows hold no times."""
+
+    path: Path
+    lines: list[str]
+    separator: str
+    decimal: str | None
+    missing: tuple[str, ...]
+    times_computed: bool
+    segments: list[_Segment]
+
+    def stored(self, column: int) -> np.ndarray:
+        """The numbers of a column; blank cells at the end of a segment are no readings."""
+        parts = []
+        for segment in self.segments:
+            texts = [row[column].strip(BLANKS + '"') if column < len(row) else "" for row in segment.rows]
+            while len(texts) > 1 and not texts[-1]:
+                texts.pop()
+            place = [(self.path, *self.place(line, column)) for line in segment.lines[: len(texts)]]
+            parts.append(read_column(texts, self.decimal, self.missing, place.__getitem__))
+        return np.concatenate(parts)
+
+    def clocks(self, channel: int) -> list[tuple[float, float]]:
+        """First time and step of a channel, counted from 1, in every segment.
+
+        Raises
+        ------
+        InputError
+            If a header states none.
+        """
+        found = []
+        for segment in self.segments:
+            cells = [([*segment.keys.get(key, []), *[""] * channel])[channel - 1] for key in ("X0", "Delta_X")]
+            start, step = (number_in(cell, self.decimal or ".") for cell in cells)
+            if start is None or step is None or not np.isfinite([start, step]).all() or step <= 0.0:
+                rule = "a file without times must state X0 and a positive Delta_X for every channel"
+                raise InputError(rule, shown_cell(" ".join(cells)), _REMEDY, self.path, segment.lines[0] + 1, 1)
+            found.append((start, step))
+        return found
+
+    def computed(self, channel: int, sizes: Sequence[int]) -> np.ndarray:
+        """The times of a channel, counted from 1; ``sizes`` are the rows of the segments."""
+        pairs = zip(self.clocks(channel), sizes, strict=True)
+        return np.concatenate([start + step * np.arange(size) for (start, step), size in pairs])
+
+    def sources(self) -> list[int]:
+        """For every column that is returned, the column of the file, or -k for the computed times of channel k."""
+        names = self.segments[0].names
+        channels = range(1, len(names))
+        if not self.times_computed:
+            return list(range(len(names)))
+        alike = len({tuple(self.clocks(channel)) for channel in channels}) == 1
+        return [-1, *channels] if alike else [source for channel in channels for source in (-channel, channel)]
+
+    def place(self, line: int, column: int) -> tuple[int, int]:
+        """1-based line and character of a cell."""
+        cells = cells_of(self.lines[line], self.separator)
+        return line + 1, cells[column][1] if column < len(cells) else len(self.lines[line]) + 1
+
+
+def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
+    """Read the columns of a LabVIEW measurement file; segments follow one another.
+
+    ``X_Value`` is the column of times (or another abscissa). A file without such columns has them computed from X0 and
+    Delta_X: one where they are the same for every channel, else one before each channel. Comments are left out.
+
+    Parameters
+    ----------
+    content : the bytes of the file, or where they lie
+    path : its name, for error lines
+    layout : ``missing`` may hold texts of cells
+
+    Raises
+    ------
+    InputError
+        If the headers are incomplete, or segments have different channels.
+    """
+    refuse_line(layout, path)
+    text = TextFile(content, path)
+    if (long := _one_plain_segment(text, path, layout)) is not None:
+        return long
+    file = _take_apart([*text.lines(), ""], path, layout.missing)
+    sources, names = file.sources(), file.segments[0].names
+    sizes = [len(segment.rows) for segment in file.segments]
+
+    def values(column: int) -> np.ndarray:
+        source = sources[column]
+        return file.stored(source) if source >= 0 else file.computed(-source, sizes)
+
+    numbers = [line for segment in file.segments for line in segment.lines]
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        return file.place(numbers[0] - 1 if row is None else numbers[row], max(sources[column], 0))
+
+    headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
+    return Export(path, (headers,), len(headers), np.asarray(numbers) + 1, values, place, text.encoding)
+
+
+def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | None:
+    """Read a file with one segment of numbers alone in blocks, and only the wanted columns; None for any other file."""
+    head: list[str] = []
+    ends = 0
+    for line in islice(text.lines(), _HEAD):
+        head.append(line)
+        ends += line.startswith(_END)
+        if ends == 2 and len(head) > 2 and head[-3].startswith(_END):
+            break
+    try:
+        file = _take_apart([*head, ""], path, layout.missing)
+        sources = file.sources()
+    except InputError:
+        return None
+    segment = file.segments[0]
+    headers = tuple(_TIMES if source < 0 else segment.names[source] for source in sources)
+    chosen = [k for k in range(len(headers)) if layout.columns is None or is_wanted(k, (headers,), layout.columns)]
+    stored = sorted({sources[k] for k in chosen if sources[k] >= 0})
+    row = head[segment.lines[0]]
+    width = len(segment.names)
+    trailing = len(segment.rows[0]) == width + 1 and not segment.rows[0][-1].strip()
+    decimal = file.decimal or ("," if "," in row and file.separator != "," else ".")
+    rows: Rows | None = plain_rows(text, Shape(segment.lines[0], file.separator, width, decimal, trailing), stored)
+    # Rows must follow one another without comments and blank lines, and nothing may follow them.
+    if rows is None or len(rows.lines) == 0:
+        return None
+    if (rows.lines[0], rows.lines[-1]) != (segment.lines[0] + 1, segment.lines[0] + len(rows.lines)):
+        return None
+    if any(line.strip() for line in text.lines(int(rows.lines[-1]))):
+        return None
+
+    def values(column: int) -> np.ndarray:
+        source = sources[column]
+        return rows.column(source) if source >= 0 else file.computed(-source, [len(rows.lines)])
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        line = segment.lines[0] - 1 if row is None else int(rows.lines[row]) - 1
+        cells = cells_of(text.line(line), file.separator)
+        source = max(sources[column], 0)
+        return line + 1, cells[source][1] if source < len(cells) else len(text.line(line)) + 1
+
+    return Export(path, (headers,), len(headers), rows.lines, values, place, text.encoding)
+
+
+def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:
+    """Headers and segments of a file."""
+    if not any(line.strip().startswith(_END) for line in lines):
+        rule, remedy = (
+            f"a .lvm file must have a header that ends with {_END}",
+            "rename a file of plain columns to .txt, or export the record again",
+        )
+        raise InputError(rule, "none", remedy, path, 1, 1)
+    word = "Separator"
+    stated = next((line for line in lines if line.startswith(word)), word + "\t")
+    separator = "," if stated[len(word) :].startswith(",") else "\t"
+    head, position = _header(lines, 0, separator, path)
+    segments: list[_Segment] = []
+    while (start := _next_header(lines, position, separator)) is not None:
+        keys, first = _header(lines, start, separator, path)
+        segment, position = _segment(lines, first, separator, keys)
+        if not segment.lines:
+            raise InputError("a segment must have rows", "none", _REMEDY, path, min(first + 1, len(lines)), 1)
+        if segments and segment.names != segments[0].names:
+            value = shown_cell(" ".join(segment.names))
+            raise InputError("segments must have the same columns", value, _REMEDY, path, first + 1, 1)
+        segments.append(segment)
+    if not segments:
+        raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, len(lines), 1)
+    if len(segments[0].names) < 2:
+        raise InputError("a segment must have channels", "none", _REMEDY, path, segments[0].lines[0], 1)
+    decimal = (head.get("Decimal_Separator") or [""])[0]
+    computed = (head.get("X_Columns") or [""])[0].lower() == "no"
+    return _File(path, lines, separator, decimal if decimal in (".", ",") else None, missing, computed, segments)
+
+
+def _next_header(lines: list[str], position: int, separator: str) -> int | None:
+    """The first line of the next header, None at the end of the file; special blocks are skipped."""
+    special = False
+    for number in range(position, len(lines)):
+        word = lines[number].split(separator)[0].strip()
+        special = (special or word == _SPECIAL) and word != _END_SPECIAL
+        if not special and word and word != _END_SPECIAL:
+            return number
+    return None
+
+
+def _header(lines: list[str], position: int, separator: str, path: Path) -> tuple[dict[str, list[str]], int]:
+    """The cells behind each key of a header, and the line after it."""
+    keys: dict[str, list[str]] = {}
+    for number in range(position, len(lines)):
+        key, *cells = (cell.strip() for cell in lines[number].split(separator))
+        if key == _END:
+            return keys, number + 1
+        keys[key] = cells
+    raise InputError(f"a header must end with {_END}", "the end of the file", _REMEDY, path, len(lines), 1)
+
+
+def _segment(lines: list[str], position: int, separator: str, keys: dict[str, list[str]]) -> tuple[_Segment, int]:
+    """The columns and rows of a segment, and the line after it."""
+    names = [" ".join(name.split()) for name in lines[position].split(separator)] if position < len(lines) else []
+    while names and names[-1] in ("", _COMMENT):
+        names.pop()
+    stop = position + 1
+    while stop < len(lines) and lines[stop].strip() and not lines[stop].startswith(("***", "Channels")):
+        stop += 1
+    numbers = list(range(position + 1, stop))
+    return _Segment(keys, tuple(names), numbers, [lines[number].split(separator) for number in numbers]), stop

@@ -1,0 +1,624 @@
+"""Readers of text tables: blocks of lines, cells, rows of numbers, CSV."""
+
+import codecs
+import csv
+import gzip
+import io
+import json
+import re
+import warnings
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.rig.formats.raw import RawTable, complete, refuse_large
+from capsule_id.views import counted
+
+# cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
+
+
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+BLANKS = " \t"  # around a cell; other white space, such as a form feed, is an error
+_SWAP_MARKS = str.maketrans(",.", ".,")  # the other mark is then no decimal mark
+_NUMBER_CHARACTERS = frozenset("0123456789+-eE")  # plus the decimal mark
+_LONGEST_QUOTED = 40  # characters of a faulty cell in an error line
+
+
+def cells_of(line: str, delimiter: str | None) -> list[tuple[str, int]]:
+    """The cells of a line without spaces and tabs around them, and the 1-based character at which each begins.
+
+    A ``delimiter`` of None stands for any number of spaces and tabs.
+    """
+    if delimiter is None:
+        return [(found[0], found.start() + 1) for found in re.finditer(rf"[^{BLANKS}]+", line)]
+    cells, start = [], 0
+    for cell in line.split(delimiter):
+        bare = cell.strip(BLANKS)
+        cells.append((bare, start + (len(cell) - len(cell.lstrip(BLANKS)) if bare else 0) + 1))
+        start += len(cell) + 1
+    return cells
+
+
+def place_of_cell(line: str, delimiter: str | None, column: int) -> int:
+    """1-based character at which a cell begins; 1 where the line has no such cell."""
+    cells = cells_of(line, delimiter)
+    return cells[column][1] if column < len(cells) else 1
+
+
+def bare(cell: str) -> str:
+    """A cell without blanks and quotation marks around it."""
+    return cell.strip(BLANKS).strip('"')
+
+
+def number_in(cell: str, decimal: str) -> float | None:
+    """The number in a cell with the decimal mark ``decimal``, None if it is no plain number."""
+    written = cell.translate(_SWAP_MARKS) if decimal == "," else cell
+    return None if _NUMBER.fullmatch(written) is None else float(written)
+
+
+def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> float:
+    """One cell as a finite number.
+
+    Raises
+    ------
+    InputError
+        At ``line`` and ``column`` if it is no number.
+    """
+    if not cell:
+        remedy = "write a number or delete the row"
+        raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
+    value = number_in(cell, decimal)
+    if value is None:
+        if cell.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+            raise InputError("a cell must be a finite number", cell, "delete the row", path, line, column)
+        remedy = "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file"
+        raise InputError("a cell must be a number", shown_cell(cell), remedy, path, line, column)
+    if not np.isfinite(value):
+        remedy = "write a smaller number: float64 ends at 1.8e308"
+        raise InputError("a cell must be a finite number", shown_cell(cell), remedy, path, line, column)
+    return value
+
+
+def decimal_mark(texts: Sequence[str], missing: Sequence[str]) -> str | None:
+    """The first point or comma of the cells of a column, None where they have none."""
+    found = re.search("[.,]", "\n".join(text for text in texts if text not in missing))
+    return found[0] if found else None
+
+
+def read_column(
+    texts: Sequence[str],
+    decimal: str | None,
+    missing: Sequence[str],
+    place: Callable[[int], tuple[Path, int, int]],
+) -> np.ndarray:
+    """The numbers of one column, (n,); NaN at a missing marker.
+
+    Parameters
+    ----------
+    texts : the cells
+    decimal : decimal mark (None: the first point or comma of the column)
+    missing : texts of cells without a reading
+    place : file, line and column of a cell, for error lines
+
+    Raises
+    ------
+    InputError
+        At the first cell that is neither a finite number nor a marker.
+    """
+    mark = decimal or decimal_mark(texts, missing) or "."
+    if (_NUMBER_CHARACTERS | {mark}).issuperset("".join(texts)):  # quickly, where all are numbers
+        with suppress(ValueError):
+            values = np.array([float(text.replace(mark, ".")) for text in texts])
+            if np.isfinite(values).all():
+                return values
+    values = np.full(len(texts), np.nan)
+    for k, text in enumerate(texts):
+        if text in missing:
+            continue
+        value = number_in(text, mark)
+        if value is None:
+            remedy = (
+                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row"
+            )
+            raise InputError("a cell must be a number", shown_cell(text), remedy, *place(k))
+        values[k] = value if np.isfinite(value) else read_number(text, mark, *place(k))
+    return values
+
+
+def shown_cell(cell: str) -> str:
+    """A faulty cell for an error line: printable and short."""
+    text = repr(cell)
+    return text if len(text) <= _LONGEST_QUOTED else text[:_LONGEST_QUOTED] + "…"
+
+
+# blocks: The text of a file in blocks of whole lines.
+
+
+#: The bytes of a file, or where they lie.
+Content = bytes | Path
+COMPRESSED = ".gz"
+#: Bytes of a block, and bytes that are decompressed at a time.
+BLOCK = 1 << 22
+WINDOWS = "Windows-1252"
+_CODECS = {"UTF-16": "utf-16", WINDOWS: "cp1252"}
+_NOT_WINDOWS = re.compile(rb"[\x81\x8d\x8f\x90\x9d]")
+
+
+class TextFile:
+    """A text in UTF-8, in UTF-16 with a byte-order mark, or in Windows-1252, compressed where its name ends in ``.gz``.
+
+    Attributes
+    ----------
+    path : its name, for error lines
+    encoding : its encoding
+    last : number of the last line that is read, counted from 1 (None: all are read)
+
+    Raises
+    ------
+    InputError
+        If the content is no text, at its line and character, or a compressed file is damaged or too large.
+    """
+
+    def __init__(self, content: Content, path: Path, last: int | None = None) -> None:
+        self.path, self.last = path, last
+        raw = _bytes_of(content, path)
+        self.encoding = _encoding(raw, path)
+        text = (
+            raw.removeprefix(codecs.BOM_UTF8)
+            if self.encoding == "UTF-8"
+            else raw.decode(_CODECS[self.encoding]).encode()
+        )
+        self._text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+
+    def blocks(self, first: int = 0) -> Iterator[tuple[int, bytes]]:
+        """Blocks of lines from line ``first``, counted from 0: the number of their first line, and their text in UTF-8.
+
+        Every line ends with a line feed, the last one too.
+        """
+        number = end = 0
+        while end < len(self._text):
+            begin, end = end, self._text.find(b"\n", end + BLOCK) + 1 or len(self._text)
+            block = self._text[begin:end]
+            text = block if block.endswith(b"\n") else block + b"\n"
+            lines = occurrences("\n", text)
+            if self.last is not None and number + lines > self.last:
+                lines = self.last - number
+                text = b"\n".join([*text.split(b"\n", lines)[:-1], b""]) if lines else b""
+            if not lines:
+                return
+            if number + lines > first:
+                yield max(number, first), text.split(b"\n", first - number)[-1] if first > number else text
+            number += lines
+
+    def lines(self, first: int = 0) -> Iterator[str]:
+        """The lines from line ``first`` on, counted from 0."""
+        for _, text in self.blocks(first):
+            yield from lines_of(text)
+
+    def line(self, number: int) -> str:
+        """Line ``number``, counted from 0; "" where the file has none."""
+        return next(self.lines(number), "")
+
+
+def _bytes_of(content: Content, path: Path) -> bytes:
+    """The bytes of a text, decompressed."""
+    if path.suffix.lower() != COMPRESSED:
+        return content if isinstance(content, bytes) else content.read_bytes()
+    found = bytearray()
+    with gzip.open(io.BytesIO(content) if isinstance(content, bytes) else content) as file:
+        while True:
+            with complete(path, "compress it again by gzip"):
+                chunk = file.read(BLOCK)
+            refuse_large(len(found) + len(chunk), path)
+            if not chunk:
+                return bytes(found)
+            found += chunk
+
+
+def _encoding(raw: bytes, path: Path) -> str:
+    """The encoding of a text; Windows-1252 where it is no UTF-8 and begins with ASCII.
+
+    Raises
+    ------
+    InputError
+        At the first byte that is no text.
+    """
+    rule, binary = "the file must be text", ("a binary file (NUL byte)", "export it as text")
+    marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if not marked and (nul := raw.find(b"\0")) >= 0:
+        raise InputError(rule, *binary, path, *place_of_byte(raw[:nul], "utf-8"))
+    codec = "utf-16" if marked else "utf-8"
+    try:
+        raw.decode(codec)
+    except UnicodeDecodeError as error:
+        fault = error.start
+    else:
+        return "UTF-16" if marked else "UTF-8"
+    if marked:
+        raise InputError(rule, "damaged UTF-16", "save it as UTF-8", path, *place_of_byte(raw[:fault], codec))
+    wrong = fault if not raw[:fault].isascii() else None
+    if wrong is None and (found := _NOT_WINDOWS.search(raw)):
+        wrong = found.start()
+    if wrong is not None:
+        value = f"byte 0x{raw[wrong : wrong + 1].hex()}"
+        raise InputError(
+            "the file must be UTF-8 text", value, "save it as UTF-8", path, *place_of_byte(raw[:wrong], codec)
+        )
+    return WINDOWS
+
+
+def occurrences(mark: str, text: bytes) -> int:
+    """How often an ASCII character occurs; faster than ``count`` where it is frequent."""
+    return int(np.count_nonzero(np.frombuffer(text, np.uint8) == ord(mark)))
+
+
+def lines_of(text: bytes) -> list[str]:
+    """The lines of a block, without line feeds."""
+    return text[:-1].decode().split("\n")
+
+
+def place_of_byte(before: bytes, codec: str = "utf-8") -> tuple[int, int]:
+    """1-based line and character of a byte; the bytes ``before`` it may be invalid too."""
+    lines = re.split(r"\r\n?|\n", before.decode(codec, "replace"))
+    return len(lines), len(lines[-1]) + 1
+
+
+# rows: Reads rows of numbers from a text in blocks: quickly where all cells are numbers, else cell by cell.
+
+
+COMMENTS = ("#", "%")
+_NO_CELLS = " \t\r\f\v\n,;"  # spreadsheets write blank rows as separators alone
+_PLAIN = "0123456789+-eE \t"  # characters of rows of numbers, without the separator and the decimal mark
+_SHORT = 1_000_000  # characters of a text that NumPy reads before pandas is imported
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The rows of a text.
+
+    Attributes
+    ----------
+    first : 0-based line of the first one
+    delimiter : separator; None: any number of spaces and tabs
+    width : cells of a row
+    decimal : decimal mark; None: that of each column
+    trailing : every row ends with a separator and a blank cell, which is not counted
+    """
+
+    first: int
+    delimiter: str | None
+    width: int
+    decimal: str | None
+    trailing: bool = False
+
+
+class Rows:
+    """Numbers of some columns of a text; a column with another cell holds the error about it.
+
+    Of the columns ``words`` the texts are kept too.
+    """
+
+    def __init__(self, columns: Sequence[int], words: Sequence[int] = ()) -> None:
+        self._codes: dict[int, list[np.ndarray]] = {column: [] for column in words}
+        self._texts: dict[int, dict[str, int]] = {column: {} for column in words}
+        self._lines: list[np.ndarray] = []
+        self._columns: dict[int, list[np.ndarray] | InputError] = {column: [] for column in columns}
+
+    @property
+    def lines(self) -> np.ndarray:
+        """(rows,) 1-based line of every row."""
+        return np.concatenate([np.empty(0, int), *self._lines])
+
+    def column(self, index: int) -> np.ndarray:
+        """The numbers of a column, (rows,).
+
+        Raises
+        ------
+        InputError
+            At the first cell that is neither a number nor a missing marker.
+        """
+        column = self._columns[index]
+        if isinstance(column, InputError):
+            raise column
+        return np.concatenate([np.empty(0), *column])
+
+    def words(self, index: int) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Numbers of the texts of a column, (rows,), and the texts."""
+        return np.concatenate([np.empty(0, int), *self._codes[index]]), tuple(self._texts[index])
+
+    def add_words(self, index: int, texts: Sequence[str]) -> None:
+        """Append texts to a column."""
+        known = self._texts[index]
+        self._codes[index].append(np.array([known.setdefault(text, len(known)) for text in texts], int))
+
+    def add_lines(self, numbers: np.ndarray | Sequence[int]) -> None:
+        """Append rows by their 0-based lines."""
+        self._lines.append(np.asarray(numbers, int) + 1)
+
+    def add(self, index: int, values: np.ndarray | InputError) -> None:
+        """Append numbers to a column; the first error of a column stays."""
+        column = self._columns[index]
+        if isinstance(column, InputError):
+            return
+        if isinstance(values, InputError):
+            self._columns[index] = values
+        else:
+            column.append(values)
+
+
+def is_comment(line: str) -> bool:
+    """Whether a line is a comment."""
+    return line.lstrip().startswith(COMMENTS)
+
+
+def is_row(line: str) -> bool:
+    """Whether a line has a cell, and is no comment."""
+    return bool(line.strip(_NO_CELLS)) and not is_comment(line)
+
+
+def plain_block(text: bytes, shape: Shape, columns: Sequence[int]) -> np.ndarray | None:
+    """The (rows, columns) numbers of lines that hold numbers alone, by a reader in C; None for any other lines.
+
+    Parameters
+    ----------
+    text : lines in UTF-8, each with a line feed
+    columns : indices of the columns that are returned
+    """
+    delimiter, decimal, count = shape.delimiter, shape.decimal or ".", occurrences("\n", text)
+    allowed = f"{_PLAIN}{delimiter or ''}{decimal}\n".encode()
+    if not text.strip() or text.translate(None, allowed):
+        return None
+    # Rows with a last cell have all cells, by the number of separators. Cells between spaces are counted by the reader.
+    if delimiter is not None and occurrences(delimiter, text) != count * (shape.width - 1 + shape.trailing):
+        return None
+    used = list(range(shape.width)) if delimiter is None else sorted({*columns, shape.width - 1})
+    values = _parse(text.replace(b",", b".") if decimal == "," else text, delimiter, used)
+    if values is None or values.shape != (count, len(used)) or not np.isfinite(values).all():
+        return None
+    return values[:, np.searchsorted(used, columns)]
+
+
+def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray | None:
+    """The numbers of the columns of a text, correctly rounded; None where a cell is no number."""
+    usecols = None if delimiter is None else columns
+    try:
+        if len(text) < _SHORT:
+            lines = io.StringIO(text.decode())
+            return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=usecols)
+        import pandas as pd
+
+        with warnings.catch_warnings():
+            # pandas 2 rounds correctly by this option alone; pandas 3 always does so, and warns of the option.
+            warnings.simplefilter("ignore")
+            frame = pd.read_csv(
+                io.BytesIO(text),
+                sep=delimiter or r"\s+",
+                header=None,
+                usecols=usecols,
+                dtype=np.float64,
+                na_filter=False,
+                quoting=csv.QUOTE_NONE,
+                float_precision="round_trip",
+                low_memory=False,
+            )
+    except ValueError:
+        return None
+    return frame.to_numpy()
+
+
+def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | None:
+    """The rows of a text without missing, empty or other cells; None for any other text."""
+    rows = Rows(columns)
+    for number, text in file.blocks(shape.first):
+        numbers: np.ndarray | list[int] = np.arange(number, number + occurrences("\n", text), dtype=np.int32)
+        values = plain_block(text, shape, columns)
+        if values is None:
+            kept = list(_rows_in(number, text))
+            if not kept:
+                continue
+            numbers, lines = [line for line, _ in kept], [line for _, line in kept]
+            if len(lines) < occurrences("\n", text):  # blank lines or comments
+                values = plain_block("\n".join([*lines, ""]).encode(), shape, columns)
+        if values is None:
+            return None
+        rows.add_lines(numbers)
+        for index, column in enumerate(columns):
+            rows.add(column, values[:, index])
+    return rows
+
+
+def any_rows(
+    file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str], words: Sequence[int] = ()
+) -> Rows:
+    """The rows of a text, with NaN at a missing marker, and the texts of the columns ``words``.
+
+    Raises
+    ------
+    InputError
+        If a row has another number of cells than the first one.
+    """
+    rows = Rows(columns, words)
+    marks = dict.fromkeys(columns, shape.decimal)
+    for number, text in file.blocks(shape.first):
+        kept = list(_rows_in(number, text))
+        cells = [_cells(line, text, shape, file.path) for line, text in kept]
+        rows.add_lines([line for line, _ in kept])
+        for column in columns:
+            texts = [bare(row[column]) for row in cells]
+            if column in words:
+                rows.add_words(column, texts)
+            marks[column] = marks[column] or decimal_mark(texts, missing)
+
+            def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> tuple[Path, int, int]:
+                line, text = kept[k]
+                return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
+
+            try:
+                rows.add(column, read_column(texts, marks[column] or ".", missing, place))
+            except InputError as error:
+                rows.add(column, error)
+    return rows
+
+
+def _rows_in(number: int, text: bytes) -> Iterator[tuple[int, str]]:
+    """The rows of a block with their 0-based lines; ``number`` is that of the first line."""
+    return ((line, row) for line, row in enumerate(lines_of(text), number) if is_row(row))
+
+
+def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
+    """The cells of a row, as many as the first row has."""
+    cells = [cell for cell, _ in cells_of(text, shape.delimiter)]
+    cells = cells[:-1] if shape.trailing else cells
+    if len(cells) != shape.width:
+        rule = f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has"
+        remedy = (
+            f"correct the row, or state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if "
+            f"they begin here"
+        )
+        raise InputError(rule, counted(len(cells), "cell"), remedy, path, line + 1, 1)
+    return cells
+
+
+# csv: Reads CSV tables: a header ``name [unit]`` per column, then a row of numbers per line.
+#
+# Cells are separated by comma, semicolon or tab. The decimal mark is a point, or a comma if commas do not separate
+# cells.
+# A reader in C reads the rows block by block. If it fails, the cells are read one by one to locate the first fault.
+# Places are
+# 1-based: the line of the file, and the character of that line at which the cell begins.
+
+
+#: What exports write where there is no reading, in small letters, without signs.
+_NO_READING = ("", "nan", "inf", "infinity", "na", "n/a", "#n/a", "null", "none")
+HEADER_CELL = re.compile(r"([A-Za-z][A-Za-z0-9_]*)\s*\[([^\[\]]*)\]")
+
+
+class MissingCellsError(InputError):
+    """Cells without a reading: the error of the first one, with the ``texts`` of all."""
+
+    def __init__(self, first: InputError, texts: tuple[str, ...]) -> None:
+        super().__init__(first.rule, first.value, first.remedy, first.file, first.line, first.column)
+        self.texts = texts
+
+
+def read_csv(content: Content, path: Path) -> RawTable:
+    """Read a CSV table.
+
+    Parameters
+    ----------
+    content : the bytes of the file, or where they lie
+    path : its name, for error lines
+
+    Raises
+    ------
+    InputError
+        Naming line and column of the first fault.
+    """
+    file = TextFile(content, path)
+    header = file.line(0)
+    if not header.strip():
+        _refuse_blank(file)
+    delimiter = next((mark for mark in "\t;," if mark in header), ",")
+    names, units = _header(header, delimiter, path)
+    marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
+    decimal = next((mark[0] for mark in marks if mark), ".")
+    shape = Shape(1, delimiter, len(names), decimal)
+    columns = _plain_columns(file, shape)
+    if columns is None:
+        columns = _read_cells(file, shape)
+
+    def place(row: int | None, column: int) -> tuple[int, int]:
+        line = 0 if row is None else row + 1
+        return line + 1, cells_of(file.line(line), delimiter)[column][1]
+
+    return RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
+
+
+def _refuse_blank(file: TextFile) -> None:
+    """Raise where the first line is blank."""
+    if not any(line.strip() for line in file.lines()):
+        remedy = "write a header `name [unit]` per column and one row per reading"
+        raise InputError("a table must not be empty", "no text at all", remedy, file.path, 1, 1)
+    rule, remedy = "lines between the first and the last must not be blank", "put the header on the first line"
+    raise InputError(rule, "a blank line", remedy, file.path, 1, 1)
+
+
+def _plain_columns(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...] | None:
+    """The columns of a table of numbers alone, with blank lines at its end or none; None for any other table."""
+    blocks, ended = [], False
+    for _, text in file.blocks(shape.first):
+        size = len(text.rstrip(f"{BLANKS}\n".encode()))
+        # Blanks behind the last row may be cells.
+        rows = text[: text.index(b"\n", size)] if size else b""
+        if ended and rows:
+            return None
+        ended = len(rows) + 1 < len(text)
+        if not rows:
+            continue
+        values = plain_block(rows + b"\n", shape, range(shape.width))
+        if values is None:
+            return None
+        blocks.append(values)
+    return tuple(np.concatenate(blocks).T.copy()) if blocks else None
+
+
+def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of the columns."""
+    units: dict[str, str] = {}
+    remedy = "head each column `name [unit]`, e.g. `time [s]` ([1]: no unit)"
+    for cell, column in cells_of(line, delimiter):
+        bare = cell[1:-1].strip() if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell
+        if not bare:
+            raise InputError("every column must have a header", "an empty cell", remedy, path, 1, column)
+        found = HEADER_CELL.fullmatch(bare)
+        if found is None or not found[2].strip():
+            raise InputError("the first line must be headers `name [unit]`", shown_cell(bare), remedy, path, 1, column)
+        if found[1] in units:
+            raise InputError(
+                "column names must be unique", f"a second {found[1]}", "remove or rename it", path, 1, column
+            )
+        units[found[1]] = found[2].strip()
+    return tuple(units), tuple(units.values())
+
+
+def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
+    """The columns, read cell by cell; raises at the first fault, and at missing readings where there is no other."""
+    path, columns, blank = file.path, shape.width, None
+    missing: dict[str, InputError] = {}
+    assert shape.delimiter is not None, "a table has a separator"
+    values: list[array[float]] = [array("d") for _ in range(columns)]
+    for line, text in enumerate(file.lines(shape.first), shape.first + 1):
+        if not text.strip():
+            blank = blank or line
+            continue
+        if blank is not None:
+            rule = "lines between the first and the last must not be blank"
+            raise InputError(rule, "a blank line", "remove the line", path, blank, 1)
+        cells = cells_of(text, shape.delimiter)
+        if text.lstrip().startswith("#"):
+            remedy = "remove comments from the table"
+            raise InputError("a row must be numbers", shown_cell(text.strip()), remedy, path, line, 1)
+        if len(cells) != columns:
+            remedy = "give every row one cell per header"
+            if shape.delimiter == "," and len(cells) == 2 * columns:
+                remedy += " (a decimal comma needs semicolons or tabs between the cells)"
+            place = cells[columns][1] if len(cells) > columns else len(text) + 1
+            rule = f"a row must have {counted(columns, 'cell')}"
+            raise InputError(rule, counted(len(cells), "cell"), remedy, path, line, place)
+        for (cell, column), numbers in zip(cells, values, strict=True):
+            try:
+                numbers.append(read_number(cell, shape.decimal or ".", path, line, column))
+            except InputError as error:
+                if cell.lower().strip("+-") not in _NO_READING:
+                    raise
+                missing.setdefault(cell, error)
+    if missing:
+        raise MissingCellsError(next(iter(missing.values())), tuple(missing))
+    if not values[0]:
+        raise InputError("a table must have rows", "a header only", "add a row per reading", path, 1, 1)
+    return tuple(np.array(numbers) for numbers in values)

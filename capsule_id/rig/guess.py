@@ -1,0 +1,624 @@
+"""Guesses the layout of an export, the quantities and units of its columns, and a column map of one kind."""
+
+import json
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, pairwise, product
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from capsule_id.errors import InputError
+from capsule_id.rig.filters import clock_starts
+from capsule_id.rig.formats import EXPORTS, suffix_of
+from capsule_id.rig.formats.layouts import delimiter_of, is_number
+from capsule_id.rig.formats.raw import Export, Layout
+from capsule_id.rig.formats.text import COMPRESSED, TextFile, bare, cells_of, is_row
+from capsule_id.rig.schema import KindRule
+from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si, scale
+
+# headers: Reads names and units from headers, as loggers, spreadsheets and students write them.
+
+
+_WORDS = {
+    "time": "time t zeit messzeit temps tiempo tempo elapsed timestamp clock value duree instant istante "
+    "instante zeitstempel",
+    "x_rel": "relative displacement disp deflection position pos x s weg laser distance abstand auslenkung "
+    "ausschlag verschiebung elongation desplazamiento deplacement spostamento posicion posizione "
+    "elongacion elongazione distancia distanza amplitude amplitudes peak",
+    "x_capsule": "capsule kapsel housing capsula gehause boitier carcasa",
+    "x_base": "base shaker basis tisch",
+    "acceleration": "acceleration acc accel accelerometer beschleunigung aceleracion accelerazione a beschl",
+    "velocity": "velocity speed v geschwindigkeit vitesse velocidad velocita vel geschw",
+    "current": "current strom stromstarke i courant corriente corrente intensite intensidad amps coil",
+    "force": "force kraft f load friction weight pull fs fk fr fmax fstat fkin reibung fuerza forza "
+    "frottement friccion rozamiento attrito traction traccion trazione last charge carga carico "
+    "thrust tension effort empuje spinta schub",
+    "normal_force": "normal normalkraft normale fn load weight last auflast gewicht charge poids carga peso "
+    "carico anpresskraft",
+    "angle": "angle tilt winkel inclination incline slope neigung steigung theta alpha angulo angolo "
+    "inclinaison inclinacion inclinazione pente pendiente pendenza ang phi θ α φ",
+    "height": "height hoehe hohe h hauteur altura altezza rise elevation",
+    "length": "length laenge lange l board longueur longitud lunghezza brett planche tabla tavola",
+    "speed": "speed velocity v v0 geschwindigkeit vitesse velocidad velocita vel geschw",
+    "distance": "distance dist travel slide strecke weg x d s displacement disp distanz distancia distanza "
+    "recorrido percorso parcours deplacement desplazamiento spostamento path spazio espacio",
+    "deflection": "deflection displacement disp compression extension verformung weg x d s federweg auslenkung "
+    "deplacement fleche allongement desplazamiento deflexion alargamiento spostamento deflessione "
+    "allungamento dehnung stauchung einfederung elongation enfoncement compresion compressione "
+    "deformation deformazione deformacion flexion dx δx",
+    "coefficient": "coefficient mu μ cof reibwert reibzahl reibungszahl koeffizient coeficiente coefficiente "
+    "friction frottement rozamiento friccion attrito beiwert reibbeiwert",
+    "period": "period t periode periodendauer periodo",
+    "f": "frequency freq frequenz frequence frecuencia frequenza",
+    "duty": "duty tau tastgrad tastverhaltnis",
+    "periods": "periods n cycles perioden periodes periodos periodi zyklen ciclos cicli pulses impulse "
+    "impulses pulsos impulsi",
+    "session": "session day",
+    "uncertainty": "sd std stdev sigma err error unc uncertainty fehler abweichung unsicherheit ecart "
+    "incertitude desviacion incertidumbre errore deviazione incertezza",
+    "break-away": "fs fmax fstat max peak static statique statisch estatic maxim massim break_away breakaway "
+    "haftre haftkr losbrech losreiss limit adheren arranque distacco demarrage",
+    "no pull": "fn normal coefficient koeffizient coeficiente beiwert",
+    "sliding": "fk fkin sliding kinetic gleit glissement cinetique cinetic dynamic dynamique dinamic "
+    "deslizamiento scorrimento",
+    "reading": "reading counts adc raw cell messwert ablesung lecture lectura lettura signal output anzeige "
+    "digits",
+}  # fmt: skip
+#: Words for a column of a kind, without accents, by its name; a column is always known by its own name too. Words for
+#: the uncertainty of any, and parts of the names of frictions.
+WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(words.split()) for name, words in _WORDS.items()}
+#: Names of the same quantity.
+SAME = {"acceleration_rod": "acceleration", "slope": "angle"}
+#: Fewest letters of a word that can end a compound, and shorter words that can.
+SHORTEST_HEAD, SHORT_HEADS = 5, ("weg", "zeit")
+#: Units of headers that state none: names that programs give to their columns, and a normal force, or one in N.
+UNITS_OF_NAMES: Mapping[str, str | None] = {"X_Value": "s", "F_N": None}
+#: Other ways to write a unit.
+SPELLINGS: Mapping[str, str] = {
+    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s", "sekunden": "s", "msec": "ms", "usec": "us",
+    "millimeter": "mm", "millimetre": "mm", "meter": "m", "metre": "m", "m/s2": "m/s^2", "m/s**2": "m/s^2",
+    "newton": "N", "amp": "A", "amps": "A", "ampere": "A", "degree": "deg", "degrees": "deg", "grad": "deg",
+    "seconde": "s", "secondes": "s", "segundos": "s", "secondi": "s", "meters": "m", "metres": "m", "metros": "m",
+    "metri": "m", "newtons": "N", "grados": "deg", "gradi": "deg", "degrés": "deg", "counts": "1", "count": "1", "-": "1",
+}  # fmt: skip
+_BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*")
+_INSIDE = re.compile(r"(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*(\S.*)")
+_SEPARATED = re.compile(r"(.*?)(?:\s+/\s*|\s*,\s+|\s+in\s+)([^\s/,]\S*)")
+
+
+def unit_of(text: str, dimensions: Sequence[str]) -> str | None:
+    """The unit that ``text`` writes, if it has one of the ``dimensions`` (SI units); else None."""
+    text = text.strip()
+    written = SPELLINGS.get(text.lower(), text)
+    for si in dimensions:
+        # A lone g beside an acceleration is standard gravity.
+        candidate = "g_n" if written in ("g", "G") and si == "m/s^2" else written
+        try:
+            factor_to_si(candidate, si)
+        except UnitError:
+            continue
+        return candidate
+    return None
+
+
+def name_and_unit(header: str, dimensions: Sequence[str]) -> tuple[str, str | None]:
+    """Name and text of the unit of a header; None where it states none.
+
+    ``dimensions`` are the SI units that columns may have. A suffix such as ``_mm`` or ``/mm`` counts only if it is such a
+    unit, and so do brackets before further words, as in ``Force (N) Run 5``.
+    """
+    if header in UNITS_OF_NAMES:
+        return header, UNITS_OF_NAMES[header]
+    for pattern in (_BRACKETS, _SEPARATED):
+        found = pattern.fullmatch(header)
+        if found:
+            return found[1], next(group for group in found.groups()[1:] if group is not None).strip()
+    if unit_of(header, dimensions) is not None:
+        return header, None
+    found = _INSIDE.fullmatch(header)
+    if found and unit_of(text := found[2] or found[3] or "", dimensions) is not None:
+        return f"{found[1]} {found[4]}", text.strip()
+    for mark in ("_", "/"):
+        parts = header.split(mark)
+        for k in range(1, len(parts)):
+            suffix = mark.join(parts[k:])
+            if unit_of(suffix, dimensions) is not None:
+                return mark.join(parts[:k]), suffix
+    return header, None
+
+
+def _bare(name: str) -> str:
+    """Small letters without their accents, ``_`` between words."""
+    marks = unicodedata.normalize("NFKD", name.strip().lower())
+    return re.sub(r"[\W_]+", "_", "".join(mark for mark in marks if not unicodedata.combining(mark)))
+
+
+def fits_name(name: str, column: str) -> float:
+    """3 for the name of the column itself, 2.5 for words of it alone, 2 with others, 1 for a compound that ends with one.
+
+    0 for another name, -1 for an uncertainty. ``Federkraft`` ends with ``kraft``.
+    """
+    bare = _bare(name)
+    words = [word for word in bare.split("_") if word]
+    if any(word in WORDS["uncertainty"] or word[0] in "\u03c3\u00b1" for word in words):
+        return -1
+    if bare == column.lower():
+        return 3
+    known = WORDS.get(SAME.get(column, column), ())
+    if any(word in (*words, *map("".join, pairwise(words))) for word in known):  # F_N is FN
+        return 2.5 if set(words) <= set(known) or "".join(words) in known else 2
+    heads = (word for word in known if len(word) >= SHORTEST_HEAD or word in SHORT_HEADS)
+    return float(any(word.endswith(tuple(heads)) for word in words))
+
+
+def meaning(name: str, column: str, meant: Sequence[str]) -> int:
+    """1 for the name of the friction that is ``meant`` first, at break-away or while it slides, -1 for another, 0 for any."""
+    if column == "normal_force":
+        return 0
+    bare = _bare(name)
+    words = (*bare.split("_"), *map("".join, pairwise(bare.split("_"))))
+    told = [
+        any(part in (bare if len(part) >= SHORTEST_HEAD else words) for part in WORDS[which])
+        for which in meant[: 3 if column == "force" else 2]
+    ]
+    return told[0] - any(told[1:]) if told else 0
+
+
+def is_units_row(row: Sequence[str], dimensions: Sequence[str]) -> bool:
+    """Whether at least half of the cells of a header row are units; empty cells do not count."""
+    cells = [cell for cell in row if cell.strip(" []()")]
+    units = [cell for cell in cells if unit_of(cell.strip(" []()"), dimensions) is not None]
+    return bool(cells) and 2 * len(units) >= len(cells)
+
+
+# layout: Finds the layout of an export: the first row of readings, missing markers, headers, units, a stated sampling
+# rate.
+
+
+#: Texts that loggers and spreadsheets write where a reading is missing.
+MARKERS = ("", "-", "--", "---", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "#N/A", "?")
+#: Largest share of missing readings in a column of readings.
+MOST_MISSING = 0.5
+_BEGINNING = 100_000  # characters in which the first row of readings is searched
+_MOST_TITLES = 100  # lines
+#: Separator and number of cells of a line whose first cell is a number; None for any other line.
+Cells = tuple[str | None, int] | None
+_RATE = re.compile(r"([0-9]+(?:[.,][0-9]+)?)\s*(kHz|Hz|S/s|kS/s)\b", re.IGNORECASE)
+_RATE_NAMES = ("fs", "rate", "sampling_rate", "sample_rate", "samplerate")
+
+
+@dataclass(frozen=True)
+class FoundLayout:
+    """An export with its layout.
+
+    Attributes
+    ----------
+    path, export : the file as read with ``layout``
+    layout : what ``rig.toml`` must state, with all possible markers
+    names, units : of every column, "" where the file has none
+    columns : index of a column of readings -> (rows,) numbers, NaN where missing
+    unread : index of any other column -> the error at its first cell that is no number
+    rate : sampling rate that the file states, Hz
+    blocks : first and last line of each block of readings, counted from 1, of a text with other lines between or below
+        them, of which ``export`` holds the longest; else ()
+    """
+
+    path: Path
+    export: Export
+    layout: Layout
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    columns: dict[int, np.ndarray]
+    unread: dict[int, InputError]
+    rate: float | None
+    blocks: tuple[tuple[int, int], ...] = ()
+
+
+def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundLayout:
+    """The layout of a file of a known format.
+
+    Parameters
+    ----------
+    content : the bytes of the file
+    path : its name
+    dimensions : SI units of all columns of all kinds
+
+    Raises
+    ------
+    InputError
+        If the format is unknown, the file is damaged, or it holds no rows of numbers.
+    """
+    suffix = suffix_of(path)
+    if suffix not in EXPORTS:
+        known = " ".join(EXPORTS)
+        raise InputError(f"a file must have a known format ({known})", path.name, "export it as CSV", path)
+    text = suffix.removesuffix(COMPRESSED) in (".csv", ".txt", ".tsv", ".dat")
+    beginning = _beginning(TextFile(content, path)) if text else b""
+    blocks: tuple[tuple[int, int], ...] = ()
+    layout = Layout(missing=MARKERS)
+    try:
+        if text:
+            layout = _text_layout(beginning, path.with_suffix("") if suffix.endswith(COMPRESSED) else path)
+        export = EXPORTS[suffix](content, path, layout)
+    except InputError:
+        blocks = _blocks(TextFile(content, path), layout) if text else ()
+        if not blocks:
+            raise
+        first, last = max(blocks, key=lambda lines: lines[1] - lines[0])
+        layout = replace(layout, data_from_line=first, data_to_line=last)
+        export = EXPORTS[suffix](content, path, layout)
+    columns, singles, unread = _readings(export)
+    if not columns:
+        nothing = ("a file must have a column of numbers", "none", "export the readings as numbers")
+        raise next(iter(unread.values()), InputError(*nothing, path))
+    names, units = _headers(export, dimensions)
+    # Headers are printed: no character of them may command the terminal.
+    names = tuple("".join(mark if mark.isprintable() else " " for mark in name) for name in names)
+    return FoundLayout(path, export, layout, names, units, columns, unread, _rate(beginning, names, singles), blocks)
+
+
+def _blocks(file: TextFile, layout: Layout) -> tuple[tuple[int, int], ...]:
+    """First and last lines of the blocks of readings of a text.
+
+    () where a single line with numbers interrupts or ends them, which is a damaged row.
+    """
+    runs, longest = _runs(file.lines(), layout)
+    after_block = [run for before, run in pairwise(runs) if before[0] == longest]
+    if any(cells is not None and len(numbers) == 1 for cells, numbers in after_block):
+        return ()
+    return tuple((numbers[0], numbers[-1]) for cells, numbers in runs if longest is not None and cells == longest)
+
+
+def _skips_rows(beginning: bytes, layout: Layout, first: int) -> bool:
+    """Whether rows like those of the longest block lie above the line ``first``."""
+    runs, longest = _runs(beginning.decode().splitlines(), layout)
+    return any(numbers[0] < first for cells, numbers in runs if longest is not None and cells == longest)
+
+
+def _runs(lines: Iterable[str], layout: Layout) -> tuple[list[tuple[Cells, list[int]]], Cells]:
+    """Runs of lines with equal cells, their numbers counted from 1, and the cells of the longest run of two rows or more.
+
+    Blank lines and comments are left out.
+    """
+    kept = ((number, line) for number, line in enumerate(lines, 1) if is_row(line))
+    rows = [(number, _cells_of_row(line, layout)) for number, line in kept]
+    runs = [(cells, [number for number, _ in run]) for cells, run in groupby(rows, lambda row: row[1])]
+    tables = [run for run in runs if run[0] is not None and len(run[1]) > 1]
+    return runs, max(tables, key=lambda run: len(run[1]))[0] if tables else None
+
+
+def _cells_of_row(line: str, layout: Layout) -> Cells:
+    """Separator and number of cells of a line that begins with a number, or a missing one before others; else None."""
+    delimiter = delimiter_of(line, layout)
+    cells = cells_of(line, delimiter)
+    texts = [bare(cell[0]) for cell in cells]
+    begins = is_number(texts[0]) or (texts[0] in layout.missing and any(map(is_number, texts)))
+    return (delimiter, len(cells)) if begins else None
+
+
+def used_layout(found: FoundLayout, content: bytes, used: Sequence[int]) -> Layout:
+    """The layout with the markers alone that occur in the ``used`` columns."""
+    read = EXPORTS[suffix_of(found.path)]
+
+    def reads(markers: tuple[str, ...]) -> bool:
+        try:
+            export = read(content, found.path, replace(found.layout, missing=markers))
+            for column in used:
+                export.values(column)
+        except InputError:
+            return False
+        return True
+
+    missing = () if reads(()) else MARKERS
+    for marker in missing:
+        fewer = tuple(each for each in missing if each != marker)
+        missing = fewer if reads(fewer) else missing
+    return replace(found.layout, missing=missing)
+
+
+def _beginning(file: TextFile) -> bytes:
+    """The first lines of a text in UTF-8, about ``_BEGINNING`` characters."""
+    lines, size = [], 0
+    for line in file.lines():
+        size += len(line) + 1
+        if lines and size > _BEGINNING:
+            break
+        lines.append(line)
+    return "\n".join([*lines, ""]).encode()
+
+
+def _text_layout(beginning: bytes, path: Path) -> Layout:
+    """The layout under which the beginning of a text file has rows of numbers.
+
+    Raises
+    ------
+    InputError
+        The error of the default layout, where no line begins rows of numbers.
+    """
+    read = EXPORTS[suffix_of(path)]
+    first: InputError | None = None
+    lines = [None, *range(1, min(_MOST_TITLES, beginning.count(b"\n") + 1) + 1)]
+    for line in lines:
+        for decimal in (None, ".", ","):
+            layout = Layout(line, missing=MARKERS, decimal=decimal)
+            try:
+                export = read(beginning, path, layout)
+            except InputError as error:
+                first = first or error
+                continue
+            if decimal == "." and not _names_columns(export):
+                continue
+            columns, _, unread = _readings(export)
+            if not columns and unread:
+                first = first or unread[min(unread)]
+            if columns and len(export.lines) == 1:
+                rule, remedy = "an export must have two rows of numbers or more", "export all readings into one file"
+                first = first or InputError(rule, "one row", remedy, path, int(export.lines[0]))
+            if columns and len(export.lines) > 1 and any(np.isfinite(values[0]) for values in columns.values()):
+                if line is not None and _skips_rows(beginning, layout, line):
+                    break
+                return layout
+    assert first is not None, "every layout was refused"
+    raise first
+
+
+def _names_columns(export: Export) -> bool:
+    """Whether the header has a name for each of several columns: whole numbers between commas are then no decimals."""
+    names = export.headers[0] if export.headers else ()
+    return (
+        export.width > 1 and len(names) == export.width and all(name.strip() and not is_number(name) for name in names)
+    )
+
+
+def _readings(export: Export) -> tuple[dict[int, np.ndarray], dict[int, float], dict[int, InputError]]:
+    """The columns of readings, all of the most frequent length; the columns of one number; errors of all others."""
+    columns: dict[int, np.ndarray] = {}
+    singles: dict[int, float] = {}
+    unread: dict[int, InputError] = {}
+    for column in range(export.width):
+        try:
+            values = export.values(column)
+        except InputError as error:
+            unread[column] = error
+            continue
+        if values.size == 1:
+            singles[column] = float(values[0])
+        if values.size and np.mean(np.isnan(values)) <= MOST_MISSING:
+            columns[column] = values
+    sizes = [values.size for values in columns.values()]
+    common = max(set(sizes), key=lambda size: (sizes.count(size), size)) if sizes else 0
+    longest = max(sizes, default=0)
+    common = longest if common == 1 else common
+    return {column: values for column, values in columns.items() if values.size == common}, singles, unread
+
+
+def _headers(export: Export, dimensions: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of the columns, from the rows of headers nearest to the readings."""
+    empty = ("",) * export.width
+    rows = list(export.headers[:3])
+    units = next((row for row in rows if is_units_row(row, dimensions)), None)
+    names = next((row for row in rows if row is not units), None)
+    if names is None and units is not None:  # the only row of headers is a row of units, or of short names
+        return units, empty
+    return names or empty, tuple(cell.strip(" []()") for cell in units) if units is not None else empty
+
+
+def _rate(beginning: bytes, names: Sequence[str], singles: dict[int, float]) -> float | None:
+    """The sampling rate stated in the titles of a text, or by a number with the name of a rate, Hz."""
+    for column, value in singles.items():
+        if names[column].lower() in _RATE_NAMES and value > 0.0:
+            return value
+    for line in beginning.decode("utf-8", "replace").splitlines()[:_MOST_TITLES]:
+        found = _RATE.search(line)
+        if found:
+            return float(found[1].replace(",", ".")) * (1e3 if found[2].lower().startswith("k") else 1.0)
+    return None
+
+
+# columns: Guesses which columns of a file are those of one kind, and their units; proposes a column map for error
+# lines.
+
+
+Confidence = Literal["sure", "likely", "unsure"]
+TIME = "time"
+#: Fewest rows of a record in time.
+FEWEST_SAMPLES = 50
+#: Score of a unit that fits a column, of the word for the friction that a kind takes, of a column that is left out, and of
+#: one that is the same in every row.
+UNIT_SCORE, MEANT_SCORE, LEFT_OUT, CONSTANT = 1.0, 0.5, -0.25, -2.0
+#: Weight of the range of a column, relative to the largest one, which decides between equal scores only; score of a column
+#: whose name does not fit.
+TIE, _NO_NAME = 1e-3, -1e3
+_LONGEST_HEADER = 40  # characters; a column with a longer header is named by its number
+#: Columns that may be the same in every row, beside those that a kind calls optional.
+SETTINGS = ("length", "speed", "period", "f", "periods")
+
+
+@dataclass(frozen=True)
+class ColumnGuess:
+    """A column of the kind: index in the file, unit, what the guess rests on, and the factor to write beside it.
+
+    ``rivals`` fit too and hold other numbers. ``asked``: which of them is meant, the user must say.
+    """
+
+    index: int
+    unit: str
+    confidence: Confidence
+    reason: str
+    scale: float | None = None
+    rivals: tuple["ColumnGuess", ...] = ()
+    asked: bool = False
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """Columns of a file as those of a kind.
+
+    Attributes
+    ----------
+    columns : by name of the kind's column
+    score : how well all fit
+    wanted : the set of columns of the kind
+    missing : columns that the kind needs and the file does not have; a time may be stated as a rate
+    """
+
+    kind: KindRule
+    columns: Mapping[str, ColumnGuess]
+    score: float = 0.0
+    wanted: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+def assignments(found: FoundLayout, kind: KindRule) -> Iterable[Assignment]:
+    """The best assignment of file columns to each set of columns of a kind."""
+    for columns in kind.sets:
+        optional = [name for name in kind.optional if name != "normal_force" or "force" in columns]
+        wanted = [*columns, *kind.channels, *optional]
+        scores = np.full((len(wanted), len(found.columns)), _NO_NAME)
+        ranges = np.zeros_like(scores)
+        guesses = {}
+        for (i, name), (j, index) in product(enumerate(wanted), enumerate(found.columns)):
+            scored = score_of(found, index, name, kind)
+            if scored is not None:
+                scores[i, j], guesses[i, j] = scored
+                ranges[i, j] = np.ptp(readings_of(found, scored[1], kind.columns[name].si, finite=True))
+        # Of columns that fit as well, such as the axes of an accelerometer, the one with the largest motion.
+        largest = np.maximum(np.max(ranges, axis=1, keepdims=True, initial=0.0), np.finfo(float).tiny)
+        rows, places = linear_sum_assignment(scores + TIE * ranges / largest, maximize=True)
+        pairs = [(i, j) for i, j in zip(rows.tolist(), places.tolist(), strict=True) if scores[i, j] > _NO_NAME]
+        unused = [j for j in range(len(found.columns)) if j not in {j for _, j in pairs}]
+        chosen = {
+            wanted[i]: _with_rivals(
+                found,
+                guesses[i, j],
+                float(scores[i, j]),
+                [(guesses[i, k], float(scores[i, k])) for k in unused if (i, k) in guesses],
+                kind.columns[wanted[i]].si,
+            )
+            for i, j in pairs
+        }
+        for (i, k), other in guesses.items():
+            named = (
+                wanted[i] not in optional
+                or wanted[i] in chosen
+                or meaning(found.names[other.index], "force", kind.meant)
+            )
+            if k in unused and not named:  # a normal force under another name would change the number
+                reason = f"{other.reason}; remove the # if it is the {wanted[i]}"
+                chosen[wanted[i]] = replace(other, confidence="unsure", reason=reason, asked=True)
+        channel = () if not kind.channels or set(kind.channels) & set(chosen) else kind.channels[:1]
+        missing = (*(name for name in columns if name not in chosen and name != TIME), *channel)
+        score = sum(float(scores[pair]) for pair in pairs) + LEFT_OUT * len(set(columns) - set(chosen))
+        yield Assignment(kind, chosen, score, columns, missing)
+
+
+def readings_of(found: FoundLayout, column: ColumnGuess, si: str, *, finite: bool = False) -> np.ndarray:
+    """The readings of a column in SI, (n,); as they are where their unit is unknown."""
+    values = found.columns[column.index]
+    values = values[np.isfinite(values)] if finite else values
+    return values if column.unit == UNKNOWN else scale(values, factor_to_si(column.unit, si))
+
+
+def increases(values: np.ndarray) -> bool:
+    """Whether times increase; a clock may start anew."""
+    values = values[np.isfinite(values)]
+    return int(np.sum(np.diff(values) <= 0.0)) == len(clock_starts(values))
+
+
+def times_of(found: FoundLayout) -> list[int]:
+    """Columns that are named as times and increase from row to row."""
+    named = ((index, name_and_unit(found.names[index], ["s"])[0]) for index in found.columns)
+    return [index for index, name in named if fits_name(name, TIME) > 0 and increases(found.columns[index])]
+
+
+def is_constant(found: FoundLayout, index: int) -> bool:
+    """Whether a column of several rows is the same in all of them."""
+    return len(values := found.columns[index]) > 1 and bool(np.nanmax(values) == np.nanmin(values))
+
+
+def _with_rivals(
+    found: FoundLayout, column: ColumnGuess, score: float, others: Sequence[tuple[ColumnGuess, float]], si: str
+) -> ColumnGuess:
+    """The guess with its score beside the ``others`` that may be meant, with theirs; equal numbers are no rivals."""
+    own = readings_of(found, column, si)
+    rivals = [
+        each
+        for each in others
+        if not np.allclose(readings_of(found, each[0], si), own, rtol=1e-9, atol=0, equal_nan=True)
+    ]
+    if not rivals:
+        return column
+    # The end of a word says no more than another name.
+    least = _NO_NAME if score <= 1.0 + UNIT_SCORE else score
+    alike = tuple(other for other, its in rivals if its + UNIT_SCORE * (other.unit == UNKNOWN) >= least)
+    columns = [f"column {other.index + 1}, {found.names[other.index]!r}," for other, _ in rivals]
+    reason = f"{column.reason}; {' '.join(columns)} fits {'as well' if alike else 'less well'}"
+    confidence = "unsure" if alike else "likely" if column.confidence == "sure" else column.confidence
+    return replace(column, confidence=confidence, reason=reason, rivals=alike, asked=column.asked or bool(alike))
+
+
+def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple[float, ColumnGuess] | None:
+    """How well a column of the file fits the column ``name`` of a kind; None where it cannot be."""
+    rule = kind.columns[name]
+    stem, text = name_and_unit(found.names[index], sorted({each.si for each in kind.columns.values()}))
+    text = (text if text is not None else found.units[index]).strip()
+    unit = unit_of(text, [rule.si]) if text else None
+    constant = is_constant(found, index)
+    named, meant = fits_name(stem, name), meaning(stem, name, kind.meant)
+    said = f"the file says {found.names[index]!r}"
+    if (text and unit is None) or named < 0 or (constant and rule.varies):
+        return None
+    by_name = named + MEANT_SCORE * meant if named or name == "force" else 0.0
+    if by_name <= 0.0 or meant < 0:
+        other = (constant and name not in kind.optional) or not (unit or named) or rule.si == "1"
+        return None if other else (_NO_NAME, ColumnGuess(index, unit or UNKNOWN, "unsure", said))
+    if constant and name not in (*SETTINGS, *kind.optional):
+        reason = f"{said}, the same in every row: a setting, or a coarse reading"
+        return by_name + CONSTANT, ColumnGuess(index, unit or UNKNOWN, "unsure", reason, asked=True)
+    if unit is None and rule.si == "1":
+        return by_name, ColumnGuess(index, "1", "likely", "a number without unit")
+    if unit is None:
+        return by_name, ColumnGuess(index, UNKNOWN, "unsure", "the file states no unit")
+    reason = said if unit == text else f"{said}, read as {unit}"
+    return by_name + UNIT_SCORE, ColumnGuess(index, unit, "likely" if unit == "g_n" else "sure", reason)
+
+
+def source_of(found: FoundLayout, index: int) -> str:
+    """The header of a column, or its number where the header is not unique, long or absent."""
+    header = found.names[index]
+    everything = [name for row in found.export.headers for name in row]
+    usable = header and header.isprintable() and len(header) <= _LONGEST_HEADER and everything.count(header) == 1
+    return json.dumps(header, ensure_ascii=False) if usable else str(index + 1)
+
+
+def proposal(kind: KindRule, found: FoundLayout | None) -> str:
+    """The text ``columns = { ... }`` that reads a file as a table of ``kind``; ``?`` is what the file does not say.
+
+    ``found`` is the file (None: unknown).
+    """
+    best, record = Assignment(kind, {}, 0.0, kind.sets[0], kind.channels[:1]), False
+    if found is not None:
+        best = max(assignments(found, kind), key=lambda one: (-len(one.missing), one.score))
+        # A reading of a calibration is a row of a record; a trial is not.
+        record = not any(rule.varies for rule in kind.columns.values()) and any(
+            len(found.columns[index]) >= FEWEST_SAMPLES for index in times_of(found)
+        )
+    texts, words = [], []
+    for name in dict.fromkeys((*best.wanted, *best.columns, *best.missing)):
+        column = best.columns.get(name)
+        source = f'from = "{UNKNOWN}", unit = "{UNKNOWN if column is None else column.unit}"'
+        if found is not None and column is None and name == TIME:
+            source = f'rate = {{ value = "{UNKNOWN}", unit = "Hz" }}'
+        elif found is not None and column is not None:
+            if record or column.asked:
+                words.append(f"{name}: {'the file is a record in time' if record else column.reason}")
+            else:
+                source = source.replace(f'"{UNKNOWN}"', source_of(found, column.index), 1)
+        if column is None or not column.asked or name not in kind.optional:
+            texts.append(f"{name} = {{ {source} }}")
+    return f"columns = {{ {', '.join(texts)} }}" + (f" ({'; '.join(words)})" if words else "")

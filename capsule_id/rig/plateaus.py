@@ -1,0 +1,305 @@
+"""Readings from plateaus of a time trace, and outliers that a stated rule drops."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from capsule_id.rig.filters import hampel_outliers, median_step
+from capsule_id.rig.formats.raw import RawTable
+from capsule_id.rig.schema import KindRule
+from capsule_id.rig.toml import (
+    KeyPath,
+    TomlDocument,
+    read_choice,
+    read_string,
+    read_table,
+    read_unit,
+    refuse_unknown_keys,
+    shown,
+)
+from capsule_id.rig.units import UnitError, factor_to_si, scale
+from capsule_id.views import counted
+
+# rejection: Drops outliers of a record by the rule that ``rig.toml`` states: ``reject = { rule = "hampel", ... }``.
+
+
+_REJECT_EXAMPLE = '{ rule = "hampel", window = "50 ms", n_sd = 5 }'
+_DURATION = re.compile(r"\s*([+-]?[0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?)\s*([^\s0-9]+)\s*")
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Hampel's rule: a sample further than ``n_sd`` robust sds from the median of ``window``, s, around it is dropped."""
+
+    window: float
+    n_sd: float
+
+
+def read_duration(document: TomlDocument, path: KeyPath, value: object) -> float:
+    """A duration such as "50 ms", s.
+
+    Raises
+    ------
+    InputError
+        If it is no number with a unit of time, or not positive.
+    """
+    text = read_string(document, path, value)
+    found = _DURATION.fullmatch(text)
+    remedy = f'write {path[-1]} = "50 ms"'
+    if found is None:
+        raise document.error(path, f"{path[-1]} must be a number with a unit of time", shown(text), remedy)
+    try:
+        duration = scale(float(found[1]), factor_to_si(found[2], "s"))
+    except UnitError as error:
+        raise document.error(path, error.rule, shown(text), remedy) from None
+    if not 0.0 < duration < np.inf:
+        raise document.error(path, f"{path[-1]} must be greater than 0", shown(text), remedy)
+    return duration
+
+
+def read_rejection(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> Rejection | None:
+    """The rule of the experiment at ``path``, None where it states none.
+
+    Raises
+    ------
+    InputError
+        At the key or value that is wrong.
+    """
+    if "reject" not in entry:
+        return None
+    place = (*path, "reject")
+    stated = read_table(document, place, entry["reject"], _REJECT_EXAMPLE)
+    refuse_unknown_keys(document, place, stated, ("rule", "window", "n_sd"))
+    for key in ("rule", "window", "n_sd"):
+        if key not in stated:
+            raise document.error(place, f"reject must have a {key}", shown(stated), f"write {_REJECT_EXAMPLE}")
+    read_choice(document, (*place, "rule"), stated["rule"], ("hampel",))
+    number = stated["n_sd"]
+    if isinstance(number, bool) or not isinstance(number, int | float) or not 1.0 <= number < np.inf:
+        raise document.error((*place, "n_sd"), "n_sd must be a number, 1 or more", shown(number), "write n_sd = 5")
+    return Rejection(read_duration(document, (*place, "window"), stated["window"]), float(number))
+
+
+def outlying_rows(
+    document: TomlDocument, path: KeyPath, raw: RawTable, time: np.ndarray, rejection: Rejection
+) -> np.ndarray:
+    """Whether a reading of each row is an outlier, (n,) bool.
+
+    Parameters
+    ----------
+    path : of the experiment, for the error line
+    raw : the table; its column ``time`` is not judged
+    time : (n,) s, increasing
+
+    Raises
+    ------
+    InputError
+        If the window holds less than two sampling steps, or does not fit into the record.
+    """
+    step = median_step(time) if len(time) > 1 else np.inf
+    half = rejection.window / step / 2.0
+    if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
+        rule = "the window must hold two sampling steps or more, and fit into the record"
+        value = f"{rejection.window:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s"
+        remedy = "write a window of about 10 steps"
+        raise document.error((*path, "reject", "window"), rule, value, remedy)
+    samples = 2 * round(half) + 1
+    found = np.zeros(len(time), bool)
+    for name, values in zip(raw.names, raw.columns, strict=True):
+        if name != "time":
+            found |= hampel_outliers(values, samples, rejection.n_sd)
+    return found
+
+
+# plateaus: Makes readings of a time trace of steps: ``plateaus = { levels = [0, 10, 20], unit = "lbf", guard = "2 s"
+# }``.
+#
+# The trace is divided into as many parts as there are levels, by least squares of a piecewise constant function
+# (dynamic
+# programming; Bellman, Commun. ACM 4, 284 (1961)). Each part gives one row: its mean without the guard at both ends.
+
+
+_EXAMPLE = '{ levels = [0, 10, 20], unit = "N", guard = "2 s" }'
+#: Most parts of a trace that are compared; longer traces are averaged in blocks first.
+MOST_BLOCKS = 1500
+#: Smallest correlation of the levels with the means of the parts.
+SMALLEST_CORRELATION = 0.9
+#: Reversed levels that leave less than this share of the misfit, 1 - correlation, are the true order.
+CLEARLY_LESS = 0.1
+#: Fewest samples of a plateau.
+FEWEST_SAMPLES = 3
+#: Largest step inside a plateau relative to the median step between plateaus, where both sides of it hold at least this
+#: share of the samples of the plateau.
+LARGEST_INNER_STEP, LEAST_SHARE = 0.3, 0.1
+
+
+@dataclass(frozen=True)
+class Plateaus:
+    """Levels of the column ``name`` in the order of time, in ``unit``; ``guard``: left out beside each step, s."""
+
+    name: str
+    levels: np.ndarray
+    unit: str
+    guard: float
+
+
+def read_plateaus(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any], kind: KindRule) -> Plateaus | None:
+    """The plateaus of the experiment at ``path``, None where it states none.
+
+    The levels are those of the column of the kind that ``columns`` leaves out.
+
+    Raises
+    ------
+    InputError
+        At the key or value that is wrong.
+    """
+    if "plateaus" not in entry:
+        return None
+    place = (*path, "plateaus")
+    mapped = set(entry["columns"]) if isinstance(entry.get("columns"), dict) else set()
+    left = [[name for name in columns if name not in mapped] for columns in kind.sets if "time" not in columns]
+    names = next((names for names in left if len(names) == 1), None)
+    if names is None or "time" not in mapped:
+        rule = f"plateaus of {kind.name} need a map of time and of all its columns but one"
+        remedy = f"map time and {' or '.join(sorted({name for columns in kind.sets for name in columns}))} in columns"
+        raise document.error(place, rule, " ".join(sorted(mapped)) or "no columns", remedy, of_key=True)
+    stated = read_table(document, place, entry["plateaus"], _EXAMPLE)
+    refuse_unknown_keys(document, place, stated, ("levels", "unit", "guard"))
+    levels = stated.get("levels")
+    numbers = isinstance(levels, list) and all(
+        isinstance(level, int | float) and not isinstance(level, bool) and np.isfinite(level) for level in levels
+    )
+    if not isinstance(levels, list) or not numbers or len(set(levels)) < 2:
+        rule = "levels must be a list of numbers, two or more different ones"
+        raise document.error((*place, "levels"), rule, shown(levels), "write a level for each plateau, in order")
+    read_unit(document, place, stated, kind.columns[names[0]].si)
+    guard = read_duration(document, (*place, "guard"), stated["guard"]) if "guard" in stated else 0.0
+    return Plateaus(names[0], np.array(levels, float), stated["unit"], guard)
+
+
+def readings_of_plateaus(
+    document: TomlDocument, path: KeyPath, raw: RawTable, time: np.ndarray, plateaus: Plateaus
+) -> tuple[RawTable, np.ndarray]:
+    """A row for each plateau, and the index of its first sample, (k,).
+
+    Parameters
+    ----------
+    raw : the trace; its columns but ``time`` are averaged
+    time : (n,) s, increasing
+
+    Raises
+    ------
+    InputError
+        If the guard leaves too few samples, or the readings do not follow the levels.
+    """
+    place = (*path, "plateaus")
+    channels = [index for index, name in enumerate(raw.names) if name != "time"]
+    trace = raw.values[:, channels]
+    count = len(plateaus.levels)
+    if len(time) < FEWEST_SAMPLES * count:
+        raise document.error(place, f"{count} plateaus need more samples", f"{len(time)}", "record them for longer")
+    edges, block = find_steps(trace, count)
+    guard = plateaus.guard + (block - 1) * float(np.median(np.diff(time)))
+    parts = []
+    for first, last in pairwise(edges):
+        begins = time[first] + (guard if first > 0 else 0.0)
+        ends = time[last - 1] - (guard if last < len(time) else 0.0)
+        part = np.flatnonzero((time >= begins) & (time <= ends) & (np.arange(len(time)) >= first))
+        parts.append(part[part < last])
+        if len(parts[-1]) < FEWEST_SAMPLES:
+            rule = f"a plateau must have {FEWEST_SAMPLES} samples beside the guard"
+            value = f"{len(parts[-1])} from {time[first]:.4g} to {time[last - 1]:.4g} s"
+            raise document.error(place, rule, value, "shorten guard, or state a level for each plateau of the trace")
+    means = np.array([trace[part].mean(axis=0) for part in parts])
+    correlation = abs(float(np.corrcoef(plateaus.levels, means[:, 0])[0, 1]))
+    _check_order(document, place, plateaus.levels, means[:, 0])
+    if not correlation >= SMALLEST_CORRELATION:
+        rule = f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)"
+        value = f"{correlation:.2g}; means {' '.join(f'{mean:.4g}' for mean in means[:, 0])}"
+        raise document.error((*place, "levels"), rule, value, "state a level for each plateau, in the order of time")
+    _check_constant(document, place, trace, parts, means)
+    starts = np.array([part[0] for part in parts])
+    names = (*(raw.names[index] for index in channels), plateaus.name)
+    units = (*(raw.units[index] for index in channels), plateaus.unit)
+
+    def cell(row: int | None, column: int) -> tuple[int, int]:
+        return raw.place(None if row is None else int(starts[row]), channels[min(column, len(channels) - 1)])
+
+    return RawTable(names, units, (*means.T, plateaus.levels), raw.rows[starts], cell), starts
+
+
+def _check_order(document: TomlDocument, place: KeyPath, levels: np.ndarray, means: np.ndarray) -> None:
+    """Refuse levels (k,) that fit the means (k,) of the parts in reverse order only: every sensitivity is positive.
+
+    Raises
+    ------
+    InputError
+        At the list of levels.
+    """
+    stated, reversed_ = (float(np.corrcoef(order, means)[0, 1]) for order in (levels, levels[::-1]))
+    if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):
+        rule = "the levels must stand in the order of time, and the readings must increase with them"
+        value = f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order"
+        remedy = "reverse the levels, or state scale = -1 for a sensor of the other sign"
+        raise document.error((*place, "levels"), rule, value, remedy)
+
+
+def _check_constant(
+    document: TomlDocument, place: KeyPath, trace: np.ndarray, parts: list[np.ndarray], means: np.ndarray
+) -> None:
+    """Refuse a part with a step inside: the trace then has more plateaus than levels.
+
+    Parameters
+    ----------
+    trace : (n, channels)
+    parts, means : samples of each part, and their means (k, channels)
+
+    Raises
+    ------
+    InputError
+        At the list of levels.
+    """
+    step = np.median(np.abs(np.diff(means[:, 0])))
+    for part in parts:
+        middle = find_steps(trace[part], 2)[0][1]
+        one, other = trace[part[:middle], 0], trace[part[middle:], 0]
+        if min(len(one), len(other)) < LEAST_SHARE * len(part):
+            continue
+        if abs(one.mean() - other.mean()) > LARGEST_INNER_STEP * step:
+            rule = "the trace must be constant on each plateau"
+            value = f"{one.mean():.4g} and {other.mean():.4g} on one of {len(parts)} plateaus"
+            raise document.error((*place, "levels"), rule, value, "state a level for each plateau of the trace")
+
+
+def find_steps(trace: np.ndarray, count: int) -> tuple[np.ndarray, int]:
+    """First sample of each of ``count`` constant parts, and the end, (count + 1,); and the samples of a block.
+
+    Parameters
+    ----------
+    trace : (n, channels) readings; every channel counts by its own scatter
+    """
+    block = -(-len(trace) // MOST_BLOCKS)
+    sizes = np.diff(np.append(np.arange(0, len(trace), block), len(trace)))
+    spread = np.std(trace, axis=0)
+    scaled = (trace - trace.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0)
+    sums = np.add.reduceat(scaled, np.arange(0, len(trace), block), axis=0)
+    total = np.vstack([np.zeros(trace.shape[1]), np.cumsum(sums, axis=0)])
+    number = np.concatenate([[0], np.cumsum(sizes)]).astype(float)
+    # Gain of a part from block i to block j: the part of the sum of squares that its mean explains.
+    length = number[None, :] - number[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gain = np.sum((total[None] - total[:, None]) ** 2, axis=2) / length
+    gain[~(length > 0.0)] = -np.inf
+    best, origins = gain[0], []
+    for _ in range(count - 1):
+        through = best[:, None] + gain
+        origins.append(np.argmax(through, axis=0))
+        best = np.max(through, axis=0)
+    edges = [len(sizes)]
+    for origin in reversed(origins):
+        edges.append(int(origin[edges[-1]]))
+    return number[[0, *edges[::-1]]].astype(int), block
