@@ -151,6 +151,7 @@ def test_the_table_is_parameters_csv(fitted: Fit, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["value"].to_numpy(float), table["value"].to_numpy(float))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", ["plot_comparison", "plot_residuals", "plot_autocorrelation", "plot_corner", "plot_traces", "plot_starts"]
 )
@@ -238,6 +239,7 @@ def test_compare_names_what_it_takes(fitted: Fit) -> None:
         compare(fitted, "results/a")  # type: ignore[arg-type]
 
 
+@pytest.mark.full
 def test_compare_finds_two_equal_rigs_equal(fitted: Fit) -> None:
     """1 pair in 20 of results of equal rigs shows a difference; with sds half as large, far more do."""
     rng = np.random.default_rng(0)
@@ -256,6 +258,7 @@ def test_compare_finds_two_equal_rigs_equal(fitted: Fit) -> None:
     assert found[0.5] > 50
 
 
+@pytest.mark.full
 def test_arviz_needs_no_arguments(capsule: Fit, tmp_path: Path) -> None:
     """ArviZ 0.2x and 1: ``loo`` of a fit, with 1,000 draws where it has them; only rows of a small table decide a parameter."""
     capsule.write(tmp_path / "out")

@@ -80,6 +80,7 @@ def test_what_is_not_public_would_be_noticed(line: str, found: str) -> None:
     assert found in not_public(notebook)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ODD)
 def test_a_notebook_runs_from_a_clean_copy(name: str, tmp_path: Path, kernel: AsyncKernelManager) -> None:
     run_short(name, tmp_path, kernel)

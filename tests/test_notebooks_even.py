@@ -16,6 +16,7 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AsyncKernelMana
         yield manager
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", EVEN)
 def test_a_notebook_runs_from_a_clean_copy(name: str, tmp_path: Path, kernel: AsyncKernelManager) -> None:
     run_short(name, tmp_path, kernel)

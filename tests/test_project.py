@@ -43,7 +43,7 @@ def tool(*words: str) -> subprocess.CompletedProcess[str]:
     [
         ("ruff", "check", "--no-cache", "."),
         ("ruff", "format", "--no-cache", "--check", "."),
-        ("pyright", "--pythonpath", sys.executable),
+        pytest.param(("pyright", "--pythonpath", sys.executable), marks=pytest.mark.full),
         ("lint-imports", "--no-cache"),
     ],
     ids=lambda words: " ".join(words[:2]),

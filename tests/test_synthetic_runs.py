@@ -37,6 +37,7 @@ def runs_of(folder: Path) -> list[Table]:
     return [table for table in read_rig(folder).tables if table.kind == "forced_run"]
 
 
+@pytest.mark.full
 def test_the_bench_is_the_same_with_and_without_runs(folder: Path, tmp_path: Path) -> None:
     synthesize(tmp_path / "bench", SEED, Truth().with_values({"k1": 1500.0, "K": 2.2}), name="rig")
     for file in (tmp_path / "bench").glob("*.csv"):
@@ -103,6 +104,7 @@ def test_the_seed_makes_the_runs(folder: Path, tmp_path: Path) -> None:
     assert other != same
 
 
+@pytest.mark.full
 def test_the_bench_can_be_fitted_with_runs_in_the_folder(folder: Path) -> None:
     rig = read_rig(folder)
     assert {e.kind for e in make_experiments(rig, "bench")}.isdisjoint({"forced_run"})

@@ -40,6 +40,7 @@ def _opened(name: str) -> xr.Dataset:
         return data.load()
 
 
+@pytest.mark.full
 def test_a_diagram_becomes_a_file_in_si_and_a_picture(capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(*OVER, *SHORT, "--c", "4") == 0
     said = capsys.readouterr()
@@ -58,6 +59,7 @@ def test_a_diagram_becomes_a_file_in_si_and_a_picture(capsys: pytest.CaptureFixt
     assert sorted(listing(Path())) == ["bifurcation-k2.nc", "bifurcation-k2.png"]
 
 
+@pytest.mark.full
 def test_continuation_and_many_states(capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(*OVER, *SHORT, "--method", "both", "--out", "new/both.nc") == 0
     assert list(_opened("new/both.nc")["branch"].to_numpy()) == ["forward", "backward"]
@@ -66,6 +68,7 @@ def test_continuation_and_many_states(capsys: pytest.CaptureFixture[str]) -> Non
     assert "motions of" in capsys.readouterr().out
 
 
+@pytest.mark.full
 def test_an_interrupted_map_is_taken_up_and_equals_the_whole_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

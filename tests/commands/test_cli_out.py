@@ -189,6 +189,7 @@ def test_resume_needs_something_to_resume(here: Path, capsys: pytest.CaptureFixt
     assert listing(here) == before
 
 
+@pytest.mark.full
 def test_a_point_fit_in_an_odd_place(here: Path) -> None:
     """Unusual paths, a current directory without results, a closed pipe and an ASCII terminal, all at once."""
     small_rig(here / "-mein Prüfstand")

@@ -169,6 +169,7 @@ def test_an_internal_failure_is_one_line(
     assert (line.count("\n"), "could not be saved" in line) == (1, True)
 
 
+@pytest.mark.full
 def test_commands_in_a_bare_surrounding(tmp_path: Path) -> None:
     """No HOME, no locale, closed standard streams: the exit code is right and no traceback appears."""
     small_rig(tmp_path / "rig ü")
@@ -192,6 +193,7 @@ def test_commands_in_a_bare_surrounding(tmp_path: Path) -> None:
     assert (missing.returncode, missing.stdout) == (2, b"")
 
 
+@pytest.mark.full
 def test_a_reader_that_leaves_is_no_failure(tmp_path: Path) -> None:
     for words in (("check", str(DATA)), ("--help",)):
         reader, writer = os.pipe()
@@ -230,6 +232,7 @@ check.run = act
     assert line.startswith("capsule-id: warning: RuntimeWarning: overflow encountered (")
 
 
+@pytest.mark.full
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
 @pytest.mark.parametrize("words", [("check", str(DATA)), ("init", "rig")])
 def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, words: tuple[str, ...]) -> None:

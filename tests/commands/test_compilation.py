@@ -12,6 +12,7 @@ from tests.cli_tools import environment, run
 MOTION = ("simulate", "--k2", "18960", "--P_d", "4", "--Omega", "34.56", "--G", "1e-3", "--periods", "1")
 
 
+@pytest.mark.full
 def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={}))
     emitter, loop = compilation.XLA_EMITTER_OPTION, compilation.XLA_LOOP_OPTION
@@ -53,6 +54,7 @@ def simulated(folder: Path, cache: Path, *options: str) -> tuple[bytes, str]:
     return out.read_bytes(), done.stderr
 
 
+@pytest.mark.full
 def test_programs_are_kept_and_a_damaged_cache_is_replaced(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     plain = simulated(tmp_path, cache, "--no-cache")

@@ -48,6 +48,7 @@ def test_several_rigs_have_the_results_of_single_fits(
     assert sorted(path.name for path in (here / "all").iterdir()) == sorted(TABLES)
 
 
+@pytest.mark.full
 def test_a_change_of_the_model_stands_below_the_line_of_its_rig(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,6 +89,7 @@ def test_bad_input_is_named_and_nothing_is_written(
     assert listing(here) == before
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("scheduler", [(), ("--scheduler", "threads")], ids=["in turn", "threads"])
 def test_a_rig_that_fails_does_not_stop_the_others(
     here: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, scheduler: tuple[str, ...]
@@ -107,6 +109,7 @@ def test_a_rig_that_fails_does_not_stop_the_others(
     assert [path.name for path in (here / "results").iterdir()] == ["spring"]
 
 
+@pytest.mark.full
 def test_a_result_that_cannot_be_written_does_not_stop_the_others(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

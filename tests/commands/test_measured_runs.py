@@ -31,6 +31,7 @@ def _truth(folder: Path, run: str) -> dict:
     return json.loads(folder.with_name("rig.truth.json").read_text(encoding="utf-8"))["runs"][run]
 
 
+@pytest.mark.full
 def test_fig_10_shows_its_two_runs(folder: Path) -> None:
     found = overlay(read_rig(folder), F, FIG_10, FITTED)
     assert [run.label for run in found.motions] == ["P-1-F-3", "P-1-F-2"]
@@ -60,6 +61,7 @@ def test_another_setting_leaves_a_run_out(folder: Path, change: dict[str, float]
     assert reason in found.sentence()
 
 
+@pytest.mark.full
 def test_the_value_of_a_run_is_its_own(folder: Path) -> None:
     """P_d is K times the current; k2 is fitted or the paper's estimate; the gap is stated."""
     rig = read_rig(folder)
@@ -76,6 +78,7 @@ def test_the_value_of_a_run_is_its_own(folder: Path) -> None:
     assert overlay(rig, Span("G", 0.0, 2e-3), FIG_6 | {"Omega": 34.8}, FITTED).motions == ()
 
 
+@pytest.mark.full
 def test_the_sentence_gives_reasons_for_omitted_runs(folder: Path) -> None:
     rig = read_rig(folder)
     assert "f = 4.23 Hz is outside the diagram" in overlay(rig, Span("f", 5.0, 9.0), FIG_10, FITTED).sentence()
@@ -84,6 +87,7 @@ def test_the_sentence_gives_reasons_for_omitted_runs(folder: Path) -> None:
     assert "run_3 (spring hard, not stiff)" in by_name.sentence()
 
 
+@pytest.mark.full
 def test_the_command_draws_them(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ def in_steps(folder: Path, table: str, column: int, steps: float) -> Path:
     return folder
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("steps", [1, 3, 1e5], ids=["two levels", "coarse", "fine"])
 def test_check_of_runs_whose_accelerometer_has_coarse_steps(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], steps: float
@@ -58,6 +59,7 @@ def test_fits_of_tables_in_coarse_steps(
     assert all(line.startswith(("fit-params: verdict not clean: ", str(folder))) for line in lines)
 
 
+@pytest.mark.full
 def test_the_users_matplotlibrc_has_no_say_in_a_command(tmp_path: Path) -> None:
     """(Before: lines of Matplotlib's log, and an internal failure where LaTeX is missing.)"""
     small_rig(tmp_path / "rig")

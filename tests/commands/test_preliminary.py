@@ -28,6 +28,7 @@ def pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return found
 
 
+@pytest.mark.full
 def test_a_fit_with_runs_shows_its_point_fit_first(
     pages: list[str], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -48,6 +49,7 @@ def test_a_fit_with_runs_shows_its_point_fit_first(
     assert not Path("results/small.partial").exists()
 
 
+@pytest.mark.full
 def test_a_quiet_fit_and_one_of_bench_tests_alone_do_not(
     pages: list[str], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

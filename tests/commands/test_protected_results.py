@@ -21,6 +21,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.full
 def test_no_sample_keeps_a_posterior(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = listing(here / "out")
     assert fit_params(["rig", "--no-sample", "--quiet", "--out", "out"]) == 2

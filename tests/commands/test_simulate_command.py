@@ -45,6 +45,7 @@ def test_table_is_the_simulated_motion(tmp_path: Path, capsys: pytest.CaptureFix
         assert picture.size == (1500, 720)
 
 
+@pytest.mark.full
 def test_netcdf_carries_units_and_parameters(tmp_path: Path) -> None:
     out = tmp_path / "run.nc"
     start = ["--initial", "1e-3", "0", "0.5", "0.1"]

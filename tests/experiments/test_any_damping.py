@@ -48,6 +48,7 @@ def twin(
     return time, size * (viscous(time, k1, c, m1) + noise * rng.standard_normal(samples)), k1, c, m1
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("samples", [12, 40, 500])
 def test_the_search_finds_a_decay_of_any_damping(samples: int) -> None:
     """60 decays of 0.7 to 40 periods: the residuals are those of the noise. (Before: rough values from zero crossings.)"""
@@ -76,6 +77,7 @@ def check(path: Path) -> None:
     default_registry()["free_vibration"].check(rig.tables)
 
 
+@pytest.mark.full
 def test_friction_that_ends_the_first_stroke_is_named_and_damping_is_not(tmp_path: Path) -> None:
     """20 rods that dry friction holds are refused by name; 20 viscous ones, most of which never swing, are accepted."""
     rng = np.random.default_rng(7)
@@ -91,6 +93,7 @@ def test_friction_that_ends_the_first_stroke_is_named_and_damping_is_not(tmp_pat
         check(folder(tmp_path / f"viscous_{i}", time, x, m1))
 
 
+@pytest.mark.full
 def test_one_exponential_gives_no_stiffness(tmp_path: Path) -> None:
     """Amplitudes of turning points that are read as a record, or a rod so damped that its first motion is not recorded."""
     time = np.arange(12.0)
@@ -103,6 +106,7 @@ def test_one_exponential_gives_no_stiffness(tmp_path: Path) -> None:
     assert likelihood_gain(exponential_fit(dense, swinging), viscous_fit(dense, swinging)) > 100.0
 
 
+@pytest.mark.full
 def test_further_forces_of_a_rod_that_does_not_swing_are_refused(tmp_path: Path) -> None:
     time, x, _, _, m1 = twin(1.2, 0)
     with pytest.raises(InputError, match="further forces need a damping ratio below"):
@@ -176,6 +180,7 @@ def test_a_drift_larger_than_the_motion_is_no_model() -> None:
     assert all(np.isfinite(one.bic) for one in rank([small], models))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [6, 10, 32, 74, 107, 118])
 def test_a_random_decay_ends_with_a_verdict_or_is_refused(tmp_path: Path, seed: int) -> None:
     outcome(tmp_path, seed, None)
@@ -217,6 +222,7 @@ def test_m1_is_not_the_mass_of_the_record(tmp_path: Path) -> None:
     assert abs(summary.loc["k1", "value"] - k1) > 5.0 * summary.loc["k1", "sd"]
 
 
+@pytest.mark.full
 def test_a_step_after_rest_is_no_clipped_record_and_its_rounding_no_wrong_model(tmp_path: Path) -> None:
     """Readings in steps of 10 um of rest, then of a decay that comes to rest. Before: clipped, or an sd times 167."""
     time, k1, c, m1 = np.arange(600) / 1000.0, 245.062, 5.192, 0.11

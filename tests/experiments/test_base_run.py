@@ -86,6 +86,7 @@ def estimate(shaken: Rig) -> tuple[dict[str, float], dict[str, float]]:
     }
 
 
+@pytest.mark.full
 def test_a_shaken_capsule_is_identified(tmp_path: Path) -> None:
     shaken = rig(tmp_path / "right")
     values, sds = estimate(shaken)
@@ -154,6 +155,7 @@ def test_an_unevenly_sampled_base_needs_a_frequency(tmp_path: Path) -> None:
     assert BaseRun(shaken.tables[0], shaken).Omega == pytest.approx(4.0 * np.pi)
 
 
+@pytest.mark.full
 def test_a_run_without_spring_is_one_whose_spring_is_far_away() -> None:
     own = table(1, without=("acceleration_rod",))
     far = replace(own.settings, gap=Quantity(1e3))
@@ -191,6 +193,7 @@ def test_a_ground_with_an_sd_has_starting_values_too(tmp_path: Path, name: str) 
         assert starts[1][symbol].centre == pytest.approx(starts[0][symbol].centre, rel=1e-9)
 
 
+@pytest.mark.full
 def test_the_fit_of_a_shaken_capsule_begins_near_its_maximum(tmp_path: Path) -> None:
     shaken = rig(tmp_path)
     target = LogPosterior(shaken, [BaseRun(shaken.tables[0], shaken)])

@@ -93,6 +93,7 @@ def test_whitened_means_have_the_density_of_the_averaged_noise() -> None:
     np.testing.assert_allclose(np.asarray(found)[:, 0], expected, rtol=1e-9)
 
 
+@pytest.mark.full
 def test_predicted_means_of_a_rod_with_dry_friction() -> None:
     """Within the bounds of the module, which depend on the block's duration W; the rod turns inside some blocks."""
     forces = {"k1": bench.K1, "c": C, "m1": bench.M1, "F_dry": 0.1}
@@ -168,6 +169,7 @@ def test_long_records_are_thinned_and_the_finding_says_so() -> None:
     assert default_block_size(TIME[:2000], columns[1].values[:2000]) == 1
 
 
+@pytest.mark.full
 def test_a_very_long_record_is_named_and_the_remedy_works() -> None:
     """400 periods of a model that takes dry friction are fitted by the first 250; a stated stop confirms another part."""
     rate, n = np.sqrt(bench.K1 / bench.M1), 24_000

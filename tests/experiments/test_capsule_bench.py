@@ -77,6 +77,7 @@ def test_a_small_release_gives_what_the_closed_form_gives() -> None:
         assert own_sd == pytest.approx(sd, rel=0.02)
 
 
+@pytest.mark.full
 def test_a_large_release_biases_the_closed_form_only() -> None:
     """5 mm: the capsule slips at once and takes energy with it."""
     assert fitted(5e-3, "capsule").fit.agree
@@ -87,6 +88,7 @@ def test_a_large_release_biases_the_closed_form_only() -> None:
     assert abs(closed - bench.C) > 5.0 * sd
 
 
+@pytest.mark.full
 def test_a_record_that_hits_the_spring_is_described() -> None:
     """A release of 2.3 mm, spring at 1 mm: no free decay, and no lint either, for the model has the spring."""
     table = decay(2.3e-3, "capsule", gap=Quantity(1e-3), spring="soft", k2=2420.0)
@@ -100,6 +102,7 @@ def test_a_record_that_hits_the_spring_is_described() -> None:
     assert np.std(np.asarray(e.residuals(theta | {"k2": 0.0}, np))[: e.n]) > 3.0
 
 
+@pytest.mark.full
 def test_a_ringing_rod_shortens_the_slide() -> None:
     """By 11 % at 0.1 m/s and 3 % at 0.2 m/s; a rod that is stiff to its capsule is a locked one."""
     e = CapsulePushes(pushes("capsule"), bench.rig())

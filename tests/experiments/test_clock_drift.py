@@ -102,6 +102,7 @@ def decay_fit(*drifts: Quantity) -> PointFit:
     return point_fit(LogPosterior(rig, make_experiments(rig)), 0, 1)
 
 
+@pytest.mark.full
 def test_k1_follows_the_clock_twice_and_c_once() -> None:
     """k1 = m1 (omega^2 + gamma^2), c = 2 m1 gamma: relative sds of 2 and 1 times that of the clock are added."""
     exact, loose = decay_fit(NO_DRIFT), decay_fit(Quantity(0.0, SD))
@@ -112,6 +113,7 @@ def test_k1_follows_the_clock_twice_and_c_once() -> None:
     assert loose.standard_errors["clock_drift[d0]"] == pytest.approx(SD, rel=0.01)
 
 
+@pytest.mark.full
 def test_models_of_a_record_with_a_clock_are_screened() -> None:
     noisy = replace(decay_table(np.arange(2000) / 2000.0, 2e-5), drift=Quantity(0.0, SD))
     record = only(noisy)
@@ -120,6 +122,7 @@ def test_models_of_a_record_with_a_clock_are_screened() -> None:
     assert "clock_drift[free_vibration]" in {row.name for row in kept.parameters}
 
 
+@pytest.mark.full
 def test_records_of_one_clock_do_not_average_its_error() -> None:
     one, same, two = decay_fit(Quantity(0.0, SD)), decay_fit(*[Quantity(0.0, SD)] * 2), decay_fit(
         Quantity(0.0, SD), Quantity(1e-9, SD)
@@ -131,6 +134,7 @@ def test_records_of_one_clock_do_not_average_its_error() -> None:
     assert two.standard_errors["k1"] == pytest.approx(one.standard_errors["k1"] / np.sqrt(2.0), rel=0.02)
 
 
+@pytest.mark.full
 def test_the_drive_of_a_long_run_gives_the_drift() -> None:
     """Twenty twins of 60 s: least squares over drift, phase and initial state, all other values known."""
     time, noise, drift = np.arange(6000) / 100.0, 20e-6, 20e-6

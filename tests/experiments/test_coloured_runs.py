@@ -55,6 +55,7 @@ def values_of(run: BaseRun) -> dict[str, float]:
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
 def test_coloured_noise_starts_at_the_correlation_of_the_residuals(tmp_path: Path, rho: float) -> None:
     rig = shaken(tmp_path, rho)
@@ -82,6 +83,7 @@ def test_stated_noise_stays(tmp_path: Path, noise: str) -> None:
     assert run.with_coloured_noise(values_of(run)) is None
 
 
+@pytest.mark.full
 def test_parts_of_a_record_share_their_noise(tmp_path: Path) -> None:
     rig = shaken(tmp_path, 0.9)
     parts = BaseRun(rig.tables[0], rig).parts(3.0)

@@ -12,12 +12,14 @@ from tests.experiments.misfit_study import coverage
 NUMBER = 10
 
 
+@pytest.mark.full
 def test_a_drifting_decay_is_clean_and_right() -> None:
     found = outcome("drift", 0)
     assert (found.clean, found.model) == (True, "viscous damping, Gaussian-process drift")
     assert np.max(np.abs(found.z)) < 4.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_rod_that_dry_friction_stops_is_clean_and_right(seed: int) -> None:
     """Few swings: before, halves were fitted about a rough stiffness (seed 0), and one stroke was refused (seed 1)."""
@@ -34,6 +36,7 @@ def test_one_passage_of_the_rest_position_gives_the_frequency(seed: int) -> None
     assert record.rough_decrement().Omega_o == pytest.approx(np.sqrt(bench.K1 / bench.M1), rel=0.1)
 
 
+@pytest.mark.full
 def test_the_default_model_is_not_clean_and_wrong_by_many_sds() -> None:
     """Negative control: where all words are stated there is no second fit."""
     found = outcome("dry", 0, damping=("viscous",), stiffness="linear", drift="none", noise="white")

@@ -52,6 +52,7 @@ def test_viscous_decays_of_every_channel_give_k1_and_c(channel: str) -> None:
         assert sd < 0.02 * value
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_dry_friction_of_every_channel(channel: str) -> None:
     """The force comes out in newtons, so amplitude and turning time refer to x_rel."""
@@ -64,6 +65,7 @@ def test_dry_friction_of_every_channel(channel: str) -> None:
     assert own.largest_deflection == pytest.approx(RELEASE, rel=0.1)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("fraction", [0.02, 0.05, 0.1])
 def test_the_highest_of_many_maxima_of_dry_friction(fraction: float) -> None:
     """The rod sticks after a whole number of half cycles, so a start by the paper's estimate ends elsewhere."""
@@ -88,6 +90,7 @@ def test_a_velocity_called_an_acceleration_gives_another_force() -> None:
     assert abs(found.values["F_dry"] - DRY["F_dry"]) > 4.0 * found.errors["F_dry"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "fraction", [pytest.param(0.03, marks=pytest.mark.slow), 0.165, pytest.param(0.19, marks=pytest.mark.slow)]
 )
@@ -110,6 +113,7 @@ def jumps(forces: dict[str, float], seed: int, lost: slice) -> list[Finding]:
     return [found for found in lint_decay(table, bench.rig(table)) if found.code == "readings.jump"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", range(5))
 def test_lost_samples_of_an_acceleration_are_named(seed: int) -> None:
     """One jump stands alone, also beside those of weak dry friction. A jump at every turn is dry friction."""
@@ -121,6 +125,7 @@ def test_lost_samples_of_an_acceleration_are_named(seed: int) -> None:
         assert jumps(forces, seed, slice(0, 0)) == []
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("fraction", [0.03, 0.1, 0.19, 0.24, 0.28, 0.35])
 def test_jumps_of_dry_friction_are_no_lost_samples(fraction: float) -> None:
     """From 0.22 on, the rod sticks before a jump recurs."""
@@ -138,6 +143,7 @@ def write(folder: Path, header: str, columns: list[np.ndarray], settings: str = 
     return folder
 
 
+@pytest.mark.full
 def test_displacement_and_acceleration_of_one_file_are_fitted_together(tmp_path: Path) -> None:
     x, acceleration = (record(name, VISCOUS) for name in ("x_rel", "acceleration"))
     header = "time [s],x_rel [mm],acceleration [g_n]"
@@ -226,6 +232,7 @@ def sizes(values: np.ndarray) -> Finding:
     return found
 
 
+@pytest.mark.full
 def test_noise_that_follows_the_amplitude_is_no_noise() -> None:
     """Before: an error of the model, fitted as coloured noise, was trusted. Here the rod rubs at random in each stroke."""
     x = np.asarray(decay(TIME, VISCOUS, RELEASE, 0.0, 30).x_rel)
@@ -263,6 +270,7 @@ def drift_findings(angle: np.ndarray, damping: tuple[str, ...], cubic: bool) -> 
     return check_drift([again], fit)  # type: ignore[arg-type]  # pyright: ignore
 
 
+@pytest.mark.full
 def test_a_drift_that_swings_with_the_rod_fails() -> None:
     """A pendulum at large angles is no cubic spring. Its twin at small angles, and true drifts, pass."""
     (large,) = drift_findings(pendulum(2.4), ("dry",), True)
@@ -277,6 +285,7 @@ def test_a_drift_that_swings_with_the_rod_fails() -> None:
     assert mended.level == "ok"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("half_cycles", "levels"), [(3.5, []), (5.5, []), (6.5, ["ok"])])
 def test_a_drift_is_tested_over_one_period_or_more(half_cycles: float, levels: list[str]) -> None:
     """The filter reads one period to each side, so a record of fewer than six half cycles gives no finding."""

@@ -25,6 +25,7 @@ def integrate(rate: Rate, state: list[float], time: np.ndarray) -> np.ndarray:
     return solution.y[0]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [1, 2, 37, 900])
 @pytest.mark.parametrize("gamma", [GAMMA, 1e-2, 1e-9])
 def test_moments_equal_direct_sums(n: int, gamma: float) -> None:
@@ -56,6 +57,7 @@ def test_viscous_decay(xp: object) -> None:
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("ratio", [0.3, 0.999, 1.0 - 1e-9, 1.0 + 1e-9, 1.01, 1.5, 30.0])
 def test_viscous_decay_of_any_damping(ratio: float) -> None:
     """Both solutions against DOP853; their derivatives in k1 and c against central differences of those of SciPy."""

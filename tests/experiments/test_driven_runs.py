@@ -57,6 +57,7 @@ def largest_residual(run: ForcedRun, own: dict[str, float]) -> float:
     return max(float(np.sqrt(np.mean(residuals**2))) for _, residuals in records)
 
 
+@pytest.mark.full
 def test_pulses_explain_a_record_of_pulses(tmp_path: Path) -> None:
     shift = 50 * PERIOD
     write(tmp_path, Pulses(6.0, PERIOD, DUTY, phase=PHASE, lag=LAG), shift, None, PULSES)
@@ -117,6 +118,7 @@ def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
     assert largest_residual(run, {"K": 1.1 * K}) > 3.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("settings", "rule", "instead"),
     [

@@ -48,6 +48,7 @@ def stacked(experiments: Sequence[Experiment]) -> Any:
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *experiments)
 
 
+@pytest.mark.full
 def test_experiments_that_differ_in_numbers_and_label_are_computed_together() -> None:
     for members, values in (([decay(1), decay(2)], VALUES), ([make(2), make(3)], theta(2))):
         together = jit_quickly(jax.vmap(lambda e, values=values: e.log_likelihood(values)))(stacked(members))
@@ -78,6 +79,7 @@ def test_an_experiment_is_frozen_and_its_leaves_are_numbers(experiment: Experime
         experiment.values = np.zeros(3)  # type: ignore[attr-defined]
 
 
+@pytest.mark.full
 def test_every_kind_has_numbers_alone_as_leaves(tmp_path: Path) -> None:
     synthesize(tmp_path / "rig", 3)
     for e in make_experiments(read_rig(tmp_path / "rig")):
@@ -93,6 +95,7 @@ def test_another_start_or_part_of_a_run_leaves_the_run_as_it_was() -> None:
         np.testing.assert_array_equal(old, new)
 
 
+@pytest.mark.full
 def test_log_posteriors_of_many_rigs_share_one_program(tmp_path: Path) -> None:
     sizes, values = [], []
     for seed in (1, 2, 3):
@@ -148,6 +151,7 @@ class Weighing(Experiment):
         raise NotImplementedError
 
 
+@pytest.mark.full
 def test_a_kind_from_elsewhere_is_fitted_checked_and_tabulated() -> None:
     """Beside a decay: inference reads only what the class itself declares."""
     columns = [bench.column("load", [0.49, 0.5, 0.52, 0.51])]

@@ -60,6 +60,7 @@ FEASIBLE = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("P_d", "Omega", "G", "k2"), FEASIBLE)
 def test_feasible_settings_pass_without_a_word(P_d: float, Omega: float, G: float, k2: float) -> None:
     """The negative control."""
@@ -139,6 +140,7 @@ def bench_rig(*runs: Table) -> Rig:
     return bench.rig(decay, tilts, spring, *runs)
 
 
+@pytest.mark.full
 def test_rough_values_come_from_the_bench_tests_of_the_folder() -> None:
     """Without the -2.4 % that the observed frequency has; a prior's median only where there is no test."""
     estimate = rough_values(bench_rig())

@@ -23,6 +23,7 @@ def density(observed: np.ndarray, predicted: np.ndarray, covariance: np.ndarray,
     return float(stats.multivariate_normal(predicted, spread).logpdf(observed))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("number", [0, 1])
 def test_channels_are_independent_normal_densities_with_offsets_integrated_out(number: int) -> None:
     run = make(number)
@@ -77,6 +78,7 @@ def test_without_a_current_the_drive_is_the_stated_one() -> None:
     assert np.allclose(run.predict(theta(0), np)[0], channels(0)[0], rtol=0, atol=1e-13)
 
 
+@pytest.mark.full
 def test_runs_of_both_kinds_of_start_are_one_group_and_add_up() -> None:
     tables = [table(0), table(1)]
     rig = bench.rig(*tables)
@@ -120,6 +122,7 @@ def test_the_record_tells_where_the_fit_may_start(number: int) -> None:
         assert rough.noise[name] == pytest.approx(sd, rel=0.25)
 
 
+@pytest.mark.full
 def test_draws_are_predicted_in_one_batch() -> None:
     run = make(0)
     values = [theta(0), theta(0) | {"k2": 1.05 * theta(0)["k2"], "phase": theta(0)["phase"] + 0.01}]

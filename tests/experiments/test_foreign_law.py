@@ -108,6 +108,7 @@ def fitted(rig: Rig) -> Fit:
     return cid.fit(rig, budget=None, friction=Lorentzian)
 
 
+@pytest.mark.full
 def test_a_fit_recovers_the_law(fitted: Fit) -> None:
     point = fitted.point_fit
     for row in Lorentzian.parameters:
@@ -126,6 +127,7 @@ def test_the_papers_law_fits_the_same_readings_worse(rig: Rig, fitted: Fit) -> N
     assert fitted.point_fit.log_posterior.max() - other.log_posterior.max() > 30.0
 
 
+@pytest.mark.full
 def test_the_report_draws_the_fitted_law(fitted: Fit, tmp_path: Path) -> None:
     (panel,) = (panel for panel in fitted.comparisons if panel.kind == "friction")
     curve = next(curve for curve in panel.curves if curve.role == "ours")

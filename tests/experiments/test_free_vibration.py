@@ -137,6 +137,7 @@ def test_cramer_rao_bound() -> None:
     assert np.all(np.abs(np.std(pulls, axis=0) - 1.0) < 0.05)
 
 
+@pytest.mark.full
 def test_logarithmic_decrement_is_far_off_the_bound() -> None:
     """Negative control: what the bound would have to be widened to for the paper's estimator to pass."""
     ratio = decrement_sd(150, 3)

@@ -38,6 +38,7 @@ def table(
     return Entry(kind, "table", {"force [N]": force, "normal_force [N]": LOAD, **(further or {})}, settings or {})
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
 def test_forces_at_several_loads_give_one_coefficient(tmp_path: Path, kind: str) -> None:
     """Before: one experiment for each load, and no experiment for sliding without a speed."""
@@ -135,6 +136,7 @@ def at_loads(folder: Path, mu: tuple[float, ...], order: np.ndarray) -> Fit:
     return cid.fit(rig(folder, entry), budget=None)
 
 
+@pytest.mark.full
 def test_a_coefficient_that_changes_with_the_load_is_named_in_any_order(tmp_path: Path) -> None:
     """Before: trusted where the rows are shuffled, which the finding on their order had proposed."""
     shuffled = np.random.default_rng(0).permutation(len(LOAD))
@@ -165,6 +167,7 @@ def test_a_trend_with_the_load_is_named_where_every_trial_has_its_own() -> None:
     assert np.mean([p(0.0, int(seed)) < 0.05 for seed in rng.integers(0, 10**6, 200)]) < 0.09
 
 
+@pytest.mark.full
 def test_two_loads_with_few_rows_and_loads_on_a_slope(tmp_path: Path) -> None:
     rng, load = np.random.default_rng(2), np.repeat([6.0, 60.0], 5)
     force = np.repeat([0.35, 0.28], 5) * load * (1.0 + 0.02 * rng.standard_normal(10))
@@ -185,6 +188,7 @@ def test_two_loads_with_few_rows_and_loads_on_a_slope(tmp_path: Path) -> None:
     assert found[0].facts["means"][0][1] == pytest.approx(0.35, rel=0.03)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["static_friction", "sliding_friction"])
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 def test_weights_pull_along_a_slope(tmp_path: Path, kind: str, direction: str) -> None:

@@ -19,6 +19,7 @@ def test_outcomes_of_one_twin_of_each_misfit() -> None:
     assert np.max(np.abs(default.z)) > 4.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("rows", "seed"), [(4, 1), (5, 0)])
 def test_few_pulls_with_a_constant_force_are_not_trusted(rows: int, seed: int) -> None:
     """Before: trusted, four sds or more off, because no check could see the force in so few rows."""
@@ -27,6 +28,7 @@ def test_few_pulls_with_a_constant_force_are_not_trusted(rows: int, seed: int) -
     assert found.trust["mu"] != "trusted"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("kind", "rows"), [("tilts", 3), ("slides", 3), ("pulls at loads", 8), ("slides at speeds", 8)]
 )
@@ -37,6 +39,7 @@ def test_clean_tables_of_few_rows_are_trusted(kind: str, rows: int) -> None:
     assert all(found.covers.values())
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("kind", "rows"), [("tilts", 1), ("pulls", 2), ("pulls at loads", 5)])
 def test_the_sd_without_a_sample_is_that_of_the_sample(kind: str, rows: int) -> None:
     """Before: of one tilt 100 times too small, because the most probable scatter of one row is 0."""

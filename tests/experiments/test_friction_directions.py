@@ -58,6 +58,7 @@ def pulls(stated: bool) -> Entry:
     return Entry("static_friction", "pull", {"force [N]": force}, settings)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stated", [False, True])
 def test_pulls_until_slip(tmp_path: Path, stated: bool) -> None:
     rig = make_rig(tmp_path, pulls(stated), head={} if stated else MASSES)
@@ -74,6 +75,7 @@ def test_a_pull_without_a_normal_force_names_the_missing_mass(tmp_path: Path) ->
     make_rig(tmp_path / "again", pulls(False), head=MASSES)
 
 
+@pytest.mark.full
 def test_sufficient_statistics_are_those_of_all_tilts(tmp_path: Path) -> None:
     angle = np.random.default_rng(0).normal(33.0, 0.5, 300)
     (e,) = make_experiments(make_rig(tmp_path, Entry("static_friction", "tilts", {"angle [deg]": angle})))
@@ -82,6 +84,7 @@ def test_sufficient_statistics_are_those_of_all_tilts(tmp_path: Path) -> None:
     assert float(e.log_likelihood(theta)) == pytest.approx(float(misfit.log_density(0.01, np)), rel=1e-12)
 
 
+@pytest.mark.full
 def test_ten_thousand_tilts_take_seconds(tmp_path: Path) -> None:
     angle = np.random.default_rng(0).normal(33.0, 0.5, 10_000)
     rig = make_rig(tmp_path, Entry("static_friction", "tilts", {"angle [deg]": angle}))

@@ -55,6 +55,7 @@ def test_the_marginal_likelihood_against_quadrature(constant: bool, ratio: float
     assert found == pytest.approx(np.log(np.mean(np.exp(density))), abs=0.35)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [6, 12])
 def test_clean_twins_raise_no_alarm_and_a_wrong_law_does(n: int) -> None:
     """Eight seeds of the study below; the control is friction that does not depend on speed."""
@@ -126,6 +127,7 @@ def assert_the_remedy_works(folder: Path, speed: np.ndarray, coefficient: np.nda
     assert low < curve.y.min() <= curve.y.max() < high
 
 
+@pytest.mark.full
 def test_the_remedy_of_a_synthetic_rack(tmp_path: Path) -> None:
     assert_the_remedy_works(tmp_path, SPEED, LEVEL_READINGS)
 

@@ -90,6 +90,7 @@ def best_scatter(e: Progression, discrepancy: float) -> float:
     return float(at[np.argmax([profile({**SCATTERS, "trial_sd": sd, "discrepancy": discrepancy}) for sd in at])])
 
 
+@pytest.mark.full
 def test_an_outlying_trial_widens_nothing_else(tmp_path: Path) -> None:
     normal, heavy = (with_outlier(progression(tmp_path, tails), 4, 0.025) for tails in ("normal", "heavy"))
     clean = best_scatter(progression(tmp_path, "normal"), 1e-4)

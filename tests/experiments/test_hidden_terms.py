@@ -74,6 +74,7 @@ def short() -> Fit:
     return cid.fit(bench.rig(decay_table(SHORT, DRY)), budget=None)
 
 
+@pytest.mark.full
 def test_a_short_record_with_dry_friction_is_not_clean_and_wrong(short: Fit) -> None:
     assert [f.code for f in short.findings if f.level == "fail"] == ["decays.hidden"]
     row = short.summary.loc["c"]
@@ -93,6 +94,7 @@ def with_the_remedy(short: Fit) -> Rig:
     return bench.rig(decay_table(SHORT, DRY, damping=tuple(tomllib.loads(line)["damping"])))
 
 
+@pytest.mark.full
 def test_the_remedy_in_the_text_gives_an_error_that_contains_the_truth(short: Fit) -> None:
     fit = cid.fit(with_the_remedy(short), budget=None)
     assert fit.clean
@@ -120,6 +122,7 @@ def test_the_default_prior_of_a_force_follows_the_size_of_the_rig(scale: float) 
     assert median["c_q"] == pytest.approx(0.05 * bench.M1 / (scale * RELEASE), rel=0.1)
 
 
+@pytest.mark.full
 def test_records_of_unequal_size_share_a_prior_that_follows_both() -> None:
     """Before, the first record alone set the scale; one in a hundred in size excluded what the other one showed."""
     table = decay_table(SHORT, DRY, damping=("viscous", "dry"))
@@ -157,6 +160,7 @@ def test_on_a_slope_no_cubic_spring_is_proposed() -> None:
     assert "Record more periods with less noise, or release from smaller deflections. If" in last
 
 
+@pytest.mark.full
 def test_the_longer_record_in_the_text_names_dry_friction() -> None:
     records = cast(list[FreeVibration], make_experiments(bench.rig(decay_table(LONG, DRY))))
     ((record,), (finding,)) = second_models(records)
@@ -170,6 +174,7 @@ def test_stated_words_count_as_known() -> None:
     assert findings(decay_table(SHORT, DRY, damping=("viscous",), stiffness="linear")) == []
 
 
+@pytest.mark.full
 def test_viscous_records_raise_a_finding_where_they_are_short_only() -> None:
     levels = {
         periods: [[f.level for f in findings(decay_table(periods, VISCOUS, seed))] for seed in range(10)]
@@ -178,6 +183,7 @@ def test_viscous_records_raise_a_finding_where_they_are_short_only() -> None:
     assert levels == {SHORT: [["fail"]] * 10, LONG: [["ok"]] * 10}
 
 
+@pytest.mark.full
 def test_the_records_of_data_exclude_further_forces() -> None:
     rig = cid.read_rig(DATA)
     records = [e for e in make_experiments(rig, "bench") if isinstance(e, FreeVibration)]
@@ -186,6 +192,7 @@ def test_the_records_of_data_exclude_further_forces() -> None:
     assert found.level == "ok"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["F_dry", "c_q", "k_cubic"])
 def test_estimate_error_and_slope_of_a_further_force_are_those_of_a_fit_of_both(name: str) -> None:
     """Independent route: SciPy's fit of SciPy's motion with the force as an unknown."""
@@ -209,6 +216,7 @@ def test_estimate_error_and_slope_of_a_further_force_are_those_of_a_fit_of_both(
         assert found.slopes[other] * sd == pytest.approx(covariance[i, 2] / sd, abs=0.15 * np.sqrt(covariance[i, i]))
 
 
+@pytest.mark.full
 def test_the_clock_of_a_record_stretches_its_further_forces() -> None:
     """A clock that loses 1 % shows the same forces. Negative control: at times as read F_dry looks different."""
     table = decay_table(60.0, VISCOUS)

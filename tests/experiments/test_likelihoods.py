@@ -180,6 +180,7 @@ def test_decay_at_its_true_noise(time: np.ndarray) -> None:
     assert_log_likelihood(experiment, {"k1": 1430.0, "c": 3.8, "noise_sd": sd, **MASSES}, expected)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("damping", [("dry",), ("dry", "quadratic")], ids=str)
 def test_decay_by_the_integrator(damping: tuple[str, ...]) -> None:
     experiment = record(UNIFORM, *damping)

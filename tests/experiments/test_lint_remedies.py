@@ -49,6 +49,7 @@ def decay(time: np.ndarray, seed: int) -> np.ndarray:
     return bench.released(time, 2e-3) + 2e-5 * np.random.default_rng(seed).standard_normal(len(time))
 
 
+@pytest.mark.full
 def test_the_line_that_names_the_release_makes_the_fit_clean(tmp_path: Path) -> None:
     time = np.arange(3600) / 2000.0
     rng = np.random.default_rng(0)
@@ -73,6 +74,7 @@ def test_the_line_that_names_the_release_makes_the_fit_clean(tmp_path: Path) -> 
     assert abs(c["map"] - bench.C) < 4.0 * c["standard_error"]
 
 
+@pytest.mark.full
 def test_a_push_before_the_release_is_left_out(tmp_path: Path) -> None:
     """A hand raises the rod for 25 ms, from 70 % of the deflection. Fitted too, that shifts c by many sds."""
     time = np.arange(1000) / 2000.0
@@ -95,6 +97,7 @@ def test_a_push_before_the_release_is_left_out(tmp_path: Path) -> None:
     assert not cid.fit(kept, budget=None).clean
 
 
+@pytest.mark.full
 def test_the_line_that_names_a_second_excitation_ends_the_decay_there(tmp_path: Path) -> None:
     time = np.arange(2000) / 2000.0
     values = np.concatenate([decay(time[:800], 1), decay(time[:1200], 2)])
@@ -112,6 +115,7 @@ def coarse(rate: float) -> Table:
     return bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", values)])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rate", [25.0, 20.0, 17.0, 40.0])
 def test_an_aliased_decay_fails_unless_a_prior_excludes_the_aliases(rate: float) -> None:
     rig = bench.rig(coarse(rate))
@@ -138,6 +142,7 @@ def slow(per_period: float) -> Table:
     return bench.table("free_vibration", [bench.column("time", time), bench.column("x_rel", values)])
 
 
+@pytest.mark.full
 def test_a_pendulum_whose_k1_lies_outside_its_default_prior_is_not_called_aliased() -> None:
     """Before: a record with 90 samples per period failed, because k1 = 0.5 N/m is less than 1.5 N/m."""
     assert found(bench.rig(slow(150.0)), "decays.alias") == []
@@ -152,6 +157,7 @@ def test_a_pendulum_whose_k1_lies_outside_its_default_prior_is_not_called_aliase
     assert against.level == "fail"
 
 
+@pytest.mark.full
 def test_another_default_prior_moves_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
     """(Before: the default prior of k1 was read as a bound of physics.)"""
     rigs = [bench.rig(table) for table in (coarse(25.0), coarse(40.0), coarse(1000.0), slow(40.0), slow(150.0))]
@@ -163,6 +169,7 @@ def test_another_default_prior_moves_no_check(monkeypatch: pytest.MonkeyPatch) -
         assert [found(rig, "decays.alias", "decays.sampling") for rig in rigs] == before
 
 
+@pytest.mark.full
 def test_uneven_sampling_and_fast_sampling_have_no_aliases() -> None:
     assert found(bench.rig(coarse(1000.0)), "decays.alias") == []
     table = coarse(60.0)
@@ -181,6 +188,7 @@ def test_a_mass_in_the_wrong_unit_is_named_with_the_unit_meant() -> None:
     assert found(bench.rig(m1=Quantity(0.11, 0.2)), "readings.magnitude") == []
 
 
+@pytest.mark.full
 def test_times_in_milliseconds_labelled_seconds_are_named() -> None:
     time = np.arange(1000) / 2000.0
     table = bench.table("free_vibration", [bench.column("time", 1e3 * time), bench.column("x_rel", decay(time, 5))])
@@ -198,6 +206,7 @@ def test_pushes_with_swapped_columns_are_named() -> None:
     assert "the power 0.5 ±" in text(finding)
 
 
+@pytest.mark.full
 def test_decays_of_one_rig_have_one_frequency() -> None:
     time = np.arange(1000) / 2000.0
 
@@ -211,6 +220,7 @@ def test_decays_of_one_rig_have_one_frequency() -> None:
     assert "The ratio is near 60 (min and s)." in text(finding)
 
 
+@pytest.mark.full
 def test_a_rod_that_friction_holds_after_one_swing_needs_a_larger_release() -> None:
     """F_dry is 0.35 of the spring's force at the first release, and 0.07 of it at the second."""
     time = np.arange(250) / 500.0
@@ -224,6 +234,7 @@ def test_a_rod_that_friction_holds_after_one_swing_needs_a_larger_release() -> N
     KINDS["free_vibration"].check([larger])
 
 
+@pytest.mark.full
 def test_a_spike_is_no_loss_of_samples_and_its_row_can_be_deleted() -> None:
     time = np.arange(1200) / 400.0
     clean = bench.released(time, 4e-3, c=0.6) + 1.5e-5 * np.random.default_rng(13).standard_normal(1200)
@@ -241,6 +252,7 @@ def test_a_spike_is_no_loss_of_samples_and_its_row_can_be_deleted() -> None:
     assert [f.code for f in lost] == ["readings.jump"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("begin", [0, 40, 300])
 def test_the_line_that_names_a_burst_of_noise_leaves_it_out(begin: int) -> None:
     """A hand that still shakes the rig, or a rattle. Before: "samples were lost"."""
@@ -264,6 +276,7 @@ def test_the_line_that_names_a_burst_of_noise_leaves_it_out(begin: int) -> None:
     assert faults(slice(int(np.argmax(kept)), int(np.argmax(kept)) + int(np.sum(kept)))) == []
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stated", [(), ("stiffness",), ("damping", "noise")])
 def test_remedies_name_only_the_words_that_the_entry_states(tmp_path: Path, stated: tuple[str, ...]) -> None:
     """Before: "remove damping, stiffness, drift and noise from its entry" of an entry without any of them."""

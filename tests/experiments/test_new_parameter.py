@@ -74,6 +74,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.full
 def test_it_is_fitted_and_reported(site: Path, rig: Path, tmp_path: Path) -> None:
     environment = cli_tools.environment(PYTHONPATH=str(site))
     words = (str(rig), "--no-sample", "--quiet", "--out", str(tmp_path / "out"))
@@ -99,6 +100,7 @@ def test_both_engines_simulate_it(site: Path, tmp_path: Path) -> None:
     assert abs(exact - without) > 20.0 * abs(smooth - exact)
 
 
+@pytest.mark.full
 def test_without_the_three_places_it_is_unknown(rig: Path, tmp_path: Path) -> None:
     """The negative control."""
     done = cli_tools.run("check", str(rig), cwd=tmp_path, name="capsule_id")

@@ -44,6 +44,7 @@ def share_named(folder: Path, fault: Fault, rigs: int) -> float:
     return hits / rigs
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_planted_faults_are_named(tmp_path: Path, fault: Fault) -> None:
     assert share_named(tmp_path, fault, 6) == 1.0
@@ -55,6 +56,7 @@ def test_a_jump_is_named_where_the_noise_looks_larger_by_chance(tmp_path: Path) 
     assert "readings.jump" in [one.code for one in found]
 
 
+@pytest.mark.full
 def test_clean_rigs_raise_nothing(tmp_path: Path) -> None:
     assert [found for seed in range(6) for found in named(rig_of(tmp_path, seed))] == []
     assert named(run_rig(tmp_path, 0)) == ()
@@ -72,6 +74,7 @@ def test_at_most_5_percent_of_clean_rigs_raise_a_finding(tmp_path: Path) -> None
     assert np.mean([bool(named(run_rig(tmp_path, 500 + seed))) for seed in range(40)]) <= 0.05
 
 
+@pytest.mark.full
 def test_a_turned_sign_of_x_rel_is_called_a_sign(tmp_path: Path) -> None:
     rig = run_rig(tmp_path, 0)
     for index, table in enumerate(rig.tables):

@@ -63,6 +63,7 @@ def folder(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.full
 def test_check_reads_and_lints_it(site: Path, folder: Path) -> None:
     done = run(site, "check", str(folder))
     assert (done.returncode, done.stderr) == (0, "")
@@ -70,6 +71,7 @@ def test_check_reads_and_lints_it(site: Path, folder: Path) -> None:
     assert "warn: rolling_resistance: fewer than 6 speeds. Measure more." in done.stdout
 
 
+@pytest.mark.full
 def test_without_the_package_the_kind_is_unknown(folder: Path, tmp_path: Path) -> None:
     """The negative control."""
     done = run(tmp_path, "check", str(folder))
@@ -77,6 +79,7 @@ def test_without_the_package_the_kind_is_unknown(folder: Path, tmp_path: Path) -
     assert "unknown kind, 'rolling_resistance'" in done.stderr
 
 
+@pytest.mark.full
 def test_it_is_fitted_and_reported(site: Path, folder: Path, tmp_path: Path) -> None:
     """Independent route: the mean force over the weight."""
     done = run(site, str(folder), "--out", str(tmp_path / "out"), "--no-sample", "--quiet", name="fit_params")
@@ -146,6 +149,7 @@ def test_a_faulty_package_is_named(
     assert caught.value.remedy == "update the package rolling-rig, or uninstall it"
 
 
+@pytest.mark.full
 def test_a_built_in_kind_is_one_folder_and_one_line(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,7 @@ from tests.forced_runs import make, theta
 WILD = {"m2": 0.3, "k2": 56410.0, "c": 0.5, "mu": 0.2, "G": 0.5e-3, "I_d": 4.0}
 
 
+@pytest.mark.full
 def test_an_oscillator_in_a_heavy_capsule_has_its_closed_form() -> None:
     """Without contacts and sliding: the matrix exponential of m1 x'' + c x' + k1 x = drive. Y2 decays at once."""
     run = make(1, samples=400)
@@ -29,6 +30,7 @@ def test_an_oscillator_in_a_heavy_capsule_has_its_closed_form() -> None:
     assert growth(run, values | {"c": 1.0}) < 0.9 * known
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("number", "samples", "exact"), [(0, 600, 8837.3123), (2, 2000, 6407218.9), (3, 2000, 85943570.0)]
 )

@@ -75,6 +75,7 @@ def test_the_prior_that_the_text_of_an_aliased_decay_proposes_ends_the_finding(r
     assert found(bench.rig(coarse(rate), priors=stated), "decays.alias") == []
 
 
+@pytest.mark.full
 def test_a_sampling_that_cannot_show_the_usual_frequency_is_named() -> None:
     """An oscillation of 18.08 Hz sampled at 18.2 Hz has 150 samples per apparent period. Before: k1 = 0.065, trusted."""
 
@@ -91,6 +92,7 @@ def test_a_sampling_that_cannot_show_the_usual_frequency_is_named() -> None:
     assert decay_at(400.0) == []
 
 
+@pytest.mark.full
 def test_a_held_rod_before_the_release_is_left_out_of_the_rules_too(tmp_path: Path) -> None:
     """Before: "must pass its rest position at least 2 times, 1 in 8800 samples" of a record that check accepts."""
     rng, time = np.random.default_rng(0), np.arange(8800) / 2000.0
@@ -106,6 +108,7 @@ def test_a_held_rod_before_the_release_is_left_out_of_the_rules_too(tmp_path: Pa
         kind.check([bench.table("free_vibration", columns)])
 
 
+@pytest.mark.full
 def test_the_console_names_a_mass_that_is_probably_in_another_unit() -> None:
     """110 kg for 110 g: the frequency is right, so no check of the fit sees it. Before: in the report only."""
     facts = {"name": "m1 of [rig]", "value": 110.0, "unit": "kg", "low": 0.002, "high": 50.0, "meant": "g"}

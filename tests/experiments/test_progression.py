@@ -81,6 +81,7 @@ def test_the_likelihood_is_that_of_plain_runs(folder: Path) -> None:
         assert e.profile(THETA)(other) == pytest.approx(changed, abs=error * abs(changed - expected))
 
 
+@pytest.mark.full
 def test_a_scatter_and_what_it_scales_move_together(tmp_path: Path) -> None:
     """Two sessions whose frictions differ by the same, with a session sd that is five times too small."""
     synthesize_robot(tmp_path / "rig", 1, RobotDesign(1e-3 * np.array([60.0, 80.0, 100.0, 120.0]), np.full(4, 0.3)))
@@ -96,6 +97,7 @@ def test_a_scatter_and_what_it_scales_move_together(tmp_path: Path) -> None:
     assert np.all(_rescaled(target, _rescaled(target, u)) == pytest.approx(_rescaled(target, u), abs=0.16))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("sessions", "warned"), [(8, False), (9, True)])
 def test_more_sessions_than_parameters_are_named(tmp_path: Path, sessions: int, warned: bool) -> None:
     periods = 1e-3 * np.linspace(60.0, 100.0, 2 * sessions)

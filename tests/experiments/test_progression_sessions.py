@@ -36,6 +36,7 @@ from tests.experiments.summed_sessions import integrated
 from tests.inference.three_settings import THETA, three_settings
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lone", [(), (0,), (1, 3), pytest.param((0, 1, 2), marks=pytest.mark.slow)])
 def test_sums_over_groups_give_the_density_of_the_trials(lone: tuple[int, ...]) -> None:
     """Two settings in two sessions each, of which some are integrated out, against SciPy."""
@@ -68,6 +69,7 @@ def test_sums_over_groups_give_the_density_of_the_trials(lone: tuple[int, ...]) 
         np.testing.assert_allclose(found, np.sum(expected, axis=1, keepdims=True), rtol=1e-4)
 
 
+@pytest.mark.full
 def test_the_scatter_of_a_trial_follows_its_displacement() -> None:
     """A session that is integrated out, with trials near one end of what it can explain."""
     distance, z = np.array([-1.0, -1.04]), np.linspace(-6.0, 6.0, 2001)
@@ -119,6 +121,7 @@ def test_sessions_share_the_discrepancy_of_their_setting(discrepancy: float) -> 
         assert abs(alone - expected) > 0.1
 
 
+@pytest.mark.full
 def test_a_misfit_stays_where_no_friction_explains_the_readings(tmp_path: Path) -> None:
     (e,) = cast(list[Progression], make_experiments(three_settings(tmp_path / "rig")))
     (lone,) = np.flatnonzero(e.sessions.alone)
@@ -138,6 +141,7 @@ def test_a_misfit_stays_where_no_friction_explains_the_readings(tmp_path: Path) 
     assert np.min(residuals([-1.0, -0.5, 0.0, -0.5, -1.0])) > 5.0
 
 
+@pytest.mark.full
 def test_a_misfit_is_about_the_z_that_is_most_probable(tmp_path: Path) -> None:
     """Lines of 20 and 2 mm per sd of a session, and trials that scatter by 10 mm: the least cost by a fine sum over z."""
     three_settings(tmp_path)
@@ -159,6 +163,7 @@ def test_a_misfit_is_about_the_z_that_is_most_probable(tmp_path: Path) -> None:
         assert np.sum(rest[own] ** 2) + held == pytest.approx(least, rel=1e-2)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("sessions", [2, pytest.param(11, marks=pytest.mark.slow)])
 def test_an_outlying_trial_is_found(tmp_path: Path, sessions: int) -> None:
     """The columns of discrepancies span those of the parameters, which must not hide the trial."""
@@ -184,6 +189,7 @@ def test_an_outlying_trial_is_found_where_no_parameter_has_an_effect(
     assert found.row == 4
 
 
+@pytest.mark.full
 def test_a_known_session_moves_the_discrepancy_of_the_others() -> None:
     """One known session and two that are integrated out at one setting, another setting, and each of them left out."""
     rng, z = np.random.default_rng(3), np.linspace(-6.0, 6.0, 201)
@@ -203,6 +209,7 @@ def test_a_known_session_moves_the_discrepancy_of_the_others() -> None:
     np.testing.assert_allclose(np.asarray(trials.of_settings(0.0)), expected, rtol=1e-4)
 
 
+@pytest.mark.full
 def test_runs_between_the_outer_ones_matter(tmp_path: Path) -> None:
     """Sessions that differ by 20 %, against 41 exact runs of each; a line through the outer runs is worse."""
     design = RobotDesign(1e-3 * np.arange(60.0, 120.0, 5.0), np.full(12, 0.3), sessions=12, session_sd=0.2)
@@ -258,6 +265,7 @@ def test_a_session_with_several_settings_is_a_parameter() -> None:
     np.testing.assert_array_equal(found, [0, 1, 2, 3, 4, 5, 6, -1, -1, 7])
 
 
+@pytest.mark.full
 def test_a_run_is_emulated_by_the_friction_of_its_own_session() -> None:
     """Two sessions that are parameters and one that is integrated out, in the order of the runs."""
     rng = np.random.default_rng(2)
@@ -280,6 +288,7 @@ def test_a_run_is_emulated_by_the_friction_of_its_own_session() -> None:
     np.testing.assert_array_equal(changed, sessions.own[:, 0] > 0.0)
 
 
+@pytest.mark.full
 def test_the_table_of_sessions_has_the_numbers_of_the_file(tmp_path: Path) -> None:
     """The parameters are numbered from 1; the file's own sessions are not."""
     folder = tmp_path / "rig"

@@ -82,6 +82,7 @@ def test_a_delay_is_integrated_out_and_found() -> None:
     assert np.sum(np.square(rest)) < 0.05 * np.sum(np.square(plain))
 
 
+@pytest.mark.full
 def test_a_creeping_start_is_told_from_rest_by_the_whole_record() -> None:
     moving = theta(0)
     assert abs(moving["capsule_start"]) > 1e-3  # this run starts in motion

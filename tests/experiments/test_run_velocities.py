@@ -17,6 +17,7 @@ from capsule_id.synthetic import truth_beside
 NOISE = 20e-6
 
 
+@pytest.mark.full
 def test_the_record_lies_within_the_band_of_its_own_model(tmp_path: Path) -> None:
     """The band is the estimator's error alone; the record is the number that ``check`` prints.
 

@@ -66,6 +66,7 @@ def test_a_viscous_decay_keeps_its_model() -> None:
     assert second_models([own]) == ([own], [])
 
 
+@pytest.mark.full
 def test_false_alarms_are_rare() -> None:
     """Of 30 clean records none demands another model at a rate of 0.001."""
     rng = np.random.default_rng(8)
@@ -93,6 +94,7 @@ def test_what_the_record_holds_is_found(disturbance: np.ndarray, extra: dict[str
     )
 
 
+@pytest.mark.full
 def test_a_record_with_two_excitations_keeps_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
     """The finding on its readings stops the second fit; the line that the finding states brings it back."""
     whole = record(0.0, DRY)
@@ -133,6 +135,7 @@ def test_coloured_noise_is_found() -> None:
     assert second.model.symbols == ()
 
 
+@pytest.mark.full
 def test_the_lines_of_the_finding_state_the_quoted_model() -> None:
     (second,), (finding,) = second_models([record(0.0, DRY)])
     text = MESSAGES["decays.second_fit"].text("warn", finding.facts)
@@ -148,6 +151,7 @@ def test_the_lines_of_the_finding_state_the_quoted_model() -> None:
     assert second_models([own]) == ([own], [])
 
 
+@pytest.mark.full
 def test_stated_words_are_kept() -> None:
     words = {"damping": ("viscous",), "stiffness": "linear"}
     (second,), _ = second_models([record(0.0, DRY, **words)])
@@ -156,6 +160,7 @@ def test_stated_words_are_kept() -> None:
     assert second_models([own]) == ([own], [])
 
 
+@pytest.mark.full
 def test_the_console_says_that_the_model_is_another(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -102,6 +102,7 @@ def test_the_equilibrium_balances_the_weight(k_cubic: float) -> None:
     assert np.allclose(still.x_rel, expected, atol=1e-12)
 
 
+@pytest.mark.full
 def test_a_progression_on_a_slope_starts_at_equilibrium() -> None:
     columns = {"period": [0.06, 0.08], "duty": [0.3, 0.3], "periods": [4.0, 3.0], "distance": [1e-3, 2e-3]}
     table = bench.table(
@@ -150,6 +151,7 @@ def test_a_forced_run_on_a_slope_is_that_of_simulate() -> None:
     assert np.max(np.abs(level.X2 - expected.X2)) > 1e-4
 
 
+@pytest.mark.full
 def test_a_free_decay_on_a_slope_is_that_of_simulate() -> None:
     time = np.linspace(0.0, 0.3, 300)
     columns = [bench.column("time", time), bench.column("x_rel", bench.released(time, 5e-3))]

@@ -39,6 +39,7 @@ def fitted(kind: int, **ground: Quantity) -> PointFit:
     return point_fit(target_of(bench.rig(table, priors=known)), 0, 1)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("name", "kind"), CASES)
 def test_the_sd_of_mu_grows_as_the_delta_method_says(name: str, kind: int) -> None:
     """sd^2 = sd_exact^2 + (d mu/d stated)^2 sd_stated^2, the derivative from fits with exact values."""
@@ -88,6 +89,7 @@ def test_exact_and_sampled_slopes_stand_side_by_side() -> None:
     assert likelihood(loose, 0.0) != pytest.approx(likelihood(exact, 0.0), rel=1e-3)
 
 
+@pytest.mark.full
 def test_a_forced_run_moves_on_the_sampled_slope() -> None:
     exact, loose = (
         make_experiments(bench.rig(run_table(start="stuck", slope=slope)))[0]

@@ -55,6 +55,7 @@ def test_a_line_without_scatter_is_not_judged_and_the_remedy_ends_that(tmp_path:
         assert [f for f in stated.findings if f.code == code] == []
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rows", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_sample_of_a_tiny_table_ends_within_seconds(tmp_path: Path, rows: int) -> None:
     result = fit(tmp_path, motor(rows), 20_000)

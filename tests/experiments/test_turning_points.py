@@ -68,6 +68,7 @@ def test_ten_turning_points(tmp_path: Path, both: bool, extra: dict[str, float])
         assert wrong.values["c"] > 1.5 * FORCES["c"]
 
 
+@pytest.mark.full
 def test_times_without_scatter_have_the_error_of_their_digits(tmp_path: Path) -> None:
     """Times that are multiples of one period, as computed from it: without an error the maximum had no end."""
     _, x = turning_points(False, {}, 3)
@@ -85,6 +86,7 @@ def test_times_without_scatter_have_the_error_of_their_digits(tmp_path: Path) ->
     assert "0.01 s" in texts[0][0]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("time", "turning"),
     [
@@ -108,6 +110,7 @@ def test_a_record_of_amplitudes_alone_is_refused_with_its_place(
         assert abs(row["map"] - FORCES["c"]) < 4.0 * row["standard_error"]
 
 
+@pytest.mark.full
 def test_a_quarter_of_a_period_is_fitted_and_not_trusted(tmp_path: Path) -> None:
     """A viscous decay alone gives a number, and no further force can be excluded. (Before: refused.)"""
     time = np.linspace(0.0, 0.5, 60)
@@ -125,6 +128,7 @@ def test_turning_points_have_no_drift(tmp_path: Path) -> None:
         read_rig(folder(tmp_path, time, x, 'samples = "turning_points"\ndrift = "linear"'))
 
 
+@pytest.mark.full
 def test_an_uneven_record_has_no_estimate_by_the_paper(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     time = np.sort(rng.uniform(0.0, 12.0, 200))
@@ -149,6 +153,7 @@ def checked(e: TurningPoints) -> list[Finding]:
     return [finding for check in e.checks for finding in check([e], values)]
 
 
+@pytest.mark.full
 def test_the_fit_of_one_table_is_the_point_fit(tmp_path: Path) -> None:
     e = table_of(True, {"F_dry": 0.3}, 3, tmp_path, 'damping = "dry"')
     fit, theta = point_fit(LogPosterior(e.rig, [e]), 0), fitted(e)
@@ -156,6 +161,7 @@ def test_the_fit_of_one_table_is_the_point_fit(tmp_path: Path) -> None:
         assert theta[symbol] == pytest.approx(fit.values[symbol], abs=0.3 * fit.standard_errors[symbol])
 
 
+@pytest.mark.full
 def test_turning_points_without_misfit_pass(tmp_path: Path) -> None:
     """Sixteen tables: at most one finding above 3 joint sds, none above 4, and none demands another model."""
     tables = [table_of(both, {}, seed, tmp_path) for both in (True, False) for seed in range(8)]
@@ -166,6 +172,7 @@ def test_turning_points_without_misfit_pass(tmp_path: Path) -> None:
     assert TurningPoints.second_models(tables) == (tables, [])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("extra", "line"),
     [
@@ -201,6 +208,7 @@ def test_a_force_that_is_missing_is_added_or_named(tmp_path: Path, extra: dict[s
     assert checked(uncertain)[0].level == ("warn" if "k_cubic" in extra else "fail")
 
 
+@pytest.mark.full
 def test_a_force_that_another_one_replaces_is_not_chosen(tmp_path: Path) -> None:
     """Amplitudes a period apart show quadratic damping by 5 sds, and a cubic spring as much: neither is adopted alone."""
     tables = [table_of(False, {"c_q": 0.1}, seed, tmp_path) for seed in range(10)]
@@ -248,6 +256,7 @@ def test_small_and_stiff_motions_are_fitted(tmp_path: Path) -> None:
     assert theta["k1"] == pytest.approx(FORCES["k1"] / 7e-3**2, rel=5e-3)
 
 
+@pytest.mark.full
 def test_a_table_that_cannot_exclude_dry_friction_does_not_give_c(tmp_path: Path) -> None:
     """Six turning points of a weak decay; before, c was trusted."""
     rng = np.random.default_rng(0)

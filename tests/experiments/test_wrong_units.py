@@ -125,6 +125,7 @@ def heavy_and_light(folder: Path) -> Iterator[Rig]:
             yield read_rig(own, KINDS)
 
 
+@pytest.mark.full
 def test_light_and_heavy_benches_rarely_need_the_line(tmp_path: Path) -> None:
     asked = [rig for rig in heavy_and_light(tmp_path) if scales(rig)]
     assert len(asked) <= 6
@@ -139,6 +140,7 @@ def missed(rigs: Iterable[Rig]) -> list[tuple[str, str, float]]:
     return [(rig.name, scale, f) for (rig, scale, f), names in zip(slips, named, strict=True) if scale not in names]
 
 
+@pytest.mark.full
 def test_wrong_units_of_light_and_heavy_benches_are_named(tmp_path: Path) -> None:
     assert missed([*heavy_and_light(tmp_path)][::10]) == []
 
@@ -189,6 +191,7 @@ GRAMS_AS_KG = '{ value = 110, sd = 0.2, unit = "kg" }'
 RIGHT = '{ value = 110, sd = 0.2, unit = "g" }'
 
 
+@pytest.mark.full
 def test_the_fit_does_not_judge_a_mass_in_the_wrong_unit_until_it_is_confirmed(tmp_path: Path) -> None:
     """Before: k1 = 1.4e6 N/m for 1420, "trusted"."""
     fit = cid.fit(cid.read_rig(write(tmp_path / "rig", GRAMS_AS_KG)))
@@ -200,6 +203,7 @@ def test_the_fit_does_not_judge_a_mass_in_the_wrong_unit_until_it_is_confirmed(t
         assert cid.fit(cid.read_rig(write(tmp_path / "rig", m1, more))).trust == "trusted"
 
 
+@pytest.mark.full
 def test_a_wrong_unit_is_named_first_and_no_prior_is_proposed(tmp_path: Path) -> None:
     """Before: the prior that `check` and the fit proposed silenced every finding on times in ms labelled s."""
     rig = read_rig(write(tmp_path / "rig", RIGHT, times="ms as s"), KINDS)

@@ -47,6 +47,7 @@ def finding(zero: np.ndarray | float, forces: dict[str, float], step: float = 0.
     return check_zero([record], SimpleNamespace(values=values))  # type: ignore[arg-type]  # pyright: ignore
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("thin", [1, 3])
 def test_jumps_at_turning_points_are_named(thin: int) -> None:
     (found,) = finding(ZERO[HALF_SWING], VISCOUS, thin=thin)
@@ -59,11 +60,13 @@ def test_one_count_lost_in_two_swings_is_named() -> None:
     assert finding(rare[HALF_SWING], VISCOUS)[0].level == "fail"
 
 
+@pytest.mark.full
 def test_jumps_a_little_after_the_turning_point_are_named() -> None:
     later = np.round(2.0 * TIME / PERIOD - 0.09).astype(int)
     assert finding(ZERO[later], VISCOUS)[0].level == "fail"
 
 
+@pytest.mark.full
 def test_single_counts_of_an_encoder_are_named() -> None:
     """The jumps are as large as the step of the readings."""
     found = finding(ZERO[HALF_SWING], VISCOUS, step=COUNT)
@@ -71,6 +74,7 @@ def test_single_counts_of_an_encoder_are_named() -> None:
     assert finding(0.0, VISCOUS, step=COUNT)[0].level == "ok"
 
 
+@pytest.mark.full
 def test_a_rod_that_has_stopped_turns_no_more() -> None:
     """Dry friction stops it after five periods: its rate is that of rounding errors then."""
     forces = {**VISCOUS, "F_dry": 0.04 * bench.K1 * RELEASE}
@@ -78,6 +82,7 @@ def test_a_rod_that_has_stopped_turns_no_more() -> None:
     assert (found.level, 8 <= found.facts["half_swings"] <= 13) == ("fail", True)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "what", ["clean", "slow drift", "dry friction", "hysteresis", "falling hysteresis", "jumps between turning points"]
 )

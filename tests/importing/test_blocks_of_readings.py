@@ -57,6 +57,7 @@ def test_the_remedy_for_a_block_that_ends_reads_it(tmp_path: Path) -> None:
         rig(tmp_path, text, entry("data_from_line = 9\ndata_to_line = 168"))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("packed", [False, True])
 def test_import_reads_the_longest_block_and_names_all(tmp_path: Path, packed: bool) -> None:
     text = block(1, 70) + "\n" + block(2, 80)

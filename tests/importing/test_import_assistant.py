@@ -94,6 +94,7 @@ def test_the_entry_in_python_is_the_one_that_the_command_prints(
         capsule_id.propose_entry(tmp_path / "absent.csv")
 
 
+@pytest.mark.full
 def test_the_import_report_names_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     time = np.delete(np.arange(1200) * 1e-3, [300, 301, 302])
     x = np.round(np.minimum(3.6 * np.exp(-4.0 * time) * np.cos(113.0 * time), 2.5), 3)
@@ -271,6 +272,7 @@ def test_a_decay_that_is_pushed_near_its_end_is_not_sure_to_be_driven(
     assert 'kind = "forced_run"  # sure' in texts["driven"]
 
 
+@pytest.mark.full
 def test_decays_with_a_clock_of_their_own_each_are_decays_and_are_not_sorted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,6 +54,7 @@ def test_each_word_varies_its_own_choice(rig: Rig) -> None:
         variants_of(rig, ["lagg"])
 
 
+@pytest.mark.full
 def test_a_setting_left_out_has_the_conditional_density(rig: Rig) -> None:
     """p(y_b | y_rest) = p(y) / p(y_rest); the rest is also the experiment without the setting."""
     (e,) = cast(list[Progression], make_experiments(rig))

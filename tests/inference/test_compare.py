@@ -50,6 +50,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "weighted_draws", draws_near_the_truth)
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("drawn")
 def test_a_comparison_of_a_robot(rig: Rig) -> None:
     """The truth has the lag of 8 ms."""
@@ -65,6 +66,7 @@ def test_a_comparison_of_a_robot(rig: Rig) -> None:
     assert "direction is right in 3 of 3 settings" in choice.text
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("drawn")
 def test_two_progressions_are_named_in_the_predictions(rig: Rig) -> None:
     """The variants leave out the settings of both, one at a time."""
@@ -76,6 +78,7 @@ def test_two_progressions_are_named_in_the_predictions(rig: Rig) -> None:
     assert choice.table.loc["as stated", "elpd"] > choice.table.loc["no lag", "elpd"]
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("drawn")
 def test_the_models_that_the_readings_demand_are_compared(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a fit takes them from ``second_models``: here a stand-in leaves out one setting."""
@@ -206,6 +209,7 @@ def test_the_command_compares_by_points_where_nothing_is_to_be_sampled(
         assert capsys.readouterr().out.strip() == called
 
 
+@pytest.mark.full
 def test_too_few_settings_are_named(tmp_path: Path) -> None:
     synthesize_robot(tmp_path / "rig", 1, RobotDesign(PERIODS[:2], np.full(2, 0.3)))
     with pytest.raises(InputError, match="needs 3 settings or more in progression, 2 settings"):

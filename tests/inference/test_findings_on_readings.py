@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import pytest
+
 import capsule_id as cid
 from tests.cli_tools import small_rig
 
 
+@pytest.mark.full
 def test_a_file_that_is_entered_twice_is_not_clean(tmp_path: Path) -> None:
     folder = small_rig(tmp_path / "rig", tables=("motor_current",))
     assert cid.fit(cid.read_rig(folder), budget=None).clean

@@ -36,6 +36,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     return cast(Any, SimpleNamespace(rig=rig, registry=registry, posterior=posterior, observed=observed, fixed={}))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("draws", "seeds"), [(500, 60), pytest.param(1500, 120, marks=pytest.mark.slow)])
 def test_the_band_is_that_of_new_trials_in_new_sessions(result: Result, tmp_path: Path, draws: int, seeds: int) -> None:
     path = tmp_path / "settings.csv"

@@ -26,6 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.full
 def test_a_clean_rig_is_recovered_and_nothing_is_named(folder: Path) -> None:
     stage = small(folder)
     assert named_by(stage) == ""
@@ -39,6 +40,7 @@ def test_a_clean_rig_is_recovered_and_nothing_is_named(folder: Path) -> None:
     assert max(map(abs, z.values())) < 4.0, z
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("named", ["k2[medium]", pytest.param("mu", marks=pytest.mark.slow)])
 def test_a_planted_disagreement_is_named(named: str, tmp_path: Path) -> None:
     place = tmp_path / "rig"

@@ -25,6 +25,7 @@ def _fit(folder: Path, budget: int | None = None, leave_out: int | None = None, 
 
 
 # The masses are weighed to 0.01 g and the deflection is read to 1 mm: 1e-4 N against 0.29 mm.
+@pytest.mark.full
 @pytest.mark.parametrize(("settings", "with_it"), [({}, 26.37), ({"sd_ratio": quantity(0.34, "N/m")}, 27.08)])
 def test_the_mis_recorded_mass_is_flagged_by_its_line_and_kept(
     tmp_path: Path, settings: dict[str, str], with_it: float
@@ -60,6 +61,7 @@ def test_without_the_row_nothing_is_flagged(tmp_path: Path) -> None:
     assert result.clean
 
 
+@pytest.mark.full
 def test_the_posterior_is_the_textbook_one(tmp_path: Path) -> None:
     deflection, mass = coil_spring()
     line = stats.linregress(1e-2 * deflection, 9.81e-3 * mass)

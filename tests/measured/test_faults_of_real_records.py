@@ -24,6 +24,7 @@ def rig_of(folder: Path, record: tuple[np.ndarray, np.ndarray], settings: dict[s
     return make_rig(folder, entry, head={"m1": quantity(1.0, "kg", 0.01)})
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("run", [21337, 21338])
 def test_the_rest_before_the_release_of_the_ship_model_is_found(tmp_path: Path, run: int) -> None:
     rig = rig_of(tmp_path / "whole", ship_roll(run), {})
@@ -38,6 +39,7 @@ def test_the_rest_before_the_release_of_the_ship_model_is_found(tmp_path: Path, 
     assert rest == set()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("record", "start"), [(1, 0.24), (2, None), (3, 0.124)])
 def test_the_pendulum_has_no_fault_but_its_unit_and_the_hand_that_raises_it(
     tmp_path: Path, record: int, start: float | None
@@ -58,6 +60,7 @@ def test_the_pendulum_has_no_fault_but_its_unit_and_the_hand_that_raises_it(
     assert codes(rig_of(tmp_path / "cut", pendulum(record), cut)) == {"readings.magnitude"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("record", "start"), [(1, 3.2), (2, 2.3), (3, 2.0)])
 def test_a_later_start_of_the_pendulum_shows_no_clipping(tmp_path: Path, record: int, start: float) -> None:
     """Few levels repeat in a short record; record 3 sticks for 20 ms where it turns at -32.6 deg."""

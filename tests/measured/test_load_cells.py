@@ -42,6 +42,7 @@ def _fit(folder: Path, load: np.ndarray, counts: np.ndarray) -> Fit:
     return cid.fit(make_rig(folder, Entry("motor_current", "cell", columns)), budget=None)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("cell", "keep", "slope"), CELLS)
 def test_the_drop_out_is_flagged_and_the_slope_given_without_it(
     tmp_path: Path, cell: int, keep: int, slope: float
@@ -59,6 +60,7 @@ def test_the_drop_out_is_flagged_and_the_slope_given_without_it(
     assert line["±"] > 500.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("cell", "slope"), [(0, 997.1), (1, 1003.7)])
 def test_without_a_drop_out_the_calibration_is_clean(tmp_path: Path, cell: int, slope: float) -> None:
     load, counts, _ = _plateaus(cell, None)

@@ -56,6 +56,7 @@ def test_the_other_records_end_before_the_angle_is_small(record: int) -> None:
     assert min(np.min(np.abs(part)) for part in peaks) > np.deg2rad(30.0)
 
 
+@pytest.mark.full
 def test_the_part_that_is_fitted_has_small_angles(swing: Fit) -> None:
     (panel,) = swing.comparisons
     assert np.max(np.abs(panel.points[0].y)) < np.deg2rad(25.0)

@@ -44,6 +44,7 @@ def _peaks() -> tuple[np.ndarray, np.ndarray]:
     return time[index], np.abs(angle[index])
 
 
+@pytest.mark.full
 def test_the_hydrostatic_stiffness_comes_out(roll: Fit) -> None:
     assert ship_roll_stiffness() == pytest.approx(821.96, abs=0.005)  # as the authors print it
     k1 = roll.summary.loc["k1"]

@@ -3,6 +3,7 @@
 from itertools import groupby
 
 import numpy as np
+import pytest
 
 from capsule_id.motions.response import response
 from capsule_id.physics.drive import Excitation
@@ -19,6 +20,7 @@ def test_figure_10_counts_of_impacts_and_the_capsule_from_nearly_stationary_to_f
     np.testing.assert_allclose(MM * r.mean_velocity, [0.0083, 0.115, 0.271, 0.529], rtol=0.01)
 
 
+@pytest.mark.full
 def test_figure_8_is_period_one_at_every_frequency_and_forward_up_to_6_hz() -> None:
     f = np.linspace(2.5, 6.5, 10)
     r = response(CapsuleParameters(**RIG, k2=18960.0, G=1.5e-3), Excitation(4.0, 2.0 * np.pi * f))
@@ -29,6 +31,7 @@ def test_figure_8_is_period_one_at_every_frequency_and_forward_up_to_6_hz() -> N
     assert abs(MM * r.mean_velocity[-1] + 0.655) < 1e-3
 
 
+@pytest.mark.full
 def test_figure_6_is_period_one_at_every_stiffness_and_turns_three_times() -> None:
     k2 = np.linspace(1e3, 55e3, 109)
     r = response(CapsuleParameters(**RIG, k2=k2, G=1e-3), Excitation(4.0, 34.56))

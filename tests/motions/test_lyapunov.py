@@ -11,6 +11,7 @@ from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from tests.capsule_cases import Cases
 
 
+@pytest.mark.full
 def test_a_rod_on_a_capsule_that_sticks_contracts_as_its_damper_says() -> None:
     """The rate of the slower root: c/(2 m1) where the roots are complex, else (c - sqrt(c^2 - 4 k1 m1))/(2 m1)."""
     m1, k1, c = 0.11, 1420.0, np.array([3.89, 60.0])  # underdamped, overdamped
@@ -36,6 +37,7 @@ def _multiplier(p: CapsuleParameters, e: Excitation, start: np.ndarray, T: float
     return float(np.abs(np.linalg.eigvals(jacobian)).max())
 
 
+@pytest.mark.full
 def test_a_periodic_orbit_has_the_logarithm_of_its_largest_multiplier(cases: Cases) -> None:
     single = [cases.one(name) for name in ("fig10_Om_26.58", "fig11_Pd_2.05", "rand_46")]
     p, e, _ = jax.tree.map(lambda *leaves: np.array(leaves), *single)
@@ -49,6 +51,7 @@ def test_a_periodic_orbit_has_the_logarithm_of_its_largest_multiplier(cases: Cas
         assert abs(found[i] - np.log(multiplier) / T) * T < 0.02
 
 
+@pytest.mark.full
 def test_chaos_has_a_positive_exponent_which_is_the_rate_at_which_neighbours_part() -> None:
     p = CapsuleParameters(m1=0.11, m2=0.3, k1=1420.0, k2=56410.0, c=0.5, mu=0.2, v_s=0.3, G=0.5e-3)
     e, T = Excitation(8.0, 34.56), 2.0 * np.pi / 34.56

@@ -46,6 +46,7 @@ def test_the_best_point_of_a_parabola_has_the_spread_of_its_summit() -> None:
     assert abs(float(found["chosen"]) - summit.mean()) <= 0.5
 
 
+@pytest.mark.full
 def test_every_draw_is_the_response_of_its_parameters() -> None:
     k1, mu = np.array([1400.0, 1420.0, 1440.0]), np.array([0.6, 0.66, 0.7])
     p = CapsuleParameters(m1=0.11, m2=0.53, k1=k1, k2=18960.0, c=3.89, mu=mu, v_s=0.3, G=1e-3)

@@ -21,6 +21,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.full
 def test_a_slow_transient_is_not_settled() -> None:
     """Of c = 0.02 N s/m 0.7 % of the start is left after 300 periods. (Before: "aperiodic", and an exponent below 0.)"""
     p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=0.02, mu=0.66, v_s=0.3, G=0.1)
@@ -33,6 +34,7 @@ def test_a_slow_transient_is_not_settled() -> None:
     assert response(p, e, settling=Settling(exponent_periods=0)).label == "aperiodic"  # nothing contradicts it
 
 
+@pytest.mark.full
 def test_labels_and_mean_velocities_of_the_reference_cases(cases: Cases) -> None:
     r = response(cases.p, cases.e)
     np.testing.assert_array_equal(r.label, [case["label"] for case in cases.raw])
@@ -101,6 +103,7 @@ def _contacts_a_period(
     return [int(((closings > T) & (closings - before >= least)).sum()) for least in merge]
 
 
+@pytest.mark.full
 def test_contacts_parted_by_less_than_the_stated_time_are_one(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_51.05")
     settled, merge = settle(p, e), (0.0, 4e-3, 8e-3, 2e-2)
@@ -122,6 +125,7 @@ def test_work_of_the_drive_is_what_damper_and_friction_take(cases: Cases) -> Non
         np.testing.assert_allclose(seen.work_per_period[i], balance.damper + balance.friction, rtol=1e-6)
 
 
+@pytest.mark.full
 def test_settled_state_starts_the_same_motion_again(cases: Cases) -> None:
     seen = settle(cases.p, cases.e)
     again = settle(cases.p, cases.e, seen.end, Settling(dropped=0, observed=3))

@@ -49,6 +49,7 @@ def test_a_diagram_is_the_responses_value_by_value() -> None:
     np.testing.assert_allclose(data["efficiency"][0] * r.work_per_period, r.mean_velocity * 2.0 * np.pi / 34.56)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("e", [GENERAL_E, PULSES], ids=["harmonic", "pulses"])
 def test_every_quantity_can_be_swept(e: Excitation | Pulses) -> None:
     """Each one moves the motion, and leaves as attributes all the others."""
@@ -77,6 +78,7 @@ def test_a_frequency_is_that_of_the_drive() -> None:
         diagram(P, PULSES, "P_d", [1.0])
 
 
+@pytest.mark.full
 def test_continuation_follows_a_motion_to_where_rest_does_not_lead_and_shows_what_coexists() -> None:
     values = np.linspace(4.0, 5.5, 9)
     data = continuation(LIGHT, E, "P_d", values, settling=QUICK)
@@ -94,6 +96,7 @@ def test_continuation_follows_a_motion_to_where_rest_does_not_lead_and_shows_wha
         )
 
 
+@pytest.mark.full
 def test_many_starts_find_the_motions_that_coexist() -> None:
     starts = spread_starts(LIGHT, E, 12)
     assert [float(x[0]) for x in starts] == [0.0, 0.0, 0.0, 0.0]
@@ -118,6 +121,7 @@ def test_basins_agree_with_the_motions_from_the_same_starts() -> None:
     assert int(data["attractors"]) == data["attractor"].to_numpy().max() + 1 == len(np.unique(data["label"]))
 
 
+@pytest.mark.full
 def test_two_parameter_map_is_its_points_and_goes_through_a_file(tmp_path: Path) -> None:
     over = {"k2": np.linspace(1e3, 55e3, 5), "f": np.linspace(3.0, 6.5, 4)}
     data = motion_map(P, E, over, settling=QUICK)

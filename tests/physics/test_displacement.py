@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drive import Excitation
@@ -33,6 +34,7 @@ def test_it_is_the_end_of_a_plain_run() -> None:
         np.testing.assert_array_equal(found.status, plain.status)
 
 
+@pytest.mark.full
 def test_derivatives_are_those_of_the_displacement() -> None:
     def X2(theta: jax.Array) -> jax.Array:
         k1, mu, P_on, lag = theta
@@ -60,6 +62,7 @@ def test_a_factor_scales_any_law_alike() -> None:
             np.testing.assert_allclose(getattr(made, direction)(speed), expected, rtol=1e-14)
 
 
+@pytest.mark.full
 def test_a_run_that_cannot_start_has_no_displacement() -> None:
     drive = Pulses(P_on=-1.2, period=PERIOD, duty=0.3, lag=np.array([0.008, -1.0, 0.008, 0.008, 0.008]))
     found = displacement(P, drive, friction_law(P), PERIOD, COUNT)

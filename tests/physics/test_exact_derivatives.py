@@ -71,6 +71,7 @@ def test_every_leaf_of_every_reference_case_against_central_differences(cases: C
         assert worst.max() < RELATIVE, (cases.raw[i]["name"], dict(zip(LEAVES, worst, strict=True)))
 
 
+@pytest.mark.full
 def test_without_the_event_correction_the_friction_derivative_is_wrong(
     cases: Cases, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,6 +110,7 @@ def test_without_the_event_correction_the_friction_derivative_is_wrong(
     assert error[0] > 0.1
 
 
+@pytest.mark.full
 def test_transformations_agree(cases: Cases) -> None:
     """jvp of a batch and vmap of the jvp of a lane are the same numbers, and the primal is what simulate gives."""
     theta, times = thetas(cases)[:3], np.linspace(0.0, 0.2, 5)
@@ -122,6 +124,7 @@ def test_transformations_agree(cases: Cases) -> None:
     np.testing.assert_allclose(states, run(theta.T, times)[0], rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.full
 def test_samples_move_with_their_time(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_20")
     times = np.array([0.0, 0.31, 0.77, 1.0]) * T
@@ -133,6 +136,7 @@ def test_samples_move_with_their_time(cases: Cases) -> None:
     np.testing.assert_allclose(rate[1:], states_of(simulate(p, e, times))[1:, 1], rtol=1e-7)
 
 
+@pytest.mark.full
 def test_grazing_is_flagged_and_its_derivative_stays_finite() -> None:
     """An undamped rod on a capsule that cannot move swings just beyond the gap: the flag tells how closely."""
     m1, k1, G = 0.1, 1000.0, 1e-3

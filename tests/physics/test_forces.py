@@ -32,6 +32,7 @@ SMOOTHED: dict[str, Callable[[jax.Array, float], jax.Array]] = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SMOOTHED)
 def test_derivatives_are_right_for_every_width_and_argument(name: str) -> None:
     derivative = jax.jit(jax.vmap(jax.grad(SMOOTHED[name]), in_axes=(0, None)))
@@ -117,6 +118,7 @@ def test_force_gate_is_blind_to_velocity() -> None:
     np.testing.assert_allclose(force_gate(LAW, F_B, f, 0.05), [1.0, 0.5, 0.0, 0.0, 0.0, 0.5, 1.0], atol=1e-14)
 
 
+@pytest.mark.full
 def test_no_friction_gives_no_force_and_finite_derivatives() -> None:
     def held(mu: jax.Array, Y2: jax.Array, f: jax.Array) -> jax.Array:
         law = CoulombStribeck(mu, jnp.asarray(6.0), jnp.asarray(0.3))

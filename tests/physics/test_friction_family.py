@@ -52,6 +52,7 @@ def test_each_parameter_changes_the_motion_in_both_engines(leaf: str) -> None:
     assert smooth == pytest.approx(exact, rel=0.02)
 
 
+@pytest.mark.full
 def test_mu_back_is_as_mu_by_default_and_a_number_of_its_own_otherwise() -> None:
     """The derivative in mu moves both directions by default; it holds a stated mu_back."""
 

@@ -118,6 +118,7 @@ def test_eq_1_without_its_own_recursion_is_the_same_motion(cases: Cases) -> None
     np.testing.assert_array_equal(slow.status, Status.OK)
 
 
+@pytest.mark.full
 def test_a_recursion_of_a_law_is_used_and_a_wrong_one_is_seen() -> None:
     """The negative control: the same values with slopes that are 1 % off miss the motion of the functions of speed."""
     times = np.linspace(0.0, 4.0 * T, SAMPLES)
@@ -144,6 +145,7 @@ def test_the_general_reference_case_that_differs_by_friction_alone() -> None:
     assert int(t.contacts[0]) == case["front_closings"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "law",
     [
@@ -220,6 +222,7 @@ def test_lanes_of_a_batch_of_laws_do_not_depend_on_each_other() -> None:
     assert np.ptp(np.asarray(batch.X2[:, -1])) > 1e-5
 
 
+@pytest.mark.full
 def test_the_smoothed_engine_takes_the_same_law() -> None:
     law, times = in_a_batch(LORENTZIAN), np.linspace(0.0, 4.0 * T, SAMPLES)
     exact = simulate(P, E, times, friction=law)
@@ -233,6 +236,7 @@ def test_the_smoothed_engine_takes_the_same_law() -> None:
 OWN = replace(P, mu=0.66, v_s=0.3)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "law",
     [
@@ -248,6 +252,7 @@ def test_response_takes_a_law(law: FrictionLaw) -> None:
     assert seen.work_per_period == pytest.approx(expected.work_per_period, rel=1e-8)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "law",
     [

@@ -54,6 +54,7 @@ def directions(e: Any) -> list[tuple[str, CapsuleParameters, Any]]:
     return found
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "kind", ["pulses", *(pytest.param(kind, marks=pytest.mark.slow) for kind in DRIVES if kind != "pulses")]
 )

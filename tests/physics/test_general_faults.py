@@ -85,6 +85,7 @@ def study(seed: int, n: int) -> None:
     check(p, RodMotion(times, 1e-3 * values, 1e-2 * values), period, whole)
 
 
+@pytest.mark.full
 def test_a_few_absurd_sets() -> None:
     rng = np.random.default_rng(0)
     p, period = random_sets(rng, 256)

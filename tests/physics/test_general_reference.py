@@ -29,6 +29,7 @@ def test_every_period_end_of_every_case(kind: str) -> None:
     np.testing.assert_array_equal(t.contacts_back, batch.closings[1])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["pulses", *(pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS)])
 def test_what_is_absent_is_left_out_without_a_change(kind: str) -> None:
     """A single case compiles without its absent terms; the batch of all cases has every term."""

@@ -76,6 +76,7 @@ def test_a_lane_is_the_same_to_the_last_bit_wherever_it_stands(monkeypatch: pyte
     batches.pool.cache_clear()
 
 
+@pytest.mark.full
 def test_jit_and_vmap_give_the_same_motion(cases: Cases) -> None:
     p = spread(3)
     plain = states_of(simulate(p, E, TIMES))

@@ -49,6 +49,7 @@ def test_a_single_run_is_that_of_a_batch(cases: Cases, n: int) -> None:
     assert int(one.contacts) == both.contacts[0] > 0
 
 
+@pytest.mark.full
 def test_a_single_run_with_a_recorded_drive() -> None:
     batch = read_general_cases("recorded").one(1)
     assert batch.times.shape[0] == 1
@@ -71,6 +72,7 @@ class Scattered:
     backward = forward
 
 
+@pytest.mark.full
 def test_a_law_of_the_user_may_hold_any_operation() -> None:
     p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)
     t = simulate(p, E, np.linspace(0.0, 0.4, 20), friction=Scattered(2.0))
@@ -88,6 +90,7 @@ class ScatteredForce(RecordedDrive):
         return begin, value * jnp.zeros(2).at[jnp.ravel(index) % 1].add(1.0)[0], slope
 
 
+@pytest.mark.full
 def test_no_part_of_the_user_is_put_into_one_function() -> None:
     """A law inside another one, and a drive: XLA refused both."""
     p = CapsuleParameters(m1=0.11, m2=0.53, k1=1420.0, k2=18960.0, c=3.89, mu=0.66, v_s=0.3, G=1e-3)

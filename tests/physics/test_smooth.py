@@ -34,6 +34,7 @@ def _mean_velocity_error(cases: Cases, smoothing: Smoothing) -> np.ndarray:
     return error / (0.02 * np.abs(exact) + 1e-6)
 
 
+@pytest.mark.full
 def test_default_widths_are_certified_on_every_reference_case(cases: Cases) -> None:
     error = _mean_velocity_error(cases, Smoothing())
     assert error.max() < 0.5
@@ -82,6 +83,7 @@ def _tanh_field(system: smooth.System, piece: jnp.ndarray | None = None) -> smoo
     return field
 
 
+@pytest.mark.full
 def test_switch_in_velocity_alone_turns_the_capsule_round(cases: Cases, monkeypatch: pytest.MonkeyPatch) -> None:
     p, e, T = cases.one("fig6_k2_20")
     widths = replace(FINE, velocity=1e-2)
@@ -97,6 +99,7 @@ def test_switch_in_velocity_alone_turns_the_capsule_round(cases: Cases, monkeypa
     assert abs(float(ours.X2[-1]) - truth) < 0.2 * abs(float(tanh.X2[-1]) - truth)
 
 
+@pytest.mark.full
 def test_eq2_converges_to_another_motion(cases: Cases) -> None:
     p, e, T = cases.one("fig11_Pd_1.5")
     e = replace(e, P_d=1.4)
@@ -194,6 +197,7 @@ def test_bad_lanes_say_so_and_leave_the_others_alone(cases: Cases) -> None:
     assert int(t.steps[3]) == 100
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("change", [{"mu": 0.0}, {"c": 0.0}, {"G": 0.0}, {"k1": 0.0}, {"g": 0.0}, {"k2": 0.0}])
 def test_zero_parameters_run(cases: Cases, change: dict[str, float]) -> None:
     p, e, T = cases.one("fig6_k2_20")
@@ -224,6 +228,7 @@ class _Viscous:
     backward = forward
 
 
+@pytest.mark.full
 def test_a_law_of_ones_own_needs_no_change_of_the_engine() -> None:
     # The rod moves with the capsule (rigid spring at rest length): m v' = -(F + b v), in closed form.
     m, v0 = 0.64, 0.4

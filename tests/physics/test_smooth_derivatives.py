@@ -53,6 +53,7 @@ def _central(function: Callable[[Any], jax.Array], inputs: Any, i: int, step: fl
     return (at(step) - at(-step)) / (2.0 * step)
 
 
+@pytest.mark.full
 def test_reverse_mode_is_forward_mode(inputs: Any) -> None:
     coarse = (*inputs[:3], replace(inputs[3], tolerance=jnp.asarray(2e-5)), inputs[4])
     for case in (inputs, coarse):
@@ -61,6 +62,7 @@ def test_reverse_mode_is_forward_mode(inputs: Any) -> None:
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(np.asarray(b)).max(), err_msg=name)
 
 
+@pytest.mark.full
 def test_every_leaf_against_central_differences(inputs: Any) -> None:
     gradient = jax.tree.leaves(_grad(inputs))
     leaves = jax.tree.leaves(inputs)
@@ -82,6 +84,7 @@ def test_derivatives_in_the_times(inputs: Any) -> None:
         assert gradient[j] == pytest.approx(_central(_value, inputs, len(_names(inputs)) - 1, 1e-6, j), rel=1e-4)
 
 
+@pytest.mark.full
 def test_derivatives_tend_to_those_of_the_exact_model(cases: Cases) -> None:
     p, e, T = cases.one("fig6_k2_30")
     # Within the first period, before the second impact: the smoothed switch changes the slope by its width only.
@@ -140,6 +143,7 @@ def test_second_derivatives_are_refused(cases: Cases) -> None:
         jax.grad(jax.grad(advance))(0.66)
 
 
+@pytest.mark.full
 def test_frictionless_rest_has_finite_derivatives() -> None:
     p = CapsuleParameters(0.11, 0.53, 1420.0, 18960.0, 3.89, 0.0, 0.3, 1e-3)
 

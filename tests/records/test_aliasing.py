@@ -114,6 +114,7 @@ def words(aliased: bool, jitter: str, number: int) -> list[tuple[str, float]]:
     return found
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("number", [10, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("jitter", ["none", "less", "more"])
 def test_aliased_records_are_not_trusted_and_others_are(jitter: str, number: int) -> None:

@@ -39,6 +39,7 @@ def estimates(seeds: range, noise: float = NOISE) -> list[Clock]:
     return found
 
 
+@pytest.mark.full
 def test_offset_and_drift_of_twenty_twins() -> None:
     found = estimates(range(TWINS))
     z = np.array([[(c.offset - OFFSET) / c.offset_sd, (c.drift - DRIFT) / c.drift_sd] for c in found])

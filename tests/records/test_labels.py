@@ -38,6 +38,7 @@ def test_reference_cases_have_the_label_of_the_model() -> None:
     assert list(found.values()).count("right") >= 21
 
 
+@pytest.mark.full
 def test_longer_periods_and_aperiodic_motions() -> None:
     found = outcomes(longer())
     assert wrong(found) == {}
@@ -69,6 +70,7 @@ def test_the_record_places_the_impact_line() -> None:
     assert np.sqrt(np.mean(np.square(pulls))) < 2.0
 
 
+@pytest.mark.full
 def test_ten_times_the_noise_makes_no_label_wrong() -> None:
     """The period shows through ten times the noise, most contacts do not: 25 labels of 0.9 or more, about 0.2 wrong."""
     motions = {case.name: case.motion(10.0) for case in reference()}
@@ -103,6 +105,7 @@ def test_cycles_that_scatter_by_one_percent_have_their_label() -> None:
     assert found.count(UNDECIDED) <= 1
 
 
+@pytest.mark.full
 def test_periods_of_motions_on_which_no_setting_was_chosen() -> None:
     """Of 498 such records, 97 % of the labels with p in 0.9 to 0.99 were right, 98 % of those above, 7 % undecided."""
     records = [record for seed in range(5) for record in fresh(seed)]

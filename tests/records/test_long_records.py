@@ -92,6 +92,7 @@ def test_repeated_blocks(short_pieces: Callable[[pytest.MonkeyPatch], None]) -> 
     assert (found.label, found.row, found.first_row, found.count) == ("b", 0, 1234, 1111)
 
 
+@pytest.mark.full
 def test_lost_samples_release_and_frequency(short_pieces: Callable[[pytest.MonkeyPatch], None]) -> None:
     x = np.delete(record(9), np.arange(1500, 1513))
     whole = cast(Jump, jump_or_noise(x, PERIOD))

@@ -26,6 +26,7 @@ def noise(seed: int, sd: float = NOISE_SD) -> np.ndarray:
     return sd * np.random.default_rng(seed).standard_normal(len(TIME))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 8, 11])
 def test_the_period_is_the_smallest_that_repeats(n: int) -> None:
     for seed in range(20):
@@ -60,6 +61,7 @@ def test_noise_limits_the_visible_part() -> None:
     assert find_period(TIME, motion(2) + noise(4, 2e-3), T).reason.startswith("noise: its standard deviation is")
 
 
+@pytest.mark.full
 def test_no_false_second_period_in_noise() -> None:
     assert {find_period(TIME, motion(1) + noise(seed), T).period for seed in range(300)} == {1}
 

@@ -13,6 +13,7 @@ from tests.records.test_fault_detectors import PERIOD, RATE, TIME, decay, encode
 from tests.release_records import FORMS, draw
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("held", [True, False])
 def test_the_release_is_found_after_rest(held: bool) -> None:
     before = 1.3
@@ -47,6 +48,7 @@ def test_a_release_after_a_hold_is_found(before: float, hold: float) -> None:
     assert cast(FreeDecay, find_free_decay(TIME, slow, displacement=True)).start == 0.0
 
 
+@pytest.mark.full
 def test_a_record_that_begins_with_the_release_has_no_rest() -> None:
     for make in (decay, encoder):
         found = cast(FreeDecay, find_free_decay(TIME, make()))
@@ -66,6 +68,7 @@ def tapped(blow: float) -> tuple[np.ndarray, np.ndarray]:
     return time, waves @ size + 0.003 * np.random.default_rng(0).standard_normal(len(time))
 
 
+@pytest.mark.full
 def test_a_free_decay_after_a_tap_begins_when_its_fast_modes_have_died_out() -> None:
     """Before: "the energy grows after 0.107 s", and a stop that left the tap alone."""
     found = cast(FreeDecay, find_free_decay(*tapped(1.0)))
@@ -86,6 +89,7 @@ def pushed(slowing: float, release: float = 0.3 * PERIOD) -> np.ndarray:
     return np.concatenate([2.0 * np.cos(rise) + 0.02 * np.random.default_rng(2).standard_normal(len(rise)), free])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("slowing", [1.0, 1.4])
 def test_a_slow_push_to_the_first_turning_point_is_no_free_decay(slowing: float) -> None:
     time, values = TIME[:800], pushed(slowing)
@@ -100,6 +104,7 @@ def test_a_slow_push_to_the_first_turning_point_is_no_free_decay(slowing: float)
     assert not other.pushed
 
 
+@pytest.mark.full
 def test_a_decay_recorded_from_any_phase_is_not_pushed() -> None:
     """Viscous, dry, quadratic damping and cubic springs, in white and correlated noise."""
     rng = np.random.default_rng(0)
@@ -124,6 +129,7 @@ def test_a_drift_of_the_zero_is_no_rest() -> None:
         assert (found.start, found.rest) == (0.0, 0.0)
 
 
+@pytest.mark.full
 def test_a_second_excitation_ends_the_decay() -> None:
     values = np.concatenate([decay(1)[:500], decay(2)])
     time = np.arange(len(values)) / RATE
@@ -157,6 +163,7 @@ def test_the_release_is_found_whatever_comes_before_it(form: str, coarse: bool, 
     assert sum(near) >= least * number
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("number", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_record_from_behind_the_release_on_keeps_its_samples(number: int) -> None:
     """Negative control: of 60 records at most two lose more than two samples."""

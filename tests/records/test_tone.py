@@ -22,6 +22,7 @@ def replicates() -> list[Harmonic]:
     return [fit_harmonic(TIME, tone(rng), OMEGA) for _ in range(REPLICATES)]
 
 
+@pytest.mark.full
 def test_standard_errors_are_calibrated(replicates: list[Harmonic]) -> None:
     truth = {"Omega": OMEGA, "amplitude": AMPLITUDE, "phase": PHASE}
     for name, value in truth.items():

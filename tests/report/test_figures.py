@@ -184,6 +184,7 @@ def test_a_script_without_glyphs_is_no_failure(result: Result) -> None:
     assert png(figures.comparison_figure(item))
 
 
+@pytest.mark.full
 def test_synthetic_mark_changes_every_picture(result: Result, drawn: tuple[Picture, ...]) -> None:
     real = dataclasses.replace(result, rig=dataclasses.replace(result.rig, synthetic=False))
     for marked, plain in zip(drawn, pictures(real), strict=True):

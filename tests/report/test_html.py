@@ -219,6 +219,7 @@ def test_synthetic_is_said_loudly_and_only_when_true(page: str, unclean: Result)
     assert "ynthetic" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", render(unclean, ()))
 
 
+@pytest.mark.full
 def test_point_fit_only(unsampled: Result) -> None:
     text = Page(render(dataclasses.replace(unsampled, findings=()), pictures(unsampled))).text
     assert "nothing was sampled" in text

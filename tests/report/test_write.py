@@ -58,6 +58,7 @@ def _strict(text: str) -> dict:
     return json.loads(text, parse_constant=refuse)
 
 
+@pytest.mark.full
 def test_files(folder: Path, result: Result) -> None:
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     figures = {name for name in names if name.startswith("figures/")}
@@ -165,6 +166,7 @@ def test_a_column_declared_once_is_in_every_output(
             assert table.loc["k1", "z_paper"] == pytest.approx(row["paper"] - row["mean"], rel=1e-12)
 
 
+@pytest.mark.full
 def test_point_fit_only_is_null_and_has_no_posterior(unsampled: Result, tmp_path: Path) -> None:
     write_result(unsampled, tmp_path)
     assert not (tmp_path / "posterior.nc").exists()
@@ -317,6 +319,7 @@ def test_every_label_keeps_its_readings(result: Result, tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_prior[f"noise_sd[{label}]"], prior[f"noise_sd[{label}]"])
 
 
+@pytest.mark.full
 def test_a_long_label_does_not_make_a_long_file_name(result: Result, tmp_path: Path) -> None:
     long = [
         dataclasses.replace(item, label=letter * 300) for item, letter in zip(result.comparisons, "aab", strict=False)

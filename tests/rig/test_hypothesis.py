@@ -61,6 +61,7 @@ def assert_located(error: InputError, folder: Path) -> None:
         assert 1 <= error.line <= len(lines) + 1
 
 
+@pytest.mark.full
 @QUICK
 @given(entries=st.dictionaries(st.sampled_from(KEYS), values(), min_size=1, max_size=3), mapped=st.booleans())
 def test_any_value_at_any_key(

@@ -4,6 +4,8 @@ import random
 import re
 from pathlib import Path
 
+import pytest
+
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
@@ -88,6 +90,7 @@ def outcome(folder: Path) -> InputError | None:
     return None
 
 
+@pytest.mark.full
 def test_spoiled_folders_read_or_are_refused(tmp_path: Path) -> None:
     chance = random.Random(20)
     contents = {name: text.encode() for name, text in {"rig.toml": RIG_TOML, **TABLES}.items()}

@@ -93,6 +93,7 @@ def test_a_clean_rig_fails_nothing(clean: list[Finding]) -> None:
     assert [f.code for f in clean if f.level == "warn"] == ["chains.converged"]  # no sample was drawn
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("fault", "code", "experiment", "words"),
     [
@@ -116,6 +117,7 @@ def test_planted_faults_are_named(
     assert [f.level for f in clean if f.code == code] == ["ok"]
 
 
+@pytest.mark.full
 def test_an_unconverged_budget_is_named(tmp_path: Path) -> None:
     """60 steps are not enough for anything: no number is judged, and the finding names them."""
     synthesize(tmp_path / "rig", SEED)
@@ -137,6 +139,7 @@ def at_truth(line: Line) -> dict[str, float]:
     return {line.slope.symbol: TRUTH.flat()[line.slope.name], "scatter": scatter, "m1": 0.11, "m2": 0.53, "g": 9.81}
 
 
+@pytest.mark.full
 def test_tests_of_lines_keep_their_level(tmp_path: Path) -> None:
     """At 10 % both tests raise a false alarm in about 10 % of 120 clean rigs with four lines each."""
     bent, struck = [], []

@@ -69,6 +69,7 @@ def nearly_constant(folder: Path) -> Rig:
     return sliding(folder, speed, 0.5 * (1.0 + 0.04 * np.random.default_rng(5).standard_normal(6)))
 
 
+@pytest.mark.full
 def test_the_quoted_number_and_the_curve_follow_the_readings_of_nearly_constant_friction(tmp_path: Path) -> None:
     """All starts but the sample's end at a maximum of no weight, 16 sd off; before, the curve was that of this maximum."""
     result = cid.fit(nearly_constant(tmp_path))
@@ -81,6 +82,7 @@ def test_the_quoted_number_and_the_curve_follow_the_readings_of_nearly_constant_
     assert {f.code for f in result.findings if f.level == "fail"} == {"friction.variants", "trials.order"}
 
 
+@pytest.mark.full
 def test_a_maximum_away_from_the_sample_fails_and_names_both(tmp_path: Path) -> None:
     """Negative control: the check as it sees the fit before the maximum is corrected."""
     rig = nearly_constant(tmp_path)
@@ -134,6 +136,7 @@ def test_two_modes_fail_with_their_weights(tmp_path: Path) -> None:
     assert finding_text(found, FIT_MESSAGES).count("with weight 0.50") == 2
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["tilt", "push"])
 def test_a_single_row_gives_a_number_without_a_failure(tmp_path: Path, kind: str) -> None:
     entries = {
@@ -144,6 +147,7 @@ def test_a_single_row_gives_a_number_without_a_failure(tmp_path: Path, kind: str
     assert [f.code for f in result.findings if f.level == "fail"] == []
 
 
+@pytest.mark.full
 def test_the_rack_gives_a_coefficient_within_its_readings(tmp_path: Path) -> None:
     """Six averages of a rack: before, mu = 1.09 ± 0.085 beside 0.759 ± 0.022, verdict clean."""
     speed, coefficient = rack_friction()

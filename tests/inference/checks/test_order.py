@@ -46,6 +46,7 @@ def test_trials_in_order_are_named_and_in_random_order_pass(tmp_path: Path) -> N
     assert [f.level for f in shuffled.findings if f.code == "trials.order"] == ["ok"]
 
 
+@pytest.mark.full
 def test_false_alarms_and_the_factor_of_tables_that_differ() -> None:
     rng = np.random.default_rng(1)
     p = [between([rng.standard_normal(n) for n in (5, 4, 12)])[1] for _ in range(200)]
@@ -83,6 +84,7 @@ def pulls(folder: Path, mu: tuple[float, ...]) -> Fit:
     return cid.fit(cid.read_rig(folder), budget=None)
 
 
+@pytest.mark.full
 def test_tables_of_one_surface_that_disagree_are_named(tmp_path: Path) -> None:
     """A friction that grows with the load (before: mu = 0.200 ± 0.012, trusted; by table 0.16, 0.18 and 0.25)."""
     result = pulls(tmp_path / "grows", (0.162, 0.177, 0.2525))
@@ -194,6 +196,7 @@ def test_readings_that_repeat_off_the_line_fail(tmp_path: Path) -> None:
     assert clean.clean
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rows", [4, 8])
 def test_the_error_that_a_check_of_loads_states_is_seen_in_8_of_10_cases(rows: int) -> None:
     """Pulls in proportion to loads from 1 to 4, and a constant force beside them, in units of the scatter."""

@@ -53,6 +53,7 @@ def shares(make: Callable[[int], Twin], number: int) -> dict[str, float]:
     return {name: float(np.mean([p[name] < 0.05 for p in found])) for name in STATISTICS}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("make", [line, decay])
 def test_clean_twins_have_small_p_values_as_often_as_they_should(make: Callable[[int], Twin]) -> None:
     """20 twins: at most 20 %. The study of 200 is slow."""
@@ -65,6 +66,7 @@ def test_of_200_clean_twins_2_to_9_percent_have_a_small_p_value(make: Callable[[
     assert all(0.02 <= share <= 0.09 for share in shares(make, 200).values())
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("make", "statistic"),
     [
@@ -95,6 +97,7 @@ def finding_of(made: Twin) -> Finding:
     return check_statistics(cast(Any, SimpleNamespace(experiments=(e,), values={**values, **named}, flagged={})))[0]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("made", "level", "statistic"),
     [
@@ -114,6 +117,7 @@ def test_slow_residuals_fail_and_a_large_one_is_a_warning(
         assert found.facts["statistic"] in (statistic, "trend")
 
 
+@pytest.mark.full
 def test_a_modelled_drift_explains_slow_residuals() -> None:
     e, values = decay(0)
     drifting = cast(FreeVibration, e).with_model(DecayModel(drift="gp"))

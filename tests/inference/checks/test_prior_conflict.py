@@ -47,6 +47,7 @@ def test_the_distance_is_that_of_prior_and_least_squares() -> None:
     assert found.z == pytest.approx(np.log(value / 2.0) / np.hypot(sd / value, WIDTH), rel=0.08)
 
 
+@pytest.mark.full
 def test_the_distance_is_standard_normal_where_prior_and_data_agree() -> None:
     rng = np.random.default_rng(1)
     z = [conflicts(calibration(rng, 2.0, 2.0 * np.exp(WIDTH * rng.standard_normal())))["K"].z for _ in range(60)]
@@ -107,6 +108,7 @@ def fit(make: Callable[[Path], Rig], folder: Path, budget: int | None = None) ->
 K1_WRONG = 'k1 = { median = 1000, factor = 1.01, unit = "N/m" }'
 
 
+@pytest.mark.full
 def test_a_wrong_prior_that_moves_a_weighing_fails_without_and_with_a_sample(tmp_path: Path) -> None:
     for name, budget in (("point", None), ("sample", 2_000)):
         result, texts = fit(twin(K1_WRONG), tmp_path / name, budget)
@@ -137,6 +139,7 @@ def test_a_prior_in_a_wrong_unit_fails_and_in_the_right_one_passes(
     assert fit(_with_prior(entry, right), tmp_path / "right")[1] == []
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rows", [tilts, pushes], ids=["tilts of 1e-9 degrees", "pushes in km"])
 def test_readings_that_the_default_prior_excludes_fail(
     tmp_path: Path, rows: Callable[..., Callable[[Path], Rig]]

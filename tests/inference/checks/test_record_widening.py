@@ -75,6 +75,7 @@ def pulls(s: SampledFit, misfit: float, divisions: tuple = (by_time, by_phase)) 
     return np.abs(plain), np.abs(widened)
 
 
+@pytest.mark.full
 def test_intervals_cover_under_a_misfit_that_repeats(known: SampledFit) -> None:
     plain, widened = pulls(known, 5.0)
     assert np.mean(plain < 1.96) < 0.5
@@ -174,6 +175,7 @@ def errors_of_decays(misfit: float) -> tuple[np.ndarray, np.ndarray]:
     return np.abs(plain), np.abs(widened)
 
 
+@pytest.mark.full
 def test_intervals_of_a_decay_with_an_amplitude_of_its_own_cover_under_misfit() -> None:
     plain, widened = errors_of_decays(10.0)
     assert np.mean(plain < 1.96) < 0.6

@@ -42,6 +42,7 @@ def p_value(seed: int, tilted_mu: float = TRUTH.mu) -> float:
     return tension(rig, [tilt], [push]).p
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("rigs", "apart"), [(12, 6), pytest.param(25, 12, marks=pytest.mark.slow)])
 def test_false_alarms_and_power(rigs: int, apart: int) -> None:
     """The p-value is conservative (few readings, priors on the scatters).

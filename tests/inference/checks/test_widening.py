@@ -50,6 +50,7 @@ def tilts(folder: Path, angle: np.ndarray, budget: int | None = None) -> Fit:
     return cid.fit(make_rig(folder, Entry("static_friction", "tilt", {"angle [deg]": angle})), budget=budget)
 
 
+@pytest.mark.full
 def test_trials_in_sessions_are_widened_and_not_trusted(tmp_path: Path) -> None:
     """Six sessions of five trials: the mean of a session is off by 1 degree, a trial by 0.2."""
     rng = np.random.default_rng(0)
@@ -73,6 +74,7 @@ def test_a_clean_fit_is_not_widened(tmp_path: Path) -> None:
     assert result.summary.at["mu", "sd"] == result.summary.at["mu", "standard_error"]
 
 
+@pytest.mark.full
 def test_coloured_noise_of_a_decay_widens_k1(tmp_path: Path) -> None:
     time = np.arange(1200) / 1000.0
     noise = drifting(np.random.default_rng(3), 1200, 0.95)

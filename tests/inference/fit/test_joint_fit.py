@@ -139,6 +139,7 @@ def test_ends_are_one_maximum_where_the_posterior_cannot_tell() -> None:
     assert _at_another_maximum(u, value, np.ones(2)).tolist() == [False, False, False, True, True]
 
 
+@pytest.mark.full
 def test_starts_go_on_until_two_ends_describe_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A drive that is 2.5 rad late cannot be fitted: two such starts of the first three prove nothing.
 
@@ -175,6 +176,7 @@ def test_a_move_of_one_parameter_leads_out_of_a_side_maximum_and_not_out_of_the_
     assert weigh(target, better[None])[0] > weigh(target, off[None])[0] + LEAST_INCREASE
 
 
+@pytest.mark.full
 def test_a_start_that_is_not_finite_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     target, fit = fitted()
     nowhere = np.where(np.array(target.names) == "c", 300.0, fit.u)
@@ -221,6 +223,7 @@ def test_scatters_stand_at_their_conditional_maxima() -> None:
         assert top > max(low, high)
 
 
+@pytest.mark.full
 def test_smoothing_left_wide_is_wrong_by_many_sd_and_the_certified_widths_are_not() -> None:
     target, fit = fitted()
     certified, sd = smoothing_shift(target, fit, Smoothing())

@@ -94,6 +94,7 @@ def test_other_maxima_are_judged_by_the_mass_they_can_hold(
     assert [finding.level for finding in check_starts(other)] == [level]
 
 
+@pytest.mark.full
 def test_starts_are_away_from_each_other(twin: LogPosterior) -> None:
     """The first is the proposed centre; every other leaves it in every parameter by at least a third of its spread."""
     starts = dispersed_starts(twin, 3, 6)

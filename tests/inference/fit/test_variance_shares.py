@@ -36,6 +36,7 @@ def relative_sd(fit: PointFit, name: str) -> float:
     return fit.standard_errors[name] / fit.values[name]
 
 
+@pytest.mark.full
 def test_the_weighing_of_m1_is_the_part_of_k1_that_eq_2_gives(fits: dict[float, PointFit]) -> None:
     """k1 = m1 (omega^2 + gamma^2): the relative sd of m1 is a part of that of k1, whatever the decay."""
     fit = fits[2e-4]

@@ -57,6 +57,7 @@ def test_the_papers_model_leaves_white_residuals() -> None:
     assert whiteness_of().level == "ok"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "departure", [{"backward": 1.1}, {"k1_cubic": 2e7}], ids=["friction 10 % higher backward", "cubic term in k1"]
 )

@@ -44,6 +44,7 @@ def draw() -> Posterior:
     return sample(Emulable(MEAN, SIGMA, BLOCKS), 2, 20_000)
 
 
+@pytest.mark.full
 def test_a_wrong_emulator_does_not_change_the_posterior(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensembles, "DELAYED_STEPS", 3)
     found = draw()
@@ -94,6 +95,7 @@ class Learner(Gaussian):
         return Gaussian(MEAN, SIGMA, BLOCKS) if learnt else Tail()
 
 
+@pytest.mark.full
 def test_an_emulator_learns_where_walkers_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     """Until the autocorrelation times are short. Negative controls: without corrections, or without an effect of them.
 
@@ -117,6 +119,7 @@ def test_an_emulator_learns_where_walkers_stay(monkeypatch: pytest.MonkeyPatch) 
     assert made == rounds + 1
 
 
+@pytest.mark.full
 def test_short_walks_keep_the_exact_posterior() -> None:
     """Alone, with the wrong emulator. Negative control: the emulated posterior itself."""
     wrong, exact = (
@@ -161,6 +164,7 @@ def moments() -> tuple[float, float]:
     return float(t @ weight), float(weight @ (1.0 / precision + mean**2) - (weight @ mean) ** 2)
 
 
+@pytest.mark.full
 def test_rescaling_keeps_the_posterior_and_follows_a_hyperbola(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a wrong emulator, against quadrature. Negative controls: no such steps, and no Jacobian."""
     blocks, scales = [np.arange(4), np.array([4])], [Scale(0, np.array([1, 2]), np.array([3]))]
@@ -214,6 +218,7 @@ def test_the_waves_are_cosines(xp: ModuleType) -> None:
     np.testing.assert_allclose(_cosine(xp.asarray(x), xp), np.cos(x), rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.full
 def test_the_posterior_of_a_progression_is_emulated_near_its_draws(tmp_path: Path) -> None:
     """Motions and log-densities of new draws; parameters of the scatters have no part in the emulator."""
     rig = three_settings(tmp_path / "rig")

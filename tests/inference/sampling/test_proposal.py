@@ -90,6 +90,7 @@ def test_draws_have_the_density(linear: bool) -> None:
     assert abs(np.mean(weights) - 1.0) > 8.0 * np.std(weights) / np.sqrt(len(weights))
 
 
+@pytest.mark.full
 def test_two_terms_that_replace_each_other() -> None:
     """Means and sds of the logarithms within 4 Monte Carlo standard errors of quadrature; one term may be absent."""
     target = TwoTerms()
@@ -104,6 +105,7 @@ def test_two_terms_that_replace_each_other() -> None:
     assert np.max(np.abs(z)) < 4.0
 
 
+@pytest.mark.full
 def test_the_coordinates_make_the_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control: with one component in u alone the chain takes more than three times as long."""
     target = TwoTerms()
@@ -241,6 +243,7 @@ def test_a_map_describes_a_bent_block() -> None:
     assert share["straight"] < 0.5 * share["map"], share
 
 
+@pytest.mark.full
 def test_a_large_block_that_its_first_proposal_misses_gets_a_map() -> None:
     first = block_proposal([np.arange(10)], np.zeros(10), 0.4 * MIXED.T @ MIXED, [True])
     exact, waits = bent_draws(), dict[bool, float]()

@@ -86,6 +86,7 @@ def test_a_wrong_gaussian_fails(posterior: Posterior, fault: str) -> None:
     assert np.max(np.abs(scores(posterior.draws, Gaussian(mean, covariance)))) > LIMIT
 
 
+@pytest.mark.full
 def test_scores_are_standard_normal() -> None:
     """The z-test is calibrated: 4 seeds give 56 scores with sd 1 (ensembles share nothing)."""
     z = np.concatenate([scores(draw(seed).draws, KNOWN) for seed in range(10, 14)])
@@ -107,6 +108,7 @@ def test_a_spent_budget_is_not_convergence() -> None:
     assert posterior.draws.shape[0] == ENSEMBLES
 
 
+@pytest.mark.full
 def test_sampling_stops_at_the_effective_sample_size() -> None:
     """Five times the size needs more draws; both stop within one interval of checks."""
     little, much = (sample(KNOWN, 1, ess=ess) for ess in (DEFAULT_ESS, 5.0 * DEFAULT_ESS))
@@ -160,6 +162,7 @@ def test_a_walker_that_stays_keeps_its_scatters() -> None:
     assert np.max(np.abs(scores(draws, Gaussian(mean, wrong)))) > LIMIT  # negative control
 
 
+@pytest.mark.full
 def test_interrupted_chains_go_on(tmp_path: Path) -> None:
     """Stopped after half the budget and taken up again: the draws stored before are kept, the whole still passes."""
     half = draw(5, budget=60, store=tmp_path / "chains.h5")

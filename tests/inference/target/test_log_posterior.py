@@ -152,6 +152,7 @@ def at_truth(target: LogPosterior, factor: float = 1.0) -> np.ndarray:
     return target.unconstrain(np.array([known[name] * factor for name in target.names]))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("factor", [1.0, 1.03])
 def test_log_posterior_is_the_sum_of_its_experiments(
     twin: tuple[LogPosterior, tuple[Experiment, ...]], factor: float
@@ -218,6 +219,7 @@ def test_overdamped_decays_have_no_density(twin: tuple[LogPosterior, tuple[Exper
     assert float(target.batch(jnp.asarray(u[None]))[0]) == -np.inf
 
 
+@pytest.mark.full
 def test_rigs_of_one_structure_do_not_share_numbers(tmp_path: Path) -> None:
     """Compiled code is shared between rigs; readings, priors and weighings must not be."""
     values: list[float] = []

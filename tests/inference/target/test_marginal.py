@@ -158,6 +158,7 @@ def test_integrals_against_adaptive_quadrature(marginal: MarginalPosterior) -> N
     np.testing.assert_allclose(marginal.batch(v), expected, rtol=0.0, atol=LIMIT)
 
 
+@pytest.mark.full
 def test_too_few_nodes_fail(marginal: MarginalPosterior) -> None:
     """Negative control: a quarter of the nodes over the same window."""
     v, grid = walkers(marginal, 64), marginal.grid
@@ -226,6 +227,7 @@ def test_no_density_where_decays_are_overdamped(marginal: MarginalPosterior) -> 
     assert marginal.batch(v[None])[0] == -np.inf
 
 
+@pytest.mark.full
 def test_rigs_of_one_structure_share_compiled_code(tmp_path: Path) -> None:
     sizes, values = [], []
     for seed in (1, 2):

@@ -57,6 +57,7 @@ def test_numbers_are_those_that_scipy_reads(compressed: bool) -> None:
     np.testing.assert_array_equal(export.values(13), np.arange(7.0) + 1.5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("compressed", [False, True])
 def test_every_changed_or_missing_byte_reads_or_is_refused(compressed: bool) -> None:
     content = mat_file(compressed)
