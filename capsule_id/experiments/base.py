@@ -372,8 +372,8 @@ def band(values: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
 # clock: The clock of a record: where rig.toml states the sd of its drift, the drift is a parameter of the fit.
 #
 # An error of the drift stretches the record. k1 follows it twice, c once; a record of many excitation periods runs
-# out of
-# step with its drive. An error of the offset changes nothing, because each record has its own initial state and phase.
+# out of step with its drive. An error of the offset changes nothing, because each record has its own initial state
+# and phase.
 
 
 def clock_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:

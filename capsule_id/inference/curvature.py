@@ -102,9 +102,8 @@ def column_space(
 # curvature: Gradient and Hessian of the log-posterior by central differences of its batched values.
 #
 # The sampler needs the log-posterior compiled anyway. Its Hessian by automatic differentiation needs another, far
-# longer
-# compilation. Central differences with Richardson extrapolation agree with that Hessian to 1e-6 relative (tested).
-# Their steps are fractions of a posterior standard deviation.
+# longer compilation. Central differences with Richardson extrapolation agree with that Hessian to 1e-6 relative
+# (tested). Their steps are fractions of a posterior standard deviation.
 
 
 #: d coordinates, and a matrix of them.

@@ -114,8 +114,7 @@ def weigh(target: LogPosterior, u: np.ndarray) -> np.ndarray:
 
 # joint fit: Joint point fit of bench tests and forced runs.
 #
-#     bench tests -> bench point fit -> starting points around it (``joint_starts``), initial conditions from the
-# records
+#     bench tests -> bench point fit -> starting points around it (``joint_starts``), initial conditions from records
 #     -> alternate Levenberg–Marquardt on the located parameters and conditional maxima of the scatters until converged
 #     -> repeat from any better point that a change of one parameter reaches
 #
@@ -599,8 +598,8 @@ def law_of_runs(experiments: Sequence[Experiment]) -> FrictionModel | None:
 
 # point stage: Stages of the point fit: bench tests in closed form, division of unpredictable runs, joint fit.
 #
-# experiments -> fit of the bench tests in closed form -> divide runs that amplify initial errors -> LogPosterior ->
-# joint fit
+# experiments -> fit of the bench tests in closed form -> divide runs that amplify initial errors -> LogPosterior
+#     -> joint fit
 #     -> where residuals of runs are correlated: second joint fit with coloured noise, and fits with other friction laws
 
 

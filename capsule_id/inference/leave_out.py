@@ -111,11 +111,10 @@ def _pareto(x: Float[np.ndarray, " n"]) -> tuple[float, float]:
 # leave out: Expected log predictive density of settings left out, by Pareto-smoothed importance sampling (PSIS-LOO).
 #
 # Draws of a density near the posterior are weighted by the posterior: of the emulated posterior where there is one,
-# else
-# independent draws of the sampler's adapted proposal. Division by the density of the readings of a setting, given the
-# parameters and all other readings, leaves the setting out.
-# (A. Vehtari, A. Gelman, J. Gabry, *Practical Bayesian model evaluation using leave-one-out cross-validation and WAIC*,
-# Statistics and Computing 27, 2017, 1413.)
+# else independent draws of the sampler's adapted proposal. Division by the density of the readings of a setting,
+# given the parameters and all other readings, leaves the setting out. (A. Vehtari, A. Gelman, J. Gabry, *Practical
+# Bayesian model evaluation using leave-one-out cross-validation and WAIC*, Statistics and Computing 27, 2017,
+# 1413.)
 
 
 #: Draws of a proposal; draws of an emulated posterior, fewer because their weights vary less.

@@ -24,10 +24,10 @@ from capsule_id.precision import COMPILE
 
 # quadrature: Quadrature nodes of the integrals over scatters.
 #
-# The nodes are fixed before the sampler starts, so that the integrated posterior is one smooth function. Each window
-# covers all values where a conditional density exceeds e^-``DEPTH`` of its maximum. The walkers of this test extend
-# from
-# the point fit to points of negligible posterior mass. The number of nodes grows until two interlaced grids agree.
+# The nodes are fixed before the sampler starts, so that the integrated posterior is one smooth function. Each
+# window covers all values where a conditional density exceeds e^-``DEPTH`` of its maximum. The walkers of this test
+# extend from the point fit to points of negligible posterior mass. The number of nodes grows until two interlaced
+# grids agree.
 #
 # A scatter that the readings hardly distinguish from zero has a left tail as long as its prior's. The nodes are
 # therefore equidistant in t with u = log(scatter) = t - exp(bend - t). Right of ``bend``, t equals u. Left of it the
@@ -166,11 +166,11 @@ def agree(
 
 # marginal: Log-posterior with every scatter integrated out, which the sampler uses.
 #
-# Each scatter belongs to the readings of one kind or one record. Given all other parameters the scatters are therefore
-# independent, and each integral is one-dimensional. A sum over equidistant nodes in u = log(scatter) converges faster
-# than any power of the node distance. The integrated posterior has light tails and few dimensions. The same sums give
-# an
-# exact draw of the scatters from their conditional distributions: a node, drawn by weight, of a randomly shifted grid.
+# Each scatter belongs to the readings of one kind or one record. Given all other parameters the scatters are
+# therefore independent, and each integral is one-dimensional. A sum over equidistant nodes in u = log(scatter)
+# converges faster than any power of the node distance. The integrated posterior has light tails and few dimensions.
+# The same sums give an exact draw of the scatters from their conditional distributions: a node, drawn by weight, of
+# a randomly shifted grid.
 
 
 #: Smallest and largest distance from the point fit of the walkers that determine the nodes, in standard deviations.

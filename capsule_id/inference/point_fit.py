@@ -30,10 +30,10 @@ from capsule_id.parameters import is_stated
 # variance shares: Uncertainty budget of a point fit: how much every table and every prior contributes to the sd of a
 # parameter.
 #
-# At the maximum an error e of the residuals moves the estimate by C Jᵀ e, with C = (Jᵀ J)⁻¹ and unit variance of every
-# entry of e. The entries of one input, rows i of J, therefore contribute diag(C J_iᵀ J_i C) to the variance diag(C),
-# and
-# the contributions of all inputs add up to it (JCGM 100:2008, *Guide to the expression of uncertainty*, 5.1.2).
+# At the maximum an error e of the residuals moves the estimate by C Jᵀ e, with C = (Jᵀ J)⁻¹ and unit variance of
+# every entry of e. The entries of one input, rows i of J, therefore contribute diag(C J_iᵀ J_i C) to the variance
+# diag(C), and the contributions of all inputs add up to it (JCGM 100:2008, *Guide to the expression of
+# uncertainty*, 5.1.2).
 
 
 def variance_shares(

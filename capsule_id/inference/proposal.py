@@ -15,13 +15,11 @@ from capsule_id.inference.curvature import Matrix, Vector
 # coordinates: Coordinates w of the proposals of a block of parameters, and the priors of terms that may be absent.
 #
 # Most parameters are proposed in u, the logarithm of a positive parameter. Two terms that replace each other, as
-# viscous
-# and dry damping do, lie on a line in theta, which is bent in u: they are proposed in theta.
+# viscous and dry damping do, lie on a line in theta, which is bent in u: they are proposed in theta.
 #
-# A term that the readings hardly show may be absent. The tail of its u towards minus infinity is as long as that of its
-# prior, so that some proposals draw this u from its prior. Other parameters change with its theta, so that w leaves
-# this
-# change out.
+# A term that the readings hardly show may be absent. The tail of its u towards minus infinity is as long as that of
+# its prior, so that some proposals draw this u from its prior. Other parameters change with its theta, so that w
+# leaves this change out.
 
 
 #: Smallest sd of u of a parameter that may be proposed in theta, and of one that may be absent. Below these sds u and
@@ -295,11 +293,9 @@ def block_proposal(
 # transport: Proposals of a bent posterior: a triangular map to coordinates that are nearly normal (Parno & Marzouk
 # 2018).
 #
-# The posterior of a robot's friction, force and lag is bent in twelve dimensions. Components of a mixture follow that
-# badly;
-# a quadratic mean and a linear logarithmic scale of each coordinate, given those before it, follow it well. Normal
-# scores
-# come first: the logarithm of a scatter that may be zero has a long tail.
+# The posterior of a robot's friction, force and lag is bent in twelve dimensions. Components of a mixture follow
+# that badly; a quadratic mean and a linear logarithmic scale of each coordinate, given those before it, follow it
+# well. Normal scores come first: the logarithm of a scatter that may be zero has a long tail.
 
 
 #: Parameters of the largest block with a map: the time of its least squares grows with their fourth power.
@@ -452,12 +448,11 @@ def _log_scale(
 # refinement: Adapt a proposal to the posterior by adaptive multiple importance sampling (Cornuet et al. 2012), before
 # any chain.
 #
-# A short chain from the Laplace approximation misses tails where the width of the posterior depends on one parameter,
-# as
-# on the correlation time of noise, or where two terms replace each other, as viscous and dry damping do. Weighted draws
-# from a wide proposal find them. Each round draws from the mixture of the round before. The draws of all rounds are
-# weighted by the mean of the densities of all rounds. They determine the next proposal: a mixture, by expectation
-# maximisation; in a large block a triangular map.
+# A short chain from the Laplace approximation misses tails where the width of the posterior depends on one
+# parameter, as on the correlation time of noise, or where two terms replace each other, as viscous and dry damping
+# do. Weighted draws from a wide proposal find them. Each round draws from the mixture of the round before. The
+# draws of all rounds are weighted by the mean of the densities of all rounds. They determine the next proposal: a
+# mixture, by expectation maximisation; in a large block a triangular map.
 
 
 #: Message where the sampler has no point to start from.

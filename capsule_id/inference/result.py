@@ -39,7 +39,7 @@ class PointFit:
     log_posterior : (s,) at the ends
     at_other_maximum : (s,) bool: this start ended at a maximum other than the best one
     stalled : (s,) bool: the solver reported no convergence from this start
-    shares : by parameter, the share of every table and every prior in its variance; see ``fit.variance_shares``
+    shares : by parameter, the share of every table and every prior in its variance; see ``point_fit.variance_shares``
     """
 
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ class Posterior:
     tau : (d,) integrated autocorrelation time over the walkers of all ensembles, in stored draws
     rhat : (d,) split R-hat of the ensembles
     ess : (d,) draws over emcee's autocorrelation time; too large for short chains
-    ess_bulk, ess_tail : (d,) effective sample sizes for the stopping rule, see ``diagnostics.bulk_and_tail_size``
+    ess_bulk, ess_tail : (d,) effective sample sizes for the stopping rule, see ``moves.bulk_and_tail_size``
     ess_wanted : the bulk and tail effective sample size that every parameter had to reach
     converged : every parameter has N > 20 tau, R-hat <= 1.01, and both sizes reach ``ess_wanted``
     moves : pilot measurement: move -> largest tau, steps; the first move is used

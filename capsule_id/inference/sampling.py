@@ -194,14 +194,11 @@ class ChainStore:
 # emulation: Emulation of a posterior whose motions take long: exact motions near the posterior, and emulators fitted
 # to them.
 #
-# Each round adds exact motions about draws of the emulated posterior of the round before, so that the emulators learn
-# where
-# the posterior is. An emulator whose density is far too small in some region gets no draws there, so that these
-# rounds do not
-# correct it. The last rounds therefore use walkers of delayed acceptance, which can enter such regions, and draws of
-# the
-# proposal, which has heavier tails. (J. A. Christen, C. Fox, *Markov
-# chain Monte Carlo using an approximation*, Journal of Computational and Graphical Statistics 14, 2005, 795.) Where the
+# Each round adds exact motions about draws of the emulated posterior of the round before, so that the emulators
+# learn where the posterior is. An emulator whose density is far too small in some region gets no draws there, so
+# that these rounds do not correct it. The last rounds therefore use walkers of delayed acceptance, which can enter
+# such regions, and draws of the proposal, which has heavier tails. (J. A. Christen, C. Fox, *Markov chain Monte
+# Carlo using an approximation*, Journal of Computational and Graphical Statistics 14, 2005, 795.) Where the
 # sampler's pilot shows that walkers stay somewhere, ``corrected`` adds exact motions about them.
 
 

@@ -47,7 +47,7 @@ def draws_diagram(
     ----------
     p, e : leaves () or (draws,), at least one with draws
     over, values : the quantity that is varied, (n,), SI (f in Hz)
-    store, client : see ``blocks.compute``
+    store, client : see ``sweep.compute``
 
     Eight arguments: four state the diagram, the others are options by name.
 

@@ -176,9 +176,8 @@ def _same_orbit(columns: MotionColumns, i: int, j: int, period: int) -> bool:
 
 # blocks: Many points block by block: in this process or on a Dask cluster, with finished blocks kept on disk.
 #
-# The same function computes a block wherever it runs, and a lane does not depend on its block: the result is the same
-# to
-# the last bit, whoever computed it and however often the work was interrupted.
+# The same function computes a block wherever it runs, and a lane does not depend on its block: the result is the
+# same to the last bit, whoever computed it and however often the work was interrupted.
 
 
 # Points of one block: seconds of work, a multiple of the lanes of one call.
@@ -535,7 +534,7 @@ def motion_map(
     Parameters
     ----------
     over : symbol -> values (n,), SI, of the two quantities (one will do)
-    store, client, block : finished blocks on disk, Dask cluster, points of a block: see ``blocks.compute``
+    store, client, block : finished blocks on disk, Dask cluster, points of a block: see ``compute``
 
     Eight arguments: three state the map, the others are options by name.
 

@@ -191,10 +191,9 @@ def drive_power(force: Phasor, position: Phasor, Omega: float) -> tuple[float, f
 
 # duplicates: Finds readings that occur twice: equal tables, and equal blocks of rows within or across tables.
 #
-# Two independent readings agree by chance with probability q/s: q is the reading step, s the width of the scatter. A
-# block
-# counts as repeated where agreement by chance is practically impossible, so coarse readings that agree are no
-# duplicates.
+# Two independent readings agree by chance with probability q/s: q is the reading step, s the width of the scatter.
+# A block counts as repeated where agreement by chance is practically impossible, so coarse readings that agree are
+# no duplicates.
 
 
 #: Expected number of blocks that agree by chance, below which a block counts as repeated.

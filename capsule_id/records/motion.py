@@ -98,8 +98,8 @@ def intervals_above(z: Float[np.ndarray, " n"], low: float, high: float) -> list
 
 # repeat: Probability of each period of a recorded motion, in excitation periods, given its cycle-to-cycle scatter.
 #
-# record -> spline -> polynomial over every excitation period -> power of the sequence of cycles at the frequencies of
-# each period
+# record -> spline -> polynomial over every excitation period
+#        -> power of the sequence of cycles at the frequencies of each period
 #        -> Bayesian comparison of the periods 1 to 16 and of an aperiodic motion
 #
 # The coefficients y_c of cycle c are a slow drift in c, a part that repeats after n cycles, and scatter. The part has
@@ -495,11 +495,10 @@ def _mean_of_advances(time: Record, values: Record, T: float) -> tuple[float, fl
 
 # contacts: Counts contacts between rod and support spring, in the acceleration of the rod and in x_rel.
 #
-# Acceleration. Out of contact the rod obeys a linear law, acceleration = b0 + b1 x_rel + b2 rate + b3 cos(Omega t) +
-# b4 sin(Omega t). It is fitted to the samples far from contact. In contact the spring pushes the rod back,
-# and the acceleration is below this law: a spike. x_rel exceeds the gap during a contact. Sensor zero and stated gap
-# are
-# known to some tens of um only. Where spikes exist, the impact line is the x_rel at which they vanish.
+# Acceleration. Out of contact the rod obeys a linear law, acceleration = b0 + b1 x_rel + b2 rate + b3 cos(Omega t)
+# + b4 sin(Omega t). It is fitted to the samples far from contact. In contact the spring pushes the rod back, and
+# the acceleration is below this law: a spike. x_rel exceeds the gap during a contact. Sensor zero and stated gap
+# are known to some tens of um only. Where spikes exist, the impact line is the x_rel at which they vanish.
 #
 # Both are counted on the record folded onto one period of the motion, with two levels (``SPIKE_LEVELS``,
 # ``CROSSING_LEVELS``, in standard errors): a contact begins above the higher and ends below the lower one. The count is

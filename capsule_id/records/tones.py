@@ -86,9 +86,8 @@ def length_of_motion(values: Num[np.ndarray, " n"]) -> int:
 #
 #     y(t) = A cos(Omega t + phase) + offset + white noise
 #
-# Standard errors are those of linearised least squares. For a long record they are the Cramér–Rao bounds of a single
-# tone
-# with unknown frequency: D. C. Rife, R. R. Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974).
+# Standard errors are those of linearised least squares. For a long record they are the Cramér–Rao bounds of a
+# single tone with unknown frequency: D. C. Rife, R. R. Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974).
 
 
 #: The stated frequency is wrong if the fitted one differs by this many standard errors and by this fraction of it.
@@ -273,9 +272,9 @@ def _variances(jacobian: np.ndarray) -> np.ndarray:
 #     t = offset + (1 + drift) t',    b(t') = gain a(t) + constant + noise
 #
 # a and b are the common signal by the two loggers, t and t' their times. Least squares over offset, drift, gain and
-# constant; a is a cubic spline through the record with more samples per second, without its noise. The covariance is
-# that
-# of Newey and West (Econometrica 55, 703 (1987)), which admits residuals that are correlated over a few samples.
+# constant; a is a cubic spline through the record with more samples per second, without its noise. The covariance
+# is that of Newey and West (Econometrica 55, 703 (1987)), which admits residuals that are correlated over a few
+# samples.
 #
 # A periodic signal leaves the offset open by whole periods: of equally good offsets the smallest one counts.
 

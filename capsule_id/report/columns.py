@@ -99,10 +99,8 @@ def plain_symbol(name: str) -> str:
 # output.
 #
 # All numbers of a row keep two digits of the posterior sd (without a sample: of the standard error), the point fit
-# those
-# of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m); all rows of a
-# symbol
-# (G[run_1], G[run_2]) have the same unit.
+# those of its own standard error. Values far from 1 carry a decimal prefix on the unit (µm instead of m); all rows
+# of a symbol (G[run_1], G[run_2]) have the same unit.
 
 
 Output = Literal["json", "csv", "html", "console"]

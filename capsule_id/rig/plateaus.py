@@ -119,8 +119,8 @@ def outlying_rows(
 # }``.
 #
 # The trace is divided into as many parts as there are levels, by least squares of a piecewise constant function
-# (dynamic
-# programming; Bellman, Commun. ACM 4, 284 (1961)). Each part gives one row: its mean without the guard at both ends.
+# (dynamic programming; Bellman, Commun. ACM 4, 284 (1961)). Each part gives one row: its mean without the guard at
+# both ends.
 
 
 _EXAMPLE = '{ levels = [0, 10, 20], unit = "N", guard = "2 s" }'

@@ -395,9 +395,8 @@ def filtered_record(run: "ForcedRun", theta: ValuesBySymbol) -> RunRecord | None
 # second fit: Second fits of a run, where the residuals of the first one are correlated: starts of coloured noise, and
 # tables.
 #
-# A real sensor filters, and no model is exact, so that residuals of dense samples are hardly ever white. White noise
-# then
-# gives intervals that are far too short.
+# A real sensor filters, and no model is exact, so that residuals of dense samples are hardly ever white. White
+# noise then gives intervals that are far too short.
 
 
 #: Largest lag-1 correlation of the noise at which a fit starts.
@@ -826,8 +825,8 @@ class PulseRun(OtherRun):
 #     x_base -> X1(t) -> capsule model -> x_capsule, x_rel
 #
 # Only the equation of the capsule is left. X1 is the cubic spline through x_base, whose own noise is neglected. The
-# zeros
-# of x_base and x_capsule are independent, so the extension of the rod's spring at the first sample is sampled.
+# zeros of x_base and x_capsule are independent, so the extension of the rod's spring at the first sample is
+# sampled.
 
 
 #: Dispersion of the starts of k1, c and mu about their estimates from the record, natural logarithm.

@@ -25,12 +25,9 @@ from capsule_id.views import Facts
 # omega^2 = omega_0^2 - gamma^2, negative beyond critical damping. Other forces need an underdamped decay.
 #
 # Moments of a uniformly sampled underdamped one take O(sqrt(n)) transcendental functions and equal sums up to
-# rounding: the
-# solutions at t_j = j h are the real and the imaginary part of z^j, z = exp((-gamma + i omega) h). Their sums and
-# products
-# are geometric series. The polynomial sum_j y_j z^j is evaluated with j = B a + b (baby-step giant-step). This needs
-# one
-# matrix product instead of n complex exponentials.
+# rounding: the solutions at t_j = j h are the real and the imaginary part of z^j, z = exp((-gamma + i omega) h).
+# Their sums and products are geometric series. The polynomial sum_j y_j z^j is evaluated with j = B a + b (baby-
+# step giant-step). This needs one matrix product instead of n complex exponentials.
 
 
 #: Runge–Kutta steps per half cycle, and of a decay that may have more half cycles than ``LONG``, each of which changes it
@@ -280,11 +277,9 @@ def uniform_step(time: np.ndarray) -> float | None:
 # 2.2).
 #
 # The trend of damping and frequency over the amplitude is an indication, not a test. A viscous decay with a linear
-# spring
-# has the same logarithmic decrement and frequency at every amplitude. As the amplitude falls, quadratic damping
-# decreases
-# the decrement, and dry friction increases it. A drift of the frequency indicates a stiffness that depends on the
-# amplitude.
+# spring has the same logarithmic decrement and frequency at every amplitude. As the amplitude falls, quadratic
+# damping decreases the decrement, and dry friction increases it. A drift of the frequency indicates a stiffness
+# that depends on the amplitude.
 
 
 #: Smallest peak in standard deviations of the noise.

@@ -20,8 +20,8 @@ from capsule_id.views import Facts, Finding, Message
 # channels: Channels of a free decay: the displacement x_rel, its rate, or the rod's absolute acceleration.
 #
 # The capsule is at rest, so the rate of x_rel is the rod's velocity, and its second derivative the rod's
-# acceleration. A
-# constant part, such as the component of gravity along the sensor's axis, is the offset that every fit integrates out.
+# acceleration. A constant part, such as the component of gravity along the sensor's axis, is the offset that every
+# fit integrates out.
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,10 @@ KINEMATIC_MESSAGES = {"decays.kinematics": Message("columns of a decay", fail=_c
 # blocks: Block means of a record: few readings that hold nearly all of its information on a decay.
 #
 # A block of an evenly sampled record is ``size`` consecutive readings. An unevenly sampled record is divided into
-# intervals of ``size`` median steps, with any number of readings. The model's block mean is the two-point Gauss rule of
-# the reading times themselves, so it is exact for cubics of the time, at any sampling. Its error relative to the
-# amplitude
-# is below (omega W)^4/4320 for blocks of duration W, and 0.0026 (omega W)^2 of twice F_dry/k1 where a rod with dry
-# friction turns inside the block. At ``READINGS_PER_PERIOD`` these are 4e-7 and 1e-4.
+# intervals of ``size`` median steps, with any number of readings. The model's block mean is the two-point Gauss
+# rule of the reading times themselves, so it is exact for cubics of the time, at any sampling. Its error relative
+# to the amplitude is below (omega W)^4/4320 for blocks of duration W, and 0.0026 (omega W)^2 of twice F_dry/k1
+# where a rod with dry friction turns inside the block. At ``READINGS_PER_PERIOD`` these are 4e-7 and 1e-4.
 
 
 #: Block means per period that replace a long record; with more, a decay's parameters gain less than 0.5 % in precision.

@@ -58,10 +58,9 @@ if TYPE_CHECKING:
 
 # noise: Coloured noise and drift of a record, at any sampling, whitened in linear time.
 #
-# The noise is a continuous-time process: an Ornstein–Uhlenbeck process, alone or with white noise. Sampled evenly the
-# first
-# is AR(1) and the sum is ARMA(1, 1). A drift is a Matérn-3/2 process. tinygp factorises the covariance of such sums in
-# linear time (quasiseparable matrices: D. Foreman-Mackey et al., AJ 154, 220 (2017)).
+# The noise is a continuous-time process: an Ornstein–Uhlenbeck process, alone or with white noise. Sampled evenly
+# the first is AR(1) and the sum is ARMA(1, 1). A drift is a Matérn-3/2 process. tinygp factorises the covariance of
+# such sums in linear time (quasiseparable matrices: D. Foreman-Mackey et al., AJ 154, 220 (2017)).
 #
 # Block means of the first process have exactly such a covariance again, where the readings of a block are evenly
 # spaced.
@@ -434,10 +433,8 @@ def _least_squares(known: np.ndarray, columns: np.ndarray, values: np.ndarray) -
 # values.
 #
 # A short record of a decay fits viscous damping as well as its sum with dry friction, and the two give different
-# values of
-# c. The fit is linear in a small further force, so one least-squares step gives the largest force that the records
-# allow,
-# and the values beside it.
+# values of c. The fit is linear in a small further force, so one least-squares step gives the largest force that
+# the records allow, and the values beside it.
 
 
 #: Probability that a further force is below its limit.
@@ -903,9 +900,8 @@ class Screening:
 # screening: Choice of the model of free decays where the record contradicts the stated one.
 #
 # A record demands another model where its residuals are not white, or where they correlate with the response to dry
-# friction, quadratic damping, a cubic spring or a drift. Every sum of the terms that the settings leave open is then
-# fitted
-# to the record by maximum likelihood and ranked by BIC.
+# friction, quadratic damping, a cubic spring or a drift. Every sum of the terms that the settings leave open is
+# then fitted to the record by maximum likelihood and ranked by BIC.
 
 
 #: Records are thinned to this many readings per period before their models are ranked.

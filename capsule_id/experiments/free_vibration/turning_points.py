@@ -339,8 +339,7 @@ def check_halves(tables: "Sequence[TurningPoints]", fit: Fitted) -> list[Finding
 # second fit: Choice of the forces of turning points where the readings contradict the stated ones.
 #
 # A force is added where the readings demand it by ``FAIL`` sds and exclude every other one in its place. Amplitudes
-# of one
-# side must also exclude that they are counted from another place than the rest position.
+# of one side must also exclude that they are counted from another place than the rest position.
 
 
 #: Sds from zero of a force that another one must exclude.

@@ -17,10 +17,9 @@ from capsule_id.views import Finding, Message
 
 # outliers: Outlying trials of a progression with ``tails = "heavy"``: which trial of a setting has the larger scatter.
 #
-# Each trial has ``TIMES`` the scatter with probability ``SHARE``, independently of the others: a contaminated normal
-# distribution (Tukey 1960), here given that a setting has at most one such trial. No outlying trial, or one of them:
-# these
-# are the alternatives of a setting, and their densities are added.
+# Each trial has ``TIMES`` the scatter with probability ``SHARE``, independently of the others: a contaminated
+# normal distribution (Tukey 1960), here given that a setting has at most one such trial. No outlying trial, or one
+# of them: these are the alternatives of a setting, and their densities are added.
 
 
 #: Probability that a trial is outlying, and its scatter relative to that of the others.

@@ -26,10 +26,9 @@ if TYPE_CHECKING:
 # sessions: Sessions of a progression: how the friction of each one enters, and the runs of the capsule that follow.
 #
 # Session j has friction multiplied by exp(session_sd z_j), z_j ~ N(0, 1). Where it has several settings, z_j is a
-# parameter; at most eight sessions are. All others are integrated out, in each of their settings alone, with a motion
-# that
-# is piecewise linear in z_j between runs. There are more runs where the setting has several of these sessions,
-# because they determine z_j apart from the discrepancy, also far from 0.
+# parameter; at most eight sessions are. All others are integrated out, in each of their settings alone, with a
+# motion that is piecewise linear in z_j between runs. There are more runs where the setting has several of these
+# sessions, because they determine z_j apart from the discrepancy, also far from 0.
 
 
 #: z beyond which a session has no weight.

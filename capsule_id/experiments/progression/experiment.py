@@ -270,11 +270,10 @@ def check_discrepancy(experiments: "Sequence[Progression]", fit: Fitted) -> list
 #     distance_i = X2(setting, friction exp(s_j)) (1 + trial scatter) + discrepancy_b v t_b + trial sd + reading error
 #
 # Session j has friction multiplied by exp(s_j), s_j ~ N(0, session_sd^2); see
-# ``capsule_id.experiments.progression.density``.
-# The discrepancy is an error of the model's mean velocity at setting b that all trials of the setting share. It enters
-# linearly and is integrated out; see ``capsule_id.experiments.progression.density``. With heavy tails some trials
-# have a
-# larger error; see ``capsule_id.experiments.progression.declaration``.
+# ``capsule_id.experiments.progression.density``. The discrepancy is an error of the model's mean velocity at
+# setting b that all trials of the setting share. It enters linearly and is integrated out; see
+# ``capsule_id.experiments.progression.density``. With heavy tails some trials have a larger error; see
+# ``capsule_id.experiments.progression.declaration``.
 
 
 #: Scales of the half-normal priors of trial_sd and discrepancy, relative to the largest reading.
@@ -292,7 +291,7 @@ class Progression(TrialsExperiment):
 
     Attributes
     ----------
-    settings : (settings, 4) period, s, number of periods, duty, amplitude, N or A; see ``trials.settings_of``
+    settings : (settings, 4) period, s, number of periods, duty, amplitude, N or A; see ``declaration.settings_of``
     session : (n, sessions) 1 where a row belongs to it
     parameter : (sessions,) index of the parameter of a session, see ``parameters_of``
     reading_variance : m^2

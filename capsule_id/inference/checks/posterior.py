@@ -400,9 +400,8 @@ def _finding(s: SampledFit, name: str, conflict: Conflict, p: float) -> Finding:
 # predictive: Predictive checks by statistics that a fitted scatter cannot absorb.
 #
 # The residuals of an experiment are projected off its own parameters and nuisances, and divided by their rms.
-# Replicates
-# are white noise, projected and divided in the same way, so that like is compared with like: to first order in the
-# parameters the p-values hold for any noise level, and for parameters that other experiments share.
+# Replicates are white noise, projected and divided in the same way, so that like is compared with like: to first
+# order in the parameters the p-values hold for any noise level, and for parameters that other experiments share.
 
 
 #: Numbers of the replicates that are drawn, and of their readings together above the smaller number.

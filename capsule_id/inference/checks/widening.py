@@ -19,10 +19,9 @@ from capsule_id.rig.model import Table
 
 # widening: Error of the model, from the scatter of a parameter between parts of the data.
 #
-# Where a check of an experiment fails, its readings and those of its kind that inform the same parameters are divided
-# into parts of consecutive rows. Each part gives an estimate with its own sd. Their weighted chi-square over its
-# degrees
-# of freedom is the squared factor of the sd (Birge 1932), and Student's t gives the interval.
+# Where a check of an experiment fails, its readings and those of its kind that inform the same parameters are
+# divided into parts of consecutive rows. Each part gives an estimate with its own sd. Their weighted chi-square
+# over its degrees of freedom is the squared factor of the sd (Birge 1932), and Student's t gives the interval.
 
 
 #: Fewest parts of the data, and most parts of one table.

@@ -77,12 +77,10 @@ def as_one_function(run: Callable[..., Any]) -> Callable[..., tuple[Any, jax.Arr
 #
 #     mode_at -> [series -> trusted -> first_event -> advance -> correct -> motion_at] ... -> samples read off the rows
 #
-# Each lane has its own time, mode and step; one loop runs them all. Derivatives: forward mode goes through the loop.
-# Step
-# lengths and located times are held constant. At an event the state and the time get one Newton correction, dt = -g/g',
-# whose value is next to nothing and whose tangent is the event's own (the saltation matrix). Switching times of the
-# drive
-# are events with g = t - t_switch.
+# Each lane has its own time, mode and step; one loop runs them all. Derivatives: forward mode goes through the
+# loop. Step lengths and located times are held constant. At an event the state and the time get one Newton
+# correction, dt = -g/g', whose value is next to nothing and whose tangent is the event's own (the saltation
+# matrix). Switching times of the drive are events with g = t - t_switch.
 
 
 require_float64()

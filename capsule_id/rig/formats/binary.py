@@ -84,10 +84,8 @@ def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
 # mat: Reads MATLAB files: every real numeric variable is a column, of a matrix every column; so is a field of a struct.
 #
 # Files of version 7.3 are HDF5 files. The format of versions 5 to 7 is that of "MAT-File Format", The MathWorks,
-# level 5.
-# SciPy's reader ends the process by a segmentation fault on files with one changed byte, so this one checks every
-# tag; the
-# tests compare the two on intact files.
+# level 5. SciPy's reader ends the process by a segmentation fault on files with one changed byte, so this one
+# checks every tag; the tests compare the two on intact files.
 
 
 _MATRIX, _COMPRESSED = 14, 15  # types of data elements

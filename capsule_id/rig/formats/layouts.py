@@ -246,9 +246,8 @@ def _is_reading(cell: str, layout: Layout) -> bool:
 # lvm: Reads LabVIEW measurement files (``.lvm``): a header of the file, then segments with a header and rows of
 # numbers.
 #
-# The layout is that of "LabVIEW Measurement File", National Instruments. The package lvm_read reads a damaged cell as
-# NaN
-# and loads pickled copies that lie beside a file, so this reader is the package's own.
+# The layout is that of "LabVIEW Measurement File", National Instruments. The package lvm_read reads a damaged cell
+# as NaN and loads pickled copies that lie beside a file, so this reader is the package's own.
 
 
 _END = "***End_of_Header***"
