@@ -10,11 +10,12 @@ from capsule_id.physics.model import Status
 
 # rosenbrock: One step of RODAS3, the solver of the smoothed model: state, linear algebra, error estimate, step control.
 #
-# Why this method. The smoothed friction relaxes at the rate F_b / (m2 velocity): 8e3 to 8e5 1/s against 1e2 1/s of the
-# rod, so an explicit step is limited by stability while the capsule rests. A Rosenbrock method needs no Newton
-# iteration (whose stopping rule would also be differentiated), its Jacobian is exact (forward mode through the field), and after
-# X1 and X2 are eliminated by hand each stage solves two equations. Measured on the reference cases at equal bias of the
-# mean velocity, steps x field evaluations: RODAS3 2100 x 3, ROS2 3700 x 2, ROS4 2700 x 3, RODAS4 2000 x 6.
+# Why this method. The smoothed friction relaxes at the rate F_b / (m2 velocity): 8e3 to 8e5 1/s against 1e2 1/s of
+# the rod, so an explicit step is limited by stability while the capsule rests. A Rosenbrock method needs no Newton
+# iteration (whose stopping rule would also be differentiated), its Jacobian is exact (forward mode through the
+# field), and after X1 and X2 are eliminated by hand each stage solves two equations. Measured on the reference
+# cases at equal bias of the mean velocity, steps x field evaluations: RODAS3 2100 x 3, ROS2 3700 x 2, ROS4 2700 x
+# 3, RODAS4 2000 x 6.
 
 
 StateArray = jax.Array  # (4, L): X1, Y1, X2, Y2 of L lanes, m and m/s
