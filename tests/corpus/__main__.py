@@ -116,7 +116,7 @@ def _of_parameter(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     if abs(new["value"] - old["value"]) > max(SHARE * old["sd"], ERRORS * noise):
         lines.append(f"value {old['value']:.6g} -> {new['value']:.6g} (sd {old['sd']:.2g})")
     relative = sum(0.5 / size for size in sizes) ** 0.5
-    if abs(new["sd"] / old["sd"] - 1.0) > max(SD_SHARE, ERRORS * relative):
+    if abs(new["sd"] - old["sd"]) > max(SD_SHARE, ERRORS * relative) * old["sd"]:
         lines.append(f"sd {old['sd']:.3g} -> {new['sd']:.3g}")
     return lines
 
