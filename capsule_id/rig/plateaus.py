@@ -1,6 +1,7 @@
 """Readings from plateaus of a time trace, and outliers that a stated rule drops."""
 
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -79,7 +80,7 @@ def read_rejection(document: TomlDocument, path: KeyPath, entry: Mapping[str, An
             raise document.error(place, f"reject must have a {key}", shown(stated), f"write {_REJECT_EXAMPLE}")
     read_choice(document, (*place, "rule"), stated["rule"], ("hampel",))
     number = stated["n_sd"]
-    if isinstance(number, bool) or not isinstance(number, int | float) or not 1.0 <= number < np.inf:
+    if isinstance(number, bool) or not isinstance(number, int | float) or not 1.0 <= number <= sys.float_info.max:
         raise document.error((*place, "n_sd"), "n_sd must be a number, 1 or more", shown(number), "write n_sd = 5")
     return Rejection(read_duration(document, (*place, "window"), stated["window"]), float(number))
 
@@ -171,7 +172,8 @@ def read_plateaus(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any
     refuse_unknown_keys(document, place, stated, ("levels", "unit", "guard"))
     levels = stated.get("levels")
     numbers = isinstance(levels, list) and all(
-        isinstance(level, int | float) and not isinstance(level, bool) and np.isfinite(level) for level in levels
+        isinstance(level, int | float) and not isinstance(level, bool) and abs(level) <= sys.float_info.max
+        for level in levels
     )
     if not isinstance(levels, list) or not numbers or len(set(levels)) < 2:
         rule = "levels must be a list of numbers, two or more different ones"

@@ -98,8 +98,9 @@ def test_remedies_of_plateaus_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="plateaus of transducer need a map of time") as caught:
         rig_of(tmp_path, text, COLUMNS.replace("time", "force").replace('"ms"', '"N"'), PLATEAUS)
     assert "map time and" in caught.value.remedy
-    with pytest.raises(InputError, match="levels must be a list of numbers"):
-        rig_of(tmp_path, text, COLUMNS, re.sub(r"\[.*\]", '"0 to 40"', PLATEAUS))
+    for wrong in ('"0 to 40"', f"[0, 1{400 * '0'}]"):
+        with pytest.raises(InputError, match="levels must be a list of numbers"):
+            rig_of(tmp_path, text, COLUMNS, re.sub(r"\[.*\]", wrong, PLATEAUS))
 
 
 @pytest.mark.parametrize("levels", [[0.0, 10.0, 20.0, 30.0, 40.0, 25.0, 15.0, 5.0, 0.0], [0.0, 5.0, 15.0, 40.0]])
@@ -144,6 +145,7 @@ def test_outliers_of_a_record_are_dropped_by_the_rule_and_counted(
         ('{ rule = "hampel", window = "20 ms" }', "must have a n_sd"),
         ('{ rule = "grubbs", window = "20 ms", n_sd = 5 }', 'rule must be "hampel"'),
         ('{ rule = "hampel", window = "20 ms", n_sd = 0 }', "n_sd must be a number, 1 or more"),
+        (f'{{ rule = "hampel", window = "20 ms", n_sd = 1{400 * "0"} }}', "n_sd must be a number, 1 or more"),
     ):
         (tmp_path / "rig.toml").write_text(f"{head}reject = {wrong}\n", encoding="utf-8")
         with pytest.raises(InputError, match=part):
