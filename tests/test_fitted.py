@@ -86,6 +86,7 @@ def test_a_result_without_sample_is_loaded_too(tmp_path: Path) -> None:
         fit.simulate(DRIVE, TIMES)
 
 
+@pytest.mark.full
 def test_another_seed_is_another_result(fitted: Fit, tmp_path: Path) -> None:
     """Negative control of the round trip: the bytes depend on the result."""
     fitted.write(tmp_path / "one")

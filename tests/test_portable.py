@@ -90,6 +90,7 @@ def test_the_search_finds_what_it_looks_for(text: str, fault: str) -> None:
     assert faults_of(text) == [fault]
 
 
+@pytest.mark.full
 def test_a_fit_without_the_modules_of_unix(tmp_path: Path) -> None:
     small_rig(tmp_path / "rig")
     before = "import os, signal, sys\n"

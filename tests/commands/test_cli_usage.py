@@ -22,6 +22,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str, program: str = "fit
     return err
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "words"),
     [

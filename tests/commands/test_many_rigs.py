@@ -11,7 +11,7 @@ import dask
 import pytest
 
 from capsule_id.cli import fit_params
-from capsule_id.commands import fit as many_rigs
+from capsule_id.commands import rigs as many_rigs
 from capsule_id.commands.bifurcate import cluster
 from tests.cli_tools import listing, small_rig
 
@@ -32,6 +32,7 @@ def parameters(directory: Path) -> dict[str, Any]:
     return json.loads((directory / "parameters.json").read_text())["parameters"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("scheduler", [(), ("--scheduler", "threads")], ids=["in turn", "threads"])
 def test_several_rigs_have_the_results_of_single_fits(
     here: Path, capsys: pytest.CaptureFixture[str], scheduler: tuple[str, ...]

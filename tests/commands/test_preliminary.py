@@ -62,6 +62,7 @@ def test_a_quiet_fit_and_one_of_bench_tests_alone_do_not(
     assert capfd.readouterr().err.count("before the sample") == 0
 
 
+@pytest.mark.full
 def test_the_point_fit_changes_no_number(pages: list[str]) -> None:
     rig, first = cid.read_rig("rig"), list[Fit]()
     shown = cid.fit(rig, budget=200, preliminary=first.append)

@@ -91,6 +91,7 @@ def push_bias(speed: float) -> float:
     return speed**2 / (2.0 * bench.G * distance) / (0.5 * MU * (1.0 + np.exp(-speed / V_S))) - 1.0
 
 
+@pytest.mark.full
 def test_biases_of_the_decay(biases: dict[str, float]) -> None:
     """-zeta^2 = -2.4 %; 1/sqrt(1 - zeta^2) - 1 = +1.2 %."""
     assert biases["k1 = m1 Omega_o^2"] == pytest.approx(-2.42, abs=0.1)

@@ -69,6 +69,7 @@ def test_forward_chooses_the_room() -> None:
         assert [type(e) for e in make_experiments(rig)] == rooms
 
 
+@pytest.mark.full
 def test_a_small_release_gives_what_the_closed_form_gives() -> None:
     """2 mm is below F_b/k1 = 2.9 mm: the capsule stays where it is."""
     for name in ("k1", "c"):

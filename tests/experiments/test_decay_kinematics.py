@@ -38,6 +38,7 @@ def findings(folder: Path, *, velocity: str = 'unit = "m/s"', forces: dict[str, 
     return [found for found in lint(rig, KINDS, rig.tables) if found.code == "decays.kinematics"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("forces", [{}, {"F_dry": 0.05 * bench.K1 * 2e-3}, {"c": 8.0}])
 def test_channels_of_one_motion_raise_nothing(tmp_path: Path, forces: dict[str, float]) -> None:
     assert findings(tmp_path, forces=forces) == []

@@ -141,6 +141,7 @@ def test_the_report_draws_the_fitted_law(fitted: Fit, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "parameters.json").read_text(encoding="utf-8").count('"F_c"') == 1
 
 
+@pytest.mark.full
 def test_a_bench_without_runs_is_fitted_too() -> None:
     """The negative control: the paper's law fits the same readings worse."""
     rng = np.random.default_rng(2)

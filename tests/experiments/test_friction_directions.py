@@ -32,6 +32,7 @@ def with_model(folder: Path, *entries: Entry, model: str) -> cid.Fit:
     return cid.fit(cid.read_rig(folder), budget=None)
 
 
+@pytest.mark.full
 def test_two_directions_are_told_apart(tmp_path: Path) -> None:
     """One coefficient for both directions fails and names the line; with it both values are recovered."""
     entries = slides("forth", False, 0), slides("back", True, 1)

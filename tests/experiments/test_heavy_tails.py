@@ -23,6 +23,7 @@ from tests.rig.faults import fault_of
 SCATTERS = {"session_sd": THETA["session_sd"], "trial_scatter": 0.0}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lone", [(), (0,), pytest.param((0, 1, 2), marks=pytest.mark.slow)])
 def test_the_density_is_the_sum_over_outlying_trials(lone: tuple[int, ...]) -> None:
     """Two settings in two sessions each, of which some are integrated out, against SciPy."""

@@ -46,6 +46,7 @@ def turning_points(both: bool, extra: dict[str, float], seed: int) -> tuple[np.n
     return fine[turns] + 5.0 + TIME_NOISE * rng.standard_normal(n), x[turns] + NOISE * rng.standard_normal(n)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("both", "extra"), [(False, {}), (True, {}), (True, {"F_dry": 0.3})], ids=str)
 def test_ten_turning_points(tmp_path: Path, both: bool, extra: dict[str, float]) -> None:
     """k1, c and dry friction within 3.5 standard errors, which are of the size that the errors imply."""

@@ -150,6 +150,7 @@ def error_of(form: str, seed: int, coarse: bool) -> float:
     return off / (early if off < 0.0 else late)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("number", [1, pytest.param(20, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("coarse", [False, True])
 @pytest.mark.parametrize("form", sorted(FORMS))

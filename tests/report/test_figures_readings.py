@@ -37,6 +37,7 @@ def decay(values: np.ndarray, time: np.ndarray, **settings: object) -> Table:
     return bench.table("free_vibration", [replace(bench.column("time", time), unit="s"), x_rel], **settings)
 
 
+@pytest.mark.full
 def test_what_was_found_is_drawn() -> None:
     noise = 1e-5 * np.random.default_rng(0).standard_normal(2000)
     values = bench.released(TIME, 2e-3) + noise[:1000]

@@ -297,6 +297,7 @@ def _labels() -> list[str]:
     return words
 
 
+@pytest.mark.full
 def test_every_label_keeps_its_readings(result: Result, tmp_path: Path) -> None:
     """Before, ``draw`` made a file that no one could load, and ``a_row`` lost its readings beside ``a``."""
     labels, rng = _labels(), np.random.default_rng(1)

@@ -170,6 +170,7 @@ def test_too_few_nodes_fail(marginal: MarginalPosterior) -> None:
         marginal.grid = grid
 
 
+@pytest.mark.full
 def test_restored_scatters_follow_their_conditional_density(marginal: MarginalPosterior) -> None:
     """4000 draws at one walker against the distribution function summed on a fine grid of the joint posterior."""
     target = marginal.target
