@@ -459,6 +459,8 @@ def _log_scale(
 NO_MASS = "no finite log-posterior near the point fit: the Laplace approximation does not hold there"
 #: Draws of a round, and rounds with one component and with several.
 DRAWS, SINGLE, SEVERAL = 2048, 4, 12
+#: Rounds with several components where an evaluation takes long.
+FEWER = 2
 #: Number of components of a posterior that one component does not describe; components of less weight are dropped.
 COMPONENTS, LEAST_WEIGHT = 8, 0.01
 #: Steps of expectation maximisation after each round with several components.
@@ -578,6 +580,11 @@ def refined(
         # The newest proposal knows the draws of all rounds, so that it misses the fewest tails.
         proposal = BlockProposal(first.blocks, [own.proposals[-1] for own in blocks])
     return proposal
+
+
+def affordable_rounds(evaluations: float) -> int:
+    """Largest number of rounds for about so many ``evaluations``, ``FEWER`` of them with several components at least."""
+    return int(np.clip(evaluations / DRAWS, SINGLE + FEWER, SINGLE + SEVERAL))
 
 
 def effective_size(log_weights: Float[np.ndarray, " w"]) -> float:

@@ -36,6 +36,7 @@ from capsule_id.inference.proposal import (
     NO_MASS,
     BlockProposal,
     Transported,
+    affordable_rounds,
     block_proposal,
     effective_size,
     refined,
@@ -416,8 +417,9 @@ DEFAULT_ESS = 4000.0
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks: so many, or this part of all.
 FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 60, 20, 5
-#: Work of all evaluations of the default budget, at most, in readings: some 20 s on two cores.
-MOST_WORK = 1e9
+#: Work of all evaluations of the default budget, and of one measurement of the pilot, at most, in readings: some 20 s
+#: and 5 s on two cores.
+MOST_WORK, PILOT_WORK = 1e9, 2.5e8
 #: Parameters of the smallest large block among those with a motion of the capsule: a forced run correlates all its
 #: parameters and determines them well, so that the Laplace approximation is tried as it is.
 LARGE = 9
@@ -585,7 +587,11 @@ def pilot(target: Target, seed: int) -> Schedule:
     # The first move runs longer where that was not enough. The other moves come last, because they are slow.
     for other in moves:
         # A longer measurement of delayed acceptance, or of a slow move, takes longer than what it could save.
-        if min(measured.values()) < (GOOD_TAU if other == FIRST else FAIR_TAU):
+        evaluations = LONG_PILOT_STEPS * len(ensemble.state.coords)
+        if (
+            min(measured.values()) < (GOOD_TAU if other == FIRST else FAIR_TAU)
+            or evaluations * target.work > PILOT_WORK
+        ):
             break
         ensemble = Ensemble(target.parts, ensemble.state, moves[other]).run(LONG_PILOT_STEPS)
         measured[other] = _longest_time(ensemble)
@@ -651,7 +657,8 @@ def adapted_proposal(
     laplace, large = laplace_proposal(target)
     if first is not None:
         return refined(target.parts, first, target.normal_priors, random, large, NEAR)
-    return refined(target.parts, laplace, target.normal_priors, random, large)
+    rounds = affordable_rounds(PILOT_WORK / target.work)
+    return refined(target.parts, laplace, target.normal_priors, random, large, rounds)
 
 
 def laplace_proposal(target: Target) -> tuple[BlockProposal, list[bool]]:
