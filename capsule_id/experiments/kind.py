@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 # kind: Declaration of one kind of experiment: its complete interface to the rest of the package.
 #
-# A kind is a folder with a ``declaration.py`` whose ``KIND`` is a ``Kind``. Declarations do not load JAX. Functions
-# that need JAX import it when they run.
+# A kind is a file that holds a ``Kind`` named ``KIND``, or a folder whose ``declaration.py`` holds it.
 
 
 #: Parameter values, SI, by name (``k1``, ``k2[soft]``).
