@@ -125,6 +125,7 @@ def test_a_worker_thread_that_does_not_end_is_ended(tmp_path: Path) -> None:
     assert fit.returncode == 130
 
 
+@pytest.mark.full
 def test_interrupted_in_a_compilation_and_in_the_sample(tmp_path: Path) -> None:
     small_rig(tmp_path / "rig")
     words = ("rig", "--quiet", "--max-steps", "60", "--ess", "100000")

@@ -69,6 +69,7 @@ def test_pulses_explain_a_record_of_pulses(tmp_path: Path) -> None:
     assert largest_residual(run, {**own, "lag": 2.0 * LAG}) > 3.0
 
 
+@pytest.mark.full
 def test_the_growth_of_initial_errors_is_that_of_the_motion_under_the_same_pulses(tmp_path: Path) -> None:
     """Pulses of an earlier or later phase let the capsule slide at other times, and give another growth."""
     write(tmp_path, Pulses(6.0, PERIOD, DUTY, phase=PHASE, lag=LAG), 50 * PERIOD, None, PULSES)

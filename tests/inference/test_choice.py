@@ -206,6 +206,7 @@ def test_the_evidence_is_that_of_the_closed_form(outside: int) -> None:
     assert abs(_bridge(weights[:2000], weights[2000:]) - 7.0) > 0.1
 
 
+@pytest.mark.full
 def test_the_evidence_of_a_bench_test_is_that_of_quadrature() -> None:
     """Draws of the adapted proposal of two springs, each a block of its own; by sums over stiffness and scatter."""
     force = np.array([1.0, 2.1, 2.9, 4.2, 4.8, 6.1])

@@ -24,6 +24,8 @@ from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import counted_pendulum, pendulum
 
+pytestmark = pytest.mark.full
+
 #: Where the swing of record 3 is down to 24 deg, s after its first sample: from there sin x is x to 3 %.
 START = 3.3
 RESOLUTION = np.deg2rad(0.09)

@@ -17,6 +17,8 @@ from capsule_id.api import Fit
 from tests.measured.folders import Entry, make_rig, note, quantity
 from tests.measured.sources import ship_roll, ship_roll_stiffness
 
+pytestmark = pytest.mark.full
+
 INERTIA = 135.0
 #: From just after the release; the record goes on to 91.6 s, where the last third says the same once more.
 START, STOP = 25.0, 70.0

@@ -47,6 +47,7 @@ def test_labels_and_mean_velocities_of_the_reference_cases(cases: Cases) -> None
         assert label == f"P-1-{r.direction[i]}-{r.contacts_per_period[i]:.0f}"
 
 
+@pytest.mark.full
 def test_longer_periods_and_aperiodic_motion() -> None:
     m2, k2, c, mu, G, P_d, Omega = np.array(list(OTHERS.values())).T
     p = CapsuleParameters(m1=0.11, m2=m2, k1=1420.0, k2=k2, c=c, mu=mu, v_s=0.3, G=G)

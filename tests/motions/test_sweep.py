@@ -67,6 +67,7 @@ def test_every_quantity_can_be_swept(e: Excitation | Pulses) -> None:
         assert name == "phase" or data["mean_velocity"][0, 0] != data["mean_velocity"][0, 1], name
 
 
+@pytest.mark.full
 def test_a_frequency_is_that_of_the_drive() -> None:
     hertz = diagram(P, E, "f", [5.0], settling=QUICK)
     radians = diagram(P, E, "Omega", [10.0 * np.pi], settling=QUICK)

@@ -78,6 +78,7 @@ def test_every_leaf_against_central_differences(inputs: Any) -> None:
         assert float(gradient[i]) == pytest.approx(expected[1], rel=1e-3, abs=3.0 * spread), name
 
 
+@pytest.mark.full
 def test_derivatives_in_the_times(inputs: Any) -> None:
     gradient = np.asarray(_grad(inputs)[4])
     for j in (0, 3, 11):
