@@ -18,9 +18,8 @@ from scipy import stats
 from capsule_id.console import OnProgress, Progress
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
-from capsule_id.experiments.friction import friction_of
+from capsule_id.experiments.friction_model import friction_of
 from capsule_id.experiments.kind import Registry, default_registry
-from capsule_id.inference.joint_fit import fit_points
 from capsule_id.inference.pipeline import (
     check_fit,
     check_readings,
@@ -31,6 +30,7 @@ from capsule_id.inference.pipeline import (
     stage_seeds,
     unfinished,
 )
+from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.prediction import DRAWS, predict
 from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS

@@ -11,7 +11,8 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, default_registry
-from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples, reading_step
+from capsule_id.records.duplicates import reading_step
+from capsule_id.records.faults import clipped_samples, dropouts, find_gaps, frozen_samples
 from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import estimate_clock
 from capsule_id.rig.filters import clock_starts, dominant_frequency

@@ -61,7 +61,7 @@ def make_experiments(
     for name, kind in kinds.items():
         kind.check([table for table in tables if table.kind == name])
     # The law loads JAX, which takes seconds. A faulty folder must be reported before.
-    from capsule_id.experiments.friction import EQUATION_1, friction_of
+    from capsule_id.experiments.friction_model import EQUATION_1, friction_of
 
     model = friction_of(rig, friction)
     model.check(kinds.parameters)

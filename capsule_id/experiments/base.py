@@ -19,7 +19,7 @@ from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Facts, Finding
 
 if TYPE_CHECKING:
-    from capsule_id.experiments.friction import FrictionModel
+    from capsule_id.experiments.friction_model import FrictionModel
     from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.experiments.context import Check, RunRecord, TableMaker
 

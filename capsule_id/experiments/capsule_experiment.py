@@ -17,14 +17,8 @@ from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import DecayAbout, FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.second_fit import starts_of_motion
-from capsule_id.experiments.friction import (
-    EQUATION_1,
-    FrictionModel,
-    GroundExperiment,
-    ground_of,
-    ground_parameters,
-    other_laws,
-)
+from capsule_id.experiments.friction import ground_of, ground_parameters
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, GroundExperiment, other_laws
 from capsule_id.experiments.misfit import Misfit, Moments
 from capsule_id.parameters import Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation

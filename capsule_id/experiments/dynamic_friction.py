@@ -11,10 +11,8 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction import (
     CAPTIONS,
-    EQUATION_1,
     MASSES_OF_FREE,
     MESSAGES,
-    FrictionModel,
     SurfaceSettings,
     Track,
     check_scatter,
@@ -26,6 +24,7 @@ from capsule_id.experiments.friction import (
     track_of,
 )
 from capsule_id.experiments.friction_experiment import FrictionExperiment
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
 from capsule_id.experiments.misfit import Misfit

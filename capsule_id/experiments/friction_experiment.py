@@ -15,16 +15,8 @@ from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, band
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.friction import (
-    FACTOR,
-    TELLING,
-    FrictionModel,
-    GroundExperiment,
-    VariantPoints,
-    candidates,
-    fit_variant,
-    weight_along,
-)
+from capsule_id.experiments.friction import FACTOR, TELLING, VariantPoints, candidates, fit_variant, weight_along
+from capsule_id.experiments.friction_model import FrictionModel, GroundExperiment
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import CoulombStribeck, normal_force, slide_distance
 from capsule_id.rig.model import Table

@@ -19,7 +19,7 @@ from capsule_id.views import Finding, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
-    from capsule_id.experiments.friction import FrictionModel
+    from capsule_id.experiments.friction_model import FrictionModel
     from capsule_id.views import Comparison
 
 

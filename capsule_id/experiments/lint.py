@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 
 from capsule_id.experiments.kind import Estimate, Kind
+from capsule_id.records.duplicates import Readings, repeated_blocks
 from capsule_id.records.faults import (
-    Readings,
     clipped_samples,
     dropouts,
     find_gaps,
     frozen_samples,
     jump_or_noise,
     noisy_stretch,
-    repeated_blocks,
     time_rounding,
 )
 from capsule_id.rig.filters import (

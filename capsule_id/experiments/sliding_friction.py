@@ -13,11 +13,9 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction import (
     CAPTIONS,
-    EQUATION_1,
     MASSES_OF_FREE,
     MESSAGES,
     NORMAL_FORCE_COLUMN,
-    FrictionModel,
     PullSettings,
     check_load,
     check_normal_force,
@@ -29,6 +27,7 @@ from capsule_id.experiments.friction import (
     lint_slides,
 )
 from capsule_id.experiments.friction_experiment import LoadedExperiment, stated_normal_forces
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Prior, scatter

@@ -11,10 +11,8 @@ import numpy as np
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.friction import (
     CAPTIONS,
-    EQUATION_1,
     MESSAGES,
     NORMAL_FORCE_COLUMN,
-    FrictionModel,
     PullSettings,
     check_load,
     check_normal_force,
@@ -25,6 +23,7 @@ from capsule_id.experiments.friction import (
     ground_parameters,
 )
 from capsule_id.experiments.friction_experiment import FrictionExperiment, LoadedExperiment, stated_normal_forces
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_rows
 from capsule_id.experiments.misfit import Misfit, Moments

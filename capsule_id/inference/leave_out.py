@@ -10,7 +10,8 @@ from scipy import stats
 
 from capsule_id.experiments.capsule_experiment import TrialsExperiment
 from capsule_id.inference.marginal import MarginalPosterior, trials_of
-from capsule_id.inference.proposal import BlockProposal, effective_size
+from capsule_id.inference.proposal import BlockProposal
+from capsule_id.inference.refinement import effective_size
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling import Emulation, ExactMotions, adapted_proposal, emulation, laplace_proposal
 from capsule_id.inference.target import LogPosterior

@@ -16,7 +16,7 @@ from scipy.special import wrightomega
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.capsule_experiment import TrialsExperiment
-from capsule_id.experiments.friction import EQUATION_1
+from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.inference.curvature import BATCH, in_batches, require_width
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior, Scale

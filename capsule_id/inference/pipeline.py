@@ -35,9 +35,9 @@ from capsule_id.inference.checks.posterior import check_agreement, decisive_read
 from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import run_checks, with_scaled
 from capsule_id.inference.checks.widening import beside_stated, record_widenings, widenings
-from capsule_id.inference.joint_fit import PointStage
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.point_stage import PointStage
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS, sample
 from capsule_id.inference.tables import make_notes, parameter_tables

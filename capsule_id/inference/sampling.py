@@ -31,13 +31,12 @@ from capsule_id.inference.moves import (
     pooled_time,
     split_rhat,
 )
-from capsule_id.inference.proposal import (
+from capsule_id.inference.proposal import BlockProposal, block_proposal
+from capsule_id.inference.refinement import (
     LARGEST_MAP,
     NO_MASS,
-    BlockProposal,
     Transported,
     affordable_rounds,
-    block_proposal,
     effective_size,
     refined,
 )

@@ -15,9 +15,9 @@ from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import declared, informed, trust_words
 from capsule_id.inference.checks.widening import Widening
 from capsule_id.inference.curvature import covariance
-from capsule_id.inference.joint_fit import BenchFit
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target import HeldResiduals, LogPosterior
 from capsule_id.parameters import Parameter, parameter

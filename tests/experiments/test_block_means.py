@@ -14,6 +14,7 @@ from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import Decrement, half_cycles, interpolate
+from capsule_id.experiments.free_vibration.noise import ReadingTimes, averaged_process, whiten_by_shape
 from capsule_id.experiments.free_vibration.readings import (
     Blocks,
     DecayModel,
@@ -21,7 +22,7 @@ from capsule_id.experiments.free_vibration.readings import (
     block_means,
     default_block_size,
 )
-from capsule_id.experiments.free_vibration.second_fit import ReadingTimes, Screening, averaged_process, whiten_by_shape
+from capsule_id.experiments.free_vibration.second_fit import Screening
 from capsule_id.records import release
 from tests.capsule_cases import jit_quickly
 from tests.experiments import bench

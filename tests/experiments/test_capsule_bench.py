@@ -15,7 +15,7 @@ from capsule_id.experiments.free_vibration.checks import check_free_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.friction_experiment import unit_law
 from capsule_id.experiments.kind import default_registry
-from capsule_id.inference.joint_fit import PointStage, fit_points
+from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing

@@ -13,11 +13,11 @@ from capsule_id.api import fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.forced_run.checks import FEWEST_PERIODS, repetition
-from capsule_id.experiments.forced_run.experiment import BaseRun
-from capsule_id.experiments.friction import FrictionModel
+from capsule_id.experiments.forced_run.drives import BaseRun
+from capsule_id.experiments.friction_model import FrictionModel
 from capsule_id.experiments.kind import default_registry
-from capsule_id.inference import joint_fit as second_fits
-from capsule_id.inference.joint_fit import error_of_sum, fit_points, law_of_runs
+from capsule_id.inference import point_stage as second_fits
+from capsule_id.inference.point_stage import error_of_sum, fit_points, law_of_runs
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Rig

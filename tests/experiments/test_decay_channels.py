@@ -14,10 +14,11 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.checks import check_drift, check_halves, check_positions, fast_rms
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.hidden_terms import whitened
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import CHANNELS, DecayModel
-from capsule_id.experiments.free_vibration.second_fit import Screened, Screening, second_models, whitened
+from capsule_id.experiments.free_vibration.second_fit import Screened, Screening, second_models
 from capsule_id.experiments.kind import default_registry
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.views import Finding

@@ -14,10 +14,10 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.friction import EQUATION_1, FrictionModel
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.experiments.static_friction import StaticFriction
-from capsule_id.inference.joint_fit import fit_points
+from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.sampling import ChainStore
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Parameter, Prior

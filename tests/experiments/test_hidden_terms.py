@@ -18,15 +18,9 @@ from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.hidden_terms import Hidden, check_hidden_terms, hidden_terms
 from capsule_id.experiments.free_vibration.lint import MESSAGES
-from capsule_id.experiments.free_vibration.second_fit import (
-    Hidden,
-    Screened,
-    check_hidden_terms,
-    hidden_terms,
-    open_models,
-    second_models,
-)
+from capsule_id.experiments.free_vibration.second_fit import Screened, open_models, second_models
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.rig.model import Quantity, Rig, Table

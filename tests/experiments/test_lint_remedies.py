@@ -13,7 +13,7 @@ import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay as rubbed
-from capsule_id.experiments.friction import FrictionModel, other_laws
+from capsule_id.experiments.friction_model import FrictionModel, other_laws
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
 from capsule_id.parameters import TABLE, Parameter, Prior

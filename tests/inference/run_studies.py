@@ -13,7 +13,7 @@ from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.checks.posterior import check_agreement
-from capsule_id.inference.joint_fit import PointStage, fit_points
+from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.inference.result import Posterior
 from capsule_id.inference.target import LogPosterior
 from capsule_id.synthetic import Truth, synthesize

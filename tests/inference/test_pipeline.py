@@ -11,7 +11,6 @@ import pytest
 import capsule_id as cid
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.kind import default_registry
-from capsule_id.inference.joint_fit import PointStage, fit_points
 from capsule_id.inference.pipeline import (
     check_fit,
     check_readings,
@@ -20,6 +19,7 @@ from capsule_id.inference.pipeline import (
     sample_posterior,
     stage_seeds,
 )
+from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.inference.result import Pointwise, Posterior
 from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import small_rig

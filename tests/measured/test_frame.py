@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from capsule_id.experiments.forced_run.experiment import BaseRun
-from capsule_id.experiments.friction import FrictionModel
+from capsule_id.experiments.forced_run.drives import BaseRun
+from capsule_id.experiments.friction_model import FrictionModel
 from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.widening import record_widenings
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
-from capsule_id.records.motion import Repeat, find_period, measured_motion
+from capsule_id.records.motion import measured_motion
+from capsule_id.records.periods import Repeat, find_period
 from capsule_id.records.tones import fit_harmonic
 from capsule_id.views import Finding
 from tests.measured.folders import Entry, make_rig, quantity

@@ -18,7 +18,8 @@ from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.checks import check_drift, check_zero
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.second_fit import Screened, check_hidden_terms, second_models
+from capsule_id.experiments.free_vibration.hidden_terms import check_hidden_terms
+from capsule_id.experiments.free_vibration.second_fit import Screened, second_models
 from capsule_id.inference.result import Posterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity

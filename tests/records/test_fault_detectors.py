@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from capsule_id.records.duplicates import Readings, reading_step, repeated_blocks
 from capsule_id.records.faults import (
     Gaps,
     Jump,
-    Readings,
     clipped_samples,
     dropouts,
     find_gaps,
     frozen_samples,
     jump_or_noise,
-    reading_step,
-    repeated_blocks,
     time_rounding,
 )
 from tests.experiments.bench import K1, M1, C, released

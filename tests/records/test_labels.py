@@ -10,7 +10,8 @@ from capsule_id.experiments.forced_run.twin import GAP_SD, SAMPLES
 from capsule_id.motions.response import response
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.model import CapsuleParameters
-from capsule_id.records.motion import UNDECIDED, Contacts, MeanVelocity, Repeat, find_period, measured_motion
+from capsule_id.records.motion import UNDECIDED, Contacts, MeanVelocity, measured_motion
+from capsule_id.records.periods import Repeat, find_period
 from capsule_id.records.tones import Harmonic
 from tests.records.runs import FRESH, LONGER, Known, fresh, longer, noisier, reference, scattered, table_of
 

@@ -6,19 +6,16 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.records import faults as duplicates
-from capsule_id.records import release
+from capsule_id.records import duplicates, release
 from capsule_id.records import tones as noise
+from capsule_id.records.duplicates import Readings, reading_step, repeated_blocks
 from capsule_id.records.faults import (
     Jump,
-    Readings,
     clipped_samples,
     dropouts,
     find_gaps,
     frozen_samples,
     jump_or_noise,
-    reading_step,
-    repeated_blocks,
     time_rounding,
 )
 from capsule_id.records.release import FreeDecay, find_free_decay

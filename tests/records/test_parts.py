@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from capsule_id.records.motion import (
-    STANDING_ADVANCE,
-    find_period,
-    fit_mean_velocity,
-    intervals_above,
-    local_polynomials,
-)
+from capsule_id.records.motion import STANDING_ADVANCE, fit_mean_velocity
+from capsule_id.records.periods import find_period, intervals_above, local_polynomials
 from capsule_id.records.tones import noise_level
 
 TIME = np.arange(2000) / 1000.0

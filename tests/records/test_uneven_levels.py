@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from capsule_id.records import faults as duplicates
-from capsule_id.records.faults import Readings, repeated_blocks
+from capsule_id.records import duplicates
+from capsule_id.records.duplicates import Readings, repeated_blocks
 
 #: Spacing of the levels of one grid, and the shift of the other one.
 SPACING, SHIFT = 4.36e-4, 3.14e-5

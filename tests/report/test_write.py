@@ -310,8 +310,8 @@ def test_every_label_keeps_its_readings(result: Result, tmp_path: Path) -> None:
     observed = {label: rng.normal(size=n) for label, n in sizes.items()}
     prior = {f"noise_sd[{label}]": rng.normal(size=7) for label in labels}
     write_posterior(dataclasses.replace(result, observed=observed, pointwise=pointwise, prior=prior), tmp_path / "x.nc")
-    _, read_prior, read = read_sample(tmp_path / "x.nc", cast(Posterior, result.posterior))
-    assert read is not None
+    _, read_prior, found = read_sample(tmp_path / "x.nc", cast(Posterior, result.posterior))
+    read = cast(Pointwise, found)
     assert list(read.log_likelihood) == list(read.replicates) == labels
     for label in labels:
         np.testing.assert_array_equal(read.log_likelihood[label], density[label])

@@ -22,7 +22,7 @@ from capsule_id.views import Facts, Finding, Message, stated_p
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
-    from capsule_id.experiments.friction import FrictionModel
+    from capsule_id.experiments.friction_model import FrictionModel
 
 
 # rules: Rules on the drive of a forced run: what each kind of drive needs, and what it does not have.
@@ -252,9 +252,9 @@ RUN_SPRINGS = {"hard": 59410.0}
 #: Module and class of the runs of each drive.
 RUNS_OF_DRIVES = {
     "harmonic": "experiment:ForcedRun",
-    "base": "experiment:BaseRun",
-    "pulses": "experiment:PulseRun",
-    "recorded": "experiment:RecordedRun",
+    "base": "drives:BaseRun",
+    "pulses": "drives:PulseRun",
+    "recorded": "drives:RecordedRun",
 }
 
 
@@ -296,7 +296,7 @@ class RunSettings(GroundSettings):
 def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -> Iterable[Finding]:
     """Report quantities that the run cannot measure, at rough values."""
     from capsule_id.experiments.forced_run.checks import feasibility
-    from capsule_id.experiments.friction import EQUATION_1, NORMAL_FORCE
+    from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE
 
     settings = table.settings
     if settings.drive != "harmonic" or settings.ground:

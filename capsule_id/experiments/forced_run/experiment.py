@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Start, ValuesBySymbol, axis_label, band, clock_parameters, stated_rate, stretch
@@ -30,18 +29,17 @@ from capsule_id.experiments.forced_run.start_state import (
     RunStart,
     corrected_start,
     rough_start,
-    slides,
 )
-from capsule_id.experiments.friction import EQUATION_1, NORMAL_FORCE, FrictionModel, ground_of, ground_parameters
+from capsule_id.experiments.friction import ground_of, ground_parameters
+from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation
-from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
-from capsule_id.physics.forces import downhill, equilibrium, rod_acceleration, rod_on_capsule
+from capsule_id.physics.forces import equilibrium, rod_acceleration
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.records.motion import MeasuredMotion, fit_mean_velocity, measured_motion
-from capsule_id.records.tones import relative_position, stated_gap, stated_Omega
+from capsule_id.records.tones import stated_gap, stated_Omega
 from capsule_id.records.view import view_record
 from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay, window_samples
 from capsule_id.rig.model import Rig, Table
@@ -739,151 +737,3 @@ class ForcedRun(CapsuleForward):
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
         return run_comparisons(self, theta, draws)
-
-
-# runs: Runs with a drive that is not harmonic: pulses, or K times the recorded current.
-
-
-#: Periods before the first sample from which pulses act: a lag forgets its start in a few periods.
-EARLIER_PERIODS = 50.0
-
-
-class OtherRun(ForcedRun):
-    """A run without a harmonic force: what the paper's protocol and figures take from one is left out."""
-
-    checks = (check_predictable, check_repeated)
-    tables = (second_fit_table, predicted_motion)
-
-    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        del theta
-        return None
-
-
-class RecordedRun(OtherRun):
-    """One record whose drive is K times the recorded current, linear between the samples.
-
-    The current is taken as recorded: its noise and the phase shift of its filter act as a force on the rod. Noise of
-    standard deviation s at n samples per period changes the amplitude of a tone by about s sqrt(2/n), which the noise
-    levels of the other channels absorb. An offset of the current is a constant force.
-
-    Attributes
-    ----------
-    current : (n,) A
-    """
-
-    current: np.ndarray
-
-    has_phase = False
-    inputs = ("current",)
-
-    def read_drive(self, table: Table) -> None:
-        self.current = table["current"]
-
-    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
-        force = jnp.multiply.outer(jnp.asarray(theta["K"]), self.current)
-        return self.with_spring(theta), RecordedDrive(self.true_time(theta), force, self.reaction)
-
-    def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
-        p = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.with_spring(theta))
-        force = xp.asarray(theta["K"])[..., None] * self.current
-        return (force - rod_on_capsule(p, x_rel, rate) - downhill(p, p.m1)) / p.m1
-
-
-class PulseRun(OtherRun):
-    """One record driven by pulses of stated period and duty, which act since long before the first sample.
-
-    Attributes
-    ----------
-    duty, P_on, lag : 1, N, s; stated, the last two where they are exact
-    """
-
-    duty: float
-    P_on: float
-    lag: float
-
-    def read_drive(self, table: Table) -> None:
-        settings = table.settings
-        self.duty, self.P_on = settings.duty, settings.P_on.value
-        self.lag = 0.0 if settings.lag is None else settings.lag.value
-
-    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
-        force, lag = theta.get("P_on", self.P_on), theta.get("lag", self.lag)
-        period = 2.0 * np.pi / self.Omega
-        return self.with_spring(theta), Pulses(
-            force, period, self.duty, phase=theta["phase"], lag=lag, reaction=self.reaction
-        )
-
-    def simulated(
-        self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
-    ) -> Trajectory:
-        earlier = EARLIER_PERIODS * 2.0 * np.pi / self.Omega
-        return super().simulated(theta, p, e, jnp.asarray(times) - self.first + earlier, initial)
-
-
-# base run: Runs whose record prescribes the motion of the rod: a shaken base, or a position-controlled inner mass.
-#
-#     x_base -> X1(t) -> capsule model -> x_capsule, x_rel
-#
-# Only the equation of the capsule is left. X1 is the cubic spline through x_base, whose own noise is neglected. The
-# zeros of x_base and x_capsule are independent, so the extension of the rod's spring at the first sample is
-# sampled.
-
-
-#: Dispersion of the starts of k1, c and mu about their estimates from the record, natural logarithm.
-SPREAD = {"k1": 0.05, "c": 0.5, "mu": 0.1}
-
-
-class BaseRun(OtherRun):
-    """One record of a capsule on a spring whose other end moves as recorded.
-
-    Attributes
-    ----------
-    base, base_rate : (n,) X1 relative to the first sample, m, and its velocity, m/s
-    """
-
-    base: np.ndarray
-    base_rate: np.ndarray
-
-    prescribed = True
-
-    def read_drive(self, table: Table) -> None:
-        motion = RodMotion.through(table["time"], table["x_base"] - table["x_base"][0])
-        self.base, self.base_rate = np.asarray(motion.X1), np.asarray(motion.Y1)
-
-    @property
-    def masses(self) -> tuple[str, ...]:
-        # The rod's mass acts through the normal force alone.
-        return ("m2",) if self.normal_force_stated or self.rig.m1 is None else ("m1", "m2")
-
-    def first_state(self, table: Table) -> RunStart:
-        relative = relative_position(table)
-        assert relative is not None, "the reader requires x_capsule or x_rel beside x_base"
-        # Friction is about as strong in both directions, so the spring is unextended near the mean.
-        seen = {name: table[name] for name in self.channels} | {"x_rel": relative[0] - np.mean(relative[0])}
-        return rough_start(table["time"], seen, self.Omega)
-
-    def starts(self) -> dict[str, Start]:
-        """Starts as of any run, and those of spring, damper and friction from the slides of the record."""
-        starts, relative = super().starts(), relative_position(self.table)
-        if relative is None or self.rig.m2 is None or self.spring is not None:
-            return starts
-        r = relative[0] - np.mean(relative[0])
-        found = slides(self.time, r, self.table["x_base"] - relative[0], 2.0 * np.pi / self.Omega, self.rig.m2.value)
-        if found is None:
-            return starts
-        m1 = 0.0 if self.rig.m1 is None else self.rig.m1.value
-        masses = {"m1": m1, "m2": self.rig.m2.value, "g": self.rig.g.value}
-        per_mu = self.law({**masses, **self.stated_ground, "mu": 1.0, "mu_back": 1.0}).forward(found.speed)
-        values = {"k1": found.k1, "c": found.c, "mu": found.friction / float(per_mu)}
-        sampled = {row.symbol for row in self.parameters}
-        starts |= {name: Start(value, SPREAD[name]) for name, value in values.items() if name in sampled}
-        at_first = f"x_start[{self.label}]"
-        return starts | {at_first: Start(float(r[0]) + found.extension, starts[at_first].spread)}
-
-    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
-        return super().law({"m1": 0.0, **theta})
-
-    def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Any]:
-        X1, time = jnp.add.outer(theta["x_start"], self.base), self.true_time(theta)
-        rate = jnp.multiply.outer(1.0 / stretch(self.clock_rate, theta), self.base_rate)
-        return self.with_spring({"m1": 0.0, **theta}), RodMotion(time, X1, rate)

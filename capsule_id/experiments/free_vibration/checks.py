@@ -10,17 +10,14 @@ from scipy import ndimage, stats
 
 from capsule_id.experiments.checks import LEVEL, refit
 from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.free_vibration.hidden_terms import sensitivities, whitened, zero_jumps
 from capsule_id.experiments.free_vibration.models import equilibrium
+from capsule_id.experiments.free_vibration.noise import drift_by_shape
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
-from capsule_id.experiments.free_vibration.second_fit import (
-    Screening,
-    drift_by_shape,
-    sensitivities,
-    whitened,
-    zero_jumps,
-)
+from capsule_id.experiments.free_vibration.second_fit import Screening
 from capsule_id.parameters import parameter
-from capsule_id.records.faults import reading_step, sampling
+from capsule_id.records.duplicates import reading_step
+from capsule_id.records.faults import sampling
 from capsule_id.records.tones import length_of_motion
 from capsule_id.rig.filters import median_step
 from capsule_id.views import Facts, Finding

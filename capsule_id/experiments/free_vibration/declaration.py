@@ -38,7 +38,7 @@ from capsule_id.views import counted
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
     from capsule_id.experiments.free_vibration.experiment import FreeVibration
-    from capsule_id.experiments.friction import FrictionModel
+    from capsule_id.experiments.friction_model import FrictionModel
 
 
 # twin: Synthetic free decays.

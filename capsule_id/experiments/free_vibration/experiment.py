@@ -24,6 +24,7 @@ from capsule_id.experiments.checks import LEVEL, autocorrelation, ljung_box, ref
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.checks import CHECKS, later_start, stiffness_by_record
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, TURNING_TIME
+from capsule_id.experiments.free_vibration.hidden_terms import check_hidden_terms, reduced_record
 from capsule_id.experiments.free_vibration.models import (
     UNKNOWNS,
     Decrement,
@@ -40,6 +41,7 @@ from capsule_id.experiments.free_vibration.models import (
     viscous_basis,
     viscous_fit,
 )
+from capsule_id.experiments.free_vibration.noise import ReadingTimes, noise_parameters, whiten
 from capsule_id.experiments.free_vibration.readings import (
     CHANNELS,
     Channel,
@@ -52,19 +54,14 @@ from capsule_id.experiments.free_vibration.readings import (
     stated_model,
 )
 from capsule_id.experiments.free_vibration.second_fit import (
-    ReadingTimes,
     Screened,
     Screening,
-    check_hidden_terms,
     decay_starts,
     first_turning_point,
     further_parameters,
     nested_starts,
-    noise_parameters,
-    reduced_record,
-    whiten,
 )
-from capsule_id.experiments.friction import EQUATION_1, FrictionModel, SurfaceExperiment
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.records.release import shortened
@@ -474,7 +471,7 @@ class FreeVibration(SurfaceExperiment):
         return self.deflection * float(np.max(np.abs(self.values - equilibrium(self.values))))
 
     def reduced(self, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See ``capsule_id.experiments.free_vibration.second_fit.Decay``."""
+        """See ``capsule_id.experiments.free_vibration.hidden_terms.Decay``."""
         return reduced_record(self, theta)
 
     @property

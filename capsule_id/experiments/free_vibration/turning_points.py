@@ -25,10 +25,11 @@ from capsule_id.experiments.base import (
 )
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.free_vibration.declaration import AMPLITUDE, NOISE_SD, TIME_SD
+from capsule_id.experiments.free_vibration.hidden_terms import check_hidden_terms, open_forces
 from capsule_id.experiments.free_vibration.models import Decrement, half_cycles
 from capsule_id.experiments.free_vibration.readings import DAMPING, DecayModel, decay_window
-from capsule_id.experiments.free_vibration.second_fit import check_hidden_terms, further_parameters, open_forces
-from capsule_id.experiments.friction import EQUATION_1, FrictionModel, SurfaceExperiment
+from capsule_id.experiments.free_vibration.second_fit import further_parameters
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
 from capsule_id.parameters import Parameter, Prior, is_stated, parameter
 from capsule_id.rig.model import Rig, Table
@@ -505,7 +506,7 @@ class TurningPoints(SurfaceExperiment):
         return second_models(records)
 
     def reduced(self, theta: ValuesBySymbol) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See ``capsule_id.experiments.free_vibration.second_fit.Decay``."""
+        """See ``capsule_id.experiments.free_vibration.hidden_terms.Decay``."""
         return reduced_points(self, theta)
 
     @property

@@ -13,8 +13,8 @@ from capsule_id.experiments.checks import autocorrelation, estimate, refit
 from capsule_id.experiments.context import Tension
 from capsule_id.experiments.friction_experiment import varies
 from capsule_id.inference.curvature import jacobian
-from capsule_id.inference.joint_fit import BenchFit
 from capsule_id.inference.point_fit import residual_jacobian
+from capsule_id.inference.point_stage import BenchFit
 from capsule_id.inference.result import PointFit, Posterior
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import is_stated

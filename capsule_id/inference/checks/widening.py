@@ -10,7 +10,7 @@ from scipy import stats
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks import estimate
-from capsule_id.experiments.friction import EQUATION_1
+from capsule_id.experiments.friction_model import EQUATION_1
 from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.parameters import is_stated

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from capsule_id.experiments.forced_run.experiment import BaseRun
+from capsule_id.experiments.forced_run.drives import BaseRun
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.inference.checks.settings import SampledFit

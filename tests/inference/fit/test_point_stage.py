@@ -8,8 +8,8 @@ from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.declaration import MESSAGES
 from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.experiments.forced_run.twin import RunSetup, make_runs
-from capsule_id.inference import joint_fit as point_stage
-from capsule_id.inference.joint_fit import cut_unpredictable
+from capsule_id.inference import point_stage
+from capsule_id.inference.point_stage import cut_unpredictable
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Quantity, Table
 from tests.experiments import bench

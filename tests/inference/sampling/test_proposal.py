@@ -8,21 +8,17 @@ import pytest
 from scipy import stats
 
 from capsule_id.inference import proposal as coordinates
-from capsule_id.inference import proposal as refinement
+from capsule_id.inference import refinement
 from capsule_id.inference.moves import effective_sample_size, ensemble_time
 from capsule_id.inference.proposal import (
     BlockProposal,
     Coordinates,
     Mixture,
-    Transported,
-    _Rounds,
     block_proposal,
     concentric,
     coordinates_of,
-    effective_size,
-    refined,
-    tempered,
 )
+from capsule_id.inference.refinement import Transported, _Rounds, effective_size, refined, tempered
 from capsule_id.inference.sampling import Ensemble, initial_state, pilot, sample
 from tests.inference.stub import Gaussian
 

@@ -1,0 +1,351 @@
+"""Forces that the fitted model of a decay lacks, and jumps of the zero of a sensor."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy import stats
+from scipy.signal import lsim
+
+from capsule_id.experiments.base import ValuesBySymbol, stretch
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.free_vibration.models import (
+    STRONGEST,
+    viscous_state,
+)
+from capsule_id.experiments.free_vibration.readings import (
+    DAMPING,
+    FURTHER,
+    DecayModel,
+    DecaySettings,
+    block_size,
+    decay_window,
+)
+from capsule_id.parameters import parameter
+from capsule_id.rig.model import Table
+from capsule_id.views import Facts, Finding
+
+if TYPE_CHECKING:
+    from capsule_id.experiments.free_vibration.experiment import FreeVibration
+from capsule_id.experiments.free_vibration.noise import whiten
+
+# sensitivities: Effects of the parameters on the readings of a decay, and of forces that the fitted model lacks.
+
+
+#: Step of difference quotients, in natural units of each parameter.
+SENSITIVITY_STEP = 1e-5
+#: Points per period, and fewest points, of the responses to further forces.
+RESPONSE_POINTS, FEWEST_POINTS = 60, 200
+
+
+def whitened(e: "FreeVibration", theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
+    """Columns (n,) or (n, q) in the coordinates where noise and drift of ``e`` are white."""
+    table = np.reshape(columns, (e.n, -1))
+    if e.model.whitened:
+        table = np.asarray(whiten(e.times, table, e.model, theta))
+    else:
+        table = table / np.reshape(e.relative_sd, (-1, 1))
+    return np.reshape(table, columns.shape)
+
+
+def sensitivities(
+    e: "FreeVibration", theta: Mapping[str, float]
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Residuals (n,), design of the linear nuisances (n, p), and derivatives of the residuals by symbol, (n,) each."""
+    raw, design = e.unwhitened(theta, np)
+    nuisances = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
+    left, units, moved = raw - design @ nuisances, _units(e, theta), {}
+    for name in ("k1", "c", *e.model.symbols, *(() if e.closed else ("amplitude", "turning_time"))):
+        other, basis = e.unwhitened({**theta, name: theta[name] + SENSITIVITY_STEP * units[name]}, np)
+        moved[name] = (other - basis @ nuisances - left) / (SENSITIVITY_STEP * units[name])
+    return left, design, moved
+
+
+def further_sensitivities(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Derivatives (n,) of the residuals with respect to the forces that the model of ``e`` lacks, at zero force."""
+    if e.closed:
+        return {name: -response for name, response in force_responses(e, theta).items()}
+    full = e.with_model(replace(e.model, damping=tuple(DAMPING), cubic=True))
+    names = e.model.absent
+    known = {**theta, **dict.fromkeys(names, 0.0)}
+    raw, units = full.unwhitened(known, np)[0], _units(e, theta)
+    return {
+        name: (full.unwhitened({**known, name: SENSITIVITY_STEP * units[name]}, np)[0] - raw)
+        / (SENSITIVITY_STEP * units[name])
+        for name in names
+    }
+
+
+def force_responses(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Responses (n,) of the readings of a viscous decay to F_dry, c_q and k_cubic of unit size, SI, by symbol.
+
+    They are linear, for small forces, and start at rest: the nuisances of the decay contain any other start.
+    """
+    raw, design = e.unwhitened(theta, np)
+    parts = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
+    m1, k1, c = theta["m1"], theta["k1"], theta["c"]
+    time = e.time * stretch(e.clock_rate, theta)
+    length = float(time[-1])
+    points = max(FEWEST_POINTS, int(RESPONSE_POINTS * length * np.sqrt(k1 / m1) / (2.0 * np.pi)))
+    grid = np.linspace(0.0, length, points)
+    x, rate = viscous_state(grid, theta, parts, e.order)
+    system = ([1.0 / m1], [1.0, c / m1, k1 / m1])
+    found = {}
+    for name, force in zip(FURTHER, (np.sign(rate), rate * np.abs(rate), x**3), strict=True):
+        response = -lsim(system, force, grid)[1]
+        for _ in range(e.order):
+            response = np.gradient(response, grid[1])
+        found[name] = np.interp(time, grid, response)
+    return found
+
+
+def _units(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, float]:
+    """Natural units of the parameters of a decay, SI."""
+    size, k1, m1 = e.largest_deflection, theta["k1"], theta["m1"]
+    units = {"k1": k1, "c": theta["c"], "F_dry": k1 * size, "c_q": m1 / size, "k_cubic": k1 / size**2}
+    return units | {"amplitude": size, "turning_time": float(np.sqrt(m1 / k1))}
+
+
+# zero: A zero of the sensor that jumps where the rod turns, as of an encoder that loses counts or of a loose sensor.
+
+
+#: Half swings that are looked at, from the release on, and fewest of them.
+MOST_HALF_SWINGS, FEWEST_HALF_SWINGS = 60, 8
+#: Most and fewest readings, or means of readings, per half swing, and fewest of all, without those near turning points.
+MOST_READINGS, FEWEST_READINGS, FEWEST_OF_ALL = 64, 6, 200
+#: Readings nearer to a turning point than this part of a half swing are left out: a zero may jump a little later.
+NEAR = 0.1
+#: A rod moves where it is faster than this part of its largest speed.
+MOVING = 1e-6
+
+
+class Jumps(NamedTuple):
+    """Zeros of half swings.
+
+    Attributes
+    ----------
+    size : rms change of the zero from one half swing to the next, SI, without what alternates
+    ratio : sum of squares of the residuals that zeros of half swings leave, relative to that of a zero that moves in straight
+        lines from the middle of each half swing to that of the next. Both have the same number of parameters
+    half_swings : number of zeros
+    """
+
+    size: float
+    ratio: float
+    half_swings: int
+
+
+def zero_jumps(e: "FreeVibration", theta: ValuesBySymbol) -> Jumps | None:
+    """Zeros of the half swings of a record; None for too few readings, and where the readings are no displacement.
+
+    Three things are projected out of both descriptions: what the fitted parameters can take up, a zero for each direction
+    of the motion (as of dry friction or hysteresis), and one in proportion to the amplitude.
+    """
+    time, values = e.whole
+    half = np.pi / e.rough_decrement().Omega_o
+    end = MOST_HALF_SWINGS * half
+    if e.order > 0 or np.count_nonzero(time <= end) < FEWEST_OF_ALL:
+        return None
+    begin = float(decay_window(e.table)[0][0])
+    settings = replace(e.table.settings, start=begin, stop=begin + float(min(end, time[-1])))
+    thin = block_size(time[time <= end], values[time <= end], 2.0 * MOST_READINGS)
+    model = replace(e.model, thin=thin, noise="white", drift="none")
+    part = type(e)(replace(e.table, settings=settings), e.rig, e.friction, model)
+    left, design, moved = sensitivities(part, theta)
+    curve = part.values - left
+    rate = np.gradient(curve, part.time)
+    # A rod that has stopped turns no more; the sign of its rate is that of rounding errors.
+    moving = np.arange(len(rate)) <= np.flatnonzero(np.abs(rate) >= MOVING * np.max(np.abs(rate)))[-1]
+    turns = np.flatnonzero(np.diff(rate[moving] > 0.0))
+    turned = 0.5 * (part.time[turns] + part.time[turns + 1])
+    if len(turns) < FEWEST_HALF_SWINGS - 1:
+        return None
+    kept = moving & (np.min(np.abs(part.time[:, None] - turned), axis=1) > NEAR * half)
+    number = np.unique(np.searchsorted(turned, part.time[kept]), return_inverse=True)[1]
+    count = np.bincount(number)
+    if len(count) < FEWEST_HALF_SWINGS or np.median(count) < FEWEST_READINGS or len(number) < FEWEST_OF_ALL:
+        return None
+    middle = np.bincount(number, weights=part.time[kept]) / count
+    own = np.eye(len(count))
+    lines = np.stack([np.interp(part.time[kept], middle, zero) for zero in own], axis=1)
+    ahead = np.where(rate > 0.0, 1.0, -1.0)
+    amplitude = np.interp(part.time, turned[:-1], 0.5 * np.abs(np.diff(curve[turns])))
+    known = np.column_stack([design, ahead, ahead * amplitude, *moved.values()])[kept]
+    jumping, zeros = _least_squares(known, own[number], left[kept])
+    # What a zero for each direction could take up is shared between both at will: it is left out of the jumps.
+    shared = np.stack([np.bincount(number, weights=x[kept]) / count for x in (ahead, ahead * amplitude)], axis=1)
+    zeros = zeros - shared @ np.linalg.lstsq(shared, zeros)[0]
+    moving_slowly, _ = _least_squares(known, lines, left[kept])
+    ratio = jumping / moving_slowly if moving_slowly > 0.0 else 1.0
+    return Jumps(float(np.sqrt(np.mean(np.diff(zeros) ** 2))), ratio, len(count))
+
+
+def _least_squares(known: np.ndarray, columns: np.ndarray, values: np.ndarray) -> tuple[float, np.ndarray]:
+    """Sum of squares that ``known`` (n, p) and ``columns`` (n, q) leave of ``values``, and the coefficients (q,)."""
+    size = np.linalg.norm(known, axis=0)
+    table = np.hstack([known[:, size > 0.0] / size[size > 0.0], columns])
+    found = np.linalg.lstsq(table, values)[0]
+    return float(np.sum((values - table @ found) ** 2)), found[-columns.shape[1] :]
+
+
+# hidden terms: Forces that the fitted model lacks, that the records cannot exclude, and that would change the quoted
+# values.
+#
+# A short record of a decay fits viscous damping as well as its sum with dry friction, and the two give different
+# values of c. The fit is linear in a small further force, so one least-squares step gives the largest force that
+# the records allow, and the values beside it.
+
+
+#: Probability that a further force is below its limit.
+LIMIT = 0.975
+#: Changes of c and of k1 by a force at its limit that matter: relative to the value, and in standard errors.
+CHANGES: Mapping[str, float] = {"c": 0.2, "k1": 0.05}
+CHANGE_IN_ERRORS = 3.0
+#: Responses to a force that are shorter than this beside the nuisances, relative to their length, are rounding.
+UNSEEN = 1e-6
+#: Estimates further below zero, in standard errors, count as this one.
+LOWEST = -30.0
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A further force, and its effect on the parameters of the model without it.
+
+    Attributes
+    ----------
+    estimate, sd : of its parameter, SI; the estimate of a force that damps may be negative
+    slopes : change of each parameter by unit of it, SI
+    errors : standard errors of the parameters without it, SI
+    """
+
+    estimate: float
+    sd: float
+    slopes: Mapping[str, float]
+    errors: Mapping[str, float]
+
+    def limits(self, signed: bool) -> tuple[float, float]:
+        """Smallest and largest value, SI, at the level ``LIMIT``; of one that is not ``signed`` the smallest is 0."""
+        if signed:
+            width = self.sd * float(stats.norm.isf(1.0 - LIMIT))
+            return self.estimate - width, self.estimate + width
+        # Far below zero the posterior above zero is exponential: its limit goes to 0.
+        ratio = max(self.estimate / self.sd, LOWEST)
+        beyond = (1.0 - LIMIT) * float(stats.norm.cdf(ratio))
+        return 0.0, self.sd * (ratio + float(stats.norm.isf(beyond)))
+
+
+class Decay(Protocol):
+    """A record or the turning points of a decay."""
+
+    model: DecayModel
+
+    @property
+    def label(self) -> str: ...
+
+    @property
+    def table(self) -> Table[DecaySettings]: ...
+
+    def local(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Select values by symbol from values by name."""
+        ...
+
+    def reduced(self, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives (n, p) and (n, q), and residuals (n,), in units of the noise, without own nuisances.
+
+        Derivatives with respect to k1, c and ``model.symbols``, and to the forces that the model lacks.
+        """
+        ...
+
+
+def check_hidden_terms(records: Sequence[Decay], fit: Fitted) -> list[Finding]:
+    """Check that viscous records exclude further forces that would change c or k1 by much, where the settings allow them."""
+    groups: dict[Any, list[Decay]] = {}
+    for e in records:
+        # A record that demands a further damping seldom excludes another one as well.
+        if not e.model.damping and (symbols := open_forces(e)):
+            groups.setdefault((symbols, e.model.cubic, e.table.settings.offers_cubic), []).append(e)
+    findings, compared = [], []
+    for (offered, _, offers_cubic), members in groups.items():
+        terms = hidden_terms(members, fit.values)
+        offered = tuple(symbol for symbol in offered if symbol in terms)
+        theta = members[0].local(fit.values)
+        # No record of a decay that does not swing excludes these forces, so the stated model is believed.
+        swings = theta["c"] < 2.0 * STRONGEST * np.sqrt(theta["k1"] * theta["m1"])
+        facts = {"labels": [e.label for e in members], "offers_cubic": offers_cubic, "swings": swings}
+        compared += facts["labels"]
+        findings += [
+            Finding("decays.hidden", "fail", {**facts, **changed}, parameters=(name,))
+            if swings
+            else Finding("decays.hidden", "warn", {**facts, **changed})
+            for name in CHANGES
+            if (changed := _change(name, fit.values[name], {symbol: terms[symbol] for symbol in offered}))
+        ]
+    if compared and not findings:
+        findings.append(Finding("decays.hidden", "ok", {"labels": ", ".join(compared)}))
+    return findings
+
+
+def open_forces(e: Decay) -> tuple[str, ...]:
+    """Symbols of the forces that the model of ``e`` lacks and whose words the settings leave open."""
+    settings = e.table.settings
+    return tuple(
+        symbol for symbol in e.model.absent if (settings.stiffness if symbol == "k_cubic" else settings.damping) is None
+    )
+
+
+def _change(name: str, value: float, terms: Mapping[str, Hidden]) -> Facts:
+    """Forces that change the parameter ``name`` by too much, and its limits beside them, SI; empty without one."""
+    ends, symbols, largest = [value], [], []
+    for symbol, term in terms.items():
+        changes = [term.slopes[name] * end for end in term.limits(symbol == "k_cubic")]
+        error = term.errors[name]
+        if max(np.abs(changes)) > max(CHANGES[name] * value, CHANGE_IN_ERRORS * error):
+            ends += [value + change + side * 1.96 * error for change in changes for side in (-1.0, 1.0)]
+            symbols.append(symbol)
+            largest.append(max(np.abs(term.limits(symbol == "k_cubic"))))
+    if not symbols:
+        return {}
+    facts = {"name": name, "unit": parameter(name).unit, "value": value, "low": max(0.0, min(ends)), "high": max(ends)}
+    return {**facts, "symbols": symbols, "largest": largest}
+
+
+def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[str, Hidden]:
+    """Every force that the common model of ``records`` lacks, by symbol; ``values`` of the fit, SI."""
+    blocks = [e.reduced(e.local(values)) for e in records]
+    known, further, left = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    model = records[0].model
+    names = ("k1", "c", *model.symbols)
+    size = np.linalg.norm(known, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    inverse = np.linalg.pinv(known / size) / size[:, None]
+    errors = dict(zip(names, np.linalg.norm(inverse, axis=1), strict=True))
+    found = {}
+    for symbol, column in zip(model.absent, further.T, strict=True):
+        change = inverse @ column
+        own = column - known @ change
+        if not column.any():
+            continue
+        power = max(float(own @ own), np.finfo(float).tiny)
+        slopes = dict(zip(names, -change, strict=True))
+        found[symbol] = Hidden(-float(own @ left) / power, power**-0.5, slopes, errors)
+    return found
+
+
+def reduced_record(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``Decay.reduced`` of a record."""
+    left, design, moved = sensitivities(e, theta)
+    further = further_sensitivities(e, theta)
+    shared = np.column_stack([moved.pop(name) for name in ("k1", "c", *e.model.symbols)])
+    own = whitened(e, theta, np.column_stack([design, *moved.values()]))
+    own = np.linalg.qr(own / np.linalg.norm(own, axis=0))[0]
+    parts = [
+        whitened(e, theta, part)
+        for part in (shared, np.column_stack([further[s] for s in e.model.absent]), left[:, None])
+    ]
+    known, others, residuals = (part - own @ (own.T @ part) for part in parts)
+    # The offset takes up dry friction in a decay that does not swing: only rounding is left of it.
+    others[:, np.linalg.norm(others, axis=0) <= UNSEEN * np.linalg.norm(parts[1], axis=0)] = 0.0
+    misfit = residuals - known @ np.linalg.lstsq(known, residuals, rcond=None)[0]
+    noise = np.sqrt(np.sum(misfit**2) / max(e.n - own.shape[1] - known.shape[1], 1))
+    return known / noise, others / noise, residuals[:, 0] / noise

@@ -1,0 +1,286 @@
+"""Friction law of a fit: its sampled parameters, and the law at given values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import Experiment, ValuesBySymbol
+from capsule_id.parameters import Parameter, Prior
+from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force
+from capsule_id.rig.model import ModelChoices, Rig, Table
+
+if TYPE_CHECKING:
+    pass
+
+
+# friction model: Friction law of a fit: its sampled parameters, and the law at given values.
+
+
+#: Symbol of the leaf that holds the normal force, N.
+NORMAL_FORCE = "N"
+#: Values of eq. (1) at which the friction is the same at every speed; v_s is then any positive number.
+CONSTANT = {"ratio": 1.0, "v_s": 1.0}
+#: Prior draws at which a parameter may change the break-away force.
+PRIOR_DRAWS = 64
+#: Relative changes of the break-away force below this are rounding.
+ROUNDING = 1e-9
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PerWeight:
+    """A law divided by the weight of capsule and rod: its resistance is the friction coefficient, 1.
+
+    Attributes
+    ----------
+    law : resistance in N
+    weight : (m1 + m2) g, N
+    """
+
+    law: FrictionLaw
+    weight: Any
+
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+
+    def forward(self, speed: Any) -> Any:
+        """Coefficient of a capsule that slides towards positive X2, 1."""
+        return self.law.forward(speed) / self.weight
+
+    def backward(self, speed: Any) -> Any:
+        """Coefficient of a capsule that slides towards negative X2, 1."""
+        return self.law.backward(speed) / self.weight
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Reversed:
+    """A law with its directions exchanged: readings of backward sliding, taken as forward ones."""
+
+    law: FrictionLaw
+
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+
+    def forward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards negative X2, N."""
+        return self.law.backward(speed)
+
+    def backward(self, speed: Any) -> Any:
+        """Resistance of a capsule that slides towards positive X2, N."""
+        return self.law.forward(speed)
+
+
+@dataclass(frozen=True)
+class FrictionModel:
+    """One friction law for all experiments of a fit, as a function of the parameter values.
+
+    The leaves of the law are its sampled parameters. A leaf ``N`` is not sampled: it holds the weight (m1 + m2) g.
+
+    Attributes
+    ----------
+    law : its class; eq. (1) by default
+    free : symbols of the optional parameters that are sampled; the others keep their defaults
+    constant : eq. (1) with ratio 1: the same friction at every speed, without v_s
+    direction : of the sliding that an experiment records. "backward" exchanges the directions of the law
+
+    Raises
+    ------
+    InputError
+        If ``law`` is no class of friction laws, if it has a leaf other than N that is not sampled, or a sampled one
+        without a default prior, or if N is sampled.
+    """
+
+    law: type[FrictionLaw] = CoulombStribeck
+    free: tuple[str, ...] = ()
+    constant: bool = False
+    direction: Literal["both", "forward", "backward"] = "both"
+
+    def __post_init__(self) -> None:
+        law, wanted = self.law, ("parameters", "forward", "backward")
+        if not isinstance(law, type) or not all(hasattr(law, name) for name in wanted):
+            rule = "friction must be a class with parameters, forward(speed) and backward(speed)"
+            raise InputError(rule, repr(law), "give the class itself; see capsule_id.physics.friction.FrictionLaw")
+        for row in law.parameters:
+            if row.symbol == NORMAL_FORCE and (row.prior is not None or row.sampled):
+                rule = f"a leaf N of the friction law {law.__name__} holds the weight, N, and is not sampled"
+                raise InputError(rule, row.meaning, "give the row no prior and sampled=False, or rename the leaf")
+            if row.symbol != NORMAL_FORCE and (row.prior is None or not row.sampled):
+                rule = f"every parameter of the friction law {law.__name__} must have a default prior"
+                raise InputError(rule, f"{row.symbol} has none", f"give Parameter({row.symbol!r}, ...) a prior")
+        try:
+            leaves = jax.tree.leaves(self._at({row.symbol: _prior_of(row).median for row in self.parameters}, 1.0))
+        except TypeError as error:
+            rule = f"the friction law {law.__name__} must have one row of parameters per field"
+            raise InputError(rule, str(error), "give every field a row with the field's name as its symbol") from None
+        if len(leaves) != len(law.parameters) or any(isinstance(leaf, law) for leaf in leaves):
+            rule = f"the friction law {law.__name__} must be a pytree whose leaves are its parameters"
+            raise InputError(rule, f"leaves: {len(leaves)}", "add @jax.tree_util.register_dataclass above @dataclass")
+
+    @property
+    def name(self) -> str:
+        """Name for legends."""
+        if self.law is not CoulombStribeck:
+            return self.law.__name__
+        words = ["constant friction" if self.constant else "eq. (1)", *(f"free {symbol}" for symbol in self.free)]
+        return ", ".join(words)
+
+    @property
+    def is_proportional(self) -> bool:
+        """Whether the law is proportional to the normal force, so that a coefficient needs no mass."""
+        return self.law is CoulombStribeck and "viscous" not in self.free
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The sampled parameters."""
+        rows = (row for row in self.law.parameters if row.symbol != NORMAL_FORCE)
+        absent = set(CONSTANT) if self.constant else set()
+        if "mu_back" in self.free:
+            absent |= {"forward": {"mu_back"}, "backward": {"mu"}}.get(self.direction, set())
+        sampled = (row for row in rows if not row.optional or row.symbol in self.free)
+        return tuple(row for row in sampled if row.symbol not in absent)
+
+    @property
+    def parameters_at_rest(self) -> tuple[Parameter, ...]:
+        """Parameters that change the break-away force at some prior draw: mu alone in eq. (1)."""
+        rng = np.random.default_rng(0)
+        draws = {row.symbol: _prior_of(row).sample(rng, PRIOR_DRAWS) for row in self.parameters}
+        still = np.zeros(PRIOR_DRAWS)
+        force = np.asarray(self._at(draws, 1.0).forward(still))
+
+        def matters(row: Parameter) -> bool:
+            other = self._at({**draws, row.symbol: np.roll(draws[row.symbol], 1)}, 1.0)
+            change = np.abs(np.asarray(other.forward(still)) - force)
+            # A force that is not finite does not show that the parameter has no effect.
+            return not bool(np.all(change <= ROUNDING * np.abs(force)))
+
+        return tuple(row for row in self.parameters if matters(row))
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        """Symbols of the masses that the coefficient depends on."""
+        return () if self.is_proportional else ("m1", "m2")
+
+    @property
+    def source(self) -> str:
+        """Name of the law in provenance: module and class; "eq. (1)" for the paper's, with its free parameters."""
+        return self.name if self.law is CoulombStribeck else f"{self.law.__module__}.{self.law.__qualname__}"
+
+    def check(self, known: Mapping[str, Parameter]) -> None:
+        """Reject a law that has the symbol of a different parameter in ``known`` (package and kinds).
+
+        Raises
+        ------
+        InputError
+            At the first such parameter.
+        """
+        for row in self.parameters:
+            if known.get(row.symbol, row) != row:
+                rule = f"a parameter of the friction law {self.law.__name__} must have a symbol of its own"
+                raise InputError(rule, f"{row.symbol}: {known[row.symbol].meaning}", "rename it")
+
+    def force(self, theta: ValuesBySymbol) -> FrictionLaw:
+        """The law at ``theta``, N; theta has m1, m2, g and, off level ground, slope and N0; or N."""
+        return self._at(theta, _weight(theta))
+
+    def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
+        """Resistance per weight (m1 + m2) g at ``theta``, 1; theta has ``masses`` and g."""
+        # Without masses only the break-away coefficient is read, and nothing viscous acts at rest.
+        if self.is_proportional or (self.law is CoulombStribeck and not {"m1", "m2"} <= set(theta)):
+            return self._at(theta, 1.0)
+        return PerWeight(self.force(theta), _weight(theta))
+
+    def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
+        # Parameters that tilts do not sample have no effect at rest, so any value is valid there.
+        held = set(CONSTANT) if self.constant else set()
+        rows = (row for row in self.law.parameters if row.symbol not in {NORMAL_FORCE, *held})
+        used = (row for row in rows if not row.optional or row.symbol in self.free)
+        known = {row.symbol: theta.get(row.symbol, _prior_of(row).median) for row in used}
+        constant = {row.symbol: N for row in self.law.parameters if row.symbol == NORMAL_FORCE}
+        law = cast(Any, self.law)(**known, **constant, **(CONSTANT if self.constant else {}))
+        return Reversed(law) if self.direction == "backward" else law
+
+
+def _prior_of(row: Parameter) -> Prior:
+    assert row.prior is not None, "a friction model refuses rows without a prior"
+    return row.prior
+
+
+def _weight(theta: ValuesBySymbol) -> Any:
+    """Normal force, N: as stated, else that of the weight on the slope, and N0."""
+    if NORMAL_FORCE in theta:
+        return theta[NORMAL_FORCE]
+    return normal_force(theta["m1"], theta["m2"], theta["g"], theta.get("slope"), theta.get("N0"))
+
+
+def other_laws(friction: FrictionModel) -> tuple[str, ...]:
+    """Lines of ``[model]`` that state simple laws other than ``friction``; () for a law of a user's own."""
+    if friction.law is not CoulombStribeck:
+        return ()
+    constant = () if friction.constant else ('friction = "constant"',)
+    ratio = () if friction.constant or "ratio" in friction.free else ('free = ["ratio"]',)
+    return (*constant, *ratio)
+
+
+#: Default friction law: eq. (1) of the paper.
+EQUATION_1 = FrictionModel()
+
+
+def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel:
+    """Return the friction model of a fit: the class ``law``, by default eq. (1) with the choices of ``[model]``.
+
+    Raises
+    ------
+    InputError
+        If both ``law`` and ``[model]`` choose the friction, or ``law`` cannot be fitted.
+    """
+    own = {row.symbol for row in CoulombStribeck.parameters}
+    free = tuple(symbol for symbol in rig.model.free if symbol in own)
+    if law is None:
+        return FrictionModel(free=free, constant=rig.model.friction == "constant")
+    if free or rig.model.friction != ModelChoices().friction:
+        rule, remedy = "a friction law of its own replaces [model]", "remove friction and free from [model]"
+        raise InputError(rule, f"both {law.__name__} and [model]", remedy, rig.folder / "rig.toml")
+    return FrictionModel(law)
+
+
+class SurfaceExperiment(Experiment):
+    """An experiment with a sliding capsule; its constructor takes a friction law in addition to table and rig.
+
+    Attributes
+    ----------
+    friction : the law that all experiments of the fit share
+    """
+
+    friction: FrictionModel = eqx.field(static=True)
+
+    @classmethod
+    def make(cls, table: Table, rig: Rig, friction: FrictionModel) -> "tuple[SurfaceExperiment, ...]":
+        return (cls(table, rig, friction),)  # type: ignore[call-arg, arg-type]  # pyright: ignore
+
+    def with_friction(self, friction: FrictionModel) -> "SurfaceExperiment":
+        """Return the same readings with another friction law."""
+        return type(self)(self.table, self.rig, friction)  # type: ignore[call-arg, arg-type]  # pyright: ignore
+
+
+class GroundExperiment(SurfaceExperiment):
+    """An experiment whose capsule slides on a track that may have a slope, with a force besides the weight.
+
+    Attributes
+    ----------
+    ground : slope, rad, and N0, N, where they are not 0; None: a parameter, because an sd is stated
+    """
+
+    ground: dict[str, float | None]
+
+    def ground_at(self, theta: ValuesBySymbol) -> dict[str, Any]:
+        """Slope, rad, and N0, N, at ``theta``, where they are not 0."""
+        return {name: theta[name] if value is None else value for name, value in self.ground.items()}
+
+    @property
+    def stated_ground(self) -> dict[str, float]:
+        """``ground_at`` at the stated values."""
+        return {name: self.table.settings.ground[name].value for name in self.ground}

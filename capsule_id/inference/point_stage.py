@@ -1,0 +1,313 @@
+"""Stages of the point fit: bench tests in closed form, joint fit, second fits where residuals of runs are correlated."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from capsule_id.console import threads
+from capsule_id.errors import InputError
+from capsule_id.experiments import make_experiments, paper_estimates, select_tables
+from capsule_id.experiments.base import Experiment
+from capsule_id.experiments.checks import Whiteness, correlated_records
+from capsule_id.experiments.friction import model_lines
+from capsule_id.experiments.friction_model import FrictionModel, SurfaceExperiment
+from capsule_id.experiments.kind import Registry
+from capsule_id.inference.joint_fit import joint_fit
+from capsule_id.inference.marginal import MarginalPosterior
+from capsule_id.inference.point_fit import point_fit
+from capsule_id.inference.result import PointFit, Posterior
+from capsule_id.inference.sampling import sample
+from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import is_stated
+from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.views import Finding
+
+# second fits: Further fits of runs whose residuals are correlated: coloured noise, then other friction laws.
+#
+# first joint fit -> residuals correlated -> joint fit with AR(1) noise, quoted where it explains more
+#     -> residuals still correlated -> joint fits with other friction laws, which are named and never quoted
+
+
+#: Friction laws that are compared, the simplest first.
+LAWS = (FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",)))
+#: Difference of penalised log-posteriors that rejects a simpler law: "strong" (Kass & Raftery 1995).
+STRONG = 3.0
+#: Standard errors of the difference that reject a simpler law where every law leaves correlated residuals.
+ERRORS = 2.0
+#: Parts of an excitation period.
+PHASES = 6
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A target and its point fit."""
+
+    target: LogPosterior
+    fit: PointFit
+
+    @classmethod
+    def of(
+        cls, other: LogPosterior, experiments: Sequence[Experiment], known: Mapping[str, float], seed: int
+    ) -> "_Fit":
+        """Fit other models of the same readings, from many starts about values by name."""
+        target = LogPosterior(other.rig, experiments)
+        return cls(target, joint_fit(target, known, seed))
+
+    def with_law(self, law: FrictionModel, seed: int) -> "_Fit":
+        """Fit another friction law from this fit alone: the motion is known, and only a comparison needs the result."""
+        experiments = [e.with_friction(law) if isinstance(e, SurfaceExperiment) else e for e in self.target.experiments]
+        target = LogPosterior(self.target.rig, experiments)
+        values = {**{name: start.centre for name, start in target.starts().items()}, **self.values}
+        start = target.unconstrain(np.array([values[name] for name in target.names]))
+        return _Fit(target, joint_fit(target, values, seed, starts=start[None]))
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Parameters and constants by name, SI."""
+        return self.target.mapping(self.target.theta(self.fit.u))
+
+    @property
+    def correlated(self) -> list[Whiteness]:
+        """Records whose residuals are not white."""
+        return correlated_records(self.target.experiments, self.values)[0]
+
+    @property
+    def height(self) -> float:
+        """Largest log-posterior, less Schwarz's penalty for the number of parameters."""
+        readings = sum(e.n for e in self.target.experiments)
+        return float(np.max(self.fit.log_posterior)) - 0.5 * self.target.dimension * float(np.log(readings))
+
+    @property
+    def physical(self) -> list[str]:
+        """Names of the physical parameters that are no stated values."""
+        return [row.name for row in self.target.parameters if row.physical and not is_stated(row.name)]
+
+    def row(self, name: str) -> dict[str, Any]:
+        """Row of a table that compares fits of the same readings."""
+        values, errors = self.fit.values, self.fit.standard_errors
+        return {
+            "fit": name,
+            "parameters": ", ".join(f"{own} = {values[own]:.5g} ± {errors[own]:.2g}" for own in self.physical),
+            "log-posterior": float(np.max(self.fit.log_posterior)),
+            "residuals white": "no" if self.correlated else "yes",
+        }
+
+    def densities(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Cycle, and log-density up to a constant, of every reading of each record (n,)."""
+        values, found = self.values, []
+        for e in self.target.experiments:
+            if e.cycles is not None:
+                misfit, channels = e.misfit(e.local(values)), e.n // len(e.cycles)
+                density = -0.5 * misfit.at_nuisance_mean(np)[0] ** 2 - np.log(misfit.sd)
+                found.append((np.tile(e.cycles, channels), density[: channels * len(e.cycles)]))
+        return found
+
+
+def fit_coloured(target: LogPosterior, first: PointFit, seed: int) -> tuple[LogPosterior, PointFit, list[Finding]]:
+    """Fit runs again with coloured noise where their residuals are correlated and the settings state no noise.
+
+    The second fit is returned where it explains the readings better, and a finding that shows both.
+    """
+    white = _Fit(target, first)
+    values, correlated = white.values, {one.experiment.shares_noise for one in white.correlated}
+    changed = [
+        e.with_coloured_noise(e.local(values)) if e.shares_noise in correlated else None for e in target.experiments
+    ]
+    if not any(changed):
+        return target, first, []
+    experiments = [e if new is None else new[0] for e, new in zip(target.experiments, changed, strict=True)]
+    starts = {name: value for new in changed if new is not None for name, value in new[1].items()}
+    coloured = _Fit.of(target, experiments, {**values, **starts}, seed)
+    if coloured.height < white.height:
+        return target, first, []
+    rows = [white.row("first, white noise"), coloured.row("quoted, AR(1) noise")]
+    records = list(dict.fromkeys(e.shares_noise for e, new in zip(target.experiments, changed, strict=True) if new))
+    finding = Finding("runs.second_fit", "warn", {"records": records, "fits": rows}, records[0])
+    return coloured.target, coloured.fit, [finding]
+
+
+def compare_laws(target: LogPosterior, fit: PointFit, seed: int) -> list[Finding]:
+    """Fit other friction laws to runs whose residuals are correlated; a finding names the simplest of the best ones.
+
+    Only where runs alone measure friction: friction tests compare the laws themselves.
+    """
+    quoted, own = _Fit(target, fit), law_of_runs(target.experiments)
+    correlated = [one.experiment for one in quoted.correlated if one.experiment.event_driven]
+    if own is None or not correlated:
+        return []
+    fits = {own: quoted}
+    for law in LAWS:
+        if law != own:
+            with suppress(InputError):  # no motion with this law is finite
+                fits[law] = quoted.with_law(law, seed)
+    best = max(fits.values(), key=lambda one: one.height)
+    behind = {law: _behind(one, best) for law, one in fits.items()}
+    close = [law for law, (difference, error) in behind.items() if difference <= max(STRONG, ERRORS * error)]
+    chosen = min(close, key=lambda law: (len(law.parameters), law != own))
+    new = fits[chosen].fit.values
+    facts = {
+        "own": own.name,
+        "law": chosen.name,
+        "line": model_lines(chosen),
+        "better": own not in close,
+        "gain": behind[own][0] - behind[chosen][0],
+        "moved": [(name, quoted.values[name], new[name]) for name in quoted.physical if name in new],
+        "laws": [
+            {**fits[law].row(law.name), "behind the best": f"{difference:.0f} ± {error:.0f}"}
+            for law, (difference, error) in sorted(behind.items(), key=lambda item: item[1][0])
+        ],
+    }
+    return [Finding("runs.laws", "ok" if chosen == own else "warn", facts, correlated[0].label)]
+
+
+def _behind(one: _Fit, best: _Fit) -> tuple[float, float]:
+    """Penalised log-posterior of the ``best`` fit less that of ``one``, and its standard error.
+
+    Where the best fit leaves white residuals, the standard error is 0. Else every model has an error, and likelihoods
+    count the readings as more than they are: the standard error is that of a sum over parts of the records, over whole
+    periods or over phases of the excitation, whichever is larger.
+    """
+    difference = best.height - one.height
+    if one is best or not best.correlated:
+        return difference, 0.0
+    by_period, by_phase = [], []
+    for (cycles, high), (_, low) in zip(best.densities(), one.densities(), strict=True):
+        by_period.append(np.bincount((cycles - cycles[0]).astype(int), high - low))
+        by_phase.append(np.bincount((cycles % 1.0 * PHASES).astype(int), high - low))
+    return difference, max(error_of_sum(np.concatenate(parts)) for parts in (by_period, by_phase))
+
+
+def error_of_sum(parts: np.ndarray) -> float:
+    """Standard error of the sum of independent ``parts`` (n,); 0 for a single one, which tells nothing of it."""
+    return float(np.sqrt(len(parts) * np.var(parts, ddof=1))) if len(parts) > 1 else 0.0
+
+
+def law_of_runs(experiments: Sequence[Experiment]) -> FrictionModel | None:
+    """The friction law of the runs; None where other tests measure friction, or the law is a user's own."""
+    symbols = {row.symbol for row in CoulombStribeck.parameters}
+    users = [e for e in experiments if symbols & {row.symbol for row in e.parameters}]
+    laws = [e.friction for e in users if isinstance(e, SurfaceExperiment) and e.event_driven and e.time_series]
+    return laws[0] if laws and len(laws) == len(users) and laws[0].law is CoulombStribeck else None
+
+
+# point stage: Stages of the point fit: bench tests in closed form, division of unpredictable runs, joint fit.
+#
+# experiments -> fit of the bench tests in closed form -> divide runs that amplify initial errors -> LogPosterior
+#     -> joint fit
+#     -> where residuals of runs are correlated: second joint fit with coloured noise, and fits with other friction laws
+
+
+#: emcee steps of the bench sample, which measures the precision gained from runs and their agreement.
+BENCH_BUDGET = 1000
+#: Largest number of fits. Each fit follows a correction of the kinds of initial state that the last one contradicts.
+STAGE_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class BenchFit:
+    """Fit and sample of the bench tests in closed form alone, ``event_driven`` false.
+
+    Both are None where there are none; the sample is None where nothing was sampled.
+    """
+
+    fit: PointFit | None = None
+    sample: Posterior | None = None
+
+
+@dataclass(frozen=True)
+class PointStage:
+    """Result of the point fit; ``target`` holds the experiments as fitted, with divided records."""
+
+    target: LogPosterior
+    fit: PointFit
+    bench: BenchFit
+    seed: int
+    findings: tuple[Finding, ...] = ()
+
+
+def fit_points(target: LogPosterior, registry: Registry, seed: int, sampled: bool) -> PointStage:
+    """Fit the experiments of ``target``.
+
+    Parameters
+    ----------
+    registry : kinds of experiments of the rig, for rough values from bench tests that are not fitted
+    seed : seed of the starting points and of the bench sample
+    sampled : whether a sample follows: then sample the bench tests alone too
+    """
+    closed = [e for e in target.experiments if not e.event_driven]
+    if len(closed) == len(target.experiments):
+        return PointStage(target, point_fit(target, seed), BenchFit(), seed)
+    alone = LogPosterior(target.rig, closed) if closed else None
+    bench = None if alone is None else point_fit(alone, seed)
+    known = _paper_values(target, registry) if bench is None else dict(bench.values)
+    target, findings = cut_unpredictable(target, known)
+    # The joint fit takes one core most of the time: the bench is sampled on another one.
+    with threads(1) as beside:
+        own = None
+        if alone and bench and sampled:
+            own = beside.submit(sample, MarginalPosterior(alone, bench), seed, BENCH_BUDGET)
+        target, joint, wavering = _fit_with_right_starts(target, known, seed)
+        target, joint, second = fit_coloured(target, joint, seed)
+        second += compare_laws(target, joint, seed)
+        bench_fit = BenchFit(bench, None if own is None else own.result())
+    return PointStage(target, joint, bench_fit, seed, (*findings, *wavering, *second))
+
+
+def _fit_with_right_starts(
+    target: LogPosterior, known: Mapping[str, float], seed: int
+) -> tuple[LogPosterior, PointFit, list[Finding]]:
+    """Repeat the joint fit while it contradicts the kind of initial state of a run; report what remains."""
+    first = None
+    for remaining in reversed(range(STAGE_ROUNDS)):
+        joint = joint_fit(target, known, seed, first)
+        corrected = correct_starts(target, joint)
+        if corrected is None:
+            return target, joint, []
+        if remaining:
+            target, first = LogPosterior(target.rig, corrected[0]), corrected[1]
+    doubtful = [a.label for a, b in zip(target.experiments, corrected[0], strict=True) if a is not b]
+    facts = {"labels": ", ".join(doubtful), "rounds": STAGE_ROUNDS}
+    return target, joint, [Finding("runs.start", "fail", facts, doubtful[0])]
+
+
+def _paper_values(target: LogPosterior, registry: Registry) -> dict[str, float]:
+    """Return the paper's estimates from the rig's bench tests, including tests that ``target`` lacks."""
+    bench = [e for e in target.experiments if e.bench]
+    if not bench and select_tables(target.rig, "bench"):
+        bench = make_experiments(target.rig, "bench", registry)
+    return paper_estimates(bench, registry)
+
+
+def cut_unpredictable(target: LogPosterior, known: Mapping[str, float]) -> tuple[LogPosterior, list[Finding]]:
+    """Divide every run that amplifies errors of its initial state too much; return findings too.
+
+    Parameters
+    ----------
+    known : estimates by name; a missing parameter takes the starting value of a fit
+    """
+    values = {**target.fixed, **{name: start.centre for name, start in target.starts().items()}, **known}
+    kept: list[Experiment] = []
+    findings: list[Finding] = []
+    for e in target.experiments:
+        parts, found = e.predictable_parts(e.local(values))
+        kept += parts
+        findings += found
+    return (LogPosterior(target.rig, kept) if len(kept) > len(target.experiments) else target), findings
+
+
+def correct_starts(target: LogPosterior, fit: PointFit) -> tuple[list[Experiment], dict[str, float]] | None:
+    """Replace initial conditions that the record contradicts at ``fit``; return experiments and starting values.
+
+    None: the record contradicts no initial condition.
+    """
+    values = target.mapping(target.theta(fit.u))
+    corrected = [e.corrected_start(e.local(values)) for e in target.experiments]
+    if not any(corrected):
+        return None
+    for found in corrected:
+        values |= {} if found is None else found[1]
+    pairs = zip(target.experiments, corrected, strict=True)
+    return [e if found is None else found[0] for e, found in pairs], values

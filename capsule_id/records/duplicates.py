@@ -1,0 +1,223 @@
+"""Finds readings that occur twice: equal tables, and equal blocks of rows within or across tables."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from capsule_id.records.tones import noise_level
+from capsule_id.rig.filters import PIECE, thinned
+
+# duplicates: Finds readings that occur twice: equal tables, and equal blocks of rows within or across tables.
+#
+# Two independent readings agree by chance with probability q/s: q is the reading step, s the width of the scatter.
+# A block counts as repeated where agreement by chance is practically impossible, so coarse readings that agree are
+# no duplicates.
+
+
+#: Expected number of blocks that agree by chance, below which a block counts as repeated.
+CHANCE = 1e-6
+#: Shortest block of a record, samples; shortest record whose noise level is estimated.
+SHORTEST_BLOCK, SHORTEST_RECORD = 8, 50
+#: Width of a scatter, in standard deviations; scatter of a table of single readings, relative to its range.
+WIDTH, TABLE_SCATTER = 3.5, 0.01
+#: Rows that are compared at a time.
+COMPARED = 4096
+#: Most decimal places of a reading step.
+MOST_DECIMALS = 15
+#: Distance of a level from an even spacing, in spacings; share of the levels that must be within it.
+LEVEL_TOLERANCE, REGULAR_LEVELS = 0.2, 0.9
+#: A gap between levels is large beyond so many steps; levels are uneven where this share of the gaps is large.
+LARGE_GAP, MANY_LARGE_GAPS = 3.0, 0.3
+#: Largest number of levels per reading of a table and of a record: at a high amplitude most levels are read once.
+MOST_LEVELS, MOST_LEVELS_OF_RECORD = 0.5, 0.9
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of one table without time.
+
+    Attributes
+    ----------
+    values : (n, columns), in units that are the same in all tables
+    record : a time series
+    to_display : (columns,) factors to the units in which the readings were written; (): 1
+    """
+
+    label: str
+    values: np.ndarray
+    record: bool
+    to_display: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """``count`` rows of ``label`` from index ``row`` equal those of ``first`` from index ``first_row``."""
+
+    label: str
+    row: int
+    first: str
+    first_row: int
+    count: int
+
+
+def reading_step(values: np.ndarray) -> float:
+    """Reading step of ``values`` (n,), in their unit: a power of ten, or the spacing of their levels; 0 without one."""
+    scale = _largest(values)
+    if scale == 0.0:
+        return 0.0
+    values = thinned(values)
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > 1e-9 * scale]
+    most = MOST_LEVELS if len(values) < SHORTEST_RECORD else MOST_LEVELS_OF_RECORD
+    if 2 < len(gaps) < most * len(values):
+        spacing = float(np.median(gaps[gaps < 1.5 * np.min(gaps)]))
+        if np.mean(np.abs(gaps / spacing - np.round(gaps / spacing)) < LEVEL_TOLERANCE) > REGULAR_LEVELS:
+            return spacing
+    first = -int(np.floor(np.log10(scale)))
+    for decimals in range(first, first + MOST_DECIMALS):
+        if np.allclose(np.round(values, decimals), values, rtol=0.0, atol=1e-9 * 10.0**-decimals + 4e-16 * scale):
+            return 10.0**-decimals
+    return 0.0
+
+
+def _largest(values: np.ndarray) -> float:
+    """Largest magnitude; 0 without values."""
+    return max(float(np.max(values)), -float(np.min(values))) if len(values) else 0.0
+
+
+def chance_of_equality(readings: Readings) -> float:
+    """Probability that two independent rows agree in all columns; 1 where the reading step hides the scatter."""
+    chance = 1.0
+    factors = readings.to_display or (1.0,) * readings.values.shape[1]
+    for values, factor in zip(readings.values.T, factors, strict=True):
+        # A step of 0.1 deg is a decimal one in deg alone.
+        step, width = reading_step(factor * thinned(values)) / factor, TABLE_SCATTER * float(np.ptp(values))
+        if readings.record and len(values) >= SHORTEST_RECORD:
+            step, width = max(step, _uneven_spacing(values, step)), WIDTH * noise_level(values)
+        # A step of 0 is that of float64.
+        own = min(1.0, max(step, 4e-16 * _largest(values)) / width) if width > 0.0 else 1.0
+        chance *= own if readings.record else max(own, _set_share(values, readings.values))
+    return chance
+
+
+def _uneven_spacing(values: np.ndarray, step: float) -> float:
+    """Mean gap between the levels of a record (n,) where many are far larger than the reading step; else 0.
+
+    An encoder may read on several grids that are shifted against each other. A few large gaps are jumps of the motion.
+    """
+    thin = thinned(values)
+    gaps = np.diff(np.unique(thin))
+    several = 1 < len(gaps) < MOST_LEVELS * len(thin)
+    uneven = several and np.mean(gaps > LARGE_GAP * step) > MANY_LARGE_GAPS
+    return float(np.mean(gaps[gaps <= LARGE_GAP * np.quantile(gaps, 0.75)])) if uneven else 0.0
+
+
+def _set_share(column: np.ndarray, rows: np.ndarray) -> float:
+    """Share of the pairs of rows that agree in one column (n,) but not in all: a setting such as a load recurs."""
+    counts = [np.unique(each, axis=0, return_counts=True)[1] for each in (column, rows)]
+    alike, equal = (int(np.sum(n * (n - 1))) for n in counts)
+    return (alike - equal) / max(len(column) * (len(column) - 1), 1)
+
+
+def repeated_blocks(tables: Sequence[Readings]) -> list[Repeated]:
+    """Return the longest repeated block of each pair of tables, and of each table with itself.
+
+    Parameters
+    ----------
+    tables : readings with the same columns, so that their rows can be compared
+    """
+    found = []
+    for index, later in enumerate(tables):
+        for earlier in tables[: index + 1]:
+            block = _longest_block(earlier, later)
+            if block is not None:
+                found.append(block)
+    return found
+
+
+def _longest_block(earlier: Readings, later: Readings) -> Repeated | None:
+    """The longest run of consecutive rows of ``later`` that are rows of ``earlier``; None where chance explains it."""
+    chance = max(chance_of_equality(earlier), chance_of_equality(later))
+    pairs = len(earlier.values) * len(later.values)
+    if chance >= 0.5:
+        # The readings are too coarse for blocks; equal tables of several rows remain.
+        if earlier is not later and len(later.values) > 2 and np.array_equal(earlier.values, later.values):
+            return Repeated(later.label, 0, earlier.label, 0, len(later.values))
+        return None
+    # With ``shortest`` rows the expected number of chance agreements is below CHANCE.
+    shortest = int(np.ceil(np.log(CHANCE / pairs) / np.log(chance)))
+    shortest = max(shortest, SHORTEST_BLOCK if later.record else 1)
+    if min(len(earlier.values), len(later.values)) < shortest + (earlier is later):
+        return None
+    best: Repeated | None = None
+    ends: dict[int, int] = {}  # by distance of the two blocks: the end of the last one
+    for where, start in _equal_windows(earlier.values, later.values, shortest, earlier is later):
+        if start < ends.get(start - where, 0):
+            continue
+        # Samples of a channel at rest repeat anyway.
+        window = later.values[start : start + shortest]
+        if later.record and np.sum(np.any(window[1:] != window[:-1], axis=1)) < shortest // 2:
+            continue
+        if len(earlier.values) >= 2 * PIECE:  # the block may begin before a window that was compared
+            back = _equal_rows(earlier.values[:where][::-1], later.values[:start][::-1])
+            where, start = where - back, start - back
+        count = _equal_rows(earlier.values[where:], later.values[start:])
+        ends[start - where] = start + count
+        if not later.record and pairs * _chance_within(later.values[start : start + count]) > CHANCE:
+            continue
+        if count >= shortest and (best is None or count > best.count):
+            best = Repeated(later.label, start, earlier.label, where, count)
+    return best
+
+
+def _chance_within(block: np.ndarray) -> float:
+    """Probability that a block (n, columns) of single readings recurs, if its own rows show how often rows are equal.
+
+    Trials of one load that are read in coarse steps agree, even where the coefficients of the whole table look fine.
+    """
+    _, sizes = np.unique(block, axis=0, return_counts=True)
+    rows = len(block)
+    return float(np.sum(sizes * (sizes - 1)) / max(rows * (rows - 1), 1)) ** rows
+
+
+def _equal_rows(one: np.ndarray, other: np.ndarray) -> int:
+    """Number of rows at the beginning of both tables that are equal."""
+    most = min(len(one), len(other))
+    for first in range(0, most, COMPARED):
+        last = min(first + COMPARED, most)
+        equal = np.all(one[first:last] == other[first:last], axis=1)
+        if not equal.all():
+            return first + int(np.argmin(equal))
+    return most
+
+
+def _equal_windows(earlier: np.ndarray, later: np.ndarray, length: int, same: bool) -> Iterable[tuple[int, int]]:
+    """First rows of windows of ``length`` rows with equal hashes: in ``earlier``, the first such one, and in ``later``.
+
+    Of a long table only every ``length``-th window of ``earlier`` is compared, which finds blocks twice as long.
+    """
+    stride = 1 if len(earlier) < 2 * PIECE else length
+    # The first window of a piece whose row is a multiple of the stride is -begin % stride rows after its first one.
+    hashes = np.concatenate([found[-begin % stride :: stride] for begin, found in _hashes(earlier, length)])
+    index = np.argsort(hashes, kind="stable")
+    known = hashes[index]
+    for begin, found in _hashes(later, length):
+        place = np.minimum(np.searchsorted(known, found), len(known) - 1)
+        where, start = stride * index[place], begin + np.arange(len(found))
+        equal = (known[place] == found) & ((where < start) if same else True)
+        yield from zip(where[equal].tolist(), start[equal].tolist(), strict=True)
+
+
+def _hashes(values: np.ndarray, length: int) -> Iterable[tuple[int, np.ndarray]]:
+    """Hashes of all windows of ``length`` rows, piece by piece, each with the row of its first window."""
+    factors = np.random.default_rng(0).integers(1, 1 << 62, (length, values.shape[1]), dtype=np.uint64)
+    for begin in range(0, len(values) - length + 1, PIECE):
+        rows = (values[begin : begin + PIECE + length - 1] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
+        rows ^= rows >> np.uint64(29)
+        total = np.zeros(len(rows) - length + 1, np.uint64)
+        for offset, factor in enumerate(factors):
+            for column, each in enumerate(factor):
+                total += rows[offset : offset + len(total), column] * (each | np.uint64(1))
+        yield begin, total
