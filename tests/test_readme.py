@@ -181,8 +181,8 @@ def test_the_settings_of_every_kind_are_the_packages(kind: str) -> None:
 
 def test_the_choices_of_model_are_the_packages() -> None:
     table = rows("| key of `[model]` | meaning |", GUIDE["friction"])
-    assert list(table) == ["friction", "free", "reaction"]
-    for key in ("friction", "reaction"):
+    assert list(table) == ["friction", "free", "reaction", "engine"]
+    for key in ("friction", "reaction", "engine"):
         words = get_args(get_type_hints(ModelChoices)[key])
         assert tuple(re.findall(r'`"(\w+)"`', table[key][0])) == words
     assert tuple(re.findall(r"`(\w+)`", table["free"][0])) == OPTIONAL

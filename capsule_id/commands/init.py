@@ -47,10 +47,12 @@ name = "@NAME@"
 #: Choices of the model. friction: "stribeck" (eq. (1)) or "constant" (the same at every speed, no v_s).
 #: free: optional parameters that the fit samples: @OPTIONAL@.
 #: reaction: "ground", or "capsule" where the drive pushes the capsule back, as a coil inside it does.
+#: engine: "exact", or "smooth" (eqs. (1) and (2) smoothed; the report states the bias). For runs, and forward = "capsule".
 # [model]
 # friction = "stribeck"
 # free = ["ratio"]
 # reaction = "ground"
+# engine = "exact"
 
 #: Priors: knowledge from before the measurement. Default priors are broad.
 #: Log-normal, 95 % within median/factor to median*factor: @LOGNORMAL@.

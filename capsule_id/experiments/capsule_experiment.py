@@ -37,11 +37,19 @@ class CapsuleForward(GroundExperiment):
     Attributes
     ----------
     smoothing : widths of the smoothed model; None: the exact model
+    reaction : share of the drive's force that pushes the capsule back, 1
     """
 
     smoothing: Smoothing | None
+    reaction: float = eqx.field(static=True)
 
     event_driven = True
+
+    def set_model(self, table: Table, rig: Rig, friction: FrictionModel) -> None:
+        """Set friction law, ground, engine and reaction, as [model] and the table state them."""
+        self.friction, self.ground = friction, ground_of(table)
+        self.smoothing = Smoothing() if rig.model.engine == "smooth" else None
+        self.reaction = rig.model.share_of_reaction
 
     @property
     def excitation_period(self) -> float | None:
@@ -191,7 +199,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         FreeVibration.__init__(self, table, rig, friction, DecayModel())
-        self.smoothing, self.ground = None, ground_of(table)
+        self.set_model(table, rig, friction)
         gap = table.settings.gap
         self.within_reach = gap is not None
         self.gap = FAR if gap is None else gap.value
@@ -250,7 +258,7 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         DynamicFriction.__init__(self, table, rig, friction)
-        self.smoothing = None
+        self.set_model(table, rig, friction)
         self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
         self.about = About(table, rig, (parameter("k1"), parameter("c"), *self.parameters))
 

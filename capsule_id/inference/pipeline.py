@@ -40,7 +40,7 @@ from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.point_stage import PointStage
 from capsule_id.inference.result import PointFit, Pointwise, Posterior, Provenance, Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS, sample
-from capsule_id.inference.tables import make_notes, parameter_tables
+from capsule_id.inference.tables import check_engine, make_notes, parameter_tables
 from capsule_id.inference.target import LogPosterior
 from capsule_id.rig.model import Rig
 from capsule_id.synthetic import truth_beside
@@ -136,7 +136,9 @@ def check_fit(sampled: SampledFit, before: Sequence[Finding] = ()) -> SampledFit
     before = [with_scaled(finding, sampled.experiments) for finding in before]
     checked = run_checks(replace(sampled, findings=before))
     agreement = check_agreement(sampled.target, sampled.fit, sampled.bench.fit, sampled.bench.sample)
-    checked = replace(checked, findings=(*checked.findings, *sampled.findings, *agreement, *before))
+    checked = replace(
+        checked, findings=(*checked.findings, *sampled.findings, *agreement, *check_engine(sampled), *before)
+    )
     widened = beside_stated(checked, {**widenings(checked), **record_widenings(checked)})
     findings = list(checked.findings)
     for lost in (False, True):
@@ -204,7 +206,8 @@ def provenance(rig: Rig, seed: int, experiments: Choice, friction: str) -> Prove
     """Return the provenance of a fit of ``rig`` with ``seed`` and these ``experiments``, made now by ``capsule_id.fit``."""
     rejected = {table.label: table.rejected for table in rig.tables if table.rejected}
     made = datetime.now(UTC).isoformat(timespec="seconds"), "capsule_id.fit"
-    return Provenance(seed, experiments, friction, package_versions(PACKAGES), dict(rig.files), rejected, made)
+    versions = package_versions(PACKAGES)
+    return Provenance(seed, experiments, friction, versions, dict(rig.files), rejected, rig.model.engine, made)
 
 
 def package_versions(packages: Sequence[str]) -> dict[str, str]:

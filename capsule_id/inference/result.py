@@ -126,6 +126,7 @@ class Provenance:
     """Inputs of a result: the seed, the chosen experiments, the friction law, versions of packages, SHA-256 of the files.
 
     ``rejected``: number of rows that the rule ``reject`` dropped, by label of the experiment.
+    ``engine``: what integrates the capsule model, "exact" or "smooth".
     ``made``: date (ISO, UTC) and command of the fit; results that differ in them only are equal.
     """
 
@@ -135,6 +136,7 @@ class Provenance:
     versions: Mapping[str, str]
     files: Mapping[str, str]
     rejected: Mapping[str, int] = field(default_factory=dict)
+    engine: str = "exact"
     made: tuple[str, str] = field(default=("", ""), compare=False)
 
 

@@ -134,6 +134,11 @@ def _tails(facts: Facts) -> str:
     return f"{seen} In [prior] state a wider or better placed prior of {facts['keys']}."
 
 
+_SMOOTHED = (
+    "the smoothed engine (velocity {velocity:g} m/s, penetration {penetration:g} m) integrates the capsule; the exact engine "
+    "would shift no parameter by more than {largest:.2g} sd"
+)
+_BIASED = '. Expected {wanted:g} sd or less, but not of {names}: fit with engine = "exact" in [model] of rig.toml.'
 _CHAINS = (
     "{draws} draws of each ensemble are {length:.0f} autocorrelation times of {slowest}, smallest effective sample size "
     "{size:.0f} ({smallest}), largest split R-hat {rhat:.4f} ({worst})"
@@ -591,6 +596,12 @@ FIT_MESSAGES: Mapping[str, Message] = {
         warn=_unlike_noise,
         fail=_unlike_noise,
     ),
+    "model.engine": Message(
+        "engine of the capsule model",
+        ok=_SMOOTHED,
+        warn=_SMOOTHED + _BIASED,
+        fail=_SMOOTHED + _BIASED,
+    ),
     "model.error": Message(
         "model error",
         warn=lambda facts: (
@@ -634,8 +645,8 @@ FIT_MESSAGES: Mapping[str, Message] = {
     "runs.smoothing": Message(
         "Effect of smoothing",
         caption=(
-            "The posterior is that of the exact model. A fit of the smoothed model (velocity {velocity:g} m/s, penetration "
-            "{penetration:g} m) would shift the estimates by this much (u: logarithm)."
+            "The posterior is that of the {engine} model. A fit of the {other} model would shift the estimates by this much "
+            "(u: logarithm). Widths of the smoothed model: velocity {velocity:g} m/s, penetration {penetration:g} m."
         ),
     ),
     "parameters.shares": Message(

@@ -56,11 +56,13 @@ class ModelChoices:
     friction : "stribeck": eq. (1); "constant": the same friction at every speed, ratio = 1 and no v_s
     free : symbols of the optional parameters that a fit samples
     reaction : what takes up the reaction of the drive: "ground", as in the paper, or "capsule", as for a coil inside it
+    engine : what integrates the capsule model: "exact" (event-driven) or "smooth" (smoothed, with the certified widths)
     """
 
     friction: Literal["stribeck", "constant"] = "stribeck"
     free: tuple[str, ...] = ()
     reaction: Literal["ground", "capsule"] = "ground"
+    engine: Literal["exact", "smooth"] = "exact"
 
     @property
     def share_of_reaction(self) -> float:

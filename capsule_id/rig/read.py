@@ -20,6 +20,7 @@ from capsule_id.rig.schema import (
     RIG_QUANTITIES,
     TABLE_KEYS,
     KindRule,
+    check_engine,
     check_masses_of_free,
     check_normal_forces,
     parameter_rows,
@@ -92,6 +93,7 @@ def read_rig(folder: str | Path, kinds: Mapping[str, KindRule], parameters: Sequ
     model = read_model(document)
     _check_masses(document, tables, kinds, set(stated))
     check_masses_of_free(document, model, tables, kinds, set(stated))
+    check_engine(document, model, tables)
     check_normal_forces(document, tables, stated)
     return Rig(
         name=name,

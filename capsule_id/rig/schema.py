@@ -262,7 +262,7 @@ RIG_QUANTITIES: Mapping[str, QuantityRule] = {
 #: Keys of the tables of rig.toml that stand once.
 TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
     "[rig]": ("name", "synthetic", "confirmed", *RIG_QUANTITIES),
-    "[model]": ("friction", "free", "reaction"),
+    "[model]": ("friction", "free", "reaction", "engine"),
 }
 
 
@@ -285,7 +285,7 @@ def read_model(document: TomlDocument) -> ModelChoices:
     head = read_table(document, ("model",), document.data.get("model", {}), "[model]")
     refuse_unknown_keys(document, ("model",), head, TABLE_KEYS["[model]"], TABLE_KEYS)
     choices: dict[str, str] = {}
-    for key in ("friction", "reaction"):
+    for key in ("friction", "reaction", "engine"):
         words = get_args(get_type_hints(ModelChoices)[key])
         choices[key] = read_choice(document, ("model", key), head.get(key, words[0]), words)
     constant = choices["friction"] == "constant"
@@ -305,6 +305,21 @@ def read_model(document: TomlDocument) -> ModelChoices:
         raise document.error(path, "constant friction has no ratio", shown("ratio"), remedy)
     in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
     return ModelChoices(free=in_order, **choices)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+
+
+def check_engine(document: TomlDocument, model: ModelChoices, tables: Sequence[Table[Any]]) -> None:
+    """Refuse a smoothed engine in a rig without an experiment that integrates eqs. (1) and (2).
+
+    Raises
+    ------
+    InputError
+        At ``engine``.
+    """
+    integrated = any(not table.bench or getattr(table.settings, "forward", "") == "capsule" for table in tables)
+    if model.engine == "smooth" and not integrated:
+        rule = 'engine = "smooth" needs an experiment that integrates eqs. (1) and (2): a run, or forward = "capsule"'
+        remedy = 'remove engine, or write forward = "capsule" for a decay or for pushes'
+        raise document.error(("model", "engine"), rule, "closed forms alone", remedy)
 
 
 def read_confirmed(document: TomlDocument, tables: Sequence[Table[Any]], stated: Iterable[str]) -> tuple[str, ...]:

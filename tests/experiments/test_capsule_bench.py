@@ -1,6 +1,8 @@
 """Bench tests through the capsule model: what the closed forms give where those are right, the truth where they are not."""
 
+from dataclasses import replace
 from functools import cache
+from typing import Literal, cast
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import Experiment
-from capsule_id.experiments.capsule_experiment import CapsuleDecay, CapsulePushes
+from capsule_id.experiments.capsule_experiment import CapsuleDecay, CapsuleForward, CapsulePushes
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.checks import check_free_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
@@ -19,7 +21,7 @@ from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.rig.model import PriorOverride, Quantity, Table
+from capsule_id.rig.model import ModelChoices, PriorOverride, Quantity, Table
 from tests.experiments import bench
 from tests.scipy_capsule import simulate_scipy
 
@@ -67,6 +69,13 @@ def test_forward_chooses_the_room() -> None:
     for forward, rooms in (("capsule", [CapsuleDecay, CapsulePushes]), ("closed", [FreeVibration, DynamicFriction])):
         rig = bench.rig(decay(2e-3, forward), pushes(forward))
         assert [type(e) for e in make_experiments(rig)] == rooms
+
+
+@pytest.mark.parametrize("engine", ["exact", "smooth"])
+def test_the_model_chooses_the_engine(engine: Literal["exact", "smooth"]) -> None:
+    rig = replace(bench.rig(decay(2e-3, "capsule"), pushes("capsule")), model=ModelChoices(engine=engine))
+    for e in make_experiments(rig):
+        assert cast(CapsuleForward, e).smoothing == (None if engine == "exact" else Smoothing())
 
 
 @pytest.mark.full

@@ -1,5 +1,6 @@
 """Progressions: the likelihood against SciPy, sessions, the start on its own, faults of a folder with their remedies."""
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -20,6 +21,7 @@ from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.model import CapsuleParameters, simulate
+from capsule_id.physics.smooth.engine import Smoothing
 from tests.capsule_cases import jit_quickly
 from tests.experiments.summed_sessions import integrated
 from tests.rig.faults import fault_of
@@ -79,6 +81,24 @@ def test_the_likelihood_is_that_of_plain_runs(folder: Path) -> None:
         changed = float(log_likelihood({**THETA, **other}))
         assert abs(changed - expected) > 0.05
         assert e.profile(THETA)(other) == pytest.approx(changed, abs=error * abs(changed - expected))
+
+
+def test_the_smoothed_engine_moves_the_trials_as_the_exact_one_does(folder: Path) -> None:
+    """Within the 2 % that the widths are certified for. Much wider ones move them by more: the negative control."""
+    text = (folder / "rig.toml").read_text(encoding="utf-8")
+    (folder.parent / "smooth").mkdir()
+    (folder.parent / "smooth" / "rig.toml").write_text(text.replace("[model]", '[model]\nengine = "smooth"'), "utf-8")
+    shutil.copy(folder / "progression.csv", folder.parent / "smooth")
+    smooth, exact = progression(folder.parent / "smooth"), progression(folder)
+    assert exact.smoothing is None
+    assert smooth.smoothing == Smoothing()
+    still = np.zeros(len(exact.settings))
+    X2, certified, wide = (
+        np.asarray(e.displacements(THETA, still, e.settings))
+        for e in (exact, smooth, smooth.with_smoothing(Smoothing(velocity=0.1)))
+    )
+    assert 0.0 < np.max(np.abs(certified / X2 - 1.0)) < 0.02
+    assert np.max(np.abs(wide / X2 - 1.0)) > 0.2
 
 
 @pytest.mark.full

@@ -38,6 +38,8 @@ def write(folder: Path, model: str, head: str = HEAD) -> Path:
         ),
         ('reaction = ‸"floor"', "reaction must be", 'reaction = "capsule"'),
         ('friction = ‸"coulomb"', "friction must be", 'friction = "constant"'),
+        ('engine = ‸"smoothed"', "engine must be", 'engine = "exact"'),
+        ('engine = ‸"smooth"', "needs an experiment that integrates eqs. (1) and (2): a run, or forward", ""),
         ('friction = "constant"\nfree = ‸["ratio"]', "constant friction has no ratio", 'friction = "constant"'),
         ('free = ‸["viscous"]', "free viscous needs m1, because slide", "free = []"),
     ],

@@ -180,6 +180,7 @@ def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
     from one batch of runs, because exact derivatives take ten times as long to compile. A factor above ``MEASURABLE``
     within the record is extrapolated from there, because differences cannot outgrow the motion. Below 1e-3: rounding.
     """
+    run = run.with_smoothing(None)  # the steps of the smoothed engine hide so small an error
     size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
     motion = run.motion(theta, np)
     start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])

@@ -30,7 +30,7 @@ from capsule_id.experiments.forced_run.start_state import (
     corrected_start,
     rough_start,
 )
-from capsule_id.experiments.friction import ground_of, ground_parameters
+from capsule_id.experiments.friction import ground_parameters
 from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -459,7 +459,6 @@ class ForcedRun(CapsuleForward):
     normal_force : stated, N; 0 where it is the weight
     first : time of the first sample of the whole record, s
     clock_rate, middle : 1 + the stated drift of the clock, and the middle of the whole record, s; None: an exact clock
-    reaction : share of the drive's force that pushes the capsule back, 1
     """
 
     about: AboutRun = eqx.field(static=True)
@@ -487,7 +486,6 @@ class ForcedRun(CapsuleForward):
     has_delay: tuple[bool, ...] = eqx.field(static=True)
     coloured: bool = eqx.field(static=True)
     second_reading: bool = eqx.field(static=True)
-    reaction: float = eqx.field(static=True)
 
     #: Whether the record prescribes the motion of the rod.
     prescribed: ClassVar[bool] = False
@@ -520,8 +518,7 @@ class ForcedRun(CapsuleForward):
         """
         self.read_drive(table)
         settings, gap = table.settings, stated_gap(table)
-        self.friction, self.smoothing, self.ground = friction, None, ground_of(table)
-        self.reaction = rig.model.share_of_reaction
+        self.set_model(table, rig, friction)
         self.channels = tuple(name for name in NOISE if name in table.columns and name not in self.inputs)
         self.time = table["time"]
         self.clock_rate = stated_rate(table)

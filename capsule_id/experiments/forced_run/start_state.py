@@ -232,7 +232,7 @@ def better_start(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float] | 
     capsule_start is 0 where it does not differ significantly from rest. For every trial speed, Gauss–Newton estimates
     position and speed of the rod again, because they compensate much of the change. Other values are as in ``theta``.
     """
-    moving, own = run.restarted(1.0), float(theta.get("capsule_start", 0.0))
+    moving, own = run.restarted(1.0).with_smoothing(None), float(theta.get("capsule_start", 0.0))
     speeds = np.append(TRIAL_SPEEDS, own)
     rod = np.full((2, len(speeds)), [[theta["x_start"]], [theta.get("y_start", 0.0) + own]])
     offsets = np.array([[0.0, 0.0], [DIFFERENCE_STEPS[0], 0.0], [0.0, DIFFERENCE_STEPS[1]]])

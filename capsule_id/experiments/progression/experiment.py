@@ -14,7 +14,7 @@ import pandas as pd
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, band
 from capsule_id.experiments.capsule_experiment import TrialsExperiment
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.friction import ground_of, ground_parameters
+from capsule_id.experiments.friction import ground_parameters
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.declaration import (
@@ -41,12 +41,12 @@ from capsule_id.experiments.progression.density import (
 )
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import pool
-from capsule_id.physics.displacement import Displacement, displacement
+from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.drives import Pulses
 from capsule_id.physics.forces import equilibrium
 from capsule_id.physics.friction import scaled
-from capsule_id.physics.model import CapsuleParameters
+from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Curve, Finding, Points, ResultTable
 
@@ -316,13 +316,11 @@ class Progression(TrialsExperiment):
 
     checks = (check_discrepancy,)
     tables = (session_table,)
-    reaction: float = eqx.field(static=True)
     emulator: RunEmulator | None
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction, self.smoothing, self.ground = friction, None, ground_of(table)
-        self.emulator = None
-        self.drive, self.reaction = table.settings.drive, rig.model.share_of_reaction
+        self.set_model(table, rig, friction)
+        self.emulator, self.drive = None, table.settings.drive
         self.distance = table["distance"]
         self.reading_variance = table.columns["distance"].reading_sd ** 2
         rows, self.amplitude_from = settings_of(
@@ -394,11 +392,6 @@ class Progression(TrialsExperiment):
     def mirrored(self) -> tuple[str, ...]:
         return (AMPLITUDE[self.drive],) if self.amplitude_from == "prior" else ()
 
-    def with_smoothing(self, widths: Any) -> "Progression":
-        """Return the experiment itself: it has the exact model only."""
-        del widths
-        return self
-
     # -- the forward model --------------------------------------------------------------------------------------------
 
     def capsule(self, theta: ValuesBySymbol, settings: Any) -> tuple[CapsuleParameters, Drive]:
@@ -429,7 +422,7 @@ class Progression(TrialsExperiment):
     def displacements(self, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
         """X2, m, at rows of ``settings`` (rows, 4) with friction multiplied by exp(s), s (rows,)."""
         # Numbers that are no arrays would be constants of the program: each new point would compile it anew.
-        return _displacements(self, {name: jnp.asarray(x) for name, x in theta.items()}, s, settings).X2
+        return _displacements(self, {name: jnp.asarray(x) for name, x in theta.items()}, s, settings)
 
     def displacements_of_draws(
         self, draws: Sequence[ValuesBySymbol], s: np.ndarray, settings: np.ndarray
@@ -556,8 +549,13 @@ def _runs_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> An
 
 
 @eqx.filter_jit
-def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Displacement:
+def _displacements(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
     p, drive = e.capsule(theta, settings)
     law = scaled(e.law(theta), jnp.exp(s))
     r0 = equilibrium(p) if "slope" in e.ground else 0.0
-    return displacement(p, drive, law, settings[:, 0], settings[:, 1], r0)
+    period, count = settings[:, 0], settings[:, 1]
+    if e.smoothing is None:
+        return displacement(p, drive, law, period, count, r0).X2
+    times = jnp.stack([jnp.zeros_like(period), period * count], axis=1)
+    rest = (r0 + jnp.zeros_like(period), 0.0, 0.0, 0.0)
+    return simulate(p, drive, times, rest, model="smooth", smoothing=e.smoothing, friction=law).X2[:, 1]

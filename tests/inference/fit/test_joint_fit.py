@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +22,7 @@ from capsule_id.experiments.forced_run.experiment import ForcedRun
 from capsule_id.inference import joint_fit as joint_starts
 from capsule_id.inference import joint_fit as module
 from capsule_id.inference.checks.posterior import check_starts
+from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.joint_fit import (
     LEAST_INCREASE,
     STARTS,
@@ -39,10 +40,10 @@ from capsule_id.inference.least_squares import Solver, least_squares, linearised
 from capsule_id.inference.marginal import MarginalPosterior
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling import laplace_proposal
-from capsule_id.inference.tables import smoothing_shift
+from capsule_id.inference.tables import check_engine, smoothing_shift
 from capsule_id.inference.target import HeldResiduals, LogPosterior
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.rig.model import PriorOverride, Quantity
+from capsule_id.rig.model import ModelChoices, PriorOverride, Quantity
 from tests.experiments import bench
 from tests.forced_runs import TRUTH, recorded, table
 from tests.inference.three_settings import three_settings
@@ -52,12 +53,19 @@ KNOWN = ("k1", "c", "mu", "v_s", "K", "k2[stiff]")
 
 
 @cache
-def fitted() -> tuple[LogPosterior, PointFit]:
-    """One second of the second run, beside priors as wide as a bench leaves them, started 1 % off."""
+def fitted(
+    engine: Literal["exact", "smooth"] = "exact", widths: Smoothing | None = None
+) -> tuple[LogPosterior, PointFit]:
+    """One second of the second run, beside priors as wide as a bench leaves them, started 1 % off.
+
+    ``widths`` : of the smoothed engine, where they are not the certified ones
+    """
     own = table(1, samples=1000)
     priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
     rig = bench.rig(own, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
-    target = LogPosterior(rig, [ForcedRun(own, rig)])
+    rig = replace(rig, model=ModelChoices(engine=engine))
+    run = ForcedRun(own, rig)
+    target = LogPosterior(rig, [run if widths is None else run.with_smoothing(widths)])
     rough = {name: 1.01 * TRUTH[name] for name in KNOWN}
     return target, joint_fit(target, rough, 0)
 
@@ -221,6 +229,37 @@ def test_scatters_stand_at_their_conditional_maxima() -> None:
         around[:, i] = mode + np.array([-0.1, 0.0, 0.1])
         low, top, high = weigh(target, around)
         assert top > max(low, high)
+
+
+def sampled_of(engine: Literal["exact", "smooth"], widths: Smoothing | None = None) -> SampledFit:
+    target, fit = fitted(engine, widths)
+    return SampledFit(target, fit, None, {**target.fixed, **fit.values})
+
+
+@pytest.mark.full
+def test_both_engines_give_one_fit_within_the_certificate() -> None:
+    (exact, own), (smooth, other) = fitted(), fitted("smooth")
+    assert check_engine(sampled_of("exact")) == []
+    shift, sd = smoothing_shift(smooth, other, None)
+    difference = (own.u - other.u)[smooth.located]
+    assert exact.names == smooth.names
+    assert np.max(np.abs(difference) / sd) < 0.2
+    np.testing.assert_allclose(difference / sd, shift / sd, atol=0.1)
+    (finding,) = check_engine(sampled_of("smooth"))
+    assert (finding.level, finding.parameters) == ("ok", ())
+    assert finding.facts["largest"] < 0.2
+
+
+@pytest.mark.full
+def test_a_wide_smoothing_fails_its_certificate_and_moves_the_fit() -> None:
+    """The negative control of the test above."""
+    wide = Smoothing(velocity=1e-2)
+    (finding,) = check_engine(sampled_of("smooth", wide))
+    assert finding.level == "fail"
+    assert finding.facts["largest"] > 1.0
+    (_, own), (target, other) = fitted(), fitted("smooth", wide)
+    sd = np.sqrt(np.diag(own.covariance))
+    assert np.max(np.abs(own.u - other.u)[target.located] / sd[target.located]) > 1.0
 
 
 @pytest.mark.full
