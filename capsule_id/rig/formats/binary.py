@@ -395,7 +395,7 @@ def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
         except InputError as error:
             raise _in_sheet(error, lines) from None
 
-    return replace(export, values=values, place=lambda row, column: (export.place(row, column)[0], column + 1))
+    return replace(export, values=values, place=lambda row, column: (*export.place(row, column)[:2], column + 1))
 
 
 def _rows(sheet: Any, path: Path) -> list[list[float | str]]:

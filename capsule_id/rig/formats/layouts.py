@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Export, Layout, refuse_line
+from capsule_id.rig.formats.raw import Export, Layout, Place, refuse_line
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
@@ -82,9 +82,9 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     def values(column: int) -> np.ndarray:
         return rows.column(column)
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
+    def place(row: int | None, column: int) -> Place:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
-        return line + 1, place_of_cell(file.line(line), delimiter, column)
+        return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
     return Export(path, headers, width, lines, values, place, file.encoding, rows.words)
 
@@ -287,7 +287,7 @@ class _File:
             texts = [row[column].strip(BLANKS + '"') if column < len(row) else "" for row in segment.rows]
             while len(texts) > 1 and not texts[-1]:
                 texts.pop()
-            place = [(self.path, *self.place(line, column)) for line in segment.lines[: len(texts)]]
+            place = [self.place(line, column) for line in segment.lines[: len(texts)]]
             parts.append(read_column(texts, self.decimal, self.missing, place.__getitem__))
         return np.concatenate(parts)
 
@@ -323,10 +323,10 @@ class _File:
         alike = len({tuple(self.clocks(channel)) for channel in channels}) == 1
         return [-1, *channels] if alike else [source for channel in channels for source in (-channel, channel)]
 
-    def place(self, line: int, column: int) -> tuple[int, int]:
-        """1-based line and character of a cell."""
+    def place(self, line: int, column: int) -> Place:
+        """Where a cell stands."""
         cells = cells_of(self.lines[line], self.separator)
-        return line + 1, cells[column][1] if column < len(cells) else len(self.lines[line]) + 1
+        return self.path, line + 1, cells[column][1] if column < len(cells) else len(self.lines[line]) + 1
 
 
 def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
@@ -360,7 +360,7 @@ def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
 
     numbers = [line for segment in file.segments for line in segment.lines]
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
+    def place(row: int | None, column: int) -> Place:
         return file.place(numbers[0] - 1 if row is None else numbers[row], max(sources[column], 0))
 
     headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
@@ -402,11 +402,11 @@ def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | N
         source = sources[column]
         return rows.column(source) if source >= 0 else file.computed(-source, [len(rows.lines)])
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
+    def place(row: int | None, column: int) -> Place:
         line = segment.lines[0] - 1 if row is None else int(rows.lines[row]) - 1
         cells = cells_of(text.line(line), file.separator)
         source = max(sources[column], 0)
-        return line + 1, cells[source][1] if source < len(cells) else len(text.line(line)) + 1
+        return path, line + 1, cells[source][1] if source < len(cells) else len(text.line(line)) + 1
 
     return Export(path, (headers,), len(headers), rows.lines, values, place, text.encoding)
 

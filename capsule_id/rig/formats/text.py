@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import RawTable, complete, refuse_large
+from capsule_id.rig.formats.raw import Place, RawTable, complete, refuse_large
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -94,7 +94,7 @@ def read_column(
     texts: Sequence[str],
     decimal: str | None,
     missing: Sequence[str],
-    place: Callable[[int], tuple[Path, int, int]],
+    place: Callable[[int], Place],
 ) -> np.ndarray:
     """The numbers of one column, (n,); NaN at a missing marker.
 
@@ -454,7 +454,7 @@ def any_rows(
                 rows.add_words(column, texts)
             marks[column] = marks[column] or decimal_mark(texts, missing)
 
-            def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> tuple[Path, int, int]:
+            def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
                 line, text = kept[k]
                 return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
 
@@ -532,9 +532,9 @@ def read_csv(content: Content, path: Path) -> RawTable:
     if columns is None:
         columns = _read_cells(file, shape)
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
+    def place(row: int | None, column: int) -> Place:
         line = 0 if row is None else row + 1
-        return line + 1, cells_of(file.line(line), delimiter)[column][1]
+        return path, line + 1, cells_of(file.line(line), delimiter)[column][1]
 
     return RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
 
