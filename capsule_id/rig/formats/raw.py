@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from capsule_id.errors import InputError
 # limits: Limits and errors that all readers of files share.
 
 
+#: The bytes of a file, or where they lie.
+Content = bytes | Path
 #: Largest decompressed size of a file, bytes. It stops archives that grow without limit when they are unpacked.
 LARGEST_CONTENT = 1 << 30
 
@@ -30,20 +33,24 @@ def refuse_large(size: int, path: Path) -> None:
         raise InputError(rule, f"{size >> 20} MiB", "export a part of the record, or fewer channels", path)
 
 
-@contextmanager
-def installed(package: str, path: Path) -> Iterator[None]:
-    """Name the optional package that reads ``path`` where its import in the body fails.
+def require(package: str, path: Path) -> None:
+    """Import the optional package that reads ``path``.
 
     Raises
     ------
     InputError
-        With the command that installs it.
+        If it is not installed, with the command that installs it.
     """
     try:
-        yield
+        import_module(package.lower())
     except ModuleNotFoundError:
         rule, remedy = f"a {path.suffix} file needs the package {package}", 'run pip install "capsule-id[formats]"'
         raise InputError(rule, "not installed", remedy, path) from None
+
+
+def whole(content: Content) -> bytes:
+    """The bytes of a file."""
+    return content if isinstance(content, bytes) else content.read_bytes()
 
 
 @contextmanager
