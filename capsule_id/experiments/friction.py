@@ -64,7 +64,7 @@ def check_normal_force(entry: Entry[Any]) -> None:
             "", "the column normal_force needs the column force", " ".join(columns), "remove normal_force"
         )
     for key in ("normal_force", "N0"):
-        if (*entry.path, key) in entry.document.keys:
+        if key in entry.node:
             raise entry.error(
                 key, f"{key} must not stand beside the column normal_force", "both", f"remove {key}", True
             )

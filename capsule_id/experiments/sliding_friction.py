@@ -53,7 +53,7 @@ def _masses(table: Table[PullSettings]) -> tuple[str, ...]:
 
 def _stated_law(entry: Entry[PullSettings]) -> Mapping[str, Any]:
     """The keys of ``[model]``; none where it is no table, which its own reader refuses."""
-    model = entry.document.data.get("model", {})
+    model = entry.node.document.data.get("model", {})
     return model if isinstance(model, dict) else {}
 
 

@@ -86,11 +86,11 @@ def _check_ground(entry: Entry[TiltSettings]) -> None:
     """Refuse a slope of its own and N0 for tilts, and N0 beside the normal force of a pull."""
     settings = entry.table.settings
     if "force" not in entry.table.columns:
-        if "slope" in settings.ground and (*entry.path, "slope") in entry.document.keys:
+        if "slope" in settings.ground and "slope" in entry.node:
             rule = "a tilt takes its own angle as slope"
             raise entry.error("slope", rule, "slope", "remove slope, or give the column force", of_key=True)
         entry.refuse_ground("N0", "a tilt must have the weight alone as normal force")
-    elif settings.normal_force is not None and (*entry.path, "N0") in entry.document.keys:
+    elif settings.normal_force is not None and "N0" in entry.node:
         raise entry.error("N0", "normal_force holds N0 too", "both", "remove N0, or normal_force", of_key=True)
 
 

@@ -1,31 +1,17 @@
 """Column maps of ``rig.toml``: what they state, and the columns that they select, combine and scale."""
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from capsule_id.rig.formats.raw import Export, Layout, RawTable
+from capsule_id.rig.formats.raw import Export, Layout, Place, RawTable
 from capsule_id.rig.model import Quantity
-from capsule_id.rig.schema import ColumnRule, KindRule
-from capsule_id.rig.toml import (
-    ANY,
-    KeyPath,
-    TomlDocument,
-    closest,
-    read_choice,
-    read_quantity,
-    read_string,
-    read_table,
-    read_unit,
-    refuse_unknown_keys,
-    shown,
-)
+from capsule_id.rig.schema import ChoiceRule, ColumnRule, KindRule, PlainRule, QuantityRule, SettingRule, read_rules
+from capsule_id.rig.toml import ANY, Node, closest, is_count, is_number, shown
 from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si
 
 # clock: Puts the times of a record on the clock of another logger: ``clock = { offset = {...}, drift = {...} }``.
@@ -35,6 +21,10 @@ from capsule_id.rig.units import UNKNOWN, UnitError, factor_to_si
 
 
 _CLOCK_EXAMPLE = '{ offset = { value = 0.3, unit = "ms" }, drift = { value = 20, sd = 2, unit = "ppm" } }'
+_CLOCK: Mapping[str, SettingRule] = {
+    "offset": QuantityRule("s", ANY, has_sd=True),
+    "drift": QuantityRule("1", ANY, has_sd=True),
+}
 #: Largest offset, s, and drift. A time in s has a resolution of 2 us at this offset; times since 1970 are smaller.
 LARGEST_OFFSET, LARGEST_DRIFT = 1e10, 0.1
 
@@ -42,12 +32,12 @@ LARGEST_OFFSET, LARGEST_DRIFT = 1e10, 0.1
 class StatedClock(NamedTuple):
     """The clock t = offset + (1 + drift) t' of times t'; s and 1."""
 
-    offset: Quantity
-    drift: Quantity
+    offset: Quantity = Quantity(0.0)
+    drift: Quantity = Quantity(0.0)
 
 
-def read_clock(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> StatedClock | None:
-    """The clock of the experiment at ``path``, None where it states none.
+def read_clock(entry: Node) -> StatedClock | None:
+    """The clock of an experiment, None where it states none.
 
     Raises
     ------
@@ -56,19 +46,10 @@ def read_clock(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) 
     """
     if "clock" not in entry:
         return None
-    place = (*path, "clock")
-    stated = read_table(document, place, entry["clock"], _CLOCK_EXAMPLE)
-    refuse_unknown_keys(document, place, stated, ("offset", "drift"))
-    if not stated:
-        raise document.error(place, "a clock must have an offset or a drift", "none", f"write {_CLOCK_EXAMPLE}")
-    clock = StatedClock(
-        *(
-            read_quantity(document, (*place, key), stated[key], si, ANY, has_sd=True)
-            if key in stated
-            else Quantity(0.0)
-            for key, si in (("offset", "s"), ("drift", "1"))
-        )
-    )
+    node = entry["clock"].table(_CLOCK_EXAMPLE, tuple(_CLOCK))
+    if not node.value:
+        raise node.error("a clock must have an offset or a drift", "none", f"write {_CLOCK_EXAMPLE}")
+    clock = StatedClock(**read_rules(node, _CLOCK))
     for key, quantity, largest, unit, remedy in (
         ("offset", clock.offset, LARGEST_OFFSET, " s", "check number and unit"),
         ("drift", clock.drift, LARGEST_DRIFT, "", 'check number and unit; 20 ppm is { value = 20, unit = "ppm" }'),
@@ -76,11 +57,11 @@ def read_clock(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) 
         for word, number in ((key, quantity.value), (f"sd of {key}", quantity.sd)):
             if abs(number) > largest:
                 rule = f"{word} must lie between -{largest:g}{unit} and {largest:g}{unit}"
-                raise document.error((*place, key), rule, f"{number:g}{unit}", remedy)
+                raise node[key].error(rule, f"{number:g}{unit}", remedy)
     return clock
 
 
-def on_reference(document: TomlDocument, path: KeyPath, raw: RawTable, clock: StatedClock) -> RawTable:
+def on_reference(entry: Node, raw: RawTable, clock: StatedClock) -> RawTable:
     """The table with its times t' replaced by offset + (1 + drift) t'.
 
     Raises
@@ -90,7 +71,7 @@ def on_reference(document: TomlDocument, path: KeyPath, raw: RawTable, clock: St
     """
     if "time" not in raw.names:
         value = " ".join(raw.names)
-        raise document.error((*path, "clock"), "clock needs a record with times", value, "remove clock", of_key=True)
+        raise entry["clock"].error("clock needs a record with times", value, "remove clock", of_key=True)
     index = raw.names.index("time")
     try:
         factor = factor_to_si(raw.units[index], "s")
@@ -104,10 +85,22 @@ def on_reference(document: TomlDocument, path: KeyPath, raw: RawTable, clock: St
 # declared: Reads the column map of an experiment in ``rig.toml``: ``columns`` and the keys that go with it.
 
 
+_LAYOUT: Mapping[str, SettingRule] = {
+    "data_from_line": PlainRule(
+        is_count, "be a line, counted from 1", "write the line of the first reading, such as 2"
+    ),
+    "data_to_line": PlainRule(is_count, "be a line, counted from 1", "write the line of the last reading, such as 2"),
+    "missing": PlainRule(
+        lambda value: isinstance(value, list) and all(isinstance(text, str) for text in value),
+        "be a list of texts",
+        'write missing = ["--", "NaN"]',
+    ),
+    "decimal": ChoiceRule((".", ",")),
+}
 #: Keys of an experiment that go with ``columns``.
-MAP_KEYS = ("columns", "files", "data_from_line", "data_to_line", "missing", "decimal", "where", "plateaus")
-#: Largest finite number; whole numbers of TOML may be larger.
-LARGEST = sys.float_info.max
+MAP_KEYS = ("columns", "files", *_LAYOUT, "where", "plateaus")
+#: A finite number without unit.
+NUMBER = PlainRule(is_number, "be a finite number", "write a number without quotes")
 _EXAMPLE = '{ from = "...", unit = "..." }'
 Header = str | int  #: a header, or a column's number counted from 1
 
@@ -134,19 +127,22 @@ class Source:
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from ``min`` to ``max``, both included, in the unit of the file."""
+    """Numbers from ``min`` to ``max``, both included, in the unit of the file; or one number, which is both of them."""
 
     min: float
     max: float
+    is_range: bool = True
 
     def __str__(self) -> str:
+        if not self.is_range:
+            return f"{self.min:.15g}"
         if self.max == inf:
             return f"{self.min:.15g} or more"
         return f"{self.max:.15g} or less" if self.min == -inf else f"{self.min:.15g} to {self.max:.15g}"
 
 
-#: What selects the rows of a column: a number in the unit of the file, a range of them, or a text.
-Wanted = float | str | Range
+#: What selects the rows of a column: numbers in the unit of the file, or a text.
+Wanted = Range | str
 
 
 @dataclass(frozen=True)
@@ -165,10 +161,8 @@ class ColumnMap:
     where: Mapping[str, Wanted]
 
 
-def read_map(
-    document: TomlDocument, path: KeyPath, entry: Mapping[str, Any], kind: KindRule, propose: Callable[[Layout], str]
-) -> ColumnMap | None:
-    """The column map of the experiment at ``path``, None where it states none.
+def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> ColumnMap | None:
+    """The column map of an experiment, None where it states none.
 
     ``propose`` gives the map that reads its first file, for remedies.
 
@@ -177,143 +171,91 @@ def read_map(
     InputError
         At the key or value of ``rig.toml`` that is wrong.
     """
-    layout = Layout(*_lines(document, path, entry), _markers(document, path, entry), _decimal(document, path, entry))
+    stated = read_rules(entry, _LAYOUT)
+    layout = Layout(**{**stated, "missing": tuple(stated.get("missing", ()))})
+    first, last = layout.data_from_line, layout.data_to_line
+    if first is not None and last is not None and last < first:
+        rule = f"data_to_line must not be above data_from_line = {first}"
+        raise entry["data_to_line"].error(rule, str(last), "exchange them")
     if "columns" not in entry:
         for key in MAP_KEYS[1:]:
             if key in entry:
-                remedy = f"add {propose(layout)}"
-                raise document.error((*path, key), f"{key} needs a column map", "no columns", remedy, of_key=True)
+                rule, remedy = f"{key} needs a column map", f"add {propose(layout)}"
+                raise entry[key].error(rule, "no columns", remedy, of_key=True)
         return None
-    place = (*path, "columns")
-    if not isinstance(entry["columns"], dict):
-        read_table(document, place, entry["columns"], propose(layout))
-    stated = entry["columns"]
-    if not stated:
-        raise document.error(place, "a column map must have columns", "none", f"write {propose(layout)}")
+    node = entry["columns"]
+    if not isinstance(node.value, dict) or not node.value:
+        example = propose(layout)
+        node.table(example)
+        raise node.error("a column map must have columns", "none", f"write {example}")
     # Plateaus are readings of a time trace, whatever the columns of the kind.
     rules = {**({"time": ColumnRule("s")} if "plateaus" in entry else {}), **kind.columns}
-    refuse_unknown_keys(document, place, stated, tuple(rules))
-    sources = {name: _source(document, (*place, name), stated[name], rules[name]) for name in stated}
-    where = _where(document, path, entry)
+    node.refuse_unknown(tuple(rules))
+    sources = {name: _source(node[name], rules[name]) for name in node.value}
+    where = entry.get("where", {}).table("where = { <header> = <value> }")
+    wanted = {key: _wanted(where[key]) for key in where.value}
     named = [header for source in sources.values() for header in (source.header, source.minus) if header is not None]
     # A key of ``where`` is a header, or the number of a column.
     keys = [
         (form, value)
-        for key, value in where.items()
+        for key, value in wanted.items()
         for form in (" ".join(key.split()), *([int(key)] if key.isdecimal() else []))
     ]
     words = tuple(form for form, value in keys if isinstance(value, str))
     layout = replace(layout, columns=(*named, *(form for form, _ in keys)), words=words)
-    return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(where))
+    return ColumnMap(MappingProxyType(sources), layout, MappingProxyType(wanted))
 
 
-def _source(document: TomlDocument, path: KeyPath, value: object, rule: ColumnRule) -> Source:
+def _source(node: Node, rule: ColumnRule) -> Source:
     """One entry of ``columns``."""
-    entry = read_table(document, path, value, _EXAMPLE)
-    if "rate" in entry:
-        refuse_unknown_keys(document, path, entry, ("rate",))
+    node.table(_EXAMPLE)
+    if "rate" in node:
+        node.refuse_unknown(("rate",))
         if rule.si != "s":
-            remedy = f"write {_EXAMPLE}"
-            raise document.error((*path, "rate"), "rate is for times", str(path[-1]), remedy, of_key=True)
-        return Source(rate=read_quantity(document, (*path, "rate"), entry["rate"], "Hz").value)
-    refuse_unknown_keys(document, path, entry, ("from", "minus", "unit", "scale", "offset"))
-    if "from" not in entry:
-        raise document.error(path, f"{path[-1]} must have a from", shown(entry), f"write {_EXAMPLE}")
-    header = _header(document, (*path, "from"), entry["from"])
-    read_unit(document, path, entry, rule.si)
-    scale, offset = (
-        _number(document, (*path, key), entry.get(key, zero)) for key, zero in (("scale", 1.0), ("offset", 0.0))
-    )
+            raise node["rate"].error("rate is for times", node.key, f"write {_EXAMPLE}", of_key=True)
+        return Source(rate=node["rate"].quantity("Hz").value)
+    node.refuse_unknown(("from", "minus", "unit", "scale", "offset"))
+    header = _header(node.required("from", f"write {_EXAMPLE}"))
+    node.unit(rule.si)
+    scale, offset = (float(NUMBER.read(node.get(key, zero))) for key, zero in (("scale", 1.0), ("offset", 0.0)))
     if scale == offset == 0.0:
         remedy = "write 1, or -1 for the other sign; for a constant, state it as offset"
-        raise document.error((*path, "scale"), "scale must not be 0", "0", remedy)
-    return Source(
-        header,
-        _header(document, (*path, "minus"), entry["minus"]) if "minus" in entry else None,
-        entry["unit"],
-        scale,
-        offset,
-    )
+        raise node["scale"].error("scale must not be 0", "0", remedy)
+    return Source(header, _header(node["minus"]) if "minus" in node else None, node.value["unit"], scale, offset)
 
 
-def _header(document: TomlDocument, path: KeyPath, value: object) -> Header:
+def _header(node: Node) -> Header:
     """A header, or a number counted from 1."""
+    key, value = node.key, node.value
     if isinstance(value, int) and not isinstance(value, bool):
         if value < 1:
-            raise document.error(path, "columns are counted from 1", str(value), "write 1 for the first column")
+            raise node.error("columns are counted from 1", str(value), "write 1 for the first column")
         return value
-    if not isinstance(value, str):
-        rule = f"{path[-1]} must be a header or the number of a column"
-        raise document.error(path, rule, shown(value), f'write {path[-1]} = 1 or {path[-1]} = "<header>"')
-    if value == UNKNOWN:
-        remedy = "write its header, or its number counted from 1"
-        raise document.error(path, f"{path[-1]} must name the column that holds {path[-2]}", shown(value), remedy)
-    return " ".join(read_string(document, path, value).split())
+    remedy = f'write {key} = 1 or {key} = "<header>"'
+    node.require(isinstance(value, str), "be a header or the number of a column", remedy)
+    rule, remedy = f"name the column that holds {node.path[-2]}", "write its header, or its number counted from 1"
+    node.require(value != UNKNOWN, rule, remedy)
+    return " ".join(node.text().split())
 
 
-def _number(document: TomlDocument, path: KeyPath, value: object) -> float:
-    """A finite number without unit."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise document.error(path, f"{path[-1]} must be a finite number", shown(value), "write a number without quotes")
-    return float(value)
-
-
-def _lines(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> tuple[int | None, int | None]:
-    """``data_from_line`` and ``data_to_line``, None where they are not stated."""
-    found = []
-    for key, which in (("data_from_line", "first"), ("data_to_line", "last")):
-        value = entry.get(key)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-            rule = f"{key} must be a line, counted from 1"
-            raise document.error((*path, key), rule, shown(value), f"write the line of the {which} reading, such as 2")
-        found.append(value)
-    first, last = found
-    if first is not None and last is not None and last < first:
-        rule = f"data_to_line must not be above data_from_line = {first}"
-        raise document.error((*path, "data_to_line"), rule, str(last), "exchange them")
-    return first, last
-
-
-def _markers(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> tuple[str, ...]:
-    """The texts of ``missing``; "" stands for an empty cell."""
-    place, value = (*path, "missing"), entry.get("missing", [])
-    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
-        remedy = 'write missing = ["--", "NaN"]'
-        raise document.error(place, "missing must be a list of texts", shown(value), remedy)
-    return tuple(value)
-
-
-def _decimal(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> str | None:
-    """``decimal``, None where it is not stated."""
-    place = (*path, "decimal")
-    return read_choice(document, place, entry["decimal"], (".", ",")) if "decimal" in entry else None
-
-
-def _where(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> dict[str, Wanted]:
-    """The numbers, ranges and texts of ``where``, by header or number."""
-    place = (*path, "where")
-    stated = read_table(document, place, entry.get("where", {}), "where = { <header> = <value> }")
-    return {key: _wanted(document, (*place, key), value) for key, value in stated.items()}
-
-
-def _wanted(document: TomlDocument, path: KeyPath, value: object) -> Wanted:
+def _wanted(node: Node) -> Wanted:
     """One value of ``where``."""
+    value = node.value
     if isinstance(value, str):
         return value.strip()
     if not isinstance(value, dict):
-        return _number(document, path, value)
-    refuse_unknown_keys(document, path, value, ("min", "max"))
+        number = float(NUMBER.read(node))
+        return Range(number, number, is_range=False)
+    node.refuse_unknown(("min", "max"))
     if not value:
-        raise document.error(
-            path, "a range must have min or max", "none", "write { min = 2, max = 10 }, or one of them"
-        )
+        raise node.error("a range must have min or max", "none", "write { min = 2, max = 10 }, or one of them")
     for key in value:
-        if isinstance(value[key], float) and not abs(value[key]) <= LARGEST:
-            raise document.error((*path, key), f"{key} must be a finite number", shown(value[key]), f"leave {key} out")
-    ends = [_number(document, (*path, key), value[key]) if key in value else None for key in ("min", "max")]
-    found = Range(*(side if end is None else end for side, end in zip((-inf, inf), ends, strict=True)))
+        finite = not isinstance(value[key], float) or is_number(value[key])
+        node[key].require(finite, "be a finite number", f"leave {key} out")
+    low, high = (float(NUMBER.read(node[k])) if k in node else end for k, end in (("min", -inf), ("max", inf)))
+    found = Range(low, high)
     if found.min > found.max:
-        raise document.error(path, "min must not exceed max", str(found), "exchange them")
+        raise node.error("min must not exceed max", str(found), "exchange them")
     return found
 
 
@@ -327,54 +269,11 @@ ULPS = 4
 _MOST_VALUES = 6  # shown of a column where no row has the value wanted
 
 
-@dataclass(frozen=True)
-class Mapped:
-    """A table made by a column map.
-
-    Attributes
-    ----------
-    raw : columns with the names of the kind, in the stated units; ``rows`` are lines of the file, or rows of the
-        table where several files are put one below the other
-    file_of : (row index or None for the header, column index) -> the file of a cell
-    missing : rows dropped because a used cell holds a missing marker
-    other : rows outside ``where``
-    """
-
-    raw: RawTable
-    file_of: Callable[[int | None, int], Path]
-    missing: int
-    other: int
+Found = tuple[np.ndarray, Callable[[int | None], Place]]  #: one column of a part: its numbers, and where a row stands
 
 
-@dataclass(frozen=True)
-class _Found:
-    """One column of a part: its numbers, and where it stands."""
-
-    values: np.ndarray
-    export: Export
-    column: int
-
-
-@dataclass(frozen=True)
-class _Selected:
-    """Rows that a key of ``where`` selects, those without a value, (n,) each; where it selects none, what there is."""
-
-    rows: np.ndarray
-    unknown: np.ndarray
-    seen: str
-
-
-@dataclass(frozen=True)
-class _Cell:
-    """Where the cells of a column stand."""
-
-    path: Path
-    place: Callable[[int | None, int], tuple[int, int]]
-    column: int
-
-
-def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], column_map: ColumnMap) -> Mapped:
-    """The table of the experiment at ``path``.
+def apply_map(entry: Node, exports: Sequence[Export], column_map: ColumnMap) -> RawTable:
+    """The table of an experiment: columns with the names of the kind, in the stated units.
 
     Files with the same headers are put one below the other; else side by side, and a column that several of them hold
     must be the same within rounding.
@@ -386,185 +285,155 @@ def apply_map(document: TomlDocument, path: KeyPath, exports: Sequence[Export], 
     """
     first = exports[0]
     alike = all((each.headers, each.width) == (first.headers, first.width) for each in exports)
-    parts = [_Part(document, path, [each]) for each in exports] if alike else [_Part(document, path, exports)]
-    place = (*path, "columns")
+    parts = [_Part([each]) for each in exports] if alike else [_Part(exports)]
+    node = entry["columns"]
     sources = {name: source for name, source in column_map.sources.items() if source.rate is None}
-    found = [
-        {name: part.find((*place, name, "from"), source.header) for name, source in sources.items()} for part in parts
-    ]
+    found = [{name: part.find(node[name]["from"], source.header) for name, source in sources.items()} for part in parts]
     # The numbers of the files are not kept beside the table.
-    cells = [
-        {name: _Cell(each.export.path, each.export.place, each.column) for name, each in here.items()} for here in found
-    ]
+    places = [{name: place for name, (_, place) in here.items()} for here in found]
     values: dict[str, np.ndarray] = {}
     for name, source in sources.items():
-        values[name] = np.concatenate(
-            [_scaled(part, here.pop(name), (*place, name), source) for part, here in zip(parts, found, strict=True)]
-        )
-    where = {key: _selected_by(parts, (*path, "where", key), value) for key, value in column_map.where.items()}
+        scaled = [_scaled(part, here.pop(name)[0], node[name], source) for part, here in zip(parts, found, strict=True)]
+        values[name] = np.concatenate(scaled)
+    where = [_selected_by(parts, entry["where"][key], value) for key, value in column_map.where.items()]
     first_rows = np.cumsum([0, *(part.rows for part in parts)])
-    keep, missing, other = _kept(document, path, values, where, column_map.where)
+    keep, missing, other = _kept(node, values, where)
     for name, source in column_map.sources.items():
         if (rate := source.rate) is not None:
             values[name] = np.arange(first_rows[-1]) / rate
     names = tuple(column_map.sources)
-    columns = tuple(_selected(values.pop(name), keep) for name in names)
     origin = None if keep is None else np.flatnonzero(keep)
+    columns = tuple(values[name] if keep is None else values.pop(name)[keep] for name in names)
 
-    def cell(row: int | None, column: int) -> tuple[_Cell, int | None]:
+    def place(row: int | None, column: int) -> Place:
         index = 0 if row is None else row if origin is None else int(origin[row])
         part = 0 if row is None else int(np.searchsorted(first_rows, index, side="right")) - 1
-        here = cells[part].get(names[column], next(iter(cells[part].values())))
-        return here, None if row is None else index - int(first_rows[part])
+        here = places[part].get(names[column]) or next(iter(places[part].values()))
+        return here(None if row is None else index - int(first_rows[part]))
 
-    def place_of(row: int | None, column: int) -> tuple[int, int]:
-        here, index = cell(row, column)
-        return here.place(index, here.column)
-
-    units = tuple(column_map.sources[name].unit for name in names)
     # Arrays of a file may have other lengths than those that the map names.
-    lines = exports[0].lines[: int(first_rows[-1])]
-    rows = _selected(lines, keep) if len(parts) == 1 else np.arange(1, 1 + len(columns[0]))
-    raw = RawTable(names, units, columns, rows, place_of)
-    return Mapped(raw, lambda row, column: cell(row, column)[0].path, missing, other)
-
-
-def _selected(values: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
-    """The rows ``keep`` of a column; None: all, without a copy."""
-    return values if keep is None else values[keep]
+    lines = first.lines[: int(first_rows[-1])]
+    rows = np.arange(1, 1 + len(columns[0])) if len(parts) > 1 else lines if keep is None else lines[keep]
+    units = tuple(column_map.sources[name].unit for name in names)
+    return RawTable(names, units, columns, rows, place, missing=missing, other=other)
 
 
 class _Part:
     """Files side by side: the columns of one are found in any of them."""
 
-    def __init__(self, document: TomlDocument, path: KeyPath, exports: Sequence[Export]) -> None:
-        self.document, self.path, self.exports = document, path, exports
-        self._rows: int | None = None  # of the columns found, None before the first one
+    def __init__(self, exports: Sequence[Export]) -> None:
+        self.exports, self._rows = exports, list[int]()
 
     @property
     def rows(self) -> int:
         """Number of rows of the columns found."""
-        return self._rows or 0
+        return next(iter(self._rows), 0)
 
-    def find(self, place: KeyPath, header: Header) -> _Found:
-        """The column ``header``, stated at ``place`` of ``rig.toml``."""
-        found = [_Found(export.values(column), export, column) for export, column in self._columns(place, header)]
-        first = found[0]
-        self._rows = first.values.size if self._rows is None else self._rows
-        for each in found:
-            self._require_rows(place, header, each.values.size)
-            if each is first:
-                continue
-            scale = float(np.nanmax(np.abs(first.values), initial=0.0))
-            if not np.allclose(each.values, first.values, rtol=0.0, atol=ROUNDING * scale, equal_nan=True):
-                rule = f"{shown(header)} must be the same in {first.export.path.name} and {each.export.path.name}"
-                value = f"a difference of {np.nanmax(np.abs(each.values - first.values)):.3g}"
-                raise self.document.error(place, rule, value, "name files that were recorded together")
-        return first
+    def find(self, node: Node, header: Header) -> Found:
+        """The column ``header``, stated at ``node`` of ``rig.toml``."""
+        (first, column), *others = self._columns(node, header)
+        values = first.values(column)
+        self._require_rows(node, header, values.size)
+        for export, index in others:
+            same = export.values(index)
+            self._require_rows(node, header, same.size)
+            scale = float(np.nanmax(np.abs(values), initial=0.0))
+            if not np.allclose(same, values, rtol=0.0, atol=ROUNDING * scale, equal_nan=True):
+                rule = f"{shown(header)} must be the same in {first.path.name} and {export.path.name}"
+                value = f"a difference of {np.nanmax(np.abs(same - values)):.3g}"
+                raise node.error(rule, value, "name files that were recorded together")
+        return values, lambda row: first.place(row, column)
 
-    def words(self, place: KeyPath, header: Header) -> np.ndarray:
-        """The texts of the column ``header``, stated at ``place`` of ``rig.toml``, (n,)."""
+    def words(self, node: Node, header: Header) -> np.ndarray:
+        """The texts of the column ``header``, stated at ``node`` of ``rig.toml``, (n,)."""
         found: list[np.ndarray] = []
-        for export, column in self._columns(place, header):
+        for export, column in self._columns(node, header):
             if export.words is None:
                 rule = f"where takes numbers for a {export.path.suffix} file"
-                raise self.document.error(place, rule, "a text", "write a number, or export the file as CSV")
+                raise node.error(rule, "a text", "write a number, or export the file as CSV")
             codes, texts = export.words(column)
-            self._require_rows(place, header, len(codes))
+            self._require_rows(node, header, len(codes))
             found.append(np.array(texts)[codes])
             if differ := np.flatnonzero(found[-1] != found[0]).tolist():
                 rule, row = f"{shown(header)} must be the same in all files that have it", differ[0]
                 value = f"{shown(str(found[0][row]))} and {shown(str(found[-1][row]))}"
-                raise self.document.error(place, rule, value, "name files that were recorded together")
+                raise node.error(rule, value, "name files that were recorded together")
         return found[0]
 
-    def _require_rows(self, place: KeyPath, header: Header, rows: int) -> None:
+    def _require_rows(self, node: Node, header: Header, rows: int) -> None:
         """Refuse a column with another number of rows than those found before."""
+        self._rows.append(rows)
         if rows != self.rows:
             rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {rows}"
-            remedy = "map columns of equal length, or make an experiment of each file, with a clock"
-            raise self.document.error(place, rule, value, remedy)
+            raise node.error(
+                rule, value, "map columns of equal length, or make an experiment of each file, with a clock"
+            )
 
-    def _columns(self, place: KeyPath, header: Header) -> list[tuple[Export, int]]:
+    def _columns(self, node: Node, header: Header) -> list[tuple[Export, int]]:
         """The files that have the column ``header``, each with its index there; at least one."""
-        found = [
-            (export, column) for export in self.exports if (column := self._column(place, export, header)) is not None
-        ]
+        found = [(export, column) for export in self.exports for column in self._column(node, export, header)]
         if not found:
             known = [name for export in self.exports for row in export.headers for name in row if name]
             close = closest(str(header), known)
             remedy = f'write "{close}"' if close else "write the number of the column, counted from 1"
             value = f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}"
-            raise self.document.error(place, f"{place[-1]} must be a header of the file", value, remedy)
+            raise node.error(f"{node.key} must be a header of the file", value, remedy)
         return found
 
-    def _column(self, place: KeyPath, export: Export, header: Header) -> int | None:
-        """Index of a column in one file; None if the file does not have the header."""
+    def _column(self, node: Node, export: Export, header: Header) -> list[int]:
+        """Index of a column in one file; none if the file does not have the header."""
         if isinstance(header, int):
             if len(self.exports) > 1:
-                rule = "columns of files with different headers are named by their headers"
-                raise self.document.error(place, rule, str(header), f'write {place[-1]} = "<header>"')
+                rule, remedy = "columns of files with different headers are named by their headers", '"<header>"'
+                raise node.error(rule, str(header), f"write {node.key} = {remedy}")
             if header > export.width:
-                rule = f"{place[-1]} must be one of the {export.width} columns of the file"
-                remedy = f"write a number from 1 to {export.width}"
-                raise self.document.error(place, rule, str(header), remedy)
-            return header - 1
-        for row in export.headers:
-            numbers = [index for index, name in enumerate(row) if name == header]
-            if len(numbers) > 1:
-                value = f"{shown(header)} in columns {' '.join(str(index + 1) for index in numbers)}"
-                where = place[-2] == "where"
-                remedy = (
-                    f"write its number, {f'{numbers[0] + 1} = ...' if where else f'{place[-1]} = {numbers[0] + 1}'}"
+                rule, remedy = (
+                    f"{node.key} must be one of the {export.width} columns of the file",
+                    f"1 to {export.width}",
                 )
-                raise self.document.error(place, "a header must be unique", value, remedy, of_key=where)
-            if numbers:
-                return numbers[0]
-        return None
+                raise node.error(rule, str(header), f"write a number from {remedy}")
+            return [header - 1]
+        found = ([index for index, name in enumerate(row) if name == header] for row in export.headers)
+        numbers = next(filter(None, found), [])
+        if len(numbers) > 1:
+            value = f"{shown(header)} in columns {' '.join(str(index + 1) for index in numbers)}"
+            where = node.path[-2] == "where"
+            remedy = f"write its number, {f'{numbers[0] + 1} = ...' if where else f'{node.key} = {numbers[0] + 1}'}"
+            raise node.error("a header must be unique", value, remedy, of_key=where)
+        return numbers
 
 
-def _where_header(part: _Part, key: str) -> Header:
-    """A key of ``where`` as a header, or as a number where no file has the header."""
-    stated = any(key in row for export in part.exports for row in export.headers)
-    return int(key) if key.isascii() and key.isdigit() and int(key) > 0 and not stated else " ".join(key.split())
-
-
-def _selected_by(parts: Sequence[_Part], place: KeyPath, wanted: Wanted) -> _Selected:
-    """The rows whose column, named by the last key of ``place``, has what is ``wanted``."""
-    key = str(place[-1])
+def _selected_by(parts: Sequence[_Part], node: Node, wanted: Wanted) -> tuple[np.ndarray, np.ndarray]:
+    """The rows whose column, named by the key of ``node``, has what is ``wanted``, and those without a value, (n,)."""
+    key = node.key
+    stated = any(key in row for part in parts for export in part.exports for row in export.headers)
+    number = key.isascii() and key.isdigit() and int(key) > 0 and not stated
+    header: Header = int(key) if number else " ".join(key.split())
+    text, remedy = shown(wanted) if isinstance(wanted, str) else str(wanted), "write one of the values of the column"
     if isinstance(wanted, str):
-        texts = np.concatenate([part.words(place, _where_header(part, key)) for part in parts])
-        rows = texts == wanted
-        return _Selected(
-            rows, texts == "", "" if rows.any() else _some([shown(str(text)) for text in np.unique(texts)])
-        )
-    column = np.concatenate([part.find(place, _where_header(part, key)).values for part in parts])
-    if isinstance(wanted, Range):
-        # 0.1 + 0.2 is 0.3; times since 1970 in microseconds keep their digits.
-        own = [np.spacing(end) if np.isfinite(end) else 0.0 for end in np.abs([wanted.min, wanted.max])]
-        rows = (column >= wanted.min - ULPS * own[0]) & (column <= wanted.max + ULPS * own[1])
+        column = np.concatenate([part.words(node, header) for part in parts])
+        rows, unknown = column == wanted, column == ""
+        holds = [shown(str(text)) for text in np.unique(column)]
     else:
-        rows = np.abs(column - wanted) <= ULPS * np.spacing(abs(wanted))
-    return _Selected(rows, np.isnan(column), "" if rows.any() else _numbers_of(column, isinstance(wanted, Range)))
+        column = np.concatenate([part.find(node, header)[0] for part in parts])
+        # 0.1 + 0.2 is 0.3; times since 1970 in microseconds keep their digits.
+        ends = np.array([wanted.min, wanted.max])
+        low, high = ULPS * np.array([-1, 1]) * np.spacing(np.where(np.isfinite(ends), np.abs(ends), 0.0)) + ends
+        rows, unknown = (column >= low) & (column <= high), np.isnan(column)
+        numbers = np.unique(column[~unknown])
+        holds = [f"{value:.15g}" for value in numbers[: _MOST_VALUES + 1]]
+        if wanted.is_range:
+            remedy, holds = "widen the range", [f"{numbers[0]:.15g} to {numbers[-1]:.15g}"] if numbers.size else []
+    if not rows.any():
+        seen = " ".join(holds[:_MOST_VALUES]) + (" …" if len(holds) > _MOST_VALUES else "")
+        raise node.error(f"where must keep a row; column {shown(key)} holds {seen or 'no number'}", text, remedy)
+    return rows, unknown
 
 
-def _some(texts: Sequence[str]) -> str:
-    return " ".join(texts[:_MOST_VALUES]) + (" …" if len(texts) > _MOST_VALUES else "")
-
-
-def _numbers_of(column: np.ndarray, is_range: bool) -> str:
-    """The range of the numbers of a column, or some of them, in words; "" where it has none."""
-    numbers = column[np.isfinite(column)]
-    if is_range and numbers.size:
-        return f"{np.min(numbers):.15g} to {np.max(numbers):.15g}"
-    return _some([f"{value:.15g}" for value in np.unique(numbers)[: _MOST_VALUES + 1]])
-
-
-def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.ndarray:
+def _scaled(part: _Part, values: np.ndarray, node: Node, source: Source) -> np.ndarray:
     """The values of a column in its stated unit."""
-    values = found.values
     if source.minus is not None:
-        values = values - part.find((*place, "minus"), source.minus).values
+        values = values - part.find(node["minus"], source.minus)[0]
     if source.scale == 1.0 and source.offset == 0.0:
         return values
     with np.errstate(over="ignore"):
@@ -572,35 +441,15 @@ def _scaled(part: _Part, found: _Found, place: KeyPath, source: Source) -> np.nd
 
 
 def _kept(
-    document: TomlDocument,
-    path: KeyPath,
-    values: Mapping[str, np.ndarray],
-    where: Mapping[str, _Selected],
-    wanted: Mapping[str, Wanted],
+    node: Node, values: Mapping[str, np.ndarray], where: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray | None, int, int]:
     """Which rows are used (None: all), and how many are dropped: for a missing cell, and outside ``where``."""
-    if not where and not any(np.isnan(column).any() for column in values.values()):
-        return None, 0, 0
-    unknown = np.any([selected.unknown for selected in where.values()], axis=0) if where else np.array(False)
-    inside = np.ones(next(iter(values.values())).size, bool)
-    for key, selected in where.items():
-        if not selected.rows.any():
-            value = wanted[key]
-            rule = f"where must keep a row; column {shown(key)} holds {selected.seen or 'no number'}"
-            found = (
-                shown(value) if isinstance(value, str) else f"{value:.15g}" if isinstance(value, float) else str(value)
-            )
-            remedy = "widen the range" if isinstance(value, Range) else "write one of the values of the column"
-            raise document.error((*path, "where", key), rule, found, remedy)
-        inside &= selected.rows
-    empty = np.zeros_like(inside)
-    for column in values.values():
-        empty |= np.isnan(column)
+    everything = np.ones(next(iter(values.values())).size, bool)
+    inside = np.all([everything, *(rows for rows, _ in where)], axis=0)
+    unknown = np.any([~everything, *(rows for _, rows in where)], axis=0)
+    empty = np.any([~everything, *(np.isnan(column) for column in values.values())], axis=0)
     keep = inside & ~empty
     if not keep.any():
-        remedy = "correct where, or map another column"
-        raise document.error((*path, "columns"), "a table must have rows", "none is left", remedy)
-    if keep.all():
-        return None, 0, 0
+        raise node.error("a table must have rows", "none is left", "correct where, or map another column")
     missing = int(np.sum(inside & empty)) + int(np.sum(unknown & ~inside))
-    return keep, missing, inside.size - int(np.sum(keep)) - missing
+    return None if keep.all() else keep, missing, keep.size - int(np.sum(keep)) - missing

@@ -1,27 +1,16 @@
 """Readings from plateaus of a time trace, and outliers that a stated rule drops."""
 
 import re
-import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from capsule_id.rig.filters import hampel_outliers, median_step
-from capsule_id.rig.formats.raw import RawTable
-from capsule_id.rig.schema import KindRule
-from capsule_id.rig.toml import (
-    KeyPath,
-    TomlDocument,
-    read_choice,
-    read_string,
-    read_table,
-    read_unit,
-    refuse_unknown_keys,
-    shown,
-)
+from capsule_id.rig.formats.raw import Place, RawTable
+from capsule_id.rig.schema import ChoiceRule, KindRule, PlainRule, SettingRule, read_rules
+from capsule_id.rig.toml import Node, is_number, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 from capsule_id.views import counted
 
@@ -32,6 +21,30 @@ _REJECT_EXAMPLE = '{ rule = "hampel", window = "50 ms", n_sd = 5 }'
 _DURATION = re.compile(r"\s*([+-]?[0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?)\s*([^\s0-9]+)\s*")
 
 
+class DurationRule:
+    """A duration such as "50 ms"."""
+
+    def read(self, node: Node) -> float:
+        """See ``SettingRule``; s."""
+        text, remedy = node.text(), f'write {node.key} = "50 ms"'
+        found = _DURATION.fullmatch(text)
+        node.require(found is not None, "be a number with a unit of time", remedy)
+        assert found is not None, "a duration"
+        try:
+            duration = scale(float(found[1]), factor_to_si(found[2], "s"))
+        except UnitError as error:
+            raise node.error(error.rule, shown(text), remedy) from None
+        node.require(0.0 < duration < np.inf, "be greater than 0", remedy)
+        return duration
+
+
+_REJECT: Mapping[str, SettingRule] = {
+    "rule": ChoiceRule(("hampel",)),
+    "n_sd": PlainRule(lambda value: is_number(value) and value >= 1, "be a number, 1 or more", "write n_sd = 5"),
+    "window": DurationRule(),
+}
+
+
 @dataclass(frozen=True)
 class Rejection:
     """Hampel's rule: a sample further than ``n_sd`` robust sds from the median of ``window``, s, around it is dropped."""
@@ -40,30 +53,8 @@ class Rejection:
     n_sd: float
 
 
-def read_duration(document: TomlDocument, path: KeyPath, value: object) -> float:
-    """A duration such as "50 ms", s.
-
-    Raises
-    ------
-    InputError
-        If it is no number with a unit of time, or not positive.
-    """
-    text = read_string(document, path, value)
-    found = _DURATION.fullmatch(text)
-    remedy = f'write {path[-1]} = "50 ms"'
-    if found is None:
-        raise document.error(path, f"{path[-1]} must be a number with a unit of time", shown(text), remedy)
-    try:
-        duration = scale(float(found[1]), factor_to_si(found[2], "s"))
-    except UnitError as error:
-        raise document.error(path, error.rule, shown(text), remedy) from None
-    if not 0.0 < duration < np.inf:
-        raise document.error(path, f"{path[-1]} must be greater than 0", shown(text), remedy)
-    return duration
-
-
-def read_rejection(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> Rejection | None:
-    """The rule of the experiment at ``path``, None where it states none.
+def read_rejection(entry: Node) -> Rejection | None:
+    """The rule of an experiment, None where it states none.
 
     Raises
     ------
@@ -72,27 +63,19 @@ def read_rejection(document: TomlDocument, path: KeyPath, entry: Mapping[str, An
     """
     if "reject" not in entry:
         return None
-    place = (*path, "reject")
-    stated = read_table(document, place, entry["reject"], _REJECT_EXAMPLE)
-    refuse_unknown_keys(document, place, stated, ("rule", "window", "n_sd"))
+    node = entry["reject"].table(_REJECT_EXAMPLE, ("rule", "window", "n_sd"))
     for key in ("rule", "window", "n_sd"):
-        if key not in stated:
-            raise document.error(place, f"reject must have a {key}", shown(stated), f"write {_REJECT_EXAMPLE}")
-    read_choice(document, (*place, "rule"), stated["rule"], ("hampel",))
-    number = stated["n_sd"]
-    if isinstance(number, bool) or not isinstance(number, int | float) or not 1.0 <= number <= sys.float_info.max:
-        raise document.error((*place, "n_sd"), "n_sd must be a number, 1 or more", shown(number), "write n_sd = 5")
-    return Rejection(read_duration(document, (*place, "window"), stated["window"]), float(number))
+        node.required(key, f"write {_REJECT_EXAMPLE}")
+    stated = read_rules(node, _REJECT)
+    return Rejection(stated["window"], float(stated["n_sd"]))
 
 
-def outlying_rows(
-    document: TomlDocument, path: KeyPath, raw: RawTable, time: np.ndarray, rejection: Rejection
-) -> np.ndarray:
+def outlying_rows(node: Node, raw: RawTable, time: np.ndarray, rejection: Rejection) -> np.ndarray:
     """Whether a reading of each row is an outlier, (n,) bool.
 
     Parameters
     ----------
-    path : of the experiment, for the error line
+    node : of the window, for the error line
     raw : the table; its column ``time`` is not judged
     time : (n,) s, increasing
 
@@ -107,7 +90,7 @@ def outlying_rows(
         rule = "the window must hold two sampling steps or more, and fit into the record"
         value = f"{rejection.window:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s"
         remedy = "write a window of about 10 steps"
-        raise document.error((*path, "reject", "window"), rule, value, remedy)
+        raise node.error(rule, value, remedy)
     samples = 2 * round(half) + 1
     found = np.zeros(len(time), bool)
     for name, values in zip(raw.names, raw.columns, strict=True):
@@ -148,8 +131,8 @@ class Plateaus:
     guard: float
 
 
-def read_plateaus(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any], kind: KindRule) -> Plateaus | None:
-    """The plateaus of the experiment at ``path``, None where it states none.
+def read_plateaus(entry: Node, kind: KindRule) -> Plateaus | None:
+    """The plateaus of an experiment, None where it states none.
 
     The levels are those of the column of the kind that ``columns`` leaves out.
 
@@ -160,36 +143,29 @@ def read_plateaus(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any
     """
     if "plateaus" not in entry:
         return None
-    place = (*path, "plateaus")
-    mapped = set(entry["columns"]) if isinstance(entry.get("columns"), dict) else set()
+    node, columns = entry["plateaus"], entry.value.get("columns")
+    mapped = set(columns) if isinstance(columns, dict) else set()
     left = [[name for name in columns if name not in mapped] for columns in kind.sets if "time" not in columns]
     names = next((names for names in left if len(names) == 1), None)
     if names is None or "time" not in mapped:
         rule = f"plateaus of {kind.name} need a map of time and of all its columns but one"
         remedy = f"map time and {' or '.join(sorted({name for columns in kind.sets for name in columns}))} in columns"
-        raise document.error(place, rule, " ".join(sorted(mapped)) or "no columns", remedy, of_key=True)
-    stated = read_table(document, place, entry["plateaus"], _EXAMPLE)
-    refuse_unknown_keys(document, place, stated, ("levels", "unit", "guard"))
-    levels = stated.get("levels")
-    numbers = isinstance(levels, list) and all(
-        isinstance(level, int | float) and not isinstance(level, bool) and abs(level) <= sys.float_info.max
-        for level in levels
-    )
-    if not isinstance(levels, list) or not numbers or len(set(levels)) < 2:
-        rule = "levels must be a list of numbers, two or more different ones"
-        raise document.error((*place, "levels"), rule, shown(levels), "write a level for each plateau, in order")
-    read_unit(document, place, stated, kind.columns[names[0]].si)
-    guard = read_duration(document, (*place, "guard"), stated["guard"]) if "guard" in stated else 0.0
-    return Plateaus(names[0], np.array(levels, float), stated["unit"], guard)
+        raise node.error(rule, " ".join(sorted(mapped)) or "no columns", remedy, of_key=True)
+    levels = node.table(_EXAMPLE, ("levels", "unit", "guard")).get("levels", None)
+    stated = levels.value if isinstance(levels.value, list) and all(map(is_number, levels.value)) else []
+    rule, remedy = "be a list of numbers, two or more different ones", "write a level for each plateau, in order"
+    levels.require(len(set(stated)) > 1, rule, remedy)
+    node.unit(kind.columns[names[0]].si)
+    guard = DurationRule().read(node["guard"]) if "guard" in node else 0.0
+    return Plateaus(names[0], np.array(stated, float), node.value["unit"], guard)
 
 
-def readings_of_plateaus(
-    document: TomlDocument, path: KeyPath, raw: RawTable, time: np.ndarray, plateaus: Plateaus
-) -> tuple[RawTable, np.ndarray]:
-    """A row for each plateau, and the index of its first sample, (k,).
+def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: Plateaus) -> RawTable:
+    """A row for each plateau, which stands where its first sample does.
 
     Parameters
     ----------
+    node : of the plateaus, for error lines
     raw : the trace; its columns but ``time`` are averaged
     time : (n,) s, increasing
 
@@ -198,12 +174,11 @@ def readings_of_plateaus(
     InputError
         If the guard leaves too few samples, or the readings do not follow the levels.
     """
-    place = (*path, "plateaus")
     channels = [index for index, name in enumerate(raw.names) if name != "time"]
     trace = raw.values[:, channels]
     count = len(plateaus.levels)
     if len(time) < FEWEST_SAMPLES * count:
-        raise document.error(place, f"{count} plateaus need more samples", f"{len(time)}", "record them for longer")
+        raise node.error(f"{count} plateaus need more samples", f"{len(time)}", "record them for longer")
     edges, block = find_steps(trace, count)
     guard = plateaus.guard + (block - 1) * float(np.median(np.diff(time)))
     parts = []
@@ -215,26 +190,27 @@ def readings_of_plateaus(
         if len(parts[-1]) < FEWEST_SAMPLES:
             rule = f"a plateau must have {FEWEST_SAMPLES} samples beside the guard"
             value = f"{len(parts[-1])} from {time[first]:.4g} to {time[last - 1]:.4g} s"
-            raise document.error(place, rule, value, "shorten guard, or state a level for each plateau of the trace")
+            raise node.error(rule, value, "shorten guard, or state a level for each plateau of the trace")
     means = np.array([trace[part].mean(axis=0) for part in parts])
     correlation = abs(float(np.corrcoef(plateaus.levels, means[:, 0])[0, 1]))
-    _check_order(document, place, plateaus.levels, means[:, 0])
+    _check_order(node["levels"], plateaus.levels, means[:, 0])
     if not correlation >= SMALLEST_CORRELATION:
         rule = f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)"
         value = f"{correlation:.2g}; means {' '.join(f'{mean:.4g}' for mean in means[:, 0])}"
-        raise document.error((*place, "levels"), rule, value, "state a level for each plateau, in the order of time")
-    _check_constant(document, place, trace, parts, means)
+        raise node["levels"].error(rule, value, "state a level for each plateau, in the order of time")
+    _check_constant(node["levels"], trace, parts, means)
     starts = np.array([part[0] for part in parts])
     names = (*(raw.names[index] for index in channels), plateaus.name)
     units = (*(raw.units[index] for index in channels), plateaus.unit)
 
-    def cell(row: int | None, column: int) -> tuple[int, int]:
+    def place(row: int | None, column: int) -> Place:
         return raw.place(None if row is None else int(starts[row]), channels[min(column, len(channels) - 1)])
 
-    return RawTable(names, units, (*means.T, plateaus.levels), raw.rows[starts], cell), starts
+    columns = (*means.T, plateaus.levels)
+    return replace(raw, names=names, units=units, columns=columns, rows=raw.rows[starts], place=place)
 
 
-def _check_order(document: TomlDocument, place: KeyPath, levels: np.ndarray, means: np.ndarray) -> None:
+def _check_order(node: Node, levels: np.ndarray, means: np.ndarray) -> None:
     """Refuse levels (k,) that fit the means (k,) of the parts in reverse order only: every sensitivity is positive.
 
     Raises
@@ -247,12 +223,10 @@ def _check_order(document: TomlDocument, place: KeyPath, levels: np.ndarray, mea
         rule = "the levels must stand in the order of time, and the readings must increase with them"
         value = f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order"
         remedy = "reverse the levels, or state scale = -1 for a sensor of the other sign"
-        raise document.error((*place, "levels"), rule, value, remedy)
+        raise node.error(rule, value, remedy)
 
 
-def _check_constant(
-    document: TomlDocument, place: KeyPath, trace: np.ndarray, parts: list[np.ndarray], means: np.ndarray
-) -> None:
+def _check_constant(node: Node, trace: np.ndarray, parts: list[np.ndarray], means: np.ndarray) -> None:
     """Refuse a part with a step inside: the trace then has more plateaus than levels.
 
     Parameters
@@ -274,7 +248,7 @@ def _check_constant(
         if abs(one.mean() - other.mean()) > LARGEST_INNER_STEP * step:
             rule = "the trace must be constant on each plateau"
             value = f"{one.mean():.4g} and {other.mean():.4g} on one of {len(parts)} plateaus"
-            raise document.error((*place, "levels"), rule, value, "state a level for each plateau of the trace")
+            raise node.error(rule, value, "state a level for each plateau of the trace")
 
 
 def find_steps(trace: np.ndarray, count: int) -> tuple[np.ndarray, int]:

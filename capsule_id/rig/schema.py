@@ -1,7 +1,7 @@
 """Types for the columns, settings and rules of a kind of experiment, and the choices of ``[model]``."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from math import cos
 from types import MappingProxyType, UnionType
@@ -20,21 +20,7 @@ from typing import (
 
 from capsule_id.parameters import TABLE, Parameter
 from capsule_id.rig.model import ModelChoices, Quantity, Settings, Table
-from capsule_id.rig.toml import (
-    ANY,
-    INCLINE,
-    POSITIVE,
-    Domain,
-    KeyPath,
-    TomlDocument,
-    closest,
-    read_choice,
-    read_name,
-    read_quantity,
-    read_table,
-    refuse_unknown_keys,
-    shown,
-)
+from capsule_id.rig.toml import ANY, INCLINE, POSITIVE, Domain, Node, closest, is_count, shown
 
 if TYPE_CHECKING:
     from capsule_id.rig.tables import Entry
@@ -65,13 +51,13 @@ class ColumnRule:
 class SettingRule(Protocol):
     """Reads one setting. A kind may define its own rule: any object with this method."""
 
-    def read(self, document: TomlDocument, path: KeyPath, value: object) -> object:
-        """The checked value at ``path`` of ``rig.toml``, as stored in the settings.
+    def read(self, node: Node) -> object:
+        """The checked value of ``node``, as stored in the settings.
 
         Raises
         ------
         InputError
-            At ``path``, where the value breaks the rule.
+            At the node, where its value breaks the rule.
         """
         ...
 
@@ -88,9 +74,9 @@ class QuantityRule:
     has_sd: bool = False
     usual: tuple[float, float] | None = None
 
-    def read(self, document: TomlDocument, path: KeyPath, value: object) -> float | Quantity:
+    def read(self, node: Node) -> float | Quantity:
         """See ``SettingRule``."""
-        quantity = read_quantity(document, path, value, self.si, self.domain, self.has_sd)
+        quantity = node.quantity(self.si, self.domain, self.has_sd)
         return quantity if self.has_sd else quantity.value
 
 
@@ -119,20 +105,23 @@ class ChoiceRule:
 
     choices: tuple[str, ...]
 
-    def read(self, document: TomlDocument, path: KeyPath, value: object) -> str:
+    def read(self, node: Node) -> str:
         """See ``SettingRule``."""
-        return read_choice(document, path, value, self.choices)
+        return node.choice(self.choices)
 
 
 @dataclass(frozen=True)
-class CountRule:
-    """A whole number, 1 or more."""
+class PlainRule:
+    """A value of TOML as it is. ``rule`` continues "<key> must ..."."""
 
-    def read(self, document: TomlDocument, path: KeyPath, value: object) -> int:
+    holds: Callable[[Any], bool]
+    rule: str
+    remedy: str
+
+    def read(self, node: Node) -> Any:
         """See ``SettingRule``."""
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise document.error(path, f"{path[-1]} must be a whole number, 1 or more", shown(value), "write e.g. 10")
-        return value
+        node.require(self.holds(node.value), self.rule, self.remedy)
+        return node.value
 
 
 @dataclass(frozen=True)
@@ -141,26 +130,26 @@ class WordsRule:
 
     choices: tuple[str, ...]
 
-    def read(self, document: TomlDocument, path: KeyPath, value: object) -> tuple[str, ...]:
+    def read(self, node: Node) -> tuple[str, ...]:
         """See ``SettingRule``."""
-        if not isinstance(value, list):
-            return (read_choice(document, path, value, self.choices),)
-        if not value:
-            known = " ".join(self.choices)
-            raise document.error(path, f"{path[-1]} must not be empty", "[]", f"write some of {known}")
+        if not isinstance(node.value, list):
+            return (node.choice(self.choices),)
+        node.require(bool(node.value), "not be empty", f"write some of {' '.join(self.choices)}")
         # Words of a list have no place of their own.
-        for word in value:
-            read_choice(document, path, word, self.choices)
-        return tuple(value)
+        return tuple(replace(node, value=word).choice(self.choices) for word in node.value)
 
 
 @dataclass(frozen=True)
 class NameRule:
     """A name of letters, digits, dot, underscore, hyphen."""
 
-    def read(self, document: TomlDocument, path: KeyPath, value: object) -> str:
+    def read(self, node: Node) -> str:
         """See ``SettingRule``."""
-        return read_name(document, path, value)
+        return node.name()
+
+
+#: A whole number, 1 or more.
+COUNT = PlainRule(is_count, "be a whole number, 1 or more", "write e.g. 10")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +224,17 @@ def _rule_of(name: str, hint: object) -> SettingRule:
     raise TypeError(f"the type of setting {name} must be a Literal, or Annotated with its rule")
 
 
+def read_rules(node: Node, rules: Mapping[str, SettingRule]) -> dict[str, Any]:
+    """The values that a table states, each read by its rule.
+
+    Raises
+    ------
+    InputError
+        At the first value, in the order of the rules, that breaks its rule.
+    """
+    return {key: rule.read(node[key]) for key, rule in rules.items() if key in node}
+
+
 def parameter_rows(kinds: Mapping[str, KindRule]) -> dict[str, Parameter]:
     """Every parameter by symbol: the package's table, then the rows of ``kinds``.
 
@@ -274,7 +274,22 @@ TABLE_KEYS: Mapping[str, tuple[str, ...]] = {
 OPTIONAL = tuple(symbol for symbol, row in TABLE.items() if row.optional)
 
 
-def read_model(document: TomlDocument) -> ModelChoices:
+def read_words(node: Node, known: Sequence[str], rule: str, remedy: str) -> list[str]:
+    """The words of a list, each of them ``known``.
+
+    Raises
+    ------
+    InputError
+        At the list; ``remedy`` is that of a word that is like no other.
+    """
+    for word in node.value:
+        if word not in known:
+            near = closest(word, known) if isinstance(word, str) else None
+            raise node.error(f"{node.key} must name {rule}", shown(word), f"write {near}" if near else remedy)
+    return node.value
+
+
+def read_model(root: Node) -> ModelChoices:
     """Return the choices of ``[model]``; the defaults where it is absent.
 
     Raises
@@ -282,32 +297,25 @@ def read_model(document: TomlDocument) -> ModelChoices:
     InputError
         If a key or word is unknown or repeated, or a free parameter has no effect in the chosen law.
     """
-    head = read_table(document, ("model",), document.data.get("model", {}), "[model]")
-    refuse_unknown_keys(document, ("model",), head, TABLE_KEYS["[model]"], TABLE_KEYS)
+    head = root.get("model", {}).table("[model]")
+    head.refuse_unknown(TABLE_KEYS["[model]"], TABLE_KEYS)
     choices: dict[str, str] = {}
     for key in ("friction", "reaction", "engine"):
         words = get_args(get_type_hints(ModelChoices)[key])
-        choices[key] = read_choice(document, ("model", key), head.get(key, words[0]), words)
-    constant = choices["friction"] == "constant"
-    free = head.get("free", [])
-    path = ("model", "free")
-    if not isinstance(free, list):
-        raise document.error(path, "free must be a list of words", shown(free), f'write free = ["{OPTIONAL[0]}"]')
-    for index, word in enumerate(free):
-        if word not in OPTIONAL:
-            near = closest(word, OPTIONAL) if isinstance(word, str) else None
-            remedy = f"write {near}" if near else f"write some of {' '.join(OPTIONAL)}"
-            raise document.error(path, "free must name optional parameters", shown(word), remedy)
-        if word in free[:index]:
-            raise document.error(path, "free must name each parameter once", shown(word), "remove the second one")
-    if constant and "ratio" in free:
+        choices[key] = head.get(key, words[0]).choice(words)
+    node = head.get("free", [])
+    node.require(isinstance(node.value, list), "be a list of words", f'write free = ["{OPTIONAL[0]}"]')
+    free = read_words(node, OPTIONAL, "optional parameters", f"write some of {' '.join(OPTIONAL)}")
+    if twice := [word for index, word in enumerate(free) if word in free[:index]]:
+        raise node.error("free must name each parameter once", shown(twice[0]), "remove the second one")
+    if choices["friction"] == "constant" and "ratio" in free:
         remedy = 'remove "ratio" from free, or remove friction = "constant"'
-        raise document.error(path, "constant friction has no ratio", shown("ratio"), remedy)
+        raise node.error("constant friction has no ratio", shown("ratio"), remedy)
     in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
     return ModelChoices(free=in_order, **choices)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 
 
-def check_engine(document: TomlDocument, model: ModelChoices, tables: Sequence[Table[Any]]) -> None:
+def check_engine(root: Node, model: ModelChoices, tables: Sequence[Table[Any]]) -> None:
     """Refuse a smoothed engine in a rig without an experiment that integrates eqs. (1) and (2).
 
     Raises
@@ -319,10 +327,10 @@ def check_engine(document: TomlDocument, model: ModelChoices, tables: Sequence[T
     if model.engine == "smooth" and not integrated:
         rule = 'engine = "smooth" needs an experiment that integrates eqs. (1) and (2): a run, or forward = "capsule"'
         remedy = 'remove engine, or write forward = "capsule" for a decay or for pushes'
-        raise document.error(("model", "engine"), rule, "closed forms alone", remedy)
+        raise root["model"]["engine"].error(rule, "closed forms alone", remedy)
 
 
-def read_confirmed(document: TomlDocument, tables: Sequence[Table[Any]], stated: Iterable[str]) -> tuple[str, ...]:
+def read_confirmed(root: Node, tables: Sequence[Table[Any]], stated: Iterable[str]) -> tuple[str, ...]:
     """Return the names in ``confirmed`` of [rig]; ``stated``: the quantities of [rig].
 
     Raises
@@ -330,47 +338,52 @@ def read_confirmed(document: TomlDocument, tables: Sequence[Table[Any]], stated:
     InputError
         If it is no list of names of [rig], or of columns and settings of experiments.
     """
-    path, names = ("rig", "confirmed"), document.data["rig"].get("confirmed", [])
+    node = root["rig"].get("confirmed", [])
     known = [*stated, *(f"{t.label}.{name}" for t in tables for name in (*t.columns, *vars(t.settings)))]
-    if not isinstance(names, list):
-        raise document.error(path, "confirmed must be a list of names", shown(names), 'write confirmed = ["m1"]')
-    for name in names:
-        if name not in known:
-            near = closest(name, known) if isinstance(name, str) else None
-            rule = "confirmed must name quantities of [rig], or LABEL.COLUMN or LABEL.SETTING of experiments"
-            raise document.error(path, rule, shown(name), f"write {near}" if near else "remove it")
-    return tuple(names)
+    node.require(isinstance(node.value, list), "be a list of names", 'write confirmed = ["m1"]')
+    rule = "quantities of [rig], or LABEL.COLUMN or LABEL.SETTING of experiments"
+    return tuple(read_words(node, known, rule, "remove it"))
 
 
-def check_masses_of_free(
-    document: TomlDocument,
-    model: ModelChoices,
-    tables: Sequence[Table],
-    kinds: Mapping[str, KindRule],
-    stated: set[str],
+def check_masses(
+    root: Node, model: ModelChoices, tables: Sequence[Table], kinds: Mapping[str, KindRule], stated: Collection[str]
 ) -> None:
-    """Refuse a free parameter whose unit an experiment converts by a mass that [rig] does not state.
+    """Refuse an experiment, or a free parameter with an experiment, that needs a mass which [rig] does not state.
 
     Raises
     ------
     InputError
-        At the word in ``free``; it names the experiment and the missing mass.
+        At the kind of the experiment, or at ``free``; it names the missing mass.
     """
-    for symbol in model.free:
-        for table in tables:
-            for mass in kinds[table.kind].masses_of_free.get(symbol, ()):
-                if mass not in stated:
-                    rule = f"free {symbol} needs {mass}, because {table.label} gives friction without the weight"
-                    remedy = f'add {mass} = {{ value = ..., sd = ..., unit = "kg" }} to [rig], or remove "{symbol}"'
-                    raise document.error(("model", "free"), rule, f"no {mass} in [rig]", remedy)
+    needs = [
+        (root["experiment"][index]["kind"], mass, f"{table.kind} needs {mass}", "")
+        for index, table in enumerate(tables)
+        for mass in kinds[table.kind].masses(table)
+    ]
+    needs += [
+        (
+            root["model"]["free"],
+            mass,
+            f"free {symbol} needs {mass}, because {table.label} gives friction without the weight",
+            f', or remove "{symbol}"',
+        )
+        for symbol in model.free
+        for table in tables
+        for mass in kinds[table.kind].masses_of_free.get(symbol, ())
+    ]
+    for node, mass, rule, other in needs:
+        if mass not in stated:
+            remedy = f'add {mass} = {{ value = ..., sd = ..., unit = "kg" }} to [rig]{other}'
+            raise node.error(rule, f"no {mass} in [rig]", remedy)
 
 
-def place_of(document: TomlDocument, path: KeyPath, key: str) -> KeyPath:
-    """The key path where ``key`` of the entry at ``path`` is stated: the entry itself, or [rig]."""
-    return (*path, key) if (*path, key) in document.keys else ("rig", key)
+def node_of_ground(entry: Node, key: str) -> Node:
+    """The node where ``key``, which an entry or [rig] may have, is stated for an experiment."""
+    root = Node(entry.document, (), entry.document.data)
+    return entry[key] if key in entry else root["rig"][key]
 
 
-def check_normal_forces(document: TomlDocument, tables: Sequence[Table[Any]], stated: Mapping[str, Quantity]) -> None:
+def check_normal_forces(root: Node, tables: Sequence[Table[Any]], stated: Mapping[str, Quantity]) -> None:
     """Refuse a pressing force that lifts the capsule off the ground; ``stated``: g and the stated masses.
 
     Raises
@@ -387,5 +400,5 @@ def check_normal_forces(document: TomlDocument, tables: Sequence[Table[Any]], st
         N = mass * stated["g"].value * cos(slope) + settings.N0.value
         if N <= 0.0:
             rule = f"the normal force (m1 + m2) g cos(slope) + N0 of {table.label} must be positive"
-            place = place_of(document, ("experiment", index), "N0")
-            raise document.error(place, rule, f"{N:.3g} N", "raise N0; N0 > 0 presses the capsule down")
+            node = node_of_ground(root["experiment"][index], "N0")
+            raise node.error(rule, f"{N:.3g} N", "raise N0; N0 > 0 presses the capsule down")

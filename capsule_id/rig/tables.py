@@ -14,21 +14,14 @@ import numpy as np
 from capsule_id.errors import InputError
 from capsule_id.rig.filters import FEWEST_PERIODS, clock_starts
 from capsule_id.rig.formats import EXPORTS, READERS, suffix_of
-from capsule_id.rig.formats.raw import Layout, RawTable
+from capsule_id.rig.formats.raw import Layout, Place, RawTable
 from capsule_id.rig.formats.text import HEADER_CELL, MissingCellsError, TextFile
 from capsule_id.rig.guess import find_layout, proposal
-from capsule_id.rig.maps import ColumnMap, apply_map, on_reference, read_clock, read_map
+from capsule_id.rig.maps import apply_map, on_reference, read_clock, read_map
 from capsule_id.rig.model import NO_DRIFT, Column, Quantity, S, Table
-from capsule_id.rig.plateaus import (
-    Plateaus,
-    Rejection,
-    outlying_rows,
-    read_plateaus,
-    read_rejection,
-    readings_of_plateaus,
-)
-from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, KindRule, place_of
-from capsule_id.rig.toml import LARGEST, SMALLEST, KeyPath, TomlDocument, closest, is_plausible, read_string, shown
+from capsule_id.rig.plateaus import outlying_rows, read_plateaus, read_rejection, readings_of_plateaus
+from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule, KindRule, node_of_ground
+from capsule_id.rig.toml import LARGEST, SMALLEST, Node, closest, is_plausible, shown
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 from capsule_id.views import counted
 
@@ -90,107 +83,102 @@ class TableFile:
     sha256 : of the bytes read, by name in ``rig.toml``, the first file first
     raw : the numbers as written, until they are converted
     columns : by name, still without reading errors
-    file_of : (row index or None for the header, column index) -> the file, for error lines
-    missing, other : rows that a column map drops: for a missing cell, and outside ``where``
-    rejected : rows dropped as outliers
     encodings : of the texts, by name in ``rig.toml``
     drift : of the clock, 1
     """
 
     sha256: Mapping[str, str]
     raw: RawTable
-    columns: Mapping[str, Column]
-    file_of: Callable[[int | None, int], Path]
-    missing: int = 0
-    other: int = 0
-    rejected: int = 0
+    columns: Mapping[str, Column] = field(default_factory=dict)
     encodings: Mapping[str, str] = field(default_factory=dict)
     drift: Quantity = NO_DRIFT
 
     def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
         """The error about a cell, or about the header of a column if ``row`` is None."""
-        index = self.raw.names.index(name)
-        return InputError(rule, value, remedy, self.file_of(row, index), *self.raw.place(row, index))
+        return InputError(rule, value, remedy, *self.raw.place(row, self.raw.names.index(name)))
 
 
-def table_path(document: TomlDocument, path: KeyPath, name: str) -> Path:
-    """The path of the table ``name``, a regular file inside the rig folder.
+def table_path(node: Node) -> Path:
+    """The path of the table that ``node`` names, a regular file inside the rig folder.
 
     Raises
     ------
     InputError
         At the ``file`` key of ``rig.toml``.
     """
-    folder = document.path.parent
+    folder, name = node.document.path.parent, node.text()
     remedy = "put the file into the rig folder and write its path relative to that folder"
     if Path(name).is_absolute() or PureWindowsPath(name).drive or not name.isprintable():
-        raise document.error(path, "file must be a path relative to the rig folder", shown(name), remedy)
+        raise node.error("file must be a path relative to the rig folder", shown(name), remedy)
     file = folder / name
     try:
         inside = file.resolve().is_relative_to(folder.resolve())
         exists, regular = file.exists(), file.is_file()
     except (OSError, RuntimeError, ValueError) as error:
-        raise document.error(path, "file must be a readable file", f"{shown(name)} ({error})", remedy) from None
-    if not inside:
-        raise document.error(path, "file must lie inside the rig folder, links followed", shown(name), remedy)
-    if not exists:
-        near = closest(
-            name, [p.relative_to(folder).as_posix() for p in file.parent.glob("*") if suffix_of(p) in EXPORTS]
-        )
-        remedy = f'write "{near}"' if near else "correct the name or add the file"
-        raise document.error(path, "file must exist", shown(name), remedy)
-    if not regular:
-        raise document.error(path, "file must be a regular file", shown(name), "name a table, not a folder or device")
-    if suffix_of(file) not in EXPORTS:
-        known = " ".join(EXPORTS)
-        raise document.error(path, f"file must be a table of a known kind ({known})", shown(name), "export it as CSV")
+        raise node.error("file must be a readable file", f"{shown(name)} ({error})", remedy) from None
+    beside = file.parent.glob("*") if inside and not exists else ()
+    near = closest(name, [p.relative_to(folder).as_posix() for p in beside if suffix_of(p) in EXPORTS])
+    for holds, rule, cure in (
+        (inside, "lie inside the rig folder, links followed", remedy),
+        (exists, "exist", f'write "{near}"' if near else "correct the name or add the file"),
+        (regular, "be a regular file", "name a table, not a folder or device"),
+        (suffix_of(file) in EXPORTS, f"be a table of a known kind ({' '.join(EXPORTS)})", "export it as CSV"),
+    ):
+        if not holds:
+            raise node.error(f"file must {rule}", shown(name), cure)
     return file
 
 
-def read_experiment_files(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any], kind: KindRule) -> TableFile:
-    """Read the table of the experiment at ``path``, by its column map if it has one, and check its columns.
+def read_experiment_files(entry: Node, kind: KindRule) -> TableFile:
+    """Read the table of an experiment, by its column map if it has one, and check its columns.
 
     Raises
     ------
     InputError
         At a key of ``rig.toml`` or at a place in a file.
     """
-    places = _file_places(document, path, entry)
     files: dict[str, Path] = {}
     hashes: dict[str, str] = {}
-    for place, name in places:
-        file = table_path(document, place, name)
+    nodes = _file_nodes(entry)
+    for node in nodes:
+        file, name = table_path(node), node.value
         if file in files.values():
-            raise document.error(place, "files must be named once", shown(name), "remove the second one")
+            raise node.error("files must be named once", shown(name), "remove the second one")
         try:
             with file.open("rb") as opened:
                 files[name], hashes[name] = file, hashlib.file_digest(opened, "sha256").hexdigest()
         except OSError as error:
             value = f"{shown(name)} ({error.strerror})"
-            raise document.error(place, "file must be readable", value, "check its permissions") from None
-    first = places[0][1]
-    rejection, plateaus = read_rejection(document, path, entry), read_plateaus(document, path, entry, kind)
-    column_map = read_map(document, path, entry, kind, partial(_proposal, files[first], kind))
+            raise node.error("file must be readable", value, "check its permissions") from None
+    first = files[nodes[0].value]
+    rejection, plateaus = read_rejection(entry), read_plateaus(entry, kind)
+    column_map = read_map(entry, kind, partial(_proposal, first, kind))
     if column_map is None:
-        table = _read_plain(document, places[0][0], files[first], hashes, kind)
+        raw = _read_plain(nodes[0], first, kind)
+        encodings = {nodes[0].value: raw.encoding}
     else:
-        _check_map_names(document, path, column_map, kind, plateaus)
-        layout = column_map.layout
-        exports = {name: EXPORTS[suffix_of(file)](file, file, layout) for name, file in files.items()}
-        mapped = apply_map(document, path, list(exports.values()), column_map)
+        # Plateaus replace the time by the column of their levels.
+        names = tuple(column_map.sources)
+        if plateaus is not None:
+            names = (*(name for name in names if name != "time"), plateaus.name)
+        _check_names(names, kind, lambda name, *text: entry["columns"].error(*text))
+        exports = {name: EXPORTS[suffix_of(file)](file, file, column_map.layout) for name, file in files.items()}
+        raw = apply_map(entry, list(exports.values()), column_map)
         encodings = {name: export.encoding for name, export in exports.items()}
         del exports
-        table = TableFile(hashes, mapped.raw, {}, mapped.file_of, mapped.missing, mapped.other, encodings=encodings)
-    if (clock := read_clock(document, path, entry)) is not None:
-        table = replace(table, raw=on_reference(document, path, table.raw, clock), drift=clock.drift)
+    drift = NO_DRIFT
+    if (clock := read_clock(entry)) is not None:
+        raw, drift = on_reference(entry, raw, clock), clock.drift
     if rejection is not None:
-        table = _without_outliers(document, path, table, rejection)
+        if "time" not in raw.names:
+            value, remedy = " ".join(raw.names), "remove reject, and correct or delete the rows"
+            raise entry["reject"].error("reject needs a record with times", value, remedy, of_key=True)
+        raw = _with_rows(raw, ~outlying_rows(entry["reject"]["window"], raw, _times(raw), rejection))
     if plateaus is not None:
-        raw, starts = readings_of_plateaus(document, path, table.raw, _times(table), plateaus)
-        table = _with_rows(table, raw, starts)
-    table.raw.rows.flags.writeable = False
-    columns = {column: _to_si(table, index, kind.columns[column]) for index, column in enumerate(table.raw.names)}
-    return replace(table, raw=replace(table.raw, columns=()), columns=columns)
+        raw = readings_of_plateaus(entry["plateaus"], raw, _times(raw), plateaus)
+    raw.rows.flags.writeable = False
+    columns = {column: _to_si(raw, index, kind.columns[column]) for index, column in enumerate(raw.names)}
+    return TableFile(hashes, replace(raw, columns=()), columns, encodings, drift)
 
 
 def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]:
@@ -207,44 +195,43 @@ def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]
     columns = {name: rule for name, rule in kind.columns.items() if name != without}
     sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
     raw = READERS[path.suffix.lower()](path, path)
-    table = TableFile({}, raw, {}, lambda row, column: path)
-    asked = replace(kind, columns=columns, sets=sets)
-    _check_names(raw.names, asked, lambda name, *text: table.error(None, name, *text))
-    return {name: _to_si(table, index, columns[name]) for index, name in enumerate(raw.names)}
+    _check_names(raw.names, replace(kind, columns=columns, sets=sets), partial(_error_at, raw, None))
+    return {name: _to_si(raw, index, columns[name]) for index, name in enumerate(raw.names)}
 
 
-def _file_places(document: TomlDocument, path: KeyPath, entry: Mapping[str, Any]) -> list[tuple[KeyPath, str]]:
-    """The files of an experiment, each with its place in ``rig.toml``."""
+def _error_at(raw: RawTable, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
+    """The error about a cell, or about the header of a column if ``row`` is None."""
+    return InputError(rule, value, remedy, *raw.place(row, raw.names.index(name)))
+
+
+def _file_nodes(entry: Node) -> list[Node]:
+    """The files of an experiment."""
     if "files" not in entry:
         if "file" not in entry:
-            raise document.error(path, "an experiment must have a file", "none", 'add file = "..."')
-        return [((*path, "file"), read_string(document, (*path, "file"), entry["file"]))]
-    place = (*path, "files")
+            raise entry.error("an experiment must have a file", "none", 'add file = "..."')
+        return [entry["file"]]
+    node = entry["files"]
     if "file" in entry:
-        raise document.error(place, "an experiment has file or files", "both", "remove file", of_key=True)
-    names = entry["files"]
-    if not isinstance(names, list) or not names:
-        raise document.error(place, "files must be a list of files", shown(names), 'write files = ["...", "..."]')
-    return [((*place, index), read_string(document, (*place, index), name)) for index, name in enumerate(names)]
+        raise node.error("an experiment has file or files", "both", "remove file", of_key=True)
+    files = isinstance(node.value, list) and bool(node.value)
+    node.require(files, "be a list of files", 'write files = ["...", "..."]')
+    found = [node[index] for index in range(len(node.value))]
+    for each in found:
+        each.text()
+    return found
 
 
-def _read_plain(
-    document: TomlDocument, place: KeyPath, file: Path, hashes: Mapping[str, str], kind: KindRule
-) -> TableFile:
+def _read_plain(node: Node, file: Path, kind: KindRule) -> RawTable:
     """A file with the column names of the kind; an error about its header proposes a column map."""
     suffix = suffix_of(file)
     if suffix not in READERS:
         remedy = f"add {_proposal(file, kind, Layout())}"
-        raise document.error(place, f"a {suffix} file needs a column map", "no columns", remedy)
+        raise node.error(f"a {suffix} file needs a column map", "no columns", remedy)
     try:
         raw = READERS[suffix](file, file)
-        table = TableFile(hashes, raw, {}, lambda row, column: file, encodings={next(iter(hashes)): raw.encoding})
-        _check_names(raw.names, kind, lambda name, *text: table.error(None, name, *text))
+        _check_names(raw.names, kind, partial(_error_at, raw, None))
     except InputError as error:
-        own, remedy = (
-            _own_map(file, kind),
-            f"{error.remedy}; or add {_proposal(file, kind, Layout())} to the experiment",
-        )
+        own = _own_map(file, kind)
         if isinstance(error, MissingCellsError) and own:
             missing = json.dumps(error.texts, ensure_ascii=False)
             remedy = (
@@ -254,8 +241,10 @@ def _read_plain(
             raise
         elif own:
             remedy = f"add to the experiment {own}: other columns are then not read"
+        else:
+            remedy = f"{error.remedy}; or add {_proposal(file, kind, Layout())} to the experiment"
         raise InputError(error.rule, error.value, remedy, file, error.line, error.column) from None
-    return table
+    return raw
 
 
 def _own_map(file: Path, kind: KindRule) -> str:
@@ -281,52 +270,20 @@ def _proposal(file: Path, kind: KindRule, layout: Layout) -> str:
     return first + proposal(kind, found)
 
 
-def _times(table: TableFile) -> np.ndarray:
+def _times(raw: RawTable) -> np.ndarray:
     """The times of a record, (n,) s, increasing."""
-    return _to_si(table, table.raw.names.index("time"), ColumnRule("s", increasing=True)).values
+    return _to_si(raw, raw.names.index("time"), ColumnRule("s", increasing=True)).values
 
 
-def _without_outliers(document: TomlDocument, path: KeyPath, table: TableFile, rejection: Rejection) -> TableFile:
-    """The table without its outliers."""
-    if "time" not in table.raw.names:
-        value, remedy = " ".join(table.raw.names), "remove reject, and correct or delete the rows"
-        raise document.error((*path, "reject"), "reject needs a record with times", value, remedy, of_key=True)
-    keep = np.flatnonzero(~outlying_rows(document, path, table.raw, _times(table), rejection))
-    raw = table.raw
-    kept = RawTable(
-        raw.names,
-        raw.units,
-        tuple(column[keep] for column in raw.columns),
-        raw.rows[keep],
-        lambda row, column: raw.place(None if row is None else int(keep[row]), column),
-    )
-    return replace(_with_rows(table, kept, keep), rejected=len(raw.rows) - len(keep))
+def _with_rows(raw: RawTable, keep: np.ndarray) -> RawTable:
+    """The table without outliers; ``keep`` (n,) are the other rows."""
+    origin = np.flatnonzero(keep)
+    columns = tuple(column[keep] for column in raw.columns)
 
+    def place(row: int | None, column: int) -> Place:
+        return raw.place(None if row is None else int(origin[row]), column)
 
-def _with_rows(table: TableFile, raw: RawTable, origin: np.ndarray) -> TableFile:
-    """The table with other rows; ``origin`` (k,) are their rows in the former one."""
-    columns = len(table.raw.names) - 1
-    return replace(
-        table,
-        raw=raw,
-        file_of=lambda row, column: table.file_of(None if row is None else int(origin[row]), min(column, columns)),
-    )
-
-
-def _check_map_names(
-    document: TomlDocument, path: KeyPath, column_map: ColumnMap, kind: KindRule, plateaus: Plateaus | None
-) -> None:
-    """Refuse a map without the columns that the kind needs; plateaus replace the time by the column of their levels."""
-    place = (*path, "columns")
-
-    def error(name: str, rule: str, value: str, remedy: str) -> InputError:
-        del name
-        return document.error(place, rule, value, remedy)
-
-    names = tuple(column_map.sources)
-    if plateaus is not None:
-        names = (*(name for name in names if name != "time"), plateaus.name)
-    _check_names(names, kind, error)
+    return replace(raw, columns=columns, rows=raw.rows[keep], place=place, rejected=int(np.sum(~keep)))
 
 
 def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str, str, str], InputError]) -> None:
@@ -357,30 +314,36 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
         raise error(names[0], rule, " ".join(names), f"add one of {wanted}")
 
 
-def _to_si(table: TableFile, index: int, rule: ColumnRule) -> Column:
+def _to_si(raw: RawTable, index: int, rule: ColumnRule) -> Column:
     """Column ``index`` in SI; its values obey ``rule``."""
-    name, unit = table.raw.names[index], table.raw.units[index]
+    name, unit, written = raw.names[index], raw.units[index], raw.columns[index]
     try:
         factor = factor_to_si(unit, rule.si)
     except UnitError as error:
-        raise table.error(None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
-    written = table.raw.columns[index]
+        raise _error_at(raw, None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
     with np.errstate(over="ignore"):
         values = written if factor == 1.0 else scale(written, factor)
-    _check_values(table, index, rule, values)
-    if rule.varies and len(values) > 1 and np.ptp(values) == 0.0:
-        value = f"{written[0]:g} {unit} in every row"
-        raise table.error(None, name, f"{name} must not be constant", value, "check the sensor and the export")
-    if rule.varies and len(values) == 1:
-        raise table.error(0, name, f"{name} must vary over the rows", "one row", "add rows")
+    _check_values(raw, index, rule, values)
+    if rule.varies and np.ptp(values) == 0.0:
+        one = len(values) == 1
+        text = (
+            (f"{name} must vary over the rows", "one row", "add rows")
+            if one
+            else (
+                f"{name} must not be constant",
+                f"{written[0]:g} {unit} in every row",
+                "check the sensor and the export",
+            )
+        )
+        raise _error_at(raw, 0 if one else None, name, *text)
     values.flags.writeable = False
     return Column(name, unit, 1.0 / factor, values)
 
 
-def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.ndarray) -> None:
-    """Refuse a value of column ``index`` outside its domain, (n,) SI."""
-    name = table.raw.names[index]
-    signed = [c for own, c in zip(table.raw.names, table.raw.columns, strict=True) if own != "normal_force"]
+def _check_values(raw: RawTable, index: int, rule: ColumnRule, values: np.ndarray) -> None:
+    """Refuse a value of column ``index`` outside its domain, or out of order, (n,) SI."""
+    name, unit = raw.names[index], raw.units[index]
+    signed = [c for own, c in zip(raw.names, raw.columns, strict=True) if own != "normal_force"]
     # Sliding and pulls; a single sign may be a slip of the pen.
     directed = name in ("speed", "force") and np.sum(values < 0.0) > 1
     correct = (
@@ -389,33 +352,20 @@ def _check_values(table: TableFile, index: int, rule: ColumnRule, values: np.nda
         if directed and all(np.array_equal(np.sign(c), np.sign(values)) for c in signed)
         else "correct the value or delete the row"
     )
-    magnitude = f"{name} must be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
-    checks: list[tuple[Callable[[np.ndarray], np.ndarray], str, str]] = [
-        (
-            lambda part: np.isfinite(part) & rule.domain.holds(part),
-            f"{name} must {rule.domain.text}",
-            correct,
-        ),
-        (is_plausible, magnitude, "correct the value or the unit of the column"),
+    magnitude = f"be 0 or lie between {SMALLEST:g} and {LARGEST:g} in SI units"
+    checks: list[tuple[Callable[[], np.ndarray], str, str | None]] = [
+        (lambda: np.isfinite(values) & rule.domain.holds(values), rule.domain.text, correct),
+        (lambda: is_plausible(values), magnitude, "correct the value or the unit of the column"),
+        (lambda: np.diff(values, prepend=-np.inf) > 0.0, "increase from row to row", None),
     ]
-    for holds, text, remedy in checks:
-        _raise_at_first_false(table, index, holds(values), (text, remedy), 0)
-    if rule.increasing:
-        rises = np.diff(values) > 0.0
-        fall = int(np.argmin(rises)) if len(rises) else 0
-        if rises.all():
-            return
-        remedy = "name the files in the order of time, or make an experiment of each"
-        if table.file_of(fall + 1, index) == table.file_of(fall, index):
-            remedy = remedy_of_order(table.raw, index)
-        _raise_at_first_false(table, index, rises, (f"{name} must increase from row to row", remedy), 1)
-
-
-def _raise_at_first_false(table: TableFile, index: int, good: np.ndarray, message: tuple[str, str], first: int) -> None:
-    """Raise at the first row from ``first`` on that is not ``good``; ``message``: rule and remedy."""
-    if not good.all():
-        row, name, (rule, remedy) = first + int(np.argmin(good)), table.raw.names[index], message
-        raise table.error(row, name, rule, f"{table.raw.columns[index][row]:g} {table.raw.units[index]}", remedy)
+    for holds, text, remedy in checks[: 2 + rule.increasing]:
+        if not (good := holds()).all():
+            row = int(np.argmin(good))
+            if remedy is None:
+                same = raw.place(row, index)[0] == raw.place(row - 1, index)[0]
+                in_files = "name the files in the order of time, or make an experiment of each"
+                remedy = remedy_of_order(raw, index) if same else in_files
+            raise _error_at(raw, row, name, f"{name} must {text}", f"{raw.columns[index][row]:g} {unit}", remedy)
 
 
 # entry: One ``[[experiment]]`` during its check: its table, and the places for error lines.
@@ -428,19 +378,17 @@ class Entry(Generic[S]):
     Attributes
     ----------
     table : columns and settings, SI
-    document, path : ``rig.toml``, and the key path of the entry
+    node : the entry in ``rig.toml``
     file : the table as written
     """
 
     table: Table[S]
-    document: TomlDocument
-    path: KeyPath
+    node: Node
     file: TableFile
 
     def error(self, key: str, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
         """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
-        path = (*self.path, key) if key else self.path
-        return self.document.error(path, rule, value, remedy, of_key)
+        return (self.node.get(key, None) if key else self.node).error(rule, value, remedy, of_key)
 
     def refuse_ground(self, key: str, rule: str) -> None:
         """Refuse a slope or N0 that this experiment cannot have, its own or that of [rig].
@@ -455,7 +403,7 @@ class Entry(Generic[S]):
             unit = "deg" if key == "slope" else "N"
             remedy = f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it'
             value = f"{stated.value:.3g}{f' ± {stated.sd:.3g}' if stated.sd else ''} in SI units"
-            raise self.document.error(place_of(self.document, self.path, key), rule, value, remedy)
+            raise node_of_ground(self.node, key).error(rule, value, remedy)
 
     def check_spring_with_gap(self) -> None:
         """Require a gap where a spring is within reach.

@@ -1,13 +1,13 @@
 """``rig.toml`` with places, and its single values: type, unit, domain, SI."""
 
 import re
+import sys
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from math import inf, isfinite, pi
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -257,8 +257,8 @@ class _Scanner:
 
 NAME_PATTERN = r"[A-Za-z0-9._-]+"
 _DEVICE = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
-#: No table of rig.toml, see ``refuse_unknown_keys``.
-NOWHERE: Mapping[str, Collection[str]] = MappingProxyType({})
+#: Largest finite number; whole numbers of TOML may be larger.
+LARGEST_NUMBER = sys.float_info.max
 #: Units of masses and lengths. Positive ones are weighed or measured to better than half of their value.
 WEIGHED = ("kg", "m", "m/s^2")
 _LONGEST_SHOWN = 60  # characters of a faulty value in an error line
@@ -297,139 +297,149 @@ def _similar(part: str, other: str) -> bool:
     return part == other or bool(get_close_matches(part, [other], cutoff=0.65))
 
 
-def refuse_unknown_keys(
-    document: TomlDocument,
-    path: KeyPath,
-    entry: dict[str, Any],
-    known: Collection[str],
-    elsewhere: Mapping[str, Collection[str]] = NOWHERE,
-) -> None:
-    """Raise at the first key of ``entry`` that is not ``known``; ``elsewhere``: keys of other tables, by table."""
-    for key in entry:
-        if key not in known:
-            close, table = closest(key, known), next((name for name, keys in elsewhere.items() if key in keys), None)
-            remedy = f"move it to {table}" if table else f"write {close}" if close else "remove it"
-            remedy += f"; known: {' '.join(known)}"
-            raise document.error((*path, key), "unknown key", shown(key), remedy, of_key=True)
+def is_number(value: object) -> bool:
+    """Whether a value of TOML is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
 
 
-def read_string(document: TomlDocument, path: KeyPath, value: object) -> str:
-    """A non-empty string."""
-    if not isinstance(value, str):
-        raise document.error(path, f"{path[-1]} must be a string", shown(value), 'write it in quotes: "..."')
-    if not value:
-        raise document.error(path, f"{path[-1]} must not be empty", '""', "write a word between the quotes")
-    return value
+def is_count(value: object) -> bool:
+    """Whether a value of TOML is a whole number, 1 or more."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
-def read_bool(document: TomlDocument, path: KeyPath, value: object) -> bool:
-    """true or false."""
-    if not isinstance(value, bool):
-        raise document.error(
-            path, f"{path[-1]} must be true or false", shown(value), "write true or false without quotes"
-        )
-    return value
+#: Keys of a prior with their domains, by the kind of its density. The factor has no unit.
+PRIOR_KEYS: Mapping[str, Mapping[str, Domain]] = {
+    "lognormal": {"median": POSITIVE, "factor": ABOVE_ONE},
+    "halfnormal": {"scale": POSITIVE},
+    "normal": {"mean": ANY, "sd": POSITIVE},
+}
 
 
-def read_name(document: TomlDocument, path: KeyPath, value: object) -> str:
-    """A name. Results are written to a folder of that name; ``.``, ``..`` and the names of Windows' devices are refused."""
-    name = read_string(document, path, value)
-    if _DEVICE.fullmatch(name):
-        rule = f"{path[-1]} must not be the name of a device of Windows"
-        raise document.error(path, rule, shown(name), f'write e.g. "{name.split(".")[0]}-1"')
-    if not re.fullmatch(NAME_PATTERN, name) or not name.strip("."):
-        rule = f"{path[-1]} must be a name of letters, digits, dot, underscore and hyphen"
-        raise document.error(path, rule, shown(name), 'write e.g. "rig-1"')
-    return name
+@dataclass(frozen=True)
+class Node:
+    """A value of ``rig.toml`` at its place.
 
+    Its methods return the value as one of a type; each raises ``InputError`` at the place of what is wrong. The texts of
+    their errors name the last key of ``path``.
 
-def read_table(document: TomlDocument, path: KeyPath, value: object, example: str) -> dict[str, Any]:
-    """A TOML table."""
-    if not isinstance(value, dict):
-        raise document.error(path, f"{path[-1]} must be a table", shown(value), f"write {example}")
-    return value
-
-
-def read_quantity(
-    document: TomlDocument, path: KeyPath, value: object, si: str, domain: Domain = POSITIVE, has_sd: bool = False
-) -> Quantity:
-    """``{ value = ..., sd = ..., unit = "..." }`` in SI; ``sd`` is refused unless ``has_sd``."""
-    example = f'{{ value = ..., {"sd = ..., " if has_sd else ""}unit = "{si}" }}'
-    entry = read_table(document, path, value, example)
-    refuse_unknown_keys(document, path, entry, ("value", "sd", "unit") if has_sd else ("value", "unit"))
-    factor = read_unit(document, path, entry, si)
-    number = _read_scaled(document, path, entry, "value", factor, domain)
-    sd = _read_scaled(document, path, entry, "sd", factor, NOT_NEGATIVE) if "sd" in entry else 0.0
-    if si in WEIGHED and domain is POSITIVE and sd > 0.5 * number:
-        rule = f"sd of {path[-1]} must be at most half of its value"
-        raise document.error((*path, "sd"), rule, shown(entry["sd"]), "weigh or measure it, or leave it out")
-    return Quantity(number, sd)
-
-
-def read_choice(document: TomlDocument, path: KeyPath, value: object, choices: Sequence[str]) -> str:
-    """One of ``choices``."""
-    word = read_string(document, path, value)
-    if word not in choices:
-        known = " or ".join(f'"{choice}"' for choice in choices)
-        raise document.error(path, f"{path[-1]} must be {known}", shown(word), f"write {known}")
-    return word
-
-
-def read_prior(document: TomlDocument, path: KeyPath, value: object, si: str, kind: str) -> PriorOverride:
-    """``{ median, factor, unit }``, ``{ scale, unit }`` or ``{ mean, sd, unit }`` by the kind of the default prior.
-
-    A unit of 1 is optional.
+    Attributes
+    ----------
+    document, path : the file, and the key path
+    value : as tomllib returns it
     """
-    keys = {"halfnormal": ("scale", "unit"), "normal": ("mean", "sd", "unit")}.get(kind, ("median", "factor", "unit"))
-    example = "{ " + ", ".join(f"{key} = ..." for key in keys[:-1]) + f', unit = "{si}" }}'
-    entry = read_table(document, path, value, example)
-    refuse_unknown_keys(document, path, entry, keys)
-    factor = 1.0 if si == "1" and "unit" not in entry else read_unit(document, path, entry, si)
-    if kind == "halfnormal":
-        return PriorOverride(scale=_read_scaled(document, path, entry, "scale", factor, POSITIVE))
-    if kind == "normal":
-        mean = _read_scaled(document, path, entry, "mean", factor, ANY)
-        return PriorOverride(mean=mean, sd=_read_scaled(document, path, entry, "sd", factor, POSITIVE))
-    return PriorOverride(
-        median=_read_scaled(document, path, entry, "median", factor, POSITIVE),
-        factor=_read_scaled(document, path, entry, "factor", 1.0, ABOVE_ONE),
-    )
 
+    document: TomlDocument
+    path: KeyPath
+    value: Any
 
-def read_unit(document: TomlDocument, path: KeyPath, entry: dict[str, Any], si: str) -> float:
-    """The factor of the entry's unit to SI."""
-    if "unit" not in entry:
-        raise document.error(
-            path, f"{path[-1]} must have a unit", shown(entry), f'add unit = "{si}" or an equivalent unit'
-        )
-    unit = read_string(document, (*path, "unit"), entry["unit"])
-    try:
-        return factor_to_si(unit, si)
-    except UnitError as error:
-        raise document.error((*path, "unit"), error.rule, shown(unit), error.remedy) from None
+    @property
+    def key(self) -> str:
+        """The last key of the path."""
+        return str(self.path[-1])
 
+    def __contains__(self, key: str) -> bool:
+        return isinstance(self.value, dict) and key in self.value
 
-def _read_scaled(
-    document: TomlDocument, path: KeyPath, entry: dict[str, Any], key: str, factor: float, domain: Domain
-) -> float:
-    """The number at ``entry[key]`` times ``factor``, finite and inside ``domain``."""
-    place = (*path, key)
-    name = path[-1] if key == "value" else f"{key} of {path[-1]}"
-    if key not in entry:
-        raise document.error(path, f"{path[-1]} must have a {key}", shown(entry), f"add {key} = ...")
-    number = entry[key]
-    if isinstance(number, bool) or not isinstance(number, int | float):
-        raise document.error(place, f"{name} must be a number", shown(number), "write a number without quotes")
-    try:
-        scaled = scale(float(number), factor)
-    except OverflowError:
-        scaled = float("inf")
-    if not isfinite(scaled):
-        raise document.error(place, f"{name} must be a finite number", shown(number), "correct the value")
-    if not is_plausible(scaled):
-        zero = "be 0 or " if domain.holds(0.0) else ""
-        rule = f"{name} must {zero}lie between {SMALLEST:g} and {LARGEST:g} in SI units"
-        raise document.error(place, rule, shown(number), "correct the value or its unit")
-    if not domain.holds(scaled):
-        raise document.error(place, f"{name} must {domain.text}", shown(number), "correct the value")
-    return scaled
+    def __getitem__(self, key: str | int) -> "Node":
+        return Node(self.document, (*self.path, key), self.value[key])
+
+    def get(self, key: str, default: Any) -> "Node":
+        """The value of ``key``; ``default`` in its place where it is not stated."""
+        return Node(self.document, (*self.path, key), self.value.get(key, default))
+
+    def error(self, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
+        """The error about the value, or about its key."""
+        return self.document.error(self.path, rule, value, remedy, of_key)
+
+    def require(self, holds: bool, rule: str, remedy: str) -> None:
+        """Raise where the value does not hold; ``rule`` continues "<key> must ..."."""
+        if not holds:
+            raise self.error(f"{self.key} must {rule}", shown(self.value), remedy)
+
+    def required(self, key: str, remedy: str) -> "Node":
+        """The value of a key that a table must have."""
+        self.require(key in self, f"have a {key}", remedy)
+        return self[key]
+
+    def refuse_unknown(self, known: Collection[str], elsewhere: Mapping[str, Collection[str]] | None = None) -> None:
+        """Raise at the first key of a table that is not ``known``; ``elsewhere``: keys of other tables, by table."""
+        for key in self.value:
+            if key not in known:
+                close = closest(key, known)
+                table = next((name for name, keys in (elsewhere or {}).items() if key in keys), None)
+                remedy = f"move it to {table}" if table else f"write {close}" if close else "remove it"
+                raise self[key].error("unknown key", shown(key), f"{remedy}; known: {' '.join(known)}", of_key=True)
+
+    def table(self, example: str, known: Collection[str] = ()) -> "Node":
+        """The value itself, a table with keys that are ``known``; (): they are not checked."""
+        self.require(isinstance(self.value, dict), "be a table", f"write {example}")
+        if known:
+            self.refuse_unknown(known)
+        return self
+
+    def text(self) -> str:
+        """A non-empty string."""
+        self.require(isinstance(self.value, str), "be a string", 'write it in quotes: "..."')
+        if not self.value:
+            raise self.error(f"{self.key} must not be empty", '""', "write a word between the quotes")
+        return self.value
+
+    def name(self) -> str:
+        """A name. Results are written to a folder of that name; ``.``, ``..`` and names of Windows' devices are refused."""
+        name = self.text()
+        device, valid = _DEVICE.fullmatch(name), re.fullmatch(NAME_PATTERN, name) and name.strip(".")
+        self.require(not device, "not be the name of a device of Windows", f'write e.g. "{name.split(".")[0]}-1"')
+        self.require(bool(valid), "be a name of letters, digits, dot, underscore and hyphen", 'write e.g. "rig-1"')
+        return name
+
+    def choice(self, choices: Sequence[str]) -> str:
+        """One of ``choices``."""
+        known = " or ".join(f'"{choice}"' for choice in choices)
+        self.require(self.text() in choices, f"be {known}", f"write {known}")
+        return self.value
+
+    def unit(self, si: str) -> float:
+        """The factor to SI of the unit that a table states."""
+        stated = self.required("unit", f'add unit = "{si}" or an equivalent unit')
+        try:
+            return factor_to_si(stated.text(), si)
+        except UnitError as error:
+            raise stated.error(error.rule, shown(stated.value), error.remedy) from None
+
+    def quantity(self, si: str, domain: Domain = POSITIVE, has_sd: bool = False) -> Quantity:
+        """``{ value = ..., sd = ..., unit = "..." }`` in SI; ``sd`` is refused unless ``has_sd``."""
+        example = f'{{ value = ..., {"sd = ..., " if has_sd else ""}unit = "{si}" }}'
+        factor = self.table(example, ("value", "sd", "unit") if has_sd else ("value", "unit")).unit(si)
+        number = self._scaled("value", factor, domain)
+        sd = self._scaled("sd", factor, NOT_NEGATIVE) if "sd" in self else 0.0
+        if si in WEIGHED and domain is POSITIVE and sd > 0.5 * number:
+            rule, stated = f"sd of {self.key} must be at most half of its value", self["sd"]
+            raise stated.error(rule, shown(stated.value), "weigh or measure it, or leave it out")
+        return Quantity(number, sd)
+
+    def prior(self, si: str, kind: str) -> PriorOverride:
+        """``{ median, factor, unit }``, ``{ scale, unit }`` or ``{ mean, sd, unit }``, by the kind of the default prior.
+
+        A unit of 1 is optional.
+        """
+        keys = PRIOR_KEYS[kind]
+        self.table(f'{{ {"".join(f"{key} = ..., " for key in keys)}unit = "{si}" }}', (*keys, "unit"))
+        factor = 1.0 if si == "1" and "unit" not in self else self.unit(si)
+        return PriorOverride(**{key: self._scaled(key, 1.0 if key == "factor" else factor, keys[key]) for key in keys})
+
+    def _scaled(self, key: str, factor: float, domain: Domain) -> float:
+        """The number of ``key`` times ``factor``, finite and inside ``domain``."""
+        stated, name = self.required(key, f"add {key} = ..."), self.key if key == "value" else f"{key} of {self.key}"
+        number, zero = stated.value, "be 0 or " if domain.holds(0.0) else ""
+        real = isinstance(number, int | float) and not isinstance(number, bool)
+        scaled = scale(float(number), factor) if real and abs(number) <= LARGEST_NUMBER else inf
+        magnitude = f"{zero}lie between {SMALLEST:g} and {LARGEST:g} in SI units"
+        for holds, rule, remedy in (
+            (real, "be a number", "write a number without quotes"),
+            (isfinite(scaled), "be a finite number", "correct the value"),
+            (is_plausible(scaled), magnitude, "correct the value or its unit"),
+            (domain.holds(scaled), domain.text, "correct the value"),
+        ):
+            if not holds:
+                raise stated.error(f"{name} must {rule}", shown(number), remedy)
+        return scaled

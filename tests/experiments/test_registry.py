@@ -18,17 +18,17 @@ from capsule_id.parameters import TABLE, scatter
 from capsule_id.report.messages import DATA_MESSAGES, FIT_MESSAGES, messages_of
 from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import (
+    COUNT,
     PRESSING_FORCE,
     SLOPE,
     ChoiceRule,
     ColumnRule,
-    CountRule,
     NameRule,
     QuantityRule,
     SettingRule,
     WordsRule,
 )
-from capsule_id.rig.toml import ANY, NOT_NEGATIVE, POSITIVE, KeyPath, TomlDocument
+from capsule_id.rig.toml import ANY, NOT_NEGATIVE, POSITIVE, Node
 from capsule_id.synthetic import Truth, synthesize
 from capsule_id.views import Message
 from tests.cli_tools import ROOT
@@ -55,7 +55,7 @@ SETTINGS: dict[str, dict[str, tuple[SettingRule, object]]] = {
         "stiffness": (ChoiceRule(("linear", "cubic")), None),
         "drift": (ChoiceRule(("none", "linear", "gp")), None),
         "noise": (ChoiceRule(("white", "ar1", "arma")), None),
-        "thin": (CountRule(), None),
+        "thin": (COUNT, None),
         "samples": (ChoiceRule(("record", "turning_points")), "record"),
         "smoothing_window": (QuantityRule("s"), None),
         "spring": (NameRule(), None),
@@ -164,10 +164,9 @@ def test_a_setting_without_a_rule_is_refused() -> None:
 class WordsRule:
     """One word, or a list of words: a rule that the package does not have."""
 
-    def read(self, document: TomlDocument, path: KeyPath, value: object) -> tuple[str, ...]:
-        words = value if isinstance(value, list) else [value]
-        if not all(isinstance(word, str) for word in words):
-            raise document.error(path, f"{path[-1]} must be words", repr(value), "write them in quotes")
+    def read(self, node: Node) -> tuple[str, ...]:
+        words = node.value if isinstance(node.value, list) else [node.value]
+        node.require(all(isinstance(word, str) for word in words), "be words", "write them in quotes")
         return tuple(words)
 
 

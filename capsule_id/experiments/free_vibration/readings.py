@@ -12,7 +12,7 @@ from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ra
 from capsule_id.records.release import FreeDecay, find_free_decay
 from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
-from capsule_id.rig.schema import CountRule, GroundSettings, NameRule, QuantityRule, WordsRule
+from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, QuantityRule, WordsRule
 from capsule_id.rig.tables import Entry
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message
@@ -249,7 +249,7 @@ class DecaySettings(GroundSettings):
     stiffness: Literal["linear", "cubic"] | None = None
     drift: Literal["none", "linear", "gp"] | None = None
     noise: Literal["white", "ar1", "arma"] | None = None
-    thin: Annotated[int | None, CountRule()] = None
+    thin: Annotated[int | None, COUNT] = None
     samples: Literal["record", "turning_points"] = "record"
     smoothing_window: Annotated[float | None, QuantityRule("s")] = None
     spring: Annotated[str | None, NameRule()] = None

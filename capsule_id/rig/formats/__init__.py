@@ -9,8 +9,8 @@ from pathlib import Path
 
 from capsule_id.rig.formats.binary import read_hdf5, read_mat, read_npz, read_parquet, read_tdms, read_xlsx
 from capsule_id.rig.formats.layouts import read_lvm, read_text
-from capsule_id.rig.formats.raw import Export, Layout, RawTable
-from capsule_id.rig.formats.text import COMPRESSED, Content, read_csv
+from capsule_id.rig.formats.raw import Content, Export, Layout, RawTable
+from capsule_id.rig.formats.text import COMPRESSED, read_csv
 
 _TEXTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
     ".csv": read_text,
@@ -28,13 +28,6 @@ def suffix_of(path: Path) -> str:
     return Path(path.stem).suffix.lower() + last if last == COMPRESSED else last
 
 
-def _whole(read: Callable[[bytes, Path, Layout], Export]) -> Callable[[Content, Path, Layout], Export]:
-    """The reader of a format that is no text: it needs all bytes at once."""
-    return lambda content, path, layout: read(
-        content if isinstance(content, bytes) else content.read_bytes(), path, layout
-    )
-
-
 READERS: Mapping[str, Callable[[Content, Path], RawTable]] = {
     **_TABLES,
     **{suffix + COMPRESSED: read for suffix, read in _TABLES.items()},
@@ -42,11 +35,11 @@ READERS: Mapping[str, Callable[[Content, Path], RawTable]] = {
 EXPORTS: Mapping[str, Callable[[Content, Path, Layout], Export]] = {
     **_TEXTS,
     **{suffix + COMPRESSED: read for suffix, read in _TEXTS.items()},
-    ".mat": _whole(read_mat),
-    ".npz": _whole(read_npz),
-    ".h5": _whole(read_hdf5),
-    ".hdf5": _whole(read_hdf5),
-    ".parquet": _whole(read_parquet),
-    ".xlsx": _whole(read_xlsx),
-    ".tdms": _whole(read_tdms),
+    ".mat": read_mat,
+    ".npz": read_npz,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
+    ".parquet": read_parquet,
+    ".xlsx": read_xlsx,
+    ".tdms": read_tdms,
 }

@@ -5,8 +5,8 @@ import logging
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,53 @@ from capsule_id.errors import InputError
 from capsule_id.rig.formats.layouts import read_text
 from capsule_id.rig.formats.raw import (
     LARGEST_CONTENT,
+    Content,
     Export,
     Layout,
     complete,
     export_of_arrays,
-    installed,
     refuse_large,
+    require,
+    whole,
 )
 from capsule_id.views import counted
+
+# arrays: Formats of named arrays: an adapter for each gives every array of real numbers with its name and unit.
+
+
+Named = Iterator[tuple[str, np.ndarray | None, str]]  #: name, numbers (None: no real numbers), unit ("": not stated)
+
+
+@dataclass(frozen=True)
+class ArraysReader:
+    """Reads the arrays of a file as columns, by name. ``missing`` of a layout may hold "NaN"; the rest does not apply.
+
+    Attributes
+    ----------
+    find : the adapter: bytes and name of a file -> its arrays
+    remedy : for a damaged file
+    package : that reads it, where it is optional
+    """
+
+    find: Callable[[bytes, Path], Named]
+    remedy: str
+    package: str = ""
+
+    def __call__(self, content: Content, path: Path, layout: Layout) -> Export:
+        """The columns of a file.
+
+        Raises
+        ------
+        InputError
+            If the package is not installed, or the file is damaged, too large, or has no array of real numbers.
+        """
+        if self.package:
+            require(self.package, path)
+        with complete(path, self.remedy):
+            found = [(name, array, unit) for name, array, unit in self.find(whole(content), path) if array is not None]
+        units = {name: unit for name, _, unit in found}
+        return export_of_arrays({name: array for name, array, _ in found}, path, layout, units)
+
 
 # hdf5: Reads HDF5 files, among them MATLAB files of version 7.3: every real numeric data set is a column, or a matrix.
 #
@@ -36,49 +75,35 @@ from capsule_id.views import counted
 SMALLEST_CHUNK = 16
 
 
-def read_hdf5(content: bytes, path: Path, layout: Layout) -> Export:
-    """Read the data sets of an HDF5 file; their names are paths such as ``group/x``.
+def _data_sets(content: bytes, path: Path) -> Named:
+    """The data sets of an HDF5 file; their names are paths such as ``group/x``."""
+    import pyfive
 
-    Parameters
-    ----------
-    content : the bytes of the file
-    path : its name, for error lines
-    layout : ``missing`` may hold "NaN"
-
-    Raises
-    ------
-    InputError
-        If the file is damaged, too large, or has no numeric data set.
-    """
-    with installed("pyfive", path):
-        import pyfive
-
-    arrays: dict[str, np.ndarray] = {}
-    units: dict[str, str] = {}
+    everything, size = list[tuple[str, Any]](), 0
     # MATLAB stores the columns of a matrix one after the other, which HDF5 sees as rows.
     by_columns = content.startswith(b"MATLAB 7.3")
-
-    def visit(name: str, found: object) -> None:
-        if not isinstance(found, pyfive.Dataset) or found.ndim not in (1, 2):
-            return
-        if getattr(found.dtype, "kind", "") not in ("f", "i", "u"):
-            return
-        # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
-        text = found.attrs.get("MATLAB_class") == b"char" or name.startswith("#") or "MATLAB_empty" in found.attrs
-        if not text:
-            refuse_large(found.size * found.dtype.itemsize + sum(array.nbytes for array in arrays.values()), path)
-            chunks = prod(-(-size // step) for size, step in zip(found.shape, found.chunks or found.shape, strict=True))
+    with pyfive.File(io.BytesIO(content)) as file:
+        file.visititems(lambda name, found: everything.append((name, found)))
+        for name, found in everything:
+            if not isinstance(found, pyfive.Dataset) or found.ndim not in (1, 2):
+                continue
+            if getattr(found.dtype, "kind", "") not in ("f", "i", "u"):
+                continue
+            # MATLAB keeps texts as numbers, and the contents of cell arrays in #refs#.
+            if found.attrs.get("MATLAB_class") == b"char" or name.startswith("#") or "MATLAB_empty" in found.attrs:
+                continue
+            size += found.size * found.dtype.itemsize
+            refuse_large(size, path)
+            chunks = prod(
+                -(-length // step) for length, step in zip(found.shape, found.chunks or found.shape, strict=True)
+            )
             if chunks > max(len(content) // SMALLEST_CHUNK, 1):  # pyfive looks for every one of them
                 raise ValueError(f"{name} states {chunks} chunks in a file of {len(content)} bytes")
-            array = np.asarray(found[()])
-            arrays[name] = array.T if by_columns else array
-            unit = found.attrs.get("units", found.attrs.get("unit"))
-            if isinstance(unit, str):
-                units[name] = unit
+            array, unit = np.asarray(found[()]), found.attrs.get("units", found.attrs.get("unit"))
+            yield name, array.T if by_columns else array, unit if isinstance(unit, str) else ""
 
-    with complete(path, "export it again"), pyfive.File(io.BytesIO(content)) as file:
-        file.visititems(visit)
-    return export_of_arrays(arrays, path, layout, units)
+
+read_hdf5 = ArraysReader(_data_sets, "export it again", "pyfive")
 
 
 # mat: Reads MATLAB files: every real numeric variable is a column, of a matrix every column; so is a field of a struct.
@@ -97,14 +122,14 @@ _COMPLEX = 0x0800  # flag of an array
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 
 
-def read_mat(content: bytes, path: Path, layout: Layout) -> Export:
+def read_mat(content: Content, path: Path, layout: Layout) -> Export:
     """Read the vectors of a MATLAB file by name; column 2 of a matrix ``data`` is called ``data(:,2)``.
 
     Fields of structs have names such as ``run.time``, or ``run(2).time`` in an array of structs.
 
     Parameters
     ----------
-    content : the bytes of the file
+    content : the bytes of the file, or where they lie
     path : its name, for error lines
     layout : ``missing`` may hold "NaN"; the rest does not apply
 
@@ -113,6 +138,7 @@ def read_mat(content: bytes, path: Path, layout: Layout) -> Export:
     InputError
         If it is no MATLAB file, is damaged, or has no numeric variable.
     """
+    content = whole(content)
     if content.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF")):
         return read_hdf5(content, path, layout)
     return export_of_arrays(_variables(content, path), path, layout)
@@ -205,30 +231,14 @@ def _fields(
 # npz: Reads NumPy archives: every real numeric array is a column, or a matrix. Pickled objects are never loaded.
 
 
-def read_npz(content: bytes, path: Path, layout: Layout) -> Export:
-    """Read the arrays of an archive by name.
-
-    Parameters
-    ----------
-    content : the bytes of the file
-    path : its name, for error lines
-    layout : ``missing`` may hold "NaN"
-
-    Raises
-    ------
-    InputError
-        If the archive is damaged, too large, or has no numeric array.
-    """
-    arrays: dict[str, np.ndarray] = {}
-    with complete(path, "write it again by numpy.savez"), zipfile.ZipFile(io.BytesIO(content)) as archive:
+def _members(content: bytes, path: Path) -> Named:
+    """The arrays of an archive."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
         refuse_large(sum(member.file_size for member in members), path)
         for member in members:
             # ``read`` returns at most the stated size of the member.
-            array = _numbers(archive.read(member))
-            if array is not None:
-                arrays[member.filename.removesuffix(".npy")] = array
-    return export_of_arrays(arrays, path, layout)
+            yield member.filename.removesuffix(".npy"), _numbers(archive.read(member)), ""
 
 
 def _numbers(content: bytes) -> np.ndarray | None:
@@ -245,42 +255,31 @@ def _numbers(content: bytes) -> np.ndarray | None:
     return np.lib.format.read_array(stream, allow_pickle=False)
 
 
+read_npz = ArraysReader(_members, "write it again by numpy.savez")
+
+
 # parquet: Reads Parquet files: every column of real numbers. pyarrow, the reference implementation, decodes them.
 
 
-def read_parquet(content: bytes, path: Path, layout: Layout) -> Export:
-    """Read the columns of a Parquet file by name; empty cells are NaN.
+def _columns(content: bytes, path: Path) -> Named:
+    """The columns of a Parquet file; empty cells are NaN."""
+    import pyarrow as pa
+    from pyarrow import parquet
 
-    Parameters
-    ----------
-    content : the bytes of the file
-    path : its name, for error lines
-    layout : ``missing`` may hold "NaN"
+    file = parquet.ParquetFile(pa.BufferReader(content))
+    schema = file.schema_arrow
+    numeric = [field.name for field in schema if pa.types.is_floating(field.type) or pa.types.is_integer(field.type)]
+    # pyarrow makes room for the rows that a row group states.
+    rows = [file.metadata.row_group(k).num_rows for k in range(file.metadata.num_row_groups)]
+    if min(rows, default=0) < 0 or sum(rows) != file.metadata.num_rows:
+        value = f"row groups of {sum(rows)} rows in a table of {file.metadata.num_rows}"
+        raise InputError("a .parquet file must be complete", value, "write it again", path)
+    refuse_large(8 * file.metadata.num_rows * len(numeric), path)
+    table = file.read(columns=numeric, use_threads=False)
+    yield from ((name, table.column(name).to_numpy(), "") for name in table.column_names)
 
-    Raises
-    ------
-    InputError
-        If pyarrow is not installed, or the file is damaged, too large, or has no column of numbers.
-    """
-    with installed("pyarrow", path):
-        import pyarrow as pa
-        from pyarrow import parquet
 
-    with complete(path, "write it again"):
-        file = parquet.ParquetFile(pa.BufferReader(content))
-        schema = file.schema_arrow
-        numeric = [
-            field.name for field in schema if pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
-        ]
-        # pyarrow makes room for the rows that a row group states.
-        rows = [file.metadata.row_group(k).num_rows for k in range(file.metadata.num_row_groups)]
-        if min(rows, default=0) < 0 or sum(rows) != file.metadata.num_rows:
-            value = f"row groups of {sum(rows)} rows in a table of {file.metadata.num_rows}"
-            raise InputError("a .parquet file must be complete", value, "write it again", path)
-        refuse_large(8 * file.metadata.num_rows * len(numeric), path)
-        table = file.read(columns=numeric, use_threads=False)
-        arrays = {name: table.column(name).to_numpy() for name in table.column_names}
-    return export_of_arrays(arrays, path, layout)
+read_parquet = ArraysReader(_columns, "write it again", "pyarrow")
 
 
 # tdms: Reads TDMS files of LabVIEW by npTDMS: every channel of numbers, scaled, and the times of waveforms.
@@ -293,32 +292,18 @@ MOST_SCALES = 1000
 _SCALES = "NI_Number_Of_Scales"
 
 
-def read_tdms(content: bytes, path: Path, layout: Layout) -> Export:
-    """Read the channels of a TDMS file by name, ``group/channel`` where two groups have a channel of that name.
+def _channels(content: bytes, path: Path) -> Named:
+    """The channels of a TDMS file by name, ``group/channel`` where two groups have a channel of that name.
 
     ``wf_time`` holds the times of waveforms, s, from their offset and increment; ``wf_time(<channel>)`` those of
     each channel where channels have different clocks. Without these properties there is no such column.
-
-    Parameters
-    ----------
-    content : the bytes of the file
-    path : its name, for error lines
-    layout : ``missing`` may hold "NaN"
-
-    Raises
-    ------
-    InputError
-        If npTDMS is not installed, or the file is damaged, too large, or has no channel of numbers.
     """
-    with installed("npTDMS", path):
-        import nptdms
-        from nptdms.log import log_manager
+    import nptdms
+    from nptdms.log import log_manager
 
     log_manager.set_level(logging.CRITICAL)  # its remarks on damaged files go to standard error otherwise
-    arrays: dict[str, np.ndarray] = {}
-    units: dict[str, str] = {}
     clocks: dict[str, tuple[float, float, int]] = {}
-    with complete(path, "export it again, or as text"), nptdms.TdmsFile.open(io.BytesIO(content)) as file:
+    with nptdms.TdmsFile.open(io.BytesIO(content)) as file:
         groups = file.groups()
         everything = [channel for group in groups for channel in group.channels()]
         for properties in (file.properties, *(each.properties for each in (*groups, *everything))):
@@ -329,17 +314,13 @@ def read_tdms(content: bytes, path: Path, layout: Layout) -> Export:
         refuse_large(8 * sum(len(channel) for channel in channels), path)
         names = [channel.name for channel in channels]
         for channel in channels:
-            unique = names.count(channel.name) == 1
-            name = channel.name if unique else f"{channel.group_name}/{channel.name}"
-            arrays[name] = np.asarray(channel[:])
-            units[name] = str(channel.properties.get("unit_string", ""))
+            name = channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}"
             if (clock := _clock(channel)) is not None:
                 clocks[name] = (*clock, len(channel))
+            yield name, np.asarray(channel[:]), str(channel.properties.get("unit_string", ""))
     common = len(set(clocks.values())) == 1
     for name, (offset, increment, samples) in clocks.items():
-        times = TIME if common else f"{TIME}({name})"
-        arrays[times], units[times] = offset + increment * np.arange(samples), "s"
-    return export_of_arrays(arrays, path, layout, units)
+        yield TIME if common else f"{TIME}({name})", offset + increment * np.arange(samples), "s"
 
 
 def _clock(channel: Any) -> tuple[float, float] | None:
@@ -350,6 +331,9 @@ def _clock(channel: Any) -> tuple[float, float] | None:
     return (float(offset) if isinstance(offset, int | float) and np.isfinite(offset) else 0.0), float(increment)
 
 
+read_tdms = ArraysReader(_channels, "export it again, or as text", "npTDMS")
+
+
 # xlsx: Reads Excel workbooks: the first sheet with numbers, as the text table that it would be saved to.
 
 
@@ -357,14 +341,14 @@ def _clock(channel: Any) -> tuple[float, float] | None:
 MOST_CELLS = 2_000_000
 
 
-def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
+def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
     """Read a sheet with titles, headers and rows of units in the same way as a text export.
 
     Places are the row and the column of the sheet. A formula counts by the value that the workbook holds for it.
 
     Parameters
     ----------
-    content : the bytes of the file
+    content : the bytes of the file, or where they lie
     path : its name, for error lines
     layout : as for text; ``data_from_line`` and ``data_to_line`` are rows of the sheet
 
@@ -373,10 +357,11 @@ def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
     InputError
         If openpyxl is not installed, the file is damaged or too large, or the rows of numbers are not found.
     """
-    with installed("openpyxl", path):
-        import openpyxl
+    require("openpyxl", path)
+    import openpyxl
 
     with complete(path, "save it again"):
+        content = whole(content)
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             refuse_large(sum(member.file_size for member in archive.infolist()), path)
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
@@ -395,7 +380,7 @@ def read_xlsx(content: bytes, path: Path, layout: Layout) -> Export:
         except InputError as error:
             raise _in_sheet(error, lines) from None
 
-    return replace(export, values=values, place=lambda row, column: (export.place(row, column)[0], column + 1))
+    return replace(export, values=values, place=lambda row, column: (*export.place(row, column)[:2], column + 1))
 
 
 def _rows(sheet: Any, path: Path) -> list[list[float | str]]:

@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import Export, Layout, refuse_line
+from capsule_id.rig.formats.raw import Content, Export, Layout, Place, refuse_line
 from capsule_id.rig.formats.text import (
     BLANKS,
     COMMENTS,
-    Content,
     Rows,
     Shape,
     TextFile,
@@ -29,6 +28,7 @@ from capsule_id.rig.formats.text import (
     occurrences,
     place_of_cell,
     plain_rows,
+    plain_table,
     read_column,
     shown_cell,
 )
@@ -82,9 +82,9 @@ def read_text(content: Content, path: Path, layout: Layout) -> Export:
     def values(column: int) -> np.ndarray:
         return rows.column(column)
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
+    def place(row: int | None, column: int) -> Place:
         line = int(lines[row]) - 1 if row is not None else found[0][0] if found else first
-        return line + 1, place_of_cell(file.line(line), delimiter, column)
+        return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
     return Export(path, headers, width, lines, values, place, file.encoding, rows.words)
 
@@ -287,8 +287,12 @@ class _File:
             texts = [row[column].strip(BLANKS + '"') if column < len(row) else "" for row in segment.rows]
             while len(texts) > 1 and not texts[-1]:
                 texts.pop()
-            place = [(self.path, *self.place(line, column)) for line in segment.lines[: len(texts)]]
-            parts.append(read_column(texts, self.decimal, self.missing, place.__getitem__))
+
+            def place(k: int, numbers: list[int] = segment.lines) -> Place:
+                line = self.lines[numbers[k]]
+                return self.path, numbers[k] + 1, place_of_cell(line, self.separator, column, len(line) + 1)
+
+            parts.append(read_column(texts, self.decimal, self.missing, place))
         return np.concatenate(parts)
 
     def clocks(self, channel: int) -> list[tuple[float, float]]:
@@ -323,10 +327,10 @@ class _File:
         alike = len({tuple(self.clocks(channel)) for channel in channels}) == 1
         return [-1, *channels] if alike else [source for channel in channels for source in (-channel, channel)]
 
-    def place(self, line: int, column: int) -> tuple[int, int]:
-        """1-based line and character of a cell."""
-        cells = cells_of(self.lines[line], self.separator)
-        return line + 1, cells[column][1] if column < len(cells) else len(self.lines[line]) + 1
+    @property
+    def headers(self) -> tuple[str, ...]:
+        """The header of every column that is returned."""
+        return tuple(_TIMES if source < 0 else self.segments[0].names[source] for source in self.sources())
 
 
 def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
@@ -348,27 +352,28 @@ def read_lvm(content: Content, path: Path, layout: Layout) -> Export:
     """
     refuse_line(layout, path)
     text = TextFile(content, path)
-    if (long := _one_plain_segment(text, path, layout)) is not None:
-        return long
-    file = _take_apart([*text.lines(), ""], path, layout.missing)
-    sources, names = file.sources(), file.segments[0].names
-    sizes = [len(segment.rows) for segment in file.segments]
+    if (plain := _one_plain_segment(text, path, layout)) is not None:
+        file, rows = plain
+        lines, sizes, stored = rows.lines, [len(rows.lines)], rows.column
+    else:
+        file = _take_apart([*text.lines(), ""], path, layout.missing)
+        sizes, stored = [len(segment.lines) for segment in file.segments], file.stored
+        lines = np.array([line for segment in file.segments for line in segment.lines]) + 1
+    sources = file.sources()
 
     def values(column: int) -> np.ndarray:
         source = sources[column]
-        return file.stored(source) if source >= 0 else file.computed(-source, sizes)
+        return stored(source) if source >= 0 else file.computed(-source, sizes)
 
-    numbers = [line for segment in file.segments for line in segment.lines]
+    def place(row: int | None, column: int) -> Place:
+        line = text.line(number := int(lines[0] - 2 if row is None else lines[row] - 1))
+        return path, number + 1, place_of_cell(line, file.separator, max(sources[column], 0), len(line) + 1)
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
-        return file.place(numbers[0] - 1 if row is None else numbers[row], max(sources[column], 0))
-
-    headers = tuple(_TIMES if source < 0 else names[source] for source in sources)
-    return Export(path, (headers,), len(headers), np.asarray(numbers) + 1, values, place, text.encoding)
+    return Export(path, (file.headers,), len(sources), lines, values, place, text.encoding)
 
 
-def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | None:
-    """Read a file with one segment of numbers alone in blocks, and only the wanted columns; None for any other file."""
+def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> "tuple[_File, Rows] | None":
+    """A file with one segment of numbers alone, read in blocks, with its wanted columns; None for any other file."""
     head: list[str] = []
     ends = 0
     for line in islice(text.lines(), _HEAD):
@@ -381,34 +386,16 @@ def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> Export | N
         sources = file.sources()
     except InputError:
         return None
-    segment = file.segments[0]
-    headers = tuple(_TIMES if source < 0 else segment.names[source] for source in sources)
-    chosen = [k for k in range(len(headers)) if layout.columns is None or is_wanted(k, (headers,), layout.columns)]
-    stored = sorted({sources[k] for k in chosen if sources[k] >= 0})
-    row = head[segment.lines[0]]
+    segment, names = file.segments[0], (file.headers,)
+    chosen = [
+        source for k, source in enumerate(sources) if layout.columns is None or is_wanted(k, names, layout.columns)
+    ]
     width = len(segment.names)
     trailing = len(segment.rows[0]) == width + 1 and not segment.rows[0][-1].strip()
-    decimal = file.decimal or ("," if "," in row and file.separator != "," else ".")
-    rows: Rows | None = plain_rows(text, Shape(segment.lines[0], file.separator, width, decimal, trailing), stored)
-    # Rows must follow one another without comments and blank lines, and nothing may follow them.
-    if rows is None or len(rows.lines) == 0:
-        return None
-    if (rows.lines[0], rows.lines[-1]) != (segment.lines[0] + 1, segment.lines[0] + len(rows.lines)):
-        return None
-    if any(line.strip() for line in text.lines(int(rows.lines[-1]))):
-        return None
-
-    def values(column: int) -> np.ndarray:
-        source = sources[column]
-        return rows.column(source) if source >= 0 else file.computed(-source, [len(rows.lines)])
-
-    def place(row: int | None, column: int) -> tuple[int, int]:
-        line = segment.lines[0] - 1 if row is None else int(rows.lines[row]) - 1
-        cells = cells_of(text.line(line), file.separator)
-        source = max(sources[column], 0)
-        return line + 1, cells[source][1] if source < len(cells) else len(text.line(line)) + 1
-
-    return Export(path, (headers,), len(headers), rows.lines, values, place, text.encoding)
+    decimal = file.decimal or ("," if "," in head[segment.lines[0]] and file.separator != "," else ".")
+    shape = Shape(segment.lines[0], file.separator, width, decimal, trailing)
+    rows = plain_table(text, shape, sorted({source for source in chosen if source >= 0}))
+    return None if rows is None else (file, rows)
 
 
 def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from capsule_id.errors import InputError
 # limits: Limits and errors that all readers of files share.
 
 
+#: The bytes of a file, or where they lie.
+Content = bytes | Path
 #: Largest decompressed size of a file, bytes. It stops archives that grow without limit when they are unpacked.
 LARGEST_CONTENT = 1 << 30
 
@@ -30,20 +33,24 @@ def refuse_large(size: int, path: Path) -> None:
         raise InputError(rule, f"{size >> 20} MiB", "export a part of the record, or fewer channels", path)
 
 
-@contextmanager
-def installed(package: str, path: Path) -> Iterator[None]:
-    """Name the optional package that reads ``path`` where its import in the body fails.
+def require(package: str, path: Path) -> None:
+    """Import the optional package that reads ``path``.
 
     Raises
     ------
     InputError
-        With the command that installs it.
+        If it is not installed, with the command that installs it.
     """
     try:
-        yield
+        import_module(package.lower())
     except ModuleNotFoundError:
         rule, remedy = f"a {path.suffix} file needs the package {package}", 'run pip install "capsule-id[formats]"'
         raise InputError(rule, "not installed", remedy, path) from None
+
+
+def whole(content: Content) -> bytes:
+    """The bytes of a file."""
+    return content if isinstance(content, bytes) else content.read_bytes()
 
 
 @contextmanager
@@ -71,6 +78,9 @@ def complete(path: Path, remedy: str) -> Iterator[None]:
 # raw: A table as written: numbers in the units of the file, and the place of each cell.
 
 
+Place = tuple[Path, int, int]  #: file, and 1-based line and column, of a cell
+
+
 @dataclass(frozen=True)
 class RawTable:
     """The result of every reader in ``formats``.
@@ -79,17 +89,21 @@ class RawTable:
     ----------
     names, units : of every column, as written
     columns : of each name (rows,) numbers, finite, in the units written
-    rows : (rows,) 1-based line number of every row
-    place : (row index or None for the header, column index) -> 1-based (line, column) in the file
+    rows : (rows,) 1-based line number of every row; of files put one below the other the number of the row
+    place : (row index or None for the header, column index) -> where the cell stands
     encoding : of the text, or "UTF-8"
+    missing, other, rejected : rows left out: for a missing cell, outside ``where``, as outliers
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     columns: tuple[np.ndarray, ...]
     rows: np.ndarray
-    place: Callable[[int | None, int], tuple[int, int]]
+    place: Callable[[int | None, int], Place]
     encoding: str = "UTF-8"
+    missing: int = 0
+    other: int = 0
+    rejected: int = 0
 
     @property
     def values(self) -> np.ndarray:
@@ -134,7 +148,7 @@ class Export:
     lines : (rows,) 1-based line of every row
     values : index of a column that ``Layout.columns`` names -> (rows,) numbers in the file's units, NaN at a stated
         missing marker; it raises ``InputError`` at the first other cell
-    place : (row index or None for the header, column index) -> 1-based (line, column) in the file
+    place : (row index or None for the header, column index) -> where the cell stands
     encoding : of a text
     words : index of a column that ``Layout.words`` names -> (rows,) numbers of its texts, and the texts; None: the format
         has no texts
@@ -145,7 +159,7 @@ class Export:
     width: int
     lines: np.ndarray
     values: Callable[[int], np.ndarray]
-    place: Callable[[int | None, int], tuple[int, int]]
+    place: Callable[[int | None, int], Place]
     encoding: str = "UTF-8"
     words: Callable[[int], tuple[np.ndarray, tuple[str, ...]]] | None = None
 
@@ -212,11 +226,11 @@ def export_of_arrays(
         if refused.any():
             row = int(np.argmax(refused))
             remedy = 'add "NaN" to missing = [...] to drop its row' if np.isnan(found[row]) else "correct the value"
-            raise InputError(f"{names[column]} must be finite", f"{found[row]}", remedy, path, *place(row, column))
+            raise InputError(f"{names[column]} must be finite", f"{found[row]}", remedy, *place(row, column))
         return found
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
-        return 1 if row is None else row + 1, column + 1
+    def place(row: int | None, column: int) -> Place:
+        return path, 1 if row is None else row + 1, column + 1
 
     longest = max(vector.size for vector in columns.values())
     headers = (names, tuple(stated)) if any(stated) else (names,)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.formats.raw import RawTable, complete, refuse_large
+from capsule_id.rig.formats.raw import Content, Place, RawTable, complete, refuse_large, whole
 from capsule_id.views import counted
 
 # cells: Splits the lines of a text table into cells and reads their numbers. Places are 1-based.
@@ -44,10 +44,10 @@ def cells_of(line: str, delimiter: str | None) -> list[tuple[str, int]]:
     return cells
 
 
-def place_of_cell(line: str, delimiter: str | None, column: int) -> int:
-    """1-based character at which a cell begins; 1 where the line has no such cell."""
+def place_of_cell(line: str, delimiter: str | None, column: int, absent: int = 1) -> int:
+    """1-based character at which a cell begins; ``absent`` where the line has no such cell."""
     cells = cells_of(line, delimiter)
-    return cells[column][1] if column < len(cells) else 1
+    return cells[column][1] if column < len(cells) else absent
 
 
 def bare(cell: str) -> str:
@@ -94,7 +94,7 @@ def read_column(
     texts: Sequence[str],
     decimal: str | None,
     missing: Sequence[str],
-    place: Callable[[int], tuple[Path, int, int]],
+    place: Callable[[int], Place],
 ) -> np.ndarray:
     """The numbers of one column, (n,); NaN at a missing marker.
 
@@ -139,8 +139,6 @@ def shown_cell(cell: str) -> str:
 # blocks: The text of a file in blocks of whole lines.
 
 
-#: The bytes of a file, or where they lie.
-Content = bytes | Path
 COMPRESSED = ".gz"
 #: Bytes of a block, and bytes that are decompressed at a time.
 BLOCK = 1 << 22
@@ -208,7 +206,7 @@ class TextFile:
 def _bytes_of(content: Content, path: Path) -> bytes:
     """The bytes of a text, decompressed."""
     if path.suffix.lower() != COMPRESSED:
-        return content if isinstance(content, bytes) else content.read_bytes()
+        return whole(content)
     found = bytearray()
     with gzip.open(io.BytesIO(content) if isinstance(content, bytes) else content) as file:
         while True:
@@ -432,6 +430,16 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
     return rows
 
 
+def plain_table(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | None:
+    """As ``plain_rows``, for rows that follow one another to the end of the text; None for any other text."""
+    rows = plain_rows(file, shape, columns)
+    count = 0 if rows is None else len(rows.lines)
+    last = shape.first + count
+    if rows is None or count == 0 or (rows.lines[0], rows.lines[-1]) != (shape.first + 1, last):
+        return None
+    return None if any(line.strip() for line in file.lines(last)) else rows
+
+
 def any_rows(
     file: TextFile, shape: Shape, columns: Sequence[int], missing: Sequence[str], words: Sequence[int] = ()
 ) -> Rows:
@@ -454,7 +462,7 @@ def any_rows(
                 rows.add_words(column, texts)
             marks[column] = marks[column] or decimal_mark(texts, missing)
 
-            def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> tuple[Path, int, int]:
+            def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
                 line, text = kept[k]
                 return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
 
@@ -528,13 +536,12 @@ def read_csv(content: Content, path: Path) -> RawTable:
     marks = (re.search("[.,]", line) for line in file.lines(1)) if delimiter != "," else iter(())
     decimal = next((mark[0] for mark in marks if mark), ".")
     shape = Shape(1, delimiter, len(names), decimal)
-    columns = _plain_columns(file, shape)
-    if columns is None:
-        columns = _read_cells(file, shape)
+    rows = plain_table(file, shape, range(len(names)))
+    columns = tuple(map(rows.column, range(len(names)))) if rows else _read_cells(file, shape)
 
-    def place(row: int | None, column: int) -> tuple[int, int]:
+    def place(row: int | None, column: int) -> Place:
         line = 0 if row is None else row + 1
-        return line + 1, cells_of(file.line(line), delimiter)[column][1]
+        return path, line + 1, place_of_cell(file.line(line), delimiter, column)
 
     return RawTable(names, units, columns, np.arange(2, 2 + len(columns[0])), place, file.encoding)
 
@@ -546,25 +553,6 @@ def _refuse_blank(file: TextFile) -> None:
         raise InputError("a table must not be empty", "no text at all", remedy, file.path, 1, 1)
     rule, remedy = "lines between the first and the last must not be blank", "put the header on the first line"
     raise InputError(rule, "a blank line", remedy, file.path, 1, 1)
-
-
-def _plain_columns(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...] | None:
-    """The columns of a table of numbers alone, with blank lines at its end or none; None for any other table."""
-    blocks, ended = [], False
-    for _, text in file.blocks(shape.first):
-        size = len(text.rstrip(f"{BLANKS}\n".encode()))
-        # Blanks behind the last row may be cells.
-        rows = text[: text.index(b"\n", size)] if size else b""
-        if ended and rows:
-            return None
-        ended = len(rows) + 1 < len(text)
-        if not rows:
-            continue
-        values = plain_block(rows + b"\n", shape, range(shape.width))
-        if values is None:
-            return None
-        blocks.append(values)
-    return tuple(np.concatenate(blocks).T.copy()) if blocks else None
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
