@@ -5,13 +5,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import MISSING, dataclass, fields
 from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from numpy.typing import ArrayLike
 from scipy import stats
 
@@ -41,12 +42,9 @@ from capsule_id.physics.drive import Drive
 from capsule_id.physics.forces import warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
-from capsule_id.report.columns import table_rows, table_text, verdict_text, wrapped
-from capsule_id.report.figures import fits as comparisons
-from capsule_id.report.figures import fits as corner
-from capsule_id.report.figures import fits as runs
-from capsule_id.report.figures import fits as traces
-from capsule_id.report.figures.style import figure_of
+from capsule_id.report.columns import sampled_parameters, table_rows, table_text, verdict_text, wrapped
+from capsule_id.report.figures import fits as figures
+from capsule_id.report.figures.style import figure_of, subfigure_at
 from capsule_id.report.html import summary_html
 from capsule_id.report.messages import caption_of, finding_text, messages_of, title_of
 from capsule_id.report.netcdf import data_tree
@@ -54,7 +52,7 @@ from capsule_id.report.saved import load as load_fields
 from capsule_id.report.write import table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
-from capsule_id.views import Comparison, Finding, ResultTable
+from capsule_id.views import Finding, ResultTable
 
 # fitted: A finished fit as an object: words, tables, plots, simulations, files. ``fit`` and ``load`` return it.
 
@@ -207,53 +205,46 @@ class Fit(Result):
 
     def prediction_figure(self, settings: str | Path, draws: int = DRAWS, seed: int = 0) -> Figure:
         """Figure of the predictions of ``predict``: mean velocity against period, with the trials of the fit."""
-        return comparisons.side_by_side(predict(self, settings, draws, seed).panels)
+        return figures.side_by_side(predict(self, settings, draws, seed).panels)
 
     def plot_comparison(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Readings with the predicted curve and its 95 % band; ``label`` as in ``comparisons``, by default the first."""
-        item = _named(self.comparisons, label, lambda panel: panel.label)
-        return comparisons.comparison(item, ax or _new_axes(6.4, 4.4))
+        return _drawn(figures.comparison, _named(self.comparisons, label, attrgetter("label")), ax)
 
     def plot_residuals(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Residuals of the point fit in units of the noise; ``label``: by default the first panel that has some."""
         panels = [panel for panel in self.comparisons if panel.residuals is not None]
-        return comparisons.residuals(_named(panels, label, _label), ax or _new_axes(6.4, 2.4))
+        return _drawn(figures.residuals, _named(panels, label, attrgetter("label")), ax, height=2.4)
 
     def plot_autocorrelation(self, label: str | None = None, ax: Axes | None = None) -> Axes:
         """Autocorrelation of the residuals of a record; ``label``: by default the first record."""
         panels = [panel for panel in self.comparisons if panel.autocorrelation is not None]
-        return comparisons.autocorrelation(_named(panels, label, _label), ax or _new_axes(6.4, 2.4))
+        return _drawn(figures.autocorrelation, _named(panels, label, attrgetter("label")), ax, height=2.4)
 
     def plot_record(self, name: str | None = None, ax: Axes | None = None) -> Figure:
         """Channels of a recorded run and its phase plane, several panels in the place of ``ax``: the figure."""
-        view = _named(self.records, name, lambda record: record.name).view
-        return figure_of(runs.run_overview(view, ax or _new_axes(*runs.overview_size(view), constrained=False)))
+        view = _named(self.records, name, attrgetter("name")).view
+        return _drawn_in_panels(figures.overview, view, ax, *figures.overview_size(view))
 
     def plot_force(self, name: str | None = None, ax: Axes | None = None) -> Axes:
         """Force on the rod from the recorded current, and the fitted drive."""
-        record = _named([r for r in self.records if r.view.force is not None], name, lambda record: record.name)
-        return runs.force_on_rod(record.view, ax or _new_axes(6.4, 4.4), (record.view.time, record.force))
+        records = [record for record in self.records if record.view.force is not None]
+        return _drawn(figures.force_on_rod, _named(records, name, attrgetter("name")), ax)
 
     def plot_corner(self, ax: Axes | None = None) -> Figure:
         """Histogram of every sampled parameter and contours (68 %, 95 %) of every pair: the figure."""
-        width, height = corner.corner_size(self._sampled)[1:]
-        return figure_of(corner.corner(self, ax or _new_axes(width, height)))
+        columns = sampled_parameters(self)
+        _, width, height = figures.corner_size(len(columns.names))
+        return figure_of(_drawn(figures.corner, columns, ax, width, height))
 
     def plot_traces(self, ax: Axes | None = None) -> Figure:
         """A few walkers of each ensemble against the step, several panels in the place of ``ax``: the figure."""
-        size = traces.traces_size(self._sampled)
-        return figure_of(traces.traces(self, ax or _new_axes(*size, constrained=False)))
+        columns = sampled_parameters(self)
+        return _drawn_in_panels(figures.traces, columns, ax, *figures.traces_size(columns))
 
     def plot_starts(self, ax: Axes | None = None) -> Axes:
         """Where each start of the point fit began and ended, in standard deviations."""
-        return comparisons.point_fit_starts(
-            self.point_fit, ax or _new_axes(7.2, 1.5 + 0.25 * len(self.point_fit.names))
-        )
-
-    @property
-    def _sampled(self) -> int:
-        """Number of sampled physical parameters."""
-        return 0 if self.posterior is None else sum(name in self.posterior.names for name in self.summary.index)
+        return _drawn(figures.point_fit_starts, self.point_fit, ax, *figures.starts_size(self.point_fit))
 
     def write(self, directory: str | Path) -> None:
         """Write parameters.json, parameters.csv, posterior.nc, report.html and figures/ into ``directory``.
@@ -304,10 +295,6 @@ def compare(a: Result, b: Result) -> pd.DataFrame:
     return frame
 
 
-def _label(panel: Comparison) -> str:
-    return panel.label
-
-
 def _named(items: Iterable[Item], label: str | None, label_of: Callable[[Item], str]) -> Item:
     """The item with this label; the first one where ``label`` is None."""
     known: Sequence[Item] = tuple(items)
@@ -322,11 +309,30 @@ def _named(items: Iterable[Item], label: str | None, label_of: Callable[[Item], 
     raise InputError(rule, "there is none" if label is None else repr(label), remedy)
 
 
-def _new_axes(width: float, height: float, constrained: bool = True) -> Axes:
+def _new_axes(width: float, height: float, layout: Literal["constrained"] | None) -> Axes:
     """The axes of a new pyplot figure, inches."""
     from matplotlib import pyplot as plt
 
-    return plt.subplots(figsize=(width, height), layout="constrained" if constrained else None)[1]
+    return plt.subplots(figsize=(width, height), layout=layout)[1]
+
+
+def _drawn(
+    panel: Callable[[Any, Axes], None], data: object, ax: Axes | None, width: float = 6.4, height: float = 4.4
+) -> Axes:
+    """The axes with the panel of ``data``: ``ax``, or those of a new pyplot figure."""
+    ax = ax or _new_axes(width, height, "constrained")
+    panel(data, ax)
+    return ax
+
+
+def _drawn_in_panels(
+    draw: Callable[[Any, SubFigure], None], data: object, ax: Axes | None, width: float, height: float
+) -> Figure:
+    """The figure with several panels of ``data`` in the place of ``ax``, or a new pyplot figure."""
+    ax = ax or _new_axes(width, height, None)
+    figure = figure_of(ax)
+    draw(data, subfigure_at(ax))
+    return figure
 
 
 # api: What the commands do, as functions: read a rig folder, fit it, load the result.

@@ -272,19 +272,17 @@ def draw(
     data: "xr.Dataset", axes: Sequence[Axis], measured: "Sequence[MeasuredPoint]" = (), synthetic: bool = False
 ) -> "Figure":
     """The figure of a computed Dataset. A diagram also shows measured runs, each with its own label."""
-    from capsule_id.report.figures import sweeps as figures_bands
-    from capsule_id.report.figures import sweeps as figures_map
-    from capsule_id.report.figures import sweeps as figures_sweep
+    from capsule_id.report.figures import sweeps
     from capsule_id.report.figures.style import mark
 
-    units = {axis.name: figures_sweep.AxisUnit(axis.unit, axis.factor) for axis in axes}
+    drawn = sweeps.in_units(data, {axis.name: (axis.unit, axis.factor) for axis in axes})
     title = str(data.attrs["rig"])
     if "probability" in data:
-        figure = figures_bands.bands(data, units, title)
+        figure = sweeps.bands(drawn, title)
     elif len(axes) == 2:
-        figure = figures_map.motion_map(data, units, title)
+        figure = sweeps.motion_map(drawn, title)
     else:
-        figure = figures_sweep.bifurcation(data, units, measured, title)
+        figure = sweeps.bifurcation(drawn, measured, title)
     if synthetic:
         mark(figure, "synthetic data")
     return figure

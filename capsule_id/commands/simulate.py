@@ -137,12 +137,15 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     import numpy as np
 
-    from capsule_id.report.figures.style import MotionView, motion, own_style, png
+    from capsule_id.report.figures.fits import MotionView, overview, overview_size
+    from capsule_id.report.figures.style import new_figure, own_style, png
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
-    view = MotionView(np.asarray(t.times), x_rel, np.asarray(t.X2), rate, x_rel[section], rate[section], G)
+    channels = {"x_capsule": np.asarray(t.X2), "x_rel": x_rel}
+    view = MotionView(np.asarray(t.times), channels, x_rel, rate, x_rel[section], rate[section], G)
     with own_style():
-        path.write_bytes(png(motion(view)))
+        overview(view, figure := new_figure(*overview_size(view)))
+        path.write_bytes(png(figure))
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:

@@ -5,6 +5,7 @@ import re
 import shutil
 import textwrap
 import unicodedata
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -56,13 +57,18 @@ def fixed(value: float, decimals: int | None) -> str:
     return f"{value:.{decimals}f}"
 
 
-def prefix_for(unit: str, magnitude: float) -> tuple[float, str]:
-    """Factor and unit that bring ``magnitude`` into a readable range: (1e6, "µm") for 2e-5 m, else (1.0, unit)."""
-    size = abs(magnitude)
-    readable = size == 0 or not math.isfinite(size) or _PREFIX_BELOW <= size < _PREFIX_ABOVE
-    if readable or not _PREFIXABLE.match(unit):
+def prefix_for(unit: str, *magnitudes: float) -> tuple[float, str]:
+    """Factor and unit that bring ``magnitudes`` into a readable range: (1e6, "µm") for 2e-5 m, else (1.0, unit).
+
+    The prefix is that of the largest one, or a smaller one that the smallest needs.
+    """
+    sizes = [abs(size) for size in magnitudes if size != 0 and math.isfinite(size)]
+    low, high = min(sizes, default=1.0), max(sizes, default=1.0)
+    if (_PREFIX_BELOW <= low and high < _PREFIX_ABOVE) or not _PREFIXABLE.match(unit):
         return 1.0, unit
-    power = min(max(3 * math.floor(math.log10(size) / 3), min(_PREFIXES)), max(_PREFIXES))
+    power = min(max(3 * math.floor(math.log10(high) / 3), min(_PREFIXES)), max(_PREFIXES))
+    while low * 10.0**-power < _PREFIX_BELOW and power > min(_PREFIXES):
+        power -= 3
     return 10.0**-power, _PREFIXES[power] + unit
 
 
@@ -142,16 +148,17 @@ class Row:
         return self.values["quote"] == "interval"
 
     @property
-    def ends(self) -> tuple[str, str]:
-        """The ends of the 95 % interval."""
-        return self._printed("lower"), self._printed("upper")
+    def interval(self) -> str:
+        """The ends of the 95 % interval; a dash where one is missing."""
+        ends = self._printed("lower"), self._printed("upper")
+        return MISSING if MISSING in ends else " to ".join(ends)
 
     @property
     def quoted(self) -> str:
         """What to quote: ``1421.3 ± 3.1``, or ``5.8 (2.1 to 20.5)`` where the posterior is skewed."""
         if not self.skewed:
             return self.plus_minus("value", "sd", self.decimals)
-        return f"{self._printed('value')} ({' to '.join(self.ends)})"
+        return f"{self._printed('value')} ({self.interval})"
 
     def _printed(self, column: str) -> str:
         """A number with the row's decimals; of a skewed posterior with two digits of the short arm and of itself."""
@@ -163,25 +170,26 @@ class Row:
         return self.number(column, None if least is None or own is None else max(least, min(own, least + 2)))
 
     @property
+    def after_number(self) -> str:
+        """The unit behind a number; nothing for a number without unit."""
+        return "" if self.unit == "1" else f" {self.unit}"
+
+    @property
     def concise(self) -> str:
         """Value and sd as ``1422.4(27) N/m``: the digits in parentheses count in the last place of the value."""
-        if self.skewed:
-            return self.quoted if self.unit == "1" else f"{self.quoted} {self.unit}"
-        places = self.decimals
-        centre, sd = self.number("value"), float(self.values["sd"]) * self.scale
-        if places is None or decimals_for(sd) is None:
-            return f"{centre} {self.unit}" if self.unit != "1" else centre
-        digits = f"{sd:.0f}" if places <= 0 else f"{sd * 10.0**places:.0f}"
-        return f"{centre}({fixed(float(digits), min(places, 0))})" + ("" if self.unit == "1" else f" {self.unit}")
+        sd, places = float(self.values["sd"]) * self.scale, self.decimals
+        if self.skewed or places is None or decimals_for(sd) is None:
+            return (self.quoted if self.skewed else self.number("value")) + self.after_number
+        digits = fixed(round(sd * 10.0 ** max(places, 0)), min(places, 0))
+        return f"{self.number('value')}({digits}){self.after_number}"
 
 
 def table_rows(frame: pd.DataFrame) -> list[Row]:
-    """The rows of ``frame`` in their order."""
+    """The rows of ``frame`` in their order. Those of a symbol share the unit of the largest."""
     rows = {str(name): values for name, values in frame.to_dict("index").items()}
-    largest: dict[str, float] = {}
+    largest: defaultdict[str, float] = defaultdict(float)
     for name, values in rows.items():
-        symbol = symbol_of(name)
-        largest[symbol] = max(largest.get(symbol, 0.0), magnitude(values))
+        largest[symbol_of(name)] = max(largest[symbol_of(name)], magnitude(values))
     return [_row(name, values, largest[symbol_of(name)]) for name, values in rows.items()]
 
 
@@ -263,7 +271,7 @@ COLUMNS = (
     OutputColumn(
         "ci95",
         "95 % interval",
-        lambda row: MISSING if MISSING in row.ends else " to ".join(row.ends),
+        lambda row: row.interval,
         _ends,
         EVERYWHERE - {"csv"},
         sampled=True,
@@ -285,13 +293,21 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def columns_of(output: Output, frame: pd.DataFrame | None = None) -> list[OutputColumn]:
-    """The columns of ``output``; of a printed ``frame`` without those that have nothing to show."""
-    columns = [column for column in COLUMNS if output in column.outputs]
-    if frame is None:
-        return columns
+def columns_of(output: Output) -> list[OutputColumn]:
+    """The columns of ``output``."""
+    return [column for column in COLUMNS if output in column.outputs]
+
+
+def printed_table(
+    frame: pd.DataFrame, output: Literal["html", "console"]
+) -> tuple[list[OutputColumn], list[tuple[str, Sequence[str]]]]:
+    """Columns of ``frame`` in print, without those that have nothing to show, and name and cells of every row."""
     sampled, rows = bool(frame["ess"].notna().any()), table_rows(frame)
-    return [c for c in columns if (sampled or not c.sampled) and any(c.text(row) not in ("", MISSING) for row in rows)]
+    printed = {
+        column: [column.text(row) for row in rows] for column in columns_of(output) if sampled or not column.sampled
+    }
+    shown = {column: cells for column, cells in printed.items() if not {"", MISSING}.issuperset(cells)}
+    return list(shown), [(row.name, [cells[i] for cells in shown.values()]) for i, row in enumerate(rows)]
 
 
 # console table: The parameter table for standard output.
@@ -316,11 +332,9 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = No
     width : columns of the terminal; None: those of standard output
     """
     width = shutil.get_terminal_size((WIDTH, 24)).columns if width is None else width
-    columns = columns_of("console", summary)
+    columns, rows = printed_table(summary, "console")
     table = [["", *(column.header for column in columns)]]
-    for row in table_rows(summary):
-        cells = [column.text(row) for column in columns]
-        table.append([row.name, *("NO" if cell == "no" else cell for cell in cells)])
+    table += [[name, *("NO" if cell == "no" else cell for cell in cells)] for name, cells in rows]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     shown = len(widths)
     while shown > 1 + KEPT and sum(widths[:shown]) + len(_GAP) * (shown - 1) > width:
@@ -381,7 +395,7 @@ class SampledParameters:
 
 
 def sampled_parameters(result: Result) -> SampledParameters:
-    """The columns of ``result``.
+    """The columns of ``result``. Parameters that share a unit share its prefix.
 
     Raises
     ------
@@ -393,7 +407,10 @@ def sampled_parameters(result: Result) -> SampledParameters:
     place = {name: i for i, name in enumerate(result.posterior.names)}
     summary = result.summary.loc[[name in place for name in result.summary.index]]
     names = tuple(str(name) for name in summary.index)
-    display = [prefix_for(str(row["unit"]), magnitude(row)) for row in summary.to_dict("records")]
+    sizes: defaultdict[str, list[float]] = defaultdict(list)
+    for row in summary.to_dict("records"):
+        sizes[str(row["unit"])].append(magnitude(row))
+    display = [prefix_for(str(unit), *sizes[str(unit)]) for unit in summary["unit"]]
     scale = np.array([factor for factor, _ in display])
     return SampledParameters(
         names=names,

@@ -4,8 +4,9 @@ import base64
 import math
 import numbers
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Literal
 
@@ -21,9 +22,10 @@ from capsule_id.parameters import is_stated
 from capsule_id.records.motion import UNDECIDED
 from capsule_id.report.columns import (
     MISSING,
-    Output,
-    columns_of,
+    Row,
+    SampledParameters,
     fixed,
+    printed_table,
     sampled_parameters,
     skewed_names,
     symbol_parts,
@@ -31,8 +33,7 @@ from capsule_id.report.columns import (
     verdict_text,
 )
 from capsule_id.report.figures import fits as figures
-from capsule_id.report.figures.fits import TWO_SIDED_95, corner, force_on_rod, run_overview, traces
-from capsule_id.report.figures.style import figure_of, mark, png
+from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png
 from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, title_of
 from capsule_id.report.sentences import AUTHORS, PUBLISHED, TITLE, bibtex, latex_table, methods_paragraph, next_steps
 from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, counted
@@ -47,6 +48,9 @@ _LONGEST = 80
 _HALF_PAGE = 650
 
 
+Section = Literal["measured", "sample", "point_fit"]
+
+
 @dataclass(frozen=True)
 class Picture:
     """A drawn figure.
@@ -56,14 +60,14 @@ class Picture:
     name : file name without suffix, safe and unique within the result
     section : "measured", "sample" or "point_fit"
     title, caption : plain text
-    alt : what is seen, for readers who do not see it
-    group : label of the experiment, "" for figures of the whole fit
     width, height : of the page's picture, CSS pixels
     png : the file
+    alt : what is seen, for readers who do not see it
+    group : label of the experiment, "" for figures of the whole fit
     """
 
     name: str
-    section: Literal["measured", "sample", "point_fit"]
+    section: Section
     title: str
     caption: str
     width: int
@@ -78,38 +82,49 @@ class Picture:
         return self.width > _HALF_PAGE
 
 
+#: Name, section, title, caption, figure, alternative text and group of a picture.
+Drawing = tuple[str, Section, str, str, Figure, str, str]
+
+
 def pictures(result: Result) -> tuple[Picture, ...]:
     """Draw every figure of the result; synthetic data are marked on each of them."""
-    names = _unique(_comparison_name(item) for item in result.comparisons)
-    drawn = [
-        Drawing(
-            name,
-            "measured",
-            item.title,
-            comparison_caption(item, result.registry.captions),
-            comparison_alt(item),
-            _group(result, item.label),
-        ).on(result, figures.comparison_figure(item))
-        for name, item in zip(names, result.comparisons, strict=True)
+    drawn = []
+    for name, section, title, caption, figure, alt, group in drawings(result):
+        stop_if_interrupted()
+        if result.rig.synthetic:
+            mark(figure, "synthetic data")
+        width, height = (round(96 * inches) for inches in figure.get_size_inches())
+        drawn.append(Picture(name, section, title, caption, width, height, png(figure), alt, group))
+    return tuple(drawn)
+
+
+def drawings(result: Result) -> Iterator[Drawing]:
+    """The table of the figures: those of the comparisons, of the records, of the sample, of the point fit."""
+    labels = [
+        item.label if item.label.startswith(item.kind) else f"{item.kind}_{item.label}" for item in result.comparisons
     ]
-    labels = _unique(_safe(record.name) for record in result.records)
+    for name, item in zip(_unique(labels), result.comparisons, strict=True):
+        caption, figure = comparison_caption(item, result.registry.captions), figures.comparison_figure(item)
+        yield name, "measured", item.title, caption, figure, comparison_alt(item), _group(result, item.label)
+    labels = _unique(record.name for record in result.records)
     for label, record in zip(labels, result.records, strict=True):
-        drawn += _record_pictures(result, label, record)
+        yield from _drawings_of_record(record, label, _group(result, record.name))
     if result.posterior is not None:
-        corner_caption = "Posterior of the physical parameters: histograms, and contours of every pair."
-        ensembles = len(result.posterior.draws)
-        trace_caption = f"A few walkers of each ensemble, one colour per ensemble ({counted(ensembles, 'ensemble')})."
-        drawing = Drawing("corner", "sample", "Corner plot", corner_caption, _corner_alt(result))
-        drawn.append(drawing.on(result, figure_of(corner(result))))
-        worst = f"{counted(ensembles, 'ensemble')}; the largest split R-hat is {max(result.posterior.rhat):.4f}."
-        drawing = Drawing("traces", "sample", "Traces", trace_caption, f"Traces of every physical parameter, {worst}")
-        drawn.append(drawing.on(result, figure_of(traces(result))))
+        columns = sampled_parameters(result)
+        caption = "Posterior of the physical parameters: histograms, and contours of every pair."
+        figures.corner(columns, ax := figures.corner_axes(len(columns.names)))
+        yield "corner", "sample", "Corner plot", caption, figure_of(ax), _corner_alt(columns), ""
+        ensembles = counted(len(result.posterior.draws), "ensemble")
+        caption = f"A few walkers of each ensemble, one colour per ensemble ({ensembles})."
+        alt = f"Traces of every physical parameter, {ensembles}; the largest split R-hat is {max(result.posterior.rhat):.4f}."
+        figures.traces(columns, figure := new_figure(*figures.traces_size(columns)))
+        yield "traces", "sample", "Traces", caption, figure, alt, ""
     fit = result.point_fit
-    starts_caption = "Where each start began and where it ended, in posterior standard deviations from its curvature."
-    ended = int(fit.at_other_maximum.sum())
-    starts_alt = f"{counted(len(fit.starts), 'start')}; {ended} ended at another maximum than the best."
-    drawing = Drawing("point_fit_starts", "point_fit", "Starts of the point fit", starts_caption, starts_alt)
-    return (*drawn, drawing.on(result, figure_of(figures.point_fit_starts(fit))))
+    caption = "Where each start began and where it ended, in posterior standard deviations from its curvature."
+    alt = f"{counted(len(fit.starts), 'start')}; {int(fit.at_other_maximum.sum())} ended at another maximum than the best."
+    ax = new_axes(*figures.starts_size(fit), left=2.6, bottom=0.7, top=0.6)
+    figures.point_fit_starts(fit, ax)
+    yield "point_fit_starts", "point_fit", "Starts of the point fit", caption, figure_of(ax), alt, ""
 
 
 def _group(result: Result, label: str) -> str:
@@ -118,7 +133,7 @@ def _group(result: Result, label: str) -> str:
     return max(own, key=len, default=label)
 
 
-def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Picture]:
+def _drawings_of_record(record: RunRecord, label: str, group: str) -> Iterator[Drawing]:
     """The record as the paper draws it (its Figs. 4 and 9); ``label`` is safe and unique."""
     view, contact = record.view, record.view.at_contact
     left = f"{view.at_drive.rate:.0%} of a rate at the drive's frequency" + (
@@ -129,23 +144,20 @@ def _record_pictures(result: Result, label: str, record: RunRecord) -> list[Pict
         f"period. The filter ({view.samples} samples) leaves {left}."
     )
     word = view.label if view.label == UNDECIDED else f"{view.label} (probability {view.probability:.2g})"
-    title, group = f"{record.name}: the record, {word}", _group(result, record.name)
     alt = (
         f"{len(view.time)} samples of {', '.join(view.channels)} over {view.time[-1] - view.time[0]:.3g} s; x_rel from "
         f"{1e3 * view.x_rel.min():.3g} to {1e3 * view.x_rel.max():.3g} mm; {len(view.section_x_rel)} points, one a period."
     )
-    drawing = Drawing(f"record_{label}", "measured", title, caption, alt, group)
-    drawn = [drawing.on(result, figure_of(run_overview(view)))]
+    figures.overview(view, figure := new_figure(*figures.overview_size(view)))
+    yield f"record_{label}", "measured", f"{record.name}: the record, {word}", caption, figure, alt, group
     if view.force is not None:
-        figure = figure_of(force_on_rod(view, model=(view.time, record.force)))
-        text = (
+        figures.force_on_rod(record, ax := new_axes())
+        caption = (
             "Force on the rod (the paper's Fig. 4d): K times the recorded current, and the drive of the fitted model."
         )
         misses = float(np.std(view.force - record.force))
         alt = f"Force between {view.force.min():.3g} and {view.force.max():.3g} N; the model differs by {misses:.2g} N (rms)."
-        drawing = Drawing(f"force_{label}", "measured", f"{record.name}: force on the rod", text, alt, group)
-        drawn.append(drawing.on(result, figure))
-    return drawn
+        yield f"force_{label}", "measured", f"{record.name}: force on the rod", caption, figure_of(ax), alt, group
 
 
 def comparison_alt(item: Comparison) -> str:
@@ -158,16 +170,15 @@ def comparison_alt(item: Comparison) -> str:
     parts.append(f"curves: {', '.join(curve.label for curve in item.curves)}" if item.curves else "no curve")
     if item.residuals is not None and item.residuals.size:
         size = np.abs(item.residuals)
-        inside = np.mean(size <= TWO_SIDED_95)
+        inside = np.mean(size <= figures.TWO_SIDED_95)
         parts.append(f"{inside:.0%} of the residuals within ±1.96 sd, the largest {np.max(size):.2g} sd")
     flagged = sum(int(points.flagged.sum()) for points in item.points if points.flagged is not None)
     parts += [f"{flagged} rows flagged by a check"] if flagged else []
     return "; ".join(parts) + "."
 
 
-def _corner_alt(result: Result) -> str:
+def _corner_alt(columns: SampledParameters) -> str:
     """Number of parameters and the strongest correlation."""
-    columns = sampled_parameters(result)
     names, flat = columns.names, columns.draws.reshape(-1, len(columns.names))
     if len(names) < 2 or not np.all(np.std(flat, axis=0) > 0.0):
         return f"Histograms of {counted(len(names), 'parameter')}."
@@ -189,47 +200,13 @@ def comparison_caption(item: Comparison, captions: Mapping[str, str]) -> str:
     return " ".join(parts)
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """The words of a picture; see ``Picture``."""
-
-    name: str
-    section: Literal["measured", "sample", "point_fit"]
-    title: str
-    caption: str
-    alt: str
-    group: str = ""
-
-    def on(self, result: Result, figure: Figure) -> Picture:
-        """The picture of ``figure``, with the mark of a synthetic rig."""
-        stop_if_interrupted()
-        if result.rig.synthetic:
-            mark(figure, "synthetic data")
-        width, height = (round(96 * inches) for inches in figure.get_size_inches())
-        return Picture(
-            self.name, self.section, self.title, self.caption, width, height, png(figure), self.alt, self.group
-        )
-
-
-def _comparison_name(item: Comparison) -> str:
-    name = item.label if item.label.startswith(item.kind) else f"{item.kind}_{item.label}"
-    return _safe(name)
-
-
-def _safe(name: str) -> str:
-    return _UNSAFE.sub("_", name)[:_LONGEST]
-
-
-def _unique(names: Iterable[str]) -> list[str]:
-    """Number names that would overwrite another picture (also on file systems that ignore case)."""
-    taken = {"corner", "traces", "point_fit_starts"}
-    unique = []
-    for name in names:
-        candidate, number = name, 2
-        while candidate.lower() in taken:
-            candidate, number = f"{name}_{number}", number + 1
-        taken.add(candidate.lower())
-        unique.append(candidate)
+def _unique(labels: Iterable[str]) -> list[str]:
+    """Names of files: safe, numbered where they would overwrite another picture (also where case is ignored)."""
+    taken, unique = {"corner", "traces", "point_fit_starts"}, list[str]()
+    for name in (_UNSAFE.sub("_", label)[:_LONGEST] for label in labels):
+        candidates = chain([name], (f"{name}_{number}" for number in count(2)))
+        unique.append(next(candidate for candidate in candidates if candidate.lower() not in taken))
+        taken.add(unique[-1].lower())
     return unique
 
 
@@ -246,6 +223,7 @@ _WORDS: Mapping[Level, str] = {"ok": "✓ ok", "warn": "! warning", "fail": "✗
 def render(result: Result, pictures: Sequence[Picture]) -> str:
     """The page for ``result``; ``pictures`` as ``gallery.pictures`` draws them. The same input gives the same text."""
     messages = messages_of(result.registry)
+    stated_last = sorted(table_rows(result.summary), key=lambda row: is_stated(row.name))
     worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
     titles = {finding.code: title_of(finding.code, messages) for finding in result.findings}
     return (
@@ -253,13 +231,13 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
         .get_template("report.html.j2")
         .render(
             result=result,
-            answers=_answers(result),
+            answers=[(row, _truth(row, result.truth.get(row.name))) for row in stated_last],
             steps=next_steps(result),
             skewed=skewed_names(result.summary),
             experiments=_experiments(result, pictures),
             sections={name: _section(pictures, name) for name in ("sample", "point_fit")},
-            parameters=_parameters(result.summary),
-            nuisances=_parameters(result.nuisances),
+            parameters=printed_table(result.summary, "html"),
+            nuisances=printed_table(result.nuisances, "html"),
             checks=_checks(result.findings, titles),
             findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
             words=_WORDS,
@@ -284,28 +262,13 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
     )
 
 
-def _answers(result: Result) -> list[dict[str, str]]:
-    """The rows of the first screen: name, value ± sd with its unit, interval, trust, truth; stated quantities last."""
-    rows = sorted(table_rows(result.summary), key=lambda row: is_stated(row.name))
-    columns = {column.key: column for column in columns_of("html", result.summary)}
-    answers = []
-    for row in rows:
-        unit = "" if row.unit == "1" else f" {row.unit}"
-        truth, sd = result.truth.get(row.name), float(row.values["sd"])
-        known = MISSING if truth is None else fixed(truth * row.scale, row.decimals)
-        if truth is not None and sd > 0.0:
-            known += f" ({(float(row.values['value']) - truth) / sd:+.1f} sd)".replace("-", "−")
-        answers.append(
-            {
-                "name": row.name,
-                "meaning": str(row.values["meaning"]),
-                "value": row.quoted + unit,
-                "interval": columns["ci95"].text(row) if "ci95" in columns else MISSING,
-                "trust": str(row.values["trust"]),
-                "truth": known,
-            }
-        )
-    return answers
+def _truth(row: Row, truth: float | None) -> str:
+    """The true value of a synthetic rig, and how far the estimate is from it."""
+    known = MISSING if truth is None else fixed(truth * row.scale, row.decimals)
+    sd = float(row.values["sd"])
+    if truth is not None and sd > 0.0:
+        known += f" ({(float(row.values['value']) - truth) / sd:+.1f} sd)".replace("-", "−")
+    return known
 
 
 def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, object]]:
@@ -332,12 +295,9 @@ def _experiments(result: Result, pictures: Sequence[Picture]) -> list[dict[str, 
 
 def summary_html(result: Result, verdict: str, changes: Sequence[str]) -> str:
     """Verdict, changes of the model (texts of the findings that make them) and parameter table, for a notebook."""
-    table = _parameters(result.summary, "console")
-    return (
-        _environment()
-        .get_template("summary.html.j2")
-        .render(result=result, changes=changes, verdict=verdict, table=table, missing=MISSING)
-    )
+    columns, rows = printed_table(result.summary, "console")
+    template = _environment().get_template("summary.html.j2")
+    return template.render(result=result, changes=changes, verdict=verdict, columns=columns, rows=rows, missing=MISSING)
 
 
 def _environment() -> Environment:
@@ -362,13 +322,6 @@ def _section(pictures: Sequence[Picture], name: str) -> list[Picture]:
     return sorted((picture for picture in pictures if picture.section == name), key=lambda picture: picture.wide)
 
 
-def _parameters(frame: pd.DataFrame, output: Output = "html") -> dict[str, object]:
-    """Columns, and rows of name and printed cells."""
-    columns = columns_of(output, frame)
-    rows = [(row.name, [(column, column.text(row)) for column in columns]) for row in table_rows(frame)]
-    return {"columns": columns, "rows": rows}
-
-
 def _checks(findings: Sequence[Finding], titles: Mapping[str, str]) -> list[tuple[str, Level, int]]:
     """A cell per check: its title, its worst level, and how many findings have that level."""
     cells = []
@@ -391,16 +344,16 @@ def _starts(result: Result) -> list[tuple[int, str, str, bool]]:
 
 def _note(note: ResultTable, messages: Mapping[str, Message]) -> dict[str, object]:
     frame = note.frame
-    named = not isinstance(frame.index, pd.RangeIndex)
-    header = [(str(frame.index.name or ""), False)] if named else []
-    numeric = [pd.api.types.is_numeric_dtype(kind) for kind in frame.dtypes]
-    header += [(str(column), number) for column, number in zip(frame.columns, numeric, strict=True)]
-    rows = [
-        ([index] if named else []) + list(row)
-        for index, row in zip(frame.index, frame.itertuples(index=False), strict=True)
-    ]
-    title, caption = title_of(note.code, messages), caption_of(note, messages)
-    return {"title": title, "caption": caption, "header": header, "rows": rows}
+    if not isinstance(frame.index, pd.RangeIndex):
+        frame = frame.rename_axis(frame.index.name or "").reset_index(allow_duplicates=True)
+    header = [(str(name), pd.api.types.is_numeric_dtype(kind)) for name, kind in frame.dtypes.items()]
+    rows = frame.itertuples(index=False, name=None)
+    return {
+        "title": title_of(note.code, messages),
+        "caption": caption_of(note, messages),
+        "header": header,
+        "rows": rows,
+    }
 
 
 def _number(value: object, form: str = ".5g") -> str:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from capsule_id.errors import InputError
+from capsule_id.experiments.context import RunRecord
 from capsule_id.experiments.kind import default_registry
 from capsule_id.records.view import SMALLEST_RATE_GAIN, Gains, RecordView, describe_run, view_record
-from capsule_id.report.figures.fits import channel_history, force_on_rod, phase_plane_of_run, run_overview
-from capsule_id.report.figures.style import figure_of, new_figure, png
+from capsule_id.report.figures.fits import channel_history, force_on_rod, overview, overview_size, phase_plane
+from capsule_id.report.figures.style import new_axes, new_figure, png
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import filter_gain
 from tests.experiments import bench
@@ -80,22 +81,22 @@ def test_a_view_needs_x_rel(case: Known) -> None:
 
 
 def test_pictures_draw_what_they_are_given(view: RecordView) -> None:
-    figure = new_figure(4.0, 3.0)
-    ax = figure.subplots()
-    assert phase_plane_of_run(view, ax) is ax
+    phase_plane(view, ax := new_axes())
     path, gap, seen, section = ax.lines
     assert len(path.get_xdata()) == len(view.time) - 2 * (view.samples // 2)  # pyright: ignore
     assert [gap.get_xdata()[0], seen.get_xdata()[0]] == [1e3 * view.gap, 1e3 * view.gap_seen]  # type: ignore
     np.testing.assert_allclose(section.get_ydata(), view.section_rate)
-    model = (view.time[:5], view.time[:5])
-    force = force_on_rod(view, model=model)
+    force_on_rod(RunRecord("run", view, view.time), force := new_axes())
     assert [line.get_label() for line in force.lines] == ["K times current", "model"]
-    assert channel_history(view, "acceleration_rod").get_ylabel().endswith("m/s²")
-    assert png(figure_of(run_overview(view))).startswith(b"\x89PNG")
+    channel_history(view, "acceleration_rod", history := new_axes())
+    assert history.get_ylabel().endswith("m/s²")
+    overview(view, figure := new_figure(*overview_size(view)))
+    assert png(figure).startswith(b"\x89PNG")
     fewer = replace(view, channels={"x_rel": view.channels["x_rel"]}, gap_seen=None, force=None)
-    assert len(figure_of(run_overview(fewer)).axes) == 2
+    overview(fewer, figure := new_figure(*overview_size(fewer)))
+    assert len(figure.axes) == 2
     with pytest.raises(ValueError, match="no force"):
-        force_on_rod(fewer)
+        force_on_rod(RunRecord("run", fewer, view.time), new_axes())
 
 
 def test_check_says_it_in_a_few_lines(case: Known) -> None:

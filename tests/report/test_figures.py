@@ -9,12 +9,13 @@ from typing import cast
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from capsule_id.inference.result import Posterior, Result
+from capsule_id.report.columns import sampled_parameters
 from capsule_id.report.figures import fits as figures
-from capsule_id.report.figures.fits import _ticks, corner, traces
-from capsule_id.report.figures.style import figure_of, png
+from capsule_id.report.figures.style import figure_of, new_axes, new_figure, png
 from capsule_id.report.html import Picture, pictures
 from capsule_id.views import Comparison
 
@@ -23,6 +24,24 @@ UNIT = re.compile(r"\[[^\]]+\]$")
 
 def _named(result: Result, label: str) -> Comparison:
     return next(item for item in result.comparisons if item.label == label)
+
+
+def drawn(panel: Callable[..., None], data: object, **size: float) -> Axes:
+    """The axes of a panel in a figure of its own."""
+    panel(data, ax := new_axes(**size))
+    return ax
+
+
+def corner_of(result: Result) -> Axes:
+    columns = sampled_parameters(result)
+    figures.corner(columns, ax := figures.corner_axes(len(columns.names)))
+    return ax
+
+
+def traces_of(result: Result) -> Figure:
+    columns = sampled_parameters(result)
+    figures.traces(columns, figure := new_figure(*figures.traces_size(columns)))
+    return figure
 
 
 def _assert_units(figure: Figure) -> None:
@@ -39,17 +58,31 @@ def _assert_units(figure: Figure) -> None:
 def test_every_panel_has_labels_with_units(result: Result) -> None:
     for item in result.comparisons:
         _assert_units(figures.comparison_figure(item))
-    _assert_units(figure_of(figures.point_fit_starts(result.point_fit)))
-    _assert_units(figure_of(traces(result)))
+    _assert_units(figure_of(drawn(figures.point_fit_starts, result.point_fit)))
+    _assert_units(traces_of(result))
 
 
 def test_corner_names_every_physical_parameter_with_its_unit(result: Result) -> None:
-    (ax,) = corner(result).figure.axes
+    ax = corner_of(result)
     labels = [text.get_text() for text in ax.texts if "[" in text.get_text()]
     # Each on the horizontal axis, and all but the first, which has a histogram in its row, on the vertical one.
     assert len(labels) == 2 * len(result.summary) - 1
     assert {"m₁\n[kg]", "k₂ stiff\n[N/m]", "vₛ\n[m/s]", "μ\n[1]"} <= set(labels)
     assert not any("noise" in label for label in labels)
+
+
+def test_parameters_of_one_unit_share_its_prefix(result: Result) -> None:
+    """Gaps of 1.0004, 0.9997 and 0.02 mm stood in mm, in µm and in µm, beside each other."""
+    gaps = {"k2[soft]": 1.0004e-3, "k2[medium]": 0.9997e-3, "k2[stiff]": 2e-5}
+    summary = result.summary.copy()
+    for name, value in gaps.items():
+        summary.loc[name, ["unit", "value", "map", "sd"]] = ["m", value, value, 3e-7]
+    gapped = dataclasses.replace(result, summary=summary)
+    columns = sampled_parameters(gapped)
+    shown = dict(zip(columns.names, zip(columns.units, columns.map, strict=True), strict=True))
+    assert {name: shown[name] for name in gaps} == {name: ("mm", pytest.approx(1e3 * gaps[name])) for name in gaps}
+    labels = [ax.get_ylabel() for ax in traces_of(gapped).axes]
+    assert sum("[mm]" in label for label in labels) == len(gaps)
 
 
 def _inside(polygons: list[np.ndarray], points: np.ndarray) -> np.ndarray:
@@ -67,7 +100,7 @@ def _inside(polygons: list[np.ndarray], points: np.ndarray) -> np.ndarray:
 def test_contours_hold_the_shares_they_claim(maker: Callable[..., Result]) -> None:
     result = maker(draws=250, walkers=32)
     posterior = cast(Posterior, result.posterior)
-    (ax,) = corner(result).figure.axes
+    ax = corner_of(result)
     n = len(result.summary)
     draws = posterior.draws.reshape(-1, len(posterior.names))[:, :2]
     low, high = np.percentile(draws, (0.1, 99.9), axis=0)
@@ -84,7 +117,7 @@ def test_contours_hold_the_shares_they_claim(maker: Callable[..., Result]) -> No
     ("low", "high"), [(0.0, 1.0), (1418.2, 1424.9), (-3e-4, 7e-4), (56399.0, 56401.0), (1e-9, 1e9)]
 )
 def test_corner_ticks_are_distinct_inside_and_say_where_they_are(low: float, high: float) -> None:
-    ticks = _ticks(low, high)
+    ticks = figures._ticks(low, high)
     values = np.array([value for value, _ in ticks])
     assert 2 <= len(ticks) <= 5
     assert np.all((low < values) & (values < high))
@@ -94,63 +127,47 @@ def test_corner_ticks_are_distinct_inside_and_say_where_they_are(low: float, hig
 def test_a_frozen_chain_is_drawn(result: Result) -> None:
     posterior = cast(Posterior, result.posterior)
     frozen = dataclasses.replace(posterior, draws=np.broadcast_to(posterior.draws[:1, :1, :1], posterior.draws.shape))
-    assert png(figure_of(corner(dataclasses.replace(result, posterior=frozen))))
-    assert png(figure_of(traces(dataclasses.replace(result, posterior=frozen))))
+    assert png(figure_of(corner_of(dataclasses.replace(result, posterior=frozen))))
+    assert png(traces_of(dataclasses.replace(result, posterior=frozen)))
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_few_parameters(result: Result, count: int) -> None:
     few = dataclasses.replace(result, summary=result.summary.iloc[:count])
-    assert len(figure_of(traces(few)).axes) == count  # an empty panel is none
-    assert png(figure_of(corner(few)))
+    assert len(traces_of(few).axes) == count  # an empty panel is none
+    assert png(figure_of(corner_of(few)))
 
 
 def test_no_sample_is_refused(unsampled: Result) -> None:
     with pytest.raises(ValueError, match="nothing was sampled"):
-        corner(unsampled)
-    with pytest.raises(ValueError, match="nothing was sampled"):
-        traces(unsampled)
-
-
-def test_panels_draw_into_given_axes(result: Result) -> None:
-    item = _named(result, "free_vibration_1")
-    for draw in (figures.comparison, figures.residuals, figures.autocorrelation):
-        ax = Figure().subplots()
-        assert draw(item, ax) is ax
-        # Without axes it makes its own, with the same content.
-        own = draw(item)
-        assert own is not ax
-        assert (own.get_xlabel(), own.get_ylabel()) == (ax.get_xlabel(), ax.get_ylabel())
-        assert (len(own.lines), len(own.collections)) == (len(ax.lines), len(ax.collections))
-    ax = Figure().subplots()
-    assert figures.point_fit_starts(result.point_fit, ax) is ax
+        sampled_parameters(unsampled)
 
 
 def test_panel_shows_points_curves_band_and_flag(result: Result) -> None:
     item = _named(result, "support_spring_stiff")
-    ax = figures.comparison(item)
+    ax = drawn(figures.comparison, item)
     labels = ax.get_legend_handles_labels()[1]
     assert set(labels) == {"this fit", "95 % band", "measured", "flagged by a check, kept"}
     flagged = ax.lines[[line.get_label() for line in ax.lines].index("flagged by a check, kept")]
     assert flagged.get_xdata() == item.points[0].x[4:5]
-    plain = figures.comparison(_named(result, "support_spring_soft"))
+    plain = drawn(figures.comparison, _named(result, "support_spring_soft"))
     assert "flagged by a check, kept" not in plain.get_legend_handles_labels()[1]
 
 
 def test_residual_panel_shows_all_and_the_band(result: Result) -> None:
     item = _named(result, "motor_current")
-    ax = figures.residuals(item)
+    ax = drawn(figures.residuals, item)
     np.testing.assert_array_equal(ax.lines[-1].get_ydata(), item.residuals)
     wild = dataclasses.replace(item, residuals=np.array([*item.residuals[:-1], 40.0]))
-    assert figures.residuals(wild).get_ylim()[1] > 40.0
+    assert drawn(figures.residuals, wild).get_ylim()[1] > 40.0
 
 
 def test_missing_parts_are_refused_not_drawn_empty(result: Result) -> None:
     friction = _named(result, "friction")
     with pytest.raises(ValueError, match="no residuals"):
-        figures.residuals(friction)
+        drawn(figures.residuals, friction)
     with pytest.raises(ValueError, match="no autocorrelation"):
-        figures.autocorrelation(friction)
+        drawn(figures.autocorrelation, friction)
     assert len(figures.comparison_figure(friction).axes) == 1
     assert len(figures.comparison_figure(_named(result, "motor_current")).axes) == 2
     assert len(figures.comparison_figure(_named(result, "free_vibration_1")).axes) == 3
@@ -160,11 +177,11 @@ def test_stalled_starts_end_in_a_cross(result: Result) -> None:
     stalled = np.array([False, True, False, False, True, False])
     ends = result.point_fit.ends.copy()
     ends[1] += 1.0
-    ax = figures.point_fit_starts(dataclasses.replace(result.point_fit, stalled=stalled, ends=ends))
+    ax = drawn(figures.point_fit_starts, dataclasses.replace(result.point_fit, stalled=stalled, ends=ends))
     assert sum(line.get_marker() == "x" for line in ax.lines) == 2
     assert "end, stalled" in ax.get_legend_handles_labels()[1]
     broken = dataclasses.replace(result.point_fit, covariance=np.full_like(result.point_fit.covariance, np.nan))
-    assert png(figure_of(figures.point_fit_starts(broken)))
+    assert png(figure_of(drawn(figures.point_fit_starts, broken)))
 
 
 def test_hostile_text_is_drawn_as_it_stands(result: Result) -> None:

@@ -1,16 +1,23 @@
 """Figures of sweeps draw what they are given: points, units, directions, measured runs, areas, intervals."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.axes import Axes
 
-from capsule_id.report.figures import sweeps as figures_bands
-from capsule_id.report.figures import sweeps as figures_map
-from capsule_id.report.figures import sweeps as figures_sweep
-from capsule_id.report.figures.style import png
-from capsule_id.report.figures.sweeps import AxisUnit, MeasuredPoint, label_classes, shown
+from capsule_id.report.figures import sweeps
+from capsule_id.report.figures.style import new_axes, png
+from capsule_id.report.figures.sweeps import MeasuredPoint, in_units, label_looks
 
-UNITS = {"k2": AxisUnit("kN/m", 1e3)}
+UNITS = {"k2": ("kN/m", 1e3)}
+
+
+def drawn(panel: Callable[..., None], *data: object) -> Axes:
+    """The axes of a panel in a figure of its own."""
+    panel(*data, ax := new_axes())
+    return ax
 
 
 def _diagram(branches: int) -> xr.Dataset:
@@ -39,34 +46,34 @@ def _diagram(branches: int) -> xr.Dataset:
 
 
 def test_poincare_points_stand_at_their_values_in_the_wanted_unit() -> None:
-    ax = figures_sweep.poincare(_diagram(1), UNITS)
+    ax = drawn(sweeps.poincare, in_units(_diagram(1), UNITS))
     points, several, impact = ax.lines
     np.testing.assert_allclose(points.get_xdata(), np.repeat([1.0, 2.0, 3.0, 4.0], 3))
     np.testing.assert_allclose(points.get_ydata()[-3:], [4.0, 4.5, 4.0])
     assert list(several.get_xdata()) == [4.0]
     np.testing.assert_allclose(impact.get_ydata(), 1.5)
     assert ax.get_xlabel() == "k2, kN/m"
-    assert figures_sweep.poincare(_diagram(1)).get_xlabel() == "k2, N/m"
+    assert drawn(sweeps.poincare, _diagram(1)).get_xlabel() == "k2, N/m"
 
 
 def test_many_branches_are_coloured_by_period() -> None:
-    ax = figures_sweep.poincare(_diagram(3), UNITS)
+    ax = drawn(sweeps.poincare, in_units(_diagram(3), UNITS))
     looks = {line.get_label(): line for line in ax.lines}
     assert set(looks) == {"aperiodic", "period 1", "period 2", "several attractors", "impact line"}
     np.testing.assert_allclose(np.unique(looks["period 2"].get_xdata()), [4.0])
-    two = figures_sweep.poincare(_diagram(2), UNITS)
+    two = drawn(sweeps.poincare, in_units(_diagram(2), UNITS))
     assert [line.get_label() for line in two.lines][:2] == ["forward", "backward"]
 
 
 def test_velocity_is_marked_by_direction_with_labels_and_measured_runs() -> None:
     measured = [MeasuredPoint(2500.0, "P-1-F-2", 1.5e-3)]
-    ax = figures_sweep.mean_velocity(_diagram(1), UNITS, measured)
-    drawn = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in ax.lines}
-    assert drawn["forward"] == ([4.0], [2.0])
-    assert drawn["backward"] == ([1.0], [-1.0])
-    assert drawn["standing"] == ([2.0], [0.0])
-    assert drawn["measured"] == ([2.5], [1.5])
-    assert drawn["run given up"][0] == [3.0, 3.0]
+    ax = drawn(sweeps.mean_velocity, in_units(_diagram(1), UNITS), measured)
+    shown = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in ax.lines}
+    assert shown["forward"] == ([4.0], [2.0])
+    assert shown["backward"] == ([1.0], [-1.0])
+    assert shown["standing"] == ([2.0], [0.0])
+    assert shown["measured"] == ([2.5], [1.5])
+    assert shown["run given up"][0] == [3.0, 3.0]
     texts = [text.get_text() for text in ax.texts]
     assert {"P-1-F-2", "P-1-B-1", "P-2-F-1/2", "failed"} <= set(texts)
 
@@ -74,19 +81,23 @@ def test_velocity_is_marked_by_direction_with_labels_and_measured_runs() -> None
 def test_areas_add_up_and_rare_labels_go_together() -> None:
     names = [f"P-1-F-{i}" for i in range(1, 9)] + ["P-1-B-1", "aperiodic", "failed"]
     heights = np.linspace(1.0, 2.0, len(names))[:, None] * np.array([1.0, 2.0])
-    own, together = shown(names, heights)
-    assert own[-1] == "other"
-    assert {"aperiodic", "failed", "P-1-B-1", "P-1-F-8"} <= set(own)
-    assert "P-1-F-1" not in own
-    np.testing.assert_allclose(together.sum(axis=0), heights.sum(axis=0))
-    label = np.array([["P-1-F-1", "P-1-B-1"], ["failed", "P-1-F-1"]])
-    kept, colours, classes = label_classes(label)
-    np.testing.assert_array_equal(np.array(kept)[classes], label)
-    assert len(set(colours)) == len(kept)
+    looks, places = label_looks(dict(zip(names, heights.sum(axis=1), strict=True)))
+    assert list(looks)[-1] == "other"
+    assert {"aperiodic", "failed", "P-1-B-1", "P-1-F-8"} <= set(looks)
+    assert "P-1-F-1" not in looks
+    data = xr.Dataset(
+        {"probability": (("label", "k2"), heights)}, {"label": names, "k2": ("k2", [1.0, 2.0], {"units": "N/m"})}
+    )
+    areas = drawn(sweeps.probabilities, data).collections
+    tops = np.max([area.get_paths()[0].get_extents().get_points()[1] for area in areas], axis=0)
+    assert tops[1] == pytest.approx(heights.sum(axis=0).max())
+    kept, places = label_looks({"P-1-F-1": 2, "P-1-B-1": 1, "failed": 1})
+    assert [list(kept)[place] for place in places.values()] == list(places)
+    assert len(set(kept.values())) == len(kept)
 
 
 def test_bands_show_the_chosen_value_and_its_interval() -> None:
-    data = xr.Dataset(
+    si = xr.Dataset(
         {
             "probability": (("label", "k2"), [[0.25, 1.0], [0.75, 0.0]]),
             "mean_velocity_quantiles": (("quantile", "k2"), 1e-3 * np.array([[0.0, 1.0], [1.0, 2.0], [2.0, 4.0]])),
@@ -97,14 +108,15 @@ def test_bands_show_the_chosen_value_and_its_interval() -> None:
         {"label": ["P-1-F-1", "P-1-B-1"], "k2": ("k2", [1e3, 2e3], {"units": "N/m"}), "quantile": [0.025, 0.5, 0.975]},
         {"objective": "mean_velocity"},
     )
-    ax = figures_bands.objective_band(data, UNITS)
+    data = in_units(si, UNITS)
+    ax = drawn(sweeps.objective_band, data)
     (bar,) = ax.containers
     np.testing.assert_allclose(bar.lines[0].get_xydata(), [[2.0, 2.0]])
     np.testing.assert_allclose(bar.lines[2][0].get_segments()[0][:, 1], [1.0, 4.0])
-    top = figures_bands.probabilities(data, UNITS)
+    top = drawn(sweeps.probabilities, data)
     edges = [area.get_paths()[0].vertices[:, 1].max() for area in top.collections]
     np.testing.assert_allclose(edges, [1.0, 1.0])
-    assert png(figures_bands.bands(data, UNITS, "rig")).startswith(b"\x89PNG")
+    assert png(sweeps.bands(data, "rig")).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("failed", [False, True])
@@ -112,25 +124,16 @@ def test_a_map_keeps_its_cells_in_place(failed: bool) -> None:
     velocity = 1e-3 * np.array([[1.0, -2.0], [np.nan if failed else 0.0, 4.0], [0.5, 0.5]])
     label = np.where(np.isnan(velocity), "failed", np.where(velocity < 0.0, "P-1-B-1", "P-1-F-1"))
     over = ("k2", "f")
-    data = xr.Dataset(
+    si = xr.Dataset(
         {"label": (over, label), "mean_velocity": (over, velocity), "efficiency": (over, velocity)},
         {"k2": ("k2", [1e3, 2e3, 3e3], {"units": "N/m"}), "f": ("f", [2.0, 4.0], {"units": "Hz"})},
     )
-    ax = figures_map.quantity(data, "mean_velocity", UNITS)
+    data = in_units(si, UNITS)
+    ax = drawn(sweeps.quantity, data, "mean_velocity")
     (mesh,) = ax.collections
     np.testing.assert_allclose(np.ma.filled(mesh.get_array(), np.nan), 1e3 * velocity.T)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("k2, kN/m", "f, Hz")
     np.testing.assert_allclose(ax.get_xlim(), [0.5, 3.5])
-    names = [text.get_text() for text in figures_map.labels(data, UNITS).get_legend().get_texts()]
+    names = [text.get_text() for text in drawn(sweeps.labels, data, "").get_legend().get_texts()]
     assert set(names) == set(np.unique(label))
-    assert png(figures_map.motion_map(data, UNITS, "rig")).startswith(b"\x89PNG")
-
-
-def test_basins_name_their_attractors() -> None:
-    over = ("x_rel_0", "rate_0")
-    data = xr.Dataset(
-        {"attractor": (over, [[0, 1], [-1, 0]]), "label": (over, [["P-1-F-1", "aperiodic"], ["failed", "P-1-F-1"]])},
-        {"x_rel_0": [-1e-3, 1e-3], "rate_0": [0.0, 0.1]},
-    )
-    ax = figures_map.basins(data)
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["failed", "1: P-1-F-1", "2: aperiodic"]
+    assert png(sweeps.motion_map(data, "rig")).startswith(b"\x89PNG")

@@ -1,7 +1,6 @@
 """No text of a figure leaves the picture or lies on another one: boxes measured by matplotlib's renderer."""
 
 import itertools
-from collections.abc import Callable
 from typing import cast
 
 import numpy as np
@@ -12,9 +11,8 @@ from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 from capsule_id.inference.result import Result
-from capsule_id.report.figures import fits as comparisons
-from capsule_id.report.figures.fits import corner, traces
-from capsule_id.report.figures.style import figure_of, make_room, own_axes, set_legend
+from capsule_id.report.figures.style import figure_of, new_axes, set_legend
+from capsule_id.report.html import drawings
 
 #: Boxes may share this much, pixels: a renderer rounds.
 SLACK = 1.0
@@ -68,21 +66,10 @@ def figure_dpi(text: Text) -> float:
     return cast(Figure, text.get_figure(root=True)).dpi
 
 
-FIGURES: dict[str, Callable[[Result], Figure]] = {
-    "corner": lambda result: figure_of(corner(result)),
-    "traces": lambda result: figure_of(traces(result)),
-    "starts": lambda result: figure_of(comparisons.point_fit_starts(result.point_fit)),
-}
-
-
-@pytest.mark.parametrize("name", FIGURES)
-def test_texts_of_the_sample_are_apart(result: Result, name: str) -> None:
-    assert faults(FIGURES[name](result)) == []
-
-
-def test_texts_of_panels_are_apart(result: Result) -> None:
-    found = {item.label: faults(comparisons.comparison_figure(item)) for item in result.comparisons}
-    assert {label: fault for label, fault in found.items() if fault} == {}
+def test_texts_of_every_figure_are_apart(result: Result) -> None:
+    found = {name: faults(figure) for name, _, _, _, figure, *_ in drawings(result)}
+    assert {"corner", "traces", "point_fit_starts", "friction", "free_vibration_1"} < set(found)
+    assert {name: fault for name, fault in found.items() if fault} == {}
 
 
 def test_overlaps_and_clipped_texts_would_be_found() -> None:
@@ -102,12 +89,11 @@ def test_overlaps_and_clipped_texts_would_be_found() -> None:
 @pytest.mark.parametrize("height", [4.4, 5.6])
 def test_a_legend_over_a_record_hides_no_sample(entries: int, height: float) -> None:
     """Three entries over a forced run lay on its last peaks: the space did not depend on their number."""
-    ax = own_axes(None, height=height)
+    ax = new_axes(height=height)
     t = np.linspace(0.0, 1.0, 400)
     for number in range(entries):
         ax.plot(t, np.sin(60.0 * t), label=f"curve {number}")
-    below = make_room(ax)
-    set_legend(ax, place="upper right")
+    below = set_legend(ax, "upper right")
     figure = figure_of(ax)
     FigureCanvasAgg(figure).draw()
     legend = cast(Legend, ax.get_legend())

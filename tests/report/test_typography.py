@@ -56,6 +56,26 @@ def test_decimal_prefix(unit: str, magnitude: float, factor: float, shown: str) 
 
 
 @pytest.mark.parametrize(
+    ("unit", "magnitudes", "shown"),
+    [
+        ("m", (1.0004e-3, 0.9997e-3), "mm"),
+        ("m", (5.0, 2e-5), "mm"),  # 5000 and 0.02
+        ("m", (2e-5, 0.0, math.nan), "µm"),
+        ("N/m", (1420.0, 56410.0), "N/m"),
+        ("N/m", (1420.0, 2.5e7), "kN/m"),
+        ("kg", (1e-5, 1e9), "kg"),
+    ],
+)
+def test_numbers_of_one_unit_share_a_prefix_in_which_each_is_readable(
+    unit: str, magnitudes: tuple[float, ...], shown: str
+) -> None:
+    scale, name = prefix_for(unit, *magnitudes)
+    assert name == shown
+    if unit != "kg":
+        assert all(1e-2 <= scale * size < 1e7 for size in magnitudes if size > 0.0)
+
+
+@pytest.mark.parametrize(
     ("name", "parts", "plain"),
     [
         ("k1", ("k", "1", ""), "k₁"),

@@ -1,21 +1,27 @@
-"""Figures of a rig and its fit: readings, recorded runs, comparisons, corner plot, traces."""
+"""Figures of a rig and its fit: readings, motions, comparisons, corner plot, traces.
+
+A panel is ``(data, ax)`` and draws into ``ax``; labels are plain text.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
+from scipy import ndimage
 
-from capsule_id.inference.result import PointFit, Result
+from capsule_id.experiments.context import RunRecord
+from capsule_id.inference.result import PointFit
 from capsule_id.records.view import RecordView
-from capsule_id.report.columns import SampledParameters, fixed, plain_symbol, sampled_parameters
+from capsule_id.report.columns import SampledParameters, fixed, plain_symbol
 from capsule_id.report.figures.style import (
     BLACK,
     BLUE,
@@ -30,19 +36,16 @@ from capsule_id.report.figures.style import (
     TEXT,
     VERMILION,
     figure_of,
-    make_room,
+    new_axes,
     new_figure,
-    own_axes,
     set_legend,
+    set_margins,
     set_text,
-    subfigure_at,
 )
 from capsule_id.rig.model import Table
 from capsule_id.views import Comparison, Curve, Finding, Points
 
 # comparisons: Measured beside predicted: the panels of a ``Comparison``, and where the point fit's starts ended.
-#
-# Every panel is ``(thing, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own; labels are plain text.
 
 
 # Beyond this many points a record is a cloud of dots, not single readings with bars.
@@ -63,24 +66,20 @@ _CURVE_STYLES: dict[str, dict[str, Any]] = {
 }
 
 
-def comparison(item: Comparison, ax: Axes | None = None) -> Axes:
+def comparison(item: Comparison, ax: Axes) -> None:
     """Measured points with the predicted curves and their 95 % bands."""
-    ax = own_axes(ax)
-    banded = [curve for curve in item.curves if curve.lower is not None and curve.upper is not None]
+    banded = next((curve for curve in item.curves if curve.lower is not None and curve.upper is not None), None)
     long = any(points.x.size > _MANY for points in item.points)
     for curve in item.curves:
-        _draw_curve(ax, curve, "95 % band" if banded and curve is banded[0] else None, over_cloud=long)
+        _draw_curve(ax, curve, "95 % band" if curve is banded else None, over_cloud=long)
     for points in item.points:
         _draw_points(ax, points)
     set_text(ax, item.x_label, item.y_label, item.title)
     # Finding the best place means testing every point: for a record that takes longer than drawing it.
-    if long:
-        make_room(ax)
-    set_legend(ax, place="upper right" if long else "best")
-    return ax
+    set_legend(ax, "upper right" if long else "best")
 
 
-def residuals(item: Comparison, ax: Axes | None = None) -> Axes:
+def residuals(item: Comparison, ax: Axes) -> None:
     """Residuals at the point fit in units of the noise sd, with the band that holds 95 % of a good fit's.
 
     Raises
@@ -90,18 +89,16 @@ def residuals(item: Comparison, ax: Axes | None = None) -> Axes:
     """
     if item.residuals is None or item.residual_x is None:
         raise ValueError(f"{item.label} has no residuals")
-    ax = own_axes(ax, height=2.2)
+    many = item.residuals.size > _MANY
     ax.axhspan(-TWO_SIDED_95, TWO_SIDED_95, color=BLUE, alpha=0.13, lw=0)
     ax.axhline(0.0, color=GREY, lw=0.8)
-    many = item.residuals.size > _MANY
     ax.plot(item.residual_x, item.residuals, ls="", marker="." if many else "o", ms=2 if many else 4.5, color=BLACK)
-    limit = 1.1 * max(3.0, float(np.max(np.abs(item.residuals), initial=0.0, where=np.isfinite(item.residuals))))
+    limit = 1.1 * max(3.0, _largest(item.residuals))
     ax.set_ylim(-limit, limit)
     set_text(ax, item.x_label, "residual / sd [1]")
-    return ax
 
 
-def autocorrelation(item: Comparison, ax: Axes | None = None) -> Axes:
+def autocorrelation(item: Comparison, ax: Axes) -> None:
     """Autocorrelation of the residuals from lag 1, with the 95 % band of a white record.
 
     Raises
@@ -111,41 +108,39 @@ def autocorrelation(item: Comparison, ax: Axes | None = None) -> Axes:
     """
     if item.autocorrelation is None:
         raise ValueError(f"{item.label} has no autocorrelation")
-    ax = own_axes(ax, height=2.2)
-    lags = np.arange(1, item.autocorrelation.size + 1)
-    bound = item.autocorrelation_bound
-    if bound is not None:
+    bound = item.autocorrelation_bound or 0.0
+    if bound:
         ax.axhspan(-bound, bound, color=BLUE, alpha=0.13, lw=0, label="95 % of white records")
     ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.vlines(lags, 0.0, item.autocorrelation, color=BLACK, lw=1.3)
-    largest = float(np.max(np.abs(item.autocorrelation), initial=0.0, where=np.isfinite(item.autocorrelation)))
-    limit = 1.25 * max(largest, 2.0 * (bound or 0.0), 0.05)
+    ax.vlines(np.arange(1, item.autocorrelation.size + 1), 0.0, item.autocorrelation, color=BLACK, lw=1.3)
+    limit = 1.25 * max(_largest(item.autocorrelation), 2.0 * bound, 0.05)
     ax.set_ylim(-limit, limit)
     set_text(ax, "lag [samples]", "autocorrelation [1]")
-    set_legend(ax, place="above")  # bars of a coloured record reach everywhere
-    return ax
+    set_legend(ax, "above")  # bars of a coloured record reach everywhere
+
+
+def _largest(values: np.ndarray) -> float:
+    return float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values)))
 
 
 def comparison_figure(item: Comparison) -> Figure:
     """The panel of a comparison with the residual and autocorrelation panels that it has."""
-    if item.autocorrelation is not None and item.residuals is not None:
+    if item.residuals is None:
+        comparison(item, ax := new_axes(height=5.6))
+        return figure_of(ax)
+    if item.autocorrelation is None:
+        figure = new_figure(6.4, 5.6)
+        top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (2.4, 1.0), "hspace": 0.12})
+    else:
         figure = new_figure(9.0, 5.6)
         grid = figure.add_gridspec(2, 2, height_ratios=(1.7, 1.0), hspace=0.38, wspace=0.25)
-        comparison(item, figure.add_subplot(grid[0, :]))
-        residuals(item, figure.add_subplot(grid[1, 0]))
+        top, bottom = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
         autocorrelation(item, figure.add_subplot(grid[1, 1]))
-        figure.subplots_adjust(left=0.09, right=0.98, bottom=0.1, top=0.93)
-        return figure
-    if item.residuals is None:
-        return figure_of(comparison(item, own_axes(None, height=5.6)))
-    figure = new_figure(6.4, 5.6)
-    top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (2.4, 1.0), "hspace": 0.12})
     comparison(item, top)
     residuals(item, bottom)
-    top.set_xlabel("")
-    top.tick_params(labelbottom=False)
-    figure.subplots_adjust(left=0.14, right=0.97, bottom=0.11, top=0.93)
-    figure.align_ylabels([top, bottom])
+    if item.autocorrelation is None:
+        top.label_outer()
+        figure.align_ylabels([top, bottom])
     return figure
 
 
@@ -153,53 +148,44 @@ def side_by_side(items: Sequence[Comparison]) -> Figure:
     """All panels in one figure, two in a row."""
     columns = min(len(items), 2)
     rows = -(-len(items) // columns)
-    figure = new_figure(6.4 * columns, 4.4 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for ax, item in zip_longest(grid.flat, items):
+    figure = new_figure(6.4 * columns, 4.4 * rows, wspace=0.2, hspace=0.3)
+    for ax, item in zip_longest(figure.subplots(rows, columns, squeeze=False).flat, items):
         if item is None:
             ax.set_axis_off()
         else:
             comparison(item, ax)
-    figure.subplots_adjust(
-        left=0.9 / (6.4 * columns),
-        right=1 - 0.2 / (6.4 * columns),
-        bottom=0.62 / (4.4 * rows),
-        top=1 - 0.39 / (4.4 * rows),
-        wspace=0.2,
-        hspace=0.3,
-    )
     return figure
 
 
-def point_fit_starts(fit: PointFit, ax: Axes | None = None) -> Axes:
+def starts_size(fit: PointFit) -> tuple[float, float]:
+    """Width and height of ``point_fit_starts``, inches."""
+    return 7.2, 1.5 + 0.25 * len(fit.names)
+
+
+def point_fit_starts(fit: PointFit, ax: Axes) -> None:
     """Where each start of the point fit began and ended, per parameter, in standard deviations from the best maximum.
 
     The standard deviation is that of the Laplace approximation in the unconstrained space; a parameter for which it is
     not a positive number is shown in the bare unconstrained unit. Starts that stalled end in a cross.
     """
-    d, height = len(fit.names), 1.5 + 0.25 * len(fit.names)
-    if ax is None:
-        ax = own_axes(None, 7.2, height)
-        figure_of(ax).subplots_adjust(left=0.36, right=0.97, bottom=0.7 / height, top=1 - 0.6 / height)
     variance = np.diag(fit.covariance)
     sd = np.sqrt(np.where(np.isfinite(variance) & (variance > 0), variance, 1.0))
-    rows = np.arange(d)[::-1]
-    shifts = np.linspace(0.25, -0.25, len(fit.starts))
+    rows = np.arange(len(fit.names))[::-1]
     stalled = np.asarray(fit.stalled, dtype=bool)
     ax.set_xscale("symlog", linthresh=1.0)
     ax.xaxis.set_major_formatter("{x:g}")
-    for i, (start, end, shift) in enumerate(zip(fit.starts, fit.ends, shifts, strict=True)):
+    for i, shift in enumerate(np.linspace(0.25, -0.25, len(fit.starts))):
         marker, size, text = ("x", 7, "end, stalled") if stalled[i] else ("o", 4, "end")
         first = not np.any(stalled[:i] == stalled[i])
+        start, end = (fit.starts[i] - fit.u) / sd, (fit.ends[i] - fit.u) / sd
         style: dict[str, Any] = {"ls": "", "color": CYCLE[i % len(CYCLE)]}
-        ax.plot((start - fit.u) / sd, rows + shift, marker="o", mfc="none", ms=5, label="" if i else "start", **style)
-        ax.plot((end - fit.u) / sd, rows + shift, marker=marker, ms=size, label=text if first else "", **style)
+        ax.plot(start, rows + shift, marker="o", mfc="none", ms=5, label="" if i else "start", **style)
+        ax.plot(end, rows + shift, marker=marker, ms=size, label=text if first else "", **style)
     ax.axvline(0.0, color=GREY, lw=0.8, zorder=0)
     ax.set_yticks(rows, [plain_symbol(name) for name in fit.names], parse_math=False)
-    ax.set_ylim(-0.8, d - 0.2)
+    ax.set_ylim(-0.8, len(rows) - 0.2)
     set_text(ax, "distance from the best maximum [posterior sd]", "", "Starts of the point fit")
-    set_legend(ax, place="above")
-    return ax
+    set_legend(ax, "above")
 
 
 def _draw_curve(ax: Axes, curve: Curve, band_label: str | None, over_cloud: bool) -> None:
@@ -218,22 +204,11 @@ def _draw_curve(ax: Axes, curve: Curve, band_label: str | None, over_cloud: bool
 
 
 def _draw_points(ax: Axes, points: Points) -> None:
-    style = _POINT_STYLES[points.role]
     if points.x.size > _MANY:
         ax.plot(points.x, points.y, ls="", marker=".", ms=3.5, color=GREY, label=points.label, zorder=2)
     else:
-        ax.errorbar(
-            points.x,
-            points.y,
-            points.y_error,
-            ls="",
-            ms=6.5,
-            mew=1.4,
-            elinewidth=1.1,
-            label=points.label,
-            zorder=4,
-            **style,
-        )
+        style = {"ms": 6.5, "mew": 1.4, "elinewidth": 1.1, "zorder": 4, **_POINT_STYLES[points.role]}
+        ax.errorbar(points.x, points.y, points.y_error, ls="", label=points.label, **style)
     if points.flagged is not None and np.any(points.flagged):
         ax.plot(
             points.x[points.flagged], points.y[points.flagged], ls="", marker="s", ms=13, mfc="none", mew=1.6,
@@ -272,22 +247,15 @@ def readings_figure(table: Table[Any], findings: Sequence[Finding]) -> Figure:
     across, channels = (names[0], names[1:]) if len(names) > 1 else ("", names)
     figure = new_figure(8.0, 0.9 + 2.1 * len(channels))
     axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
-    figure.subplots_adjust(
-        left=0.12, right=0.97, bottom=0.62 / figure.get_figheight(), top=1 - 0.4 / figure.get_figheight()
-    )
-    for index, (ax, name) in enumerate(zip(axes, channels, strict=True)):
+    for ax, name in zip(axes, channels, strict=True):
         channel_with_findings(table, name, findings, ax, across)
-        ax.set_title(f"{table.kind} {table.label}" if index == 0 else "", loc="left", parse_math=False)
-        if index + 1 < len(channels):
-            ax.set_xlabel("")
+        ax.label_outer()
+    axes[0].set_title(f"{table.kind} {table.label}", loc="left", parse_math=False)
     return figure
 
 
-def channel_with_findings(
-    table: Table[Any], name: str, findings: Sequence[Finding], ax: Axes | None = None, across: str = "time"
-) -> Axes:
+def channel_with_findings(table: Table[Any], name: str, findings: Sequence[Finding], ax: Axes, across: str) -> None:
     """Draw one column against the column ``across`` ("": row numbers), in the units of the file, with marked findings."""
-    ax = own_axes(ax)
     y = _displayed(table, name)
     x = _displayed(table, across) if across else np.arange(1.0, len(y) + 1.0)
     record = "time" in table.columns
@@ -296,17 +264,11 @@ def channel_with_findings(
     if record:
         _mark_times(table, findings, ax)
     for code, words, marker, color in _MARKS:
-        rows = [
-            row
-            for found in findings
-            if found.code == code and found.facts.get("column", name) == name
-            for row in found.facts["rows"]
-        ]
-        if rows:
+        named = [found.facts for found in findings if found.code == code and found.facts.get("column", name) == name]
+        if rows := [row for facts in named for row in facts["rows"]]:
             ax.plot(x[rows], y[rows], ls="none", marker=marker, ms=5.0, color=color, label=words, zorder=3)
-    set_text(ax, _label(table, across) if across else "row", _label(table, name))
-    set_legend(ax, place="above")
-    return ax
+    set_text(ax, *(f"{key}, {table.columns[key].unit}" if key else "row" for key in (across, name)))
+    set_legend(ax, "above")
 
 
 def _mark_times(table: Table[Any], findings: Sequence[Finding], ax: Axes) -> None:
@@ -333,14 +295,8 @@ def _displayed(table: Table[Any], name: str) -> np.ndarray:
     return table[name] * table.columns[name].to_display
 
 
-def _label(table: Table[Any], name: str) -> str:
-    return f"{name}, {table.columns[name].unit}"
-
-
-# runs: Figures of recorded runs, as the paper draws them: time histories (Fig. 4), phase plane (Figs. 9, 12), force
-# (4d).
-#
-# Every figure is ``(view, ax=None) -> ax`` and draws into ``ax`` or into a figure of its own.
+# motions: Recorded and simulated motions as the paper draws them: time histories (Fig. 4), phase plane (Figs. 9, 12),
+# force (4d).
 
 
 _MM = 1e3
@@ -353,82 +309,84 @@ _CHANNELS = {
 }
 
 
-def phase_plane_of_run(view: RecordView, ax: Axes | None = None) -> Axes:
-    """Rate against x_rel, both filtered, with the impact line and the Poincaré points at the drive's phase."""
-    ax = own_axes(ax)
-    # At the ends of the record the derivative is that of a polynomial's edge, and mostly noise.
+@dataclass(frozen=True)
+class MotionView:
+    """A simulated motion, SI, with the fields of a ``RecordView`` that ``overview`` draws."""
+
+    time: np.ndarray
+    channels: Mapping[str, np.ndarray]
+    x_rel: np.ndarray
+    rate: np.ndarray
+    section_x_rel: np.ndarray
+    section_rate: np.ndarray
+    gap: float
+    gap_seen: float | None = None
+    samples: int = 1
+    label: str = ""
+
+
+def phase_plane(view: RecordView | MotionView, ax: Axes) -> None:
+    """Rate against x_rel, with the impact line and the Poincaré points at the drive's phase."""
+    # At the ends of a filtered record the derivative is that of a polynomial's edge, and mostly noise.
     inside = slice(view.samples // 2, len(view.time) - view.samples // 2)
     ax.plot(_MM * view.x_rel[inside], view.rate[inside], color=BLUE, lw=0.6)
+    recorded = view.label != ""
     lines = []
     if np.isfinite(view.gap):
-        lines.append(ax.axvline(_MM * view.gap, color=VERMILION, ls="--", lw=1.2, label="gap as stated"))
+        words = "gap as stated" if recorded else "impact line"
+        lines.append(ax.axvline(_MM * view.gap, color=VERMILION, ls="--", lw=1.2, label=words))
     if view.gap_seen is not None:
         lines.append(ax.axvline(_MM * view.gap_seen, color=VERMILION, ls=":", lw=1.6, label="contacts begin"))
-    ax.plot(
-        _MM * view.section_x_rel,
-        view.section_rate,
-        ls="none",
-        marker="o",
-        ms=4.5,
-        color=GREEN,
-        zorder=3,
-        label="once a period",
-    )
-    set_text(ax, "X1 - X2, mm", "rate of X1 - X2, m/s", f"motion: {view.label}")
-    below_legend = make_room(ax)
+    look: dict[str, Any] = {"marker": "o", "ms": 4.5, "color": GREEN, "zorder": 3, "label": "once a period"}
+    ax.plot(_MM * view.section_x_rel, view.section_rate, ls="none", **look)
+    words = ("rate of X1 - X2, m/s", f"motion: {view.label}") if recorded else ("Y1 - Y2, m/s", "")
+    set_text(ax, "X1 - X2, mm", *words)
+    below_legend = set_legend(ax, "upper right")
     for line in lines:
         line.set_ydata([0.0, below_legend])
-    set_legend(ax, place="upper right")
-    return ax
 
 
-def force_on_rod(view: RecordView, ax: Axes | None = None, model: tuple[np.ndarray, np.ndarray] | None = None) -> Axes:
-    """K times the current against time, and beside it a model's (times, force) where given, s and N.
+def force_on_rod(record: RunRecord, ax: Axes) -> None:
+    """K times the recorded current against time, and beside it the fitted drive.
 
     Raises
     ------
     ValueError
         If the view has no force: it was made without K, or from a table without current.
     """
+    view = record.view
     if view.force is None:
         raise ValueError("this view has no force: give view_record a K and a table with current")
-    ax = own_axes(ax)
     ax.plot(view.time, view.force, color=PURPLE, lw=1.0, label="K times current")
-    if model is not None:
-        ax.plot(*model, color=BLACK, ls="--", lw=1.2, label="model")
+    ax.plot(view.time, record.force, color=BLACK, ls="--", lw=1.2, label="model")
     set_text(ax, "time, s", "force on the rod, N", f"motion: {view.label}")
-    make_room(ax)
-    set_legend(ax, place="upper right")
-    return ax
+    set_legend(ax, "upper right")
 
 
-def channel_history(view: RecordView, name: str, ax: Axes | None = None) -> Axes:
+def channel_history(view: RecordView | MotionView, name: str, ax: Axes) -> None:
     """One raw channel against time; x_rel with the gap."""
-    ax = own_axes(ax)
     label, scale, color = _CHANNELS[name]
     ax.plot(view.time, scale * view.channels[name], color=color, lw=0.7)
     if name == "x_rel" and np.isfinite(view.gap):
         ax.axhline(scale * view.gap, color=VERMILION, ls="--", lw=1.2)
     set_text(ax, "time, s", label)
-    return ax
 
 
-def overview_size(view: RecordView) -> tuple[float, float]:
-    """Width and height of ``run_overview``, inches."""
+def overview_size(view: RecordView | MotionView) -> tuple[float, float]:
+    """Width and height of ``overview``, inches."""
     return 10.0, 1.2 + 1.25 * max(sum(name in view.channels for name in _CHANNELS), 3)
 
 
-def run_overview(view: RecordView, ax: Axes | None = None) -> Axes:
-    """Every recorded channel above each other, the phase plane beside them. Returns the phase plane."""
+def overview(view: RecordView | MotionView, figure: Figure | SubFigure) -> None:
+    """Every channel above each other, the phase plane beside them."""
+    set_margins(figure, left=1.0)
     names = [name for name in _CHANNELS if name in view.channels]
-    figure = new_figure(*overview_size(view)) if ax is None else subfigure_at(ax)
-    grid = figure.add_gridspec(len(names), 2, left=0.1, right=0.98, bottom=0.11, top=0.93, wspace=0.24, hspace=0.3)
+    grid = figure.add_gridspec(len(names), 2, wspace=0.24, hspace=0.3)
     for row, name in enumerate(names):
-        history = channel_history(view, name, figure.add_subplot(grid[row, 0]))
-        if row + 1 < len(names):
-            history.set_xlabel("")
-            history.tick_params(labelbottom=False)
-    return phase_plane_of_run(view, figure.add_subplot(grid[:, 1]))
+        ax = figure.add_subplot(grid[row, 0])
+        channel_history(view, name, ax)
+        ax.label_outer()
+    phase_plane(view, figure.add_subplot(grid[:, 1]))
 
 
 # corner: Corner plot: a histogram of every parameter, contours of every pair.
@@ -455,27 +413,20 @@ def corner_size(n: int) -> tuple[float, float, float]:
     return panel, 1.25 + panel * n, 1.25 + panel * n + (0.8 if n <= 2 else 0.0)
 
 
-def corner(result: Result, ax: Axes | None = None) -> Axes:
+def corner_axes(n: int) -> Axes:
+    """The axes of a corner plot of ``n`` parameters in a figure of its own."""
+    panel, width, height = corner_size(n)
+    place = (1.1 / width, 1.0 / height, panel * n / width, panel * n / height)
+    return new_figure(width, height).add_axes(place)
+
+
+def corner(columns: SampledParameters, ax: Axes) -> None:
     """Histogram of every sampled physical parameter and contours (68 %, 95 %) of every pair.
 
     The point fit is marked in black, the paper's estimate, where it lies in the picture, in vermilion.
-
-    Raises
-    ------
-    ValueError
-        If nothing was sampled.
     """
-    columns = sampled_parameters(result)
     n = len(columns.names)
-    panel, width, height = corner_size(n)
-    if ax is None:
-        ax = new_figure(width, height).add_axes(
-            (1.1 / width, 1.0 / height, panel * n / width, panel * n / height), frameon=False
-        )
-    else:
-        ax.set_frame_on(False)
-        panel = ax.get_window_extent().width / figure_of(ax).dpi / n
-    ax.set(xlim=(0, n), ylim=(0, n), xticks=[], yticks=[])
+    ax.set(xlim=(0, n), ylim=(0, n), xticks=[], yticks=[], frame_on=False)
     low, high = _limits(columns)
     flat = columns.draws.reshape(-1, n)
     place = (flat - low) / (high - low) * _BINS
@@ -483,13 +434,14 @@ def corner(result: Result, ax: Axes | None = None) -> Axes:
     bins = np.clip(place, 0, _BINS - 1).astype(np.int64)
     _contours(ax, bins, inside)
     _histograms(ax, bins, inside)
-    _frames(ax, n)
+    square = np.array([(0.0, 0.0), (_SIDE, 0.0), (_SIDE, _SIDE), (0.0, _SIDE), (0.0, 0.0)])
+    frames = [np.add(square, (j, n - 1 - i)) for i in range(n) for j in range(i + 1)]
+    ax.add_collection(LineCollection(frames, colors=BLACK, lw=0.9, clip_on=False))
     _marks(ax, (columns.map - low) / (high - low), BLACK, "+", "-")
     _marks(ax, (columns.paper - low) / (high - low), VERMILION, "x", "--")
-    _axes(ax, columns, low, high, panel)
+    _axes(ax, columns, low, high, ax.get_window_extent().width / figure_of(ax).dpi / n)
     above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)} if n <= 2 else {"loc": "upper right"}
-    ax.legend(handles=_key(), fontsize=TEXT, frameon=False, borderaxespad=0.2, **above)
-    return ax
+    set_legend(ax, handles=_key(), fontsize=TEXT, handlelength=2.0, borderaxespad=0.2, **above)
 
 
 def _limits(columns: SampledParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -526,9 +478,8 @@ def _contours(ax: Axes, bins: np.ndarray, inside: np.ndarray) -> None:
 def _smoothed(counts: np.ndarray) -> np.ndarray:
     """Binomial smoothing over five bins each way, so that contours follow the density and not the counting noise."""
     kernel = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
-    padded = np.pad(counts, 2)
-    rows = np.sum([weight * padded[k : k + _BINS] for k, weight in enumerate(kernel)], axis=0)
-    return np.sum([weight * rows[:, k : k + _BINS] for k, weight in enumerate(kernel)], axis=0)
+    rows = ndimage.convolve1d(counts, kernel, axis=0, mode="constant")
+    return ndimage.convolve1d(rows, kernel, axis=1, mode="constant")
 
 
 def _histograms(ax: Axes, bins: np.ndarray, inside: np.ndarray) -> None:
@@ -540,12 +491,6 @@ def _histograms(ax: Axes, bins: np.ndarray, inside: np.ndarray) -> None:
         edges = i + np.linspace(0.0, _SIDE, _BINS + 1)
         ax.stairs(heights, edges, baseline=base, color=PALE_BLUE, fill=True)
         ax.stairs(heights, edges, baseline=base, color=BLUE, lw=1.2)
-
-
-def _frames(ax: Axes, n: int) -> None:
-    square = np.array([(0.0, 0.0), (_SIDE, 0.0), (_SIDE, _SIDE), (0.0, _SIDE), (0.0, 0.0)])
-    corners = [np.array([j, n - 1 - i]) for i in range(n) for j in range(i + 1)]
-    ax.add_collection(LineCollection([square + corner for corner in corners], colors=BLACK, lw=0.9, clip_on=False))
 
 
 def _marks(ax: Axes, place: np.ndarray, color: str, marker: str, line: str) -> None:
@@ -612,34 +557,22 @@ def _key() -> tuple[Patch | Line2D, ...]:
 _POINTS, _WALKERS = 120, 2
 
 
-def traces_size(n: int) -> tuple[float, float]:
-    """Width and height of the figure of ``n`` parameters, inches."""
-    return 9.0, 0.8 + 1.15 * ((n + 1) // 2)
+def traces_size(columns: SampledParameters) -> tuple[float, float]:
+    """Width and height of ``traces``, inches."""
+    return 9.0, 0.8 + 1.15 * ((len(columns.names) + 1) // 2)
 
 
-def traces(result: Result, ax: Axes | None = None) -> Axes:
-    """A panel per physical parameter: a few walkers of each ensemble against the step, one colour per ensemble.
-
-    Returns the first panel.
-
-    Raises
-    ------
-    ValueError
-        If nothing was sampled.
-    """
-    columns = sampled_parameters(result)
+def traces(columns: SampledParameters, figure: Figure | SubFigure) -> None:
+    """A panel per physical parameter: a few walkers of each ensemble against the step, one colour per ensemble."""
     n = len(columns.names)
-    rows = (n + 1) // 2
-    width, height = traces_size(n)
-    figure = new_figure(width, height) if ax is None else subfigure_at(ax)
-    axes: Any = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    set_margins(figure, right=0.22, bottom=0.6, top=0.25, wspace=0.28, hspace=0.18)
+    axes: Any = figure.subplots((n + 1) // 2, 2, sharex=True, squeeze=False)
     every = max(1, columns.draws.shape[1] // _POINTS)
     shown = columns.draws[:, ::every, :_WALKERS]
     step = np.arange(shown.shape[1]) * every * columns.posterior.thin
-    for i, panel in enumerate(axes.flat):
-        if i >= n:
-            panel.remove()
-            continue
+    for panel in axes.flat[n:]:
+        panel.remove()
+    for i, panel in enumerate(axes.flat[:n]):
         for e, ensemble in enumerate(shown[..., i]):
             panel.plot(step, ensemble, color=CYCLE[e % len(CYCLE)], lw=0.6, alpha=0.8)
         panel.set_ylabel(f"{columns.symbols[i]} [{columns.units[i]}]", fontsize=SMALL, parse_math=False)
@@ -648,12 +581,7 @@ def traces(result: Result, ax: Axes | None = None) -> Axes:
         panel.ticklabel_format(axis="y", useOffset=False, style="plain")
         panel.spines[["top", "right"]].set_visible(False)
         panel.margins(x=0.01)
-    for panel in axes[-1]:
-        panel.set_xlabel("step after burn-in [1]", fontsize=TEXT)
-    if n % 2 and n > 1:
-        # The last panel on the right is empty: the axis above it takes its place at the foot of the column.
-        axes[-2, -1].tick_params(labelbottom=True)
-        axes[-2, -1].set_xlabel("step after burn-in [1]", fontsize=TEXT)
-    figure.subplots_adjust(left=0.1, right=0.975, bottom=0.6 / height, top=1 - 0.25 / height, wspace=0.28, hspace=0.18)
+        if i + 2 >= n:  # the lowest of its column; over an empty place too
+            panel.tick_params(labelbottom=True)
+            panel.set_xlabel("step after burn-in [1]", fontsize=TEXT)
     figure.align_ylabels()
-    return axes[0, 0]
