@@ -12,7 +12,7 @@ Law = tuple[Callable[[float], float], Callable[[float], float]]  # resistance fo
 def _force(q: Parameters, y: np.ndarray, contact: bool) -> float:
     r = y[0] - y[2]
     own = q["k1"] * r + q.get("k1_cubic", 0.0) * r**3
-    return own + q["c"] * (y[1] - y[3]) + (q["k2"] * (r - q["G"]) if contact else 0.0)
+    return own + q["c"] * (y[1] - y[3]) + (q["k2"] * max(r - q["G"], 0.0) ** q.get("power", 1.0) if contact else 0.0)
 
 
 def eq_1(q: Parameters) -> Law:
@@ -46,8 +46,9 @@ def simulate_scipy(
 ) -> tuple[np.ndarray, int]:
     """(states (n, 4) at ``times`` from ``start`` (4,), default at rest; closings of the gap).
 
-    q holds the parameters, P_d, Omega, possibly a phase, and departures from the paper's model: k1_cubic, N/m^3, and
-    backward, the friction of backward over that of forward motion. law: another law of friction than eq. (1).
+    q holds the parameters, P_d, Omega, possibly a phase, and departures from the paper's model: k1_cubic, N/m^3,
+    power, of the penetration in the contact, and backward, the friction of backward over that of forward motion.
+    law: another law of friction than eq. (1).
     """
     law, phase = law or eq_1(q), q.get("phase", 0.0)
     holds_forward, holds_backward = law[0](0.0), law[1](0.0)

@@ -241,14 +241,14 @@ def _commands(text: str) -> list[str]:
 
 
 def test_the_examples_in_python_give_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
-    """The motion, then a friction law that goes on from it."""
+    """The motion, then a force and a friction law that go on from it."""
     names: dict[str, object] = {"__name__": "readme"}
     examples = blocks("python", GUIDE["capsule_model"])
     for block in examples:
         exec(block, names)
         (promised,) = re.findall(r"print\(.*\)  # (\S+)", block)
         assert capsys.readouterr().out.split() == [promised]
-    assert len(examples) == EVERYTHING.count("```python") - len(blocks("python", GUIDE["results"])) == 2
+    assert len(examples) == EVERYTHING.count("```python") - len(blocks("python", GUIDE["results"])) == 3
 
 
 def test_the_example_of_a_result_uses_what_there_is() -> None:

@@ -13,7 +13,7 @@ from capsule_id.motions.lyapunov import largest_exponent
 from capsule_id.physics.batches import CHUNK, is_traced, lanes_of, run_lanes
 from capsule_id.physics.drive import Drive, Excitation, PeriodicDrive
 from capsule_id.physics.exact.engine import RunState, initial_lanes, kernel, take_step
-from capsule_id.physics.exact.taylor import CapsuleState, Constants, StepSeries, constants_of
+from capsule_id.physics.exact.taylor import CapsuleState, Constants, StepSeries, constants_of, touching
 from capsule_id.physics.friction import FrictionLaw, friction_law, horner
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Status, without_absent
 
@@ -116,7 +116,8 @@ def _with_step(
 ) -> SpanRecord:
     """``record`` with one step added; a lane that has ended adds nothing."""
     t = after.state.t
-    closed, opened = (after.mode.contact & ~before.mode.contact), (before.mode.contact & ~after.mode.contact)
+    held, holds = (touching(constants, run.mode, 1.0) for run in (before, after))
+    closed, opened = holds & ~held, held & ~holds
     counted = closed & ~(t - record.opened < merge)
     first = closed & jnp.isinf(record.opened)
     return SpanRecord(

@@ -17,7 +17,7 @@ from capsule_id.physics.drive import Drive
 from capsule_id.physics.exact.dense import values_of
 from capsule_id.physics.exact.engine import initial_lanes, march
 from capsule_id.physics.exact.taylor import constants_of
-from capsule_id.physics.forces import downhill, support
+from capsule_id.physics.forces import downhill, forces_of
 from capsule_id.physics.friction import FrictionLaw, friction_law, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Initial, Status, without_absent
 
@@ -93,11 +93,7 @@ def energy_balance(
     # The middle of a step names the piece of the drive: its ends belong to two.
     driven = Y1 if e.reaction is None else Y1 - columns_e.reaction * Y2
     work = total(columns_e.force_at(t, begins[..., None] + half[..., None]) * driven)
-    damping = columns_p.c
-    if p.c2 is not None:
-        closed = (X1 - X2 >= columns_p.G).mean(axis=-1, keepdims=True) > 0.5
-        damping = damping + columns_p.c2 * closed * (columns_p.k2 > 0.0)
-    damper = total(damping * (Y1 - Y2) ** 2)
+    damper = total(_damped(columns_p, X1 - X2, Y1 - Y2))
     rubbed = total(np.asarray(sliding_friction(columns_law, np.sign(Y2), Y2)) * Y2)
     last = rows[:, np.maximum(taken.sum(axis=0) - 1, 0), np.arange(len(status))]
     end = values_of(jnp.asarray(last), jnp.asarray(times[:, 1]))
@@ -106,17 +102,28 @@ def energy_balance(
     return EnergyBalance(*(fields if batched else (x[0] for x in fields)))
 
 
+def _damped(p: CapsuleParameters, r: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Power lost in dampers, W, at the nodes (step, lane, node); a contact is closed in a whole step or not at all."""
+    power = np.zeros_like(r)
+    for force in forces_of(p):
+        d, closed = r, True
+        if force.gap is not None:
+            d = force.side * r - force.reach
+            closed = (d >= 0.0).mean(axis=-1, keepdims=True) > 0.5
+        power += closed * force.damping(d, force.side * w) * (force.side * w)
+    return power
+
+
 def _stored(p: CapsuleParameters, X1: np.ndarray, Y1: np.ndarray, X2: np.ndarray, Y2: np.ndarray) -> np.ndarray:
-    r = X1 - X2
-    stored = 0.5 * (p.m1 * Y1**2 + p.m2 * Y2**2 + p.k1 * r**2)
-    # The energy of a support, k2 (r - G)^2 / 2, is its force times half the penetration.
-    if p.k2 is not None:
-        stored = stored + 0.5 * support(p.k2, p.G, r) * (r - p.G)
-    if p.k2_back is not None:
-        stored = stored + 0.5 * support(p.k2_back, p.G_back, -r) * (-r - p.G_back)
-    if p.k_cubic is not None:
-        stored = stored + 0.25 * p.k_cubic * r**4
-    return stored + downhill(p, p.m1) * X1 + downhill(p, p.m2) * X2
+    node, weight = np.polynomial.legendre.leggauss(NODES)
+    stored = 0.5 * (p.m1 * Y1**2 + p.m2 * Y2**2) + downhill(p, p.m1) * X1 + downhill(p, p.m2) * X2
+    columns = jax.tree.map(lambda leaf: np.asarray(leaf)[:, None], p)
+    for force in forces_of(columns):
+        r = (X1 - X2)[:, None]
+        d = r if force.gap is None else np.maximum(force.side * r - force.reach, 0.0)
+        # The integral of the force from 0 to d: exact for polynomials up to degree 31.
+        stored = stored + (0.5 * d * weight * force.elastic(0.5 * d * (1.0 + node))).sum(axis=-1)
+    return stored
 
 
 @partial(jax.jit, static_argnums=0)

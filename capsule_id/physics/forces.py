@@ -1,13 +1,16 @@
-"""Forces of the model but friction: support spring, primary spring and damper; exact and smoothed, elementwise, SI."""
+"""Forces between rod and capsule, each written once; the smoothed steps; the accelerometer. SI, elementwise."""
 
 import warnings
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.physics.batches import array_module
+from capsule_id.parameters import Parameter
+from capsule_id.physics.batches import NumberOrBatch, array_module
 from capsule_id.physics.drive import Drive
 from capsule_id.precision import require_float64
 
@@ -81,13 +84,150 @@ def smooth_ramp(x: Array, width: Array) -> jax.Array:
     return rounded + jnp.maximum(x - width, 0.0)
 
 
-# contacts: The support spring k2 behind the gap G, exact and smoothed; forces in N, lengths in m, elementwise.
+# forces: The forces between rod and capsule. All that computes with them (both engines, events, energy balance,
+# accelerometer) asks their classes, so a further one is a further class and nothing else.
 #
-# The exact engine integrates the linear spring as series coefficients (``exact.taylor``) and does not call ``support``.
+# Sign: f is the force that the rod puts on the capsule. p has the fields of ``CapsuleParameters``; a field that is None
+# is absent. The leaves of p and of the drive broadcast with the state, so leaves (batch,) need a last axis of length 1
+# beside samples (batch, n).
 
 
 #: A gap is far beyond a motion from this multiple of its largest |r| on, and from this size on, m.
 FAR, FAR_GAP = 20.0, 0.1
+#: An infinite gap counts as this wide, m: no run reaches it.
+OUT_OF_REACH = 1e6
+#: Newton steps from the linear to the nonlinear equilibrium; a cubic share of one half needs five.
+NEWTON_STEPS = 8
+
+
+class Force:
+    """A force between rod and capsule: a frozen pytree of leaves () or (batch,) with the formulas of the force.
+
+    ``CapsuleParameters(..., forces=(force, ...))`` takes any number of them. With a gap it is a contact, which acts
+    while d = side r - gap >= 0; without one it acts always, with d = r. The formulas work elementwise on NumPy and JAX
+    arrays. The exact engine evaluates them on Taylor series: made of +, - and * and whole powers (a Python ``int``) of d
+    and w they are exact there, and all others it refuses. The smoothed engine takes any.
+
+    parameters : a row for each leaf that is to be checked, with the leaf's name as its symbol
+    """
+
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+
+    @property
+    def gap(self) -> Any:
+        """m, infinite where it is never closed; None: no contact."""
+        return None
+
+    @property
+    def side(self) -> float:
+        """1.0: a contact pushes the capsule forward; -1.0: backward, behind a gap on the other side of the rod."""
+        return 1.0
+
+    @property
+    def present(self) -> Any:
+        """Whether there is something to meet: the closings of a contact that is not present do not count."""
+        return True
+
+    def elastic(self, d: Any) -> Any:
+        """The conservative part, N, at the stretch or penetration d, m."""
+        del d
+        return 0.0
+
+    def damping(self, d: Any, w: Any) -> Any:
+        """The part that dissipates, N, at d, m, and its rate w, m/s; 0 at w = 0."""
+        del d, w
+        return 0.0
+
+    @property
+    def reach(self) -> Any:
+        """``gap`` of a contact with ``OUT_OF_REACH`` in the place of infinity, m."""
+        return array_module(self.gap).minimum(self.gap, OUT_OF_REACH)
+
+    def on_capsule(self, r: Any, w: Any, penetration: Any = None) -> Any:
+        """The force along +X on the capsule, N, at r = X1 - X2, m, and w = Y1 - Y2, m/s.
+
+        penetration : half-width, m, over which a contact is smoothed: d is rounded off to R_w(d), and what is damped
+            fades in with H_w(d), so that beyond this width the smoothed force is the exact one; None: the exact one
+
+        For k d: 5 k penetration / 32 at d = 0, the largest deviation; the energy that it stores is of second order.
+        """
+        if self.gap is None:
+            return self.elastic(r) + self.damping(r, w)
+        d = self.side * r - self.reach
+        if penetration is None:
+            xp, acts = array_module(d), d >= 0.0
+            pressed, share = xp.where(acts, d, 0.0), 1.0
+        else:
+            # Off the contact the formula stands at a harmless point: its derivatives may be infinite at 0.
+            xp, acts, share = jnp, d > -penetration, smooth_heaviside(d, penetration)
+            pressed = jnp.where(acts, smooth_ramp(d, penetration), penetration)
+        force = self.elastic(pressed) + share * self.damping(pressed, self.side * w)
+        return self.side * xp.where(acts, force, 0.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Spring(Force):
+    """k d^power + c w: the rod's spring and damper, or a support behind the gap G; without stiffness no support.
+
+    k : N/m^power        c : N s/m, None: no damper        G : m, None: no contact        back : side -1
+    """
+
+    k: NumberOrBatch
+    c: NumberOrBatch | None = None
+    G: NumberOrBatch | None = None
+    power: int = field(default=1, metadata={"static": True})
+    back: bool = field(default=False, metadata={"static": True})
+
+    @property
+    def gap(self) -> Any:
+        """G."""
+        return self.G
+
+    @property
+    def side(self) -> float:
+        """-1.0 for a back spring."""
+        return -1.0 if self.back else 1.0
+
+    @property
+    def present(self) -> Any:
+        """Whether a support has a stiffness."""
+        return self.G is None or self.k > 0.0
+
+    def elastic(self, d: Any) -> Any:
+        """k d^power."""
+        return self.k * d**self.power
+
+    def damping(self, d: Any, w: Any) -> Any:
+        """c w."""
+        del d
+        return 0.0 if self.c is None else (self.c * self.present) * w
+
+
+def forces_of(p: Any) -> tuple[Force, ...]:
+    """All forces between rod and capsule: k1 r + c w, k_cubic r^3, the supports, and those of ``p.forces``."""
+    found: list[Force] = [Spring(p.k1, p.c)]
+    if p.k_cubic is not None:
+        found.append(Spring(p.k_cubic, power=3))
+    if p.k2 is not None and p.G is not None:
+        found.append(Spring(p.k2, p.c2, p.G))
+    if p.k2_back is not None and p.G_back is not None:
+        found.append(Spring(p.k2_back, None, p.G_back, back=True))
+    return (*found, *p.forces)
+
+
+def rod_on_capsule(p: Any, r: Any, w: Any, penetration: Any = None) -> Any:
+    """f, N: the sum of the forces; see ``Force.on_capsule``.
+
+    f = k1 r + k_cubic r^3 + c w + [r >= G] (k2 (r - G) + c2 w) + [r <= -G_back] k2_back (r + G_back)
+    """
+    return total(force.on_capsule(r, w, penetration) for force in forces_of(p))
+
+
+def total(terms: Iterable[Any]) -> Any:
+    """The sum of one or more terms."""
+    first, *others = terms
+    return sum(others, first)
 
 
 def warn_of_far_gap(G: Any, r: Any) -> None:
@@ -96,52 +236,6 @@ def warn_of_far_gap(G: Any, r: Any) -> None:
     if max(FAR * reach, FAR_GAP) < gap < np.inf:
         text = f"the gap is {1e3 * gap:.4g} mm and the largest |x_rel| {1e3 * reach:.3g} mm: no contact. Is it in m?"
         warnings.warn(text, stacklevel=3)
-
-
-def support(k2: Any, G: Any, r: Any) -> Any:
-    """H1 k2 (r - G), H1 = H(r - G) (paper, eq. (2)): 0 for r < G; NumPy and JAX.
-
-    At r = G: 0, continuous, slope jumps from 0 to k2. At r -> -infinity 0; at +infinity k2 (r - G).
-    """
-    return k2 * array_module(k2, G, r).maximum(r - G, 0.0)
-
-
-def support_smooth(k2: Array, G: Array, r: Array, penetration: Array) -> jax.Array:
-    """k2 R_w(r - G), w = ``penetration`` (m): its slope is k2 times the smoothed Heaviside H1 of eq. (2).
-
-    At r = G: 5 k2 w / 32, slope k2 / 2. Equal to ``support`` wherever |r - G| >= w, so at +-infinity.
-    The largest deviation, 5 k2 w / 32, stands at r = G; the energy that it stores, k2 w^2 / 14, is of second order.
-    """
-    return k2 * smooth_ramp(r - G, penetration)
-
-
-# forces: The force between rod and capsule, and the acceleration of the rod; NumPy and JAX, elementwise, SI.
-#
-# Sign: f is the force that the rod puts on the capsule. p has the fields of ``CapsuleParameters``; a field that is None
-# is absent. The leaves of p and of the drive broadcast with the state, so leaves (batch,) need a last axis of length 1
-# beside samples (batch, n).
-
-
-#: Newton steps from the linear to the cubic equilibrium; a cubic share of one half needs five.
-NEWTON_STEPS = 8
-
-
-def spring_and_damper(p: Any, r: Any, w: Any) -> Any:
-    """k1 r + k_cubic r^3 + c w, N: what acts without contact; r = X1 - X2, w = Y1 - Y2."""
-    f = p.k1 * r + p.c * w
-    return f if p.k_cubic is None else f + p.k_cubic * (r * r * r)
-
-
-def rod_on_capsule(p: Any, r: Any, w: Any) -> Any:
-    """The spring and damper, and both supports: N.
-
-    f = k1 r + k_cubic r^3 + c w + [r >= G] (k2 (r - G) + c2 w) + [r <= -G_back] k2_back (r + G_back)
-    """
-    f = spring_and_damper(p, r, w)
-    if p.k2 is not None and p.G is not None:
-        f = f + support(p.k2, p.G, r)
-        f = f if p.c2 is None else f + (p.c2 * w) * (r >= p.G) * (p.k2 > 0.0)
-    return f if p.k2_back is None else f - support(p.k2_back, p.G_back, -r)
 
 
 def downhill(p: Any, mass: Any) -> Any:
@@ -153,10 +247,10 @@ def equilibrium(p: Any) -> Any:
     """x_rel, m, of the rod at rest with the drive off and no contact: k1 r + k_cubic r^3 = -m1 g sin(slope)."""
     load = -downhill(p, p.m1)
     r = load / p.k1
-    if p.k_cubic is None:
-        return r
-    for _ in range(NEWTON_STEPS):
-        r = r - (p.k1 * r + p.k_cubic * r**3 - load) / (p.k1 + 3.0 * p.k_cubic * r**2)
+    free = [force.elastic for force in forces_of(p) if force.gap is None]
+    for _ in range(NEWTON_STEPS if len(free) > 1 else 0):
+        pull, slope = jax.jvp(lambda r: total(elastic(r) for elastic in free), (r,), (jnp.ones_like(r),))
+        r = r - (pull - load) / slope
     return r
 
 

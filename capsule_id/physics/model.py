@@ -36,6 +36,7 @@ from capsule_id.parameters import CAPSULE_LEAVES, TABLE
 from capsule_id.physics.batches import NumberOrBatch, is_traced, lanes_of, run_lanes
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drive import Excitation as Excitation
+from capsule_id.physics.forces import Force
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
 from capsule_id.precision import require_float64
 
@@ -67,6 +68,7 @@ class CapsuleParameters:
     slope : of the ground, rad, +X uphill         N0 : force that presses the capsule down, N, besides the weight
     mu_back : static friction coefficient of backward sliding, 1; None: as mu
     ratio : kinetic over static friction, 1       viscous : viscous friction of the ground, N s/m
+    forces : further forces between rod and capsule, each of a class of its own
 
     k2 = 0 or G = inf: no support spring, and no c2; likewise the back spring.
     """
@@ -89,6 +91,7 @@ class CapsuleParameters:
     mu_back: NumberOrBatch | None = None
     ratio: NumberOrBatch = 0.5
     viscous: NumberOrBatch = 0.0
+    forces: tuple[Force, ...] = ()
 
 
 AnyDrive = TypeVar("AnyDrive", bound=Drive)
@@ -123,7 +126,7 @@ def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:
     own = tuple(row for symbol, row in CAPSULE_LEAVES.items() if symbol not in _OWN_FRICTION)
     leaves = [
         (row, getattr(owner, row.symbol))
-        for owner, rows in ((p, own), (e, e.parameters), (law, law.parameters))
+        for owner, rows in ((p, own), *((part, part.parameters) for part in (e, law, *p.forces)))
         for row in rows
     ]
     still = jnp.zeros_like(jnp.asarray(p.m1))

@@ -81,8 +81,8 @@ def test_without_the_event_correction_the_friction_derivative_is_wrong(
         constants: Constants, mode: Mode, step: StepSeries, s: jax.Array, at: CapsuleState, kind: jax.Array
     ) -> tuple[CapsuleState, jax.Array]:
         held = jax.lax.stop_gradient(at)
-        d, v = jnp.where(kind == GAP, at.d - held.d, at.d), jnp.where(kind == VELOCITY, at.v - held.v, at.v)
-        return at._replace(d=d, v=v), kind == NONE - 1
+        (d,), v = at.gaps, jnp.where(kind == VELOCITY, at.v - held.v, at.v)
+        return at._replace(gaps=(jnp.where(kind == GAP, d - held.gaps[0], d),), v=v), kind == NONE - 1
 
     def at_rest(mu_and_k2: jax.Array) -> jax.Array:
         p, e, T = cases.one("fig10_Om_37.33")

@@ -1,8 +1,8 @@
-"""The smoothed forces: limits, derivatives over widths and velocities, and a friction law of one's own."""
+"""The forces: limits and derivatives of the smoothed ones, a friction law and a contact of one's own."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from capsule_id.errors import InputError
+from capsule_id.motions.response import response
 from capsule_id.parameters import Parameter
 from capsule_id.physics import forces as steps
-from capsule_id.physics.forces import support, support_smooth
+from capsule_id.physics.drive import Excitation
+from capsule_id.physics.energy import energy_balance
+from capsule_id.physics.forces import Force, Spring
 from capsule_id.physics.friction import CoulombStribeck, friction
+from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.physics.smooth.engine import breakaway, force_gate, friction_smooth
+from tests.scipy_capsule import simulate_scipy
 
 LAW = CoulombStribeck(mu=jnp.asarray(0.66), N=jnp.asarray(6.2784), v_s=jnp.asarray(0.3))
 F_B = 0.66 * 6.2784
@@ -27,7 +33,7 @@ SMOOTHED: dict[str, Callable[[jax.Array, float], jax.Array]] = {
     "heaviside": steps.smooth_heaviside,
     "abs": steps.smooth_abs,
     "ramp": steps.smooth_ramp,
-    "support": lambda x, w: support_smooth(18960.0, 0.0, x, w),
+    "support": lambda x, w: Spring(18960.0, G=0.0).on_capsule(x, 0.0, w),
     "friction": lambda x, w: friction_smooth(LAW, F_B, x, jnp.full_like(x, 1.3), (w, 0.05)),
 }
 
@@ -71,8 +77,11 @@ def test_documented_values_and_slopes_at_zero() -> None:
 
 def test_smoothed_is_exact_outside_its_width() -> None:
     r = 1e-3 + np.array([-1.0, -1e-3, -1e-6, 1e-6, 1e-3, 1.0])
-    exact = support(18960.0, 1e-3, jnp.asarray(r))
-    np.testing.assert_allclose(support_smooth(18960.0, 1e-3, jnp.asarray(r), 1e-6), exact, rtol=1e-12, atol=0.0)
+    for c, rounding in ((None, 0.0), (3.0, 1e-15)):
+        support = Spring(18960.0, c, G=1e-3)
+        exact = 18960.0 * np.maximum(r - 1e-3, 0.0) + (c or 0.0) * 0.2 * (r >= 1e-3)
+        np.testing.assert_allclose(support.on_capsule(r, 0.2), exact, rtol=1e-12, atol=0.0)
+        np.testing.assert_allclose(support.on_capsule(jnp.asarray(r), 0.2, 1e-6), exact, rtol=1e-12, atol=rounding)
     Y2 = jnp.asarray([-2.0, -1e-2, -1.6e-3, 1.6e-3, 1e-2, 2.0])
     for f in (-50.0, -F_B, -1.0, 0.0, 1.0, F_B, 50.0):
         held = friction_smooth(LAW, F_B, Y2, jnp.full(6, f), (1e-3, 0.05))
@@ -109,7 +118,9 @@ def test_narrow_switch_tends_to_the_exact_rule(rounding: float) -> None:
 
 def test_contact_has_a_potential() -> None:
     k2, w = 18960.0, 1e-5
-    energy, _ = quad(lambda x: float(support_smooth(k2, 0.0, x, w)), -2e-5, 2e-5, points=[-w, w], epsabs=1e-18)
+    energy, _ = quad(
+        lambda x: float(Spring(k2, G=0.0).on_capsule(x, 0.0, w)), -2e-5, 2e-5, points=[-w, w], epsabs=1e-18
+    )
     assert energy == pytest.approx(0.5 * k2 * (2e-5) ** 2 + k2 * w**2 / 14.0, rel=1e-9)
 
 
@@ -158,3 +169,93 @@ def test_a_law_with_two_thresholds() -> None:
     for Y2, expected in ((0.4, 2.2), (-0.4, -3.04)):
         moving = friction_smooth(_Ramped(), jnp.asarray(2.5), jnp.asarray(Y2), jnp.asarray(-7.0), (1e-3, 0.01))
         assert float(moving) == pytest.approx(expected, rel=1e-12)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Hertz(Force):
+    """k d^p behind the gap G: a contact that the package does not know."""
+
+    k: Any
+    p: Any
+    G: Any
+
+    @property
+    def gap(self) -> Any:
+        return self.G
+
+    def elastic(self, d: Any) -> Any:
+        return self.k * d**self.p
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Whole(_Hertz):
+    """The same with a whole power, which the exact engine takes."""
+
+    p: int = field(metadata={"static": True})
+
+
+LEAVES = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.66, "v_s": 0.3, "g": 9.81}
+DRIVE = {"P_d": 4.0, "Omega": 34.56}
+TIMES = 2.0 * np.pi / DRIVE["Omega"] * np.arange(6)
+
+
+def _run(*forces: Force, k2: float = 0.0, model: Any = "exact") -> Any:
+    p = CapsuleParameters(**LEAVES, k2=k2, G=1e-3, forces=forces)
+    return simulate(p, Excitation(**DRIVE), TIMES, model=model)
+
+
+def _by_scipy(k: float, power: float) -> tuple[np.ndarray, int]:
+    q = LEAVES | DRIVE | {"k2": k, "G": 1e-3, "power": power}
+    return simulate_scipy(q, TIMES, rtol=1e-10, atol=1e-13, max_step=1e-3)
+
+
+def test_a_contact_of_ones_own_is_smoothed_as_scipy_integrates_it() -> None:
+    expected, closings = _by_scipy(1e6, 1.5)
+    t = _run(_Hertz(1e6, 1.5, 1e-3), model="smooth")
+    travel = np.abs(expected[-1, 2])
+    assert int(t.contacts) == closings
+    np.testing.assert_allclose(t.X2, expected[:, 2], rtol=0.0, atol=0.01 * travel)
+    # The negative control: without the contact, or with a linear one, the capsule goes elsewhere.
+    for other in (_run(model="smooth"), _run(k2=18960.0, model="smooth")):
+        assert abs(float(other.X2[-1]) - expected[-1, 2]) > 0.05 * travel
+
+
+@pytest.mark.parametrize("call", [simulate, response, lambda p, e, _: energy_balance(p, e, (0.0, 1.0))])
+@pytest.mark.parametrize("force", [_Hertz(1e6, 1.5, 1e-3), _Hertz(18960.0, 1.0, 1e-3), _Whole(18960.0, 0, 1e-3)])
+def test_the_exact_engine_refuses_what_has_no_series_there(call: Callable[..., Any], force: Force) -> None:
+    p = CapsuleParameters(**LEAVES, k2=0.0, G=np.inf, forces=(force,))
+    arguments = (p, Excitation(**DRIVE)) if call is response else (p, Excitation(**DRIVE), TIMES)
+    with pytest.raises(InputError, match=r'whole powers .* use simulate with model="smooth"'):
+        call(*arguments)
+
+
+def test_power_1_is_the_built_in_contact_in_both_engines() -> None:
+    for force, model in ((_Hertz(18960.0, 1.0, 1e-3), "smooth"), (_Whole(18960.0, 1, 1e-3), "exact")):
+        own, built_in = _run(force, model=model), _run(k2=18960.0, model=model)
+        np.testing.assert_allclose(own.X2, built_in.X2, rtol=0.0, atol=1e-12)
+        assert int(own.contacts) == int(built_in.contacts) > 5
+
+
+def test_a_whole_power_is_exact() -> None:
+    expected, closings = _by_scipy(1e8, 2.0)
+    t = _run(_Whole(1e8, 2, 1e-3))
+    assert int(t.contacts) == closings
+    np.testing.assert_allclose(t.X2, expected[:, 2], rtol=0.0, atol=1e-9)
+    balance = energy_balance(
+        CapsuleParameters(**LEAVES, k2=0.0, G=1.0, forces=(_Whole(1e8, 2, 1e-3),)), Excitation(**DRIVE), (0.0, 1.0)
+    )
+    assert balance.relative_residual < 1e-9
+
+
+@pytest.mark.full
+def test_the_smoothed_contact_is_differentiable_in_its_own_leaves() -> None:
+    def end(x: jax.Array) -> jax.Array:
+        return _run(_Hertz(x[0], x[1], x[2]), model="smooth").X2[-1]
+
+    x = np.array([1e6, 1.5, 1e-3])
+    slopes = np.asarray(jax.grad(end)(x)), np.asarray(jax.jacfwd(end)(x))
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-8)
+    assert np.isfinite(slopes[0]).all()
+    assert (slopes[0] != 0.0).all()

@@ -14,7 +14,7 @@ from capsule_id.motions.bias import smoothing_bias
 from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import CHUNK
 from capsule_id.physics.drive import Excitation
-from capsule_id.physics.forces import smooth_abs, support_smooth
+from capsule_id.physics.forces import Spring, smooth_abs
 from capsule_id.physics.friction import friction_law
 from capsule_id.physics.model import CapsuleParameters, Status, simulate
 from capsule_id.physics.smooth import engine as smooth
@@ -76,7 +76,7 @@ def _tanh_field(system: smooth.System, piece: jnp.ndarray | None = None) -> smoo
     p, e, law, widths = system
 
     def field(t: jnp.ndarray, r: jnp.ndarray, Y1: jnp.ndarray, Y2: jnp.ndarray) -> tuple[jnp.ndarray, ...]:
-        f = p.k1 * r + p.c * (Y1 - Y2) + support_smooth(p.k2, p.G, r, widths.penetration)
+        f = p.k1 * r + p.c * (Y1 - Y2) + Spring(p.k2, G=p.G).on_capsule(r, 0.0, widths.penetration)
         held = law.forward(smooth_abs(Y2, widths.velocity)) * jnp.tanh(Y2 / widths.velocity)
         return (e.P_d * jnp.cos(e.Omega * t + e.phase) - f) / p.m1, Y2, (f - held) / p.m2
 

@@ -17,8 +17,8 @@ from capsule_id.physics.drive import Drive, SwitchingDrive
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact.dense import WIDTH, Samples, read_off, row_of, samples_at
 from capsule_id.physics.exact.taylor import (
-    BACK,
     GAP,
+    LOWER,
     NONE,
     SWITCH,
     UPPER,
@@ -38,8 +38,10 @@ from capsule_id.physics.exact.taylor import (
     rod_rate,
     series,
     size,
+    touching,
     trusted,
 )
+from capsule_id.physics.forces import Force
 from capsule_id.physics.friction import FrictionLaw, Scaled, sliding_friction
 from capsule_id.physics.model import CapsuleParameters, Initial, Status, Trajectory, admissible
 from capsule_id.precision import require_float64
@@ -102,7 +104,7 @@ Kernel = Callable[[CapsuleParameters, Drive, FrictionLaw, Initial, jax.Array], T
 class RunState(NamedTuple):
     """Everything that a step changes, every leaf (L,): the state, its mode, and the progress of the run.
 
-    contacts, contacts_back : closings of the gap and of the back gap; the latter None without a back spring
+    contacts, contacts_back : closings of the gap and of the back gap
     """
 
     state: CapsuleState
@@ -112,7 +114,7 @@ class RunState(NamedTuple):
     contacts: jax.Array
     events: jax.Array
     steps: jax.Array
-    contacts_back: jax.Array | None = None
+    contacts_back: jax.Array
 
 
 def correct(
@@ -122,21 +124,22 @@ def correct(
 
     s, at : the located time and the state there, in the mode before the event
     """
-    spring_force = rod_force(constants, at, mode)
-    f = force_on_capsule(constants, spring_force, at.drive)
+    spring_force, D = rod_force(constants, at, mode), constants.drive.value(at.drive)
+    f = force_on_capsule(constants, spring_force, D)
     acceleration = (f - sliding_friction(constants.law, mode.sigma, at.v)) / constants.m2
     a2 = jnp.where(mode.sigma != 0.0, acceleration, 0.0)
-    w_rate = rod_rate(constants, spring_force, at.drive) - a2
+    w_rate = rod_rate(constants, spring_force, D) - a2
     level = jnp.where(kind == UPPER, -constants.F_forward, constants.F_backward)
     f_rates = [k * x for k, x in enumerate(step.f)][1:]
     braking = (jnp.abs(f) + jnp.maximum(constants.F_forward, constants.F_backward)) / constants.m2
-    meets = (kind == GAP) if at.b is None else (kind == GAP) | (kind == BACK)
-    g = jnp.where(kind == GAP, at.d, jnp.where(kind == VELOCITY, at.v, f + level))
-    rate = jnp.where(meets, at.w, jnp.where(kind == VELOCITY, a2, force_rate(constants, at, mode, w_rate)))
-    onset_or_stop = jnp.where(kind == VELOCITY, braking, size(f_rates, s) / step.h)
-    typical = jnp.where(meets, size(step.w, s), onset_or_stop)
-    if at.b is not None:
-        g = jnp.where(kind == BACK, at.b, g)
+    stops = kind == VELOCITY
+    g = jnp.where(stops, at.v, f + level)
+    rate = jnp.where(stops, a2, force_rate(constants, at, mode, w_rate))
+    typical = jnp.where(stops, braking, size(f_rates, s) / step.h)
+    for i, force in enumerate(constants.contacts):
+        meets = kind == GAP + i
+        g, rate = jnp.where(meets, at.gaps[i], g), jnp.where(meets, force.side * at.w, rate)
+        typical = jnp.where(meets, size(step.w, s), typical)
     if isinstance(constants.drive, SwitchingDrive):
         switch = kind == SWITCH
         g = jnp.where(switch, at.t - constants.drive.next_switch(at.drive), g)
@@ -148,16 +151,12 @@ def correct(
     if isinstance(constants.drive, SwitchingDrive):
         following = constants.drive.switched(drive)
         drive = tuple(jnp.where(kind == SWITCH, x, y) for x, y in zip(following, drive, strict=True))
-    return CapsuleState(
-        at.t + dt,
-        at.r + before.w * dt,
-        jnp.where(kind == GAP, 0.0, at.d + before.w * dt),
-        at.w + w_rate * dt,
-        at.X2 + before.v * dt,
-        jnp.where(kind == VELOCITY, 0.0, at.v + a2 * dt),
-        drive,
-        None if at.b is None else jnp.where(kind == BACK, 0.0, at.b + before.w * dt),
-    ), grazing
+    way = before.w * dt
+    gaps = tuple(
+        jnp.where(kind == GAP + i, 0.0, at.gaps[i] + force.side * way) for i, force in enumerate(constants.contacts)
+    )
+    v = jnp.where(stops, 0.0, at.v + a2 * dt)
+    return CapsuleState(at.t + dt, at.r + way, at.w + w_rate * dt, at.X2 + before.v * dt, v, drive, gaps), grazing
 
 
 def _mode_after(constants: Constants, mode: Mode, new: CapsuleState, kind: jax.Array) -> Mode:
@@ -166,22 +165,17 @@ def _mode_after(constants: Constants, mode: Mode, new: CapsuleState, kind: jax.A
     Contacts and the capsule's motion change one at a time; a second event at the same instant follows next. Where an
     event makes the force on the capsule jump, a stuck capsule may set off at once.
     """
-    contact, back = jnp.where(kind == GAP, new.w > 0.0, mode.contact), mode.back
-    if back is not None:
-        back = jnp.where(kind == BACK, new.w < 0.0, back)
-    after = Mode(contact, mode.sigma, back)
-    moved = (kind > GAP) & (kind < BACK)
-    if constants.c2 is not None:
-        moved = moved | ((kind == GAP) & (mode.sigma == 0.0))
+    contacts = tuple(
+        jnp.where(kind == GAP + i, force.side * new.w > 0.0, mode.contacts[i])
+        for i, force in enumerate(constants.contacts)
+    )
+    after = Mode(mode.sigma, contacts)
+    jumps = kind >= GAP
     if constants.reaction is not None and isinstance(constants.drive, SwitchingDrive):
-        moved = moved | ((kind == SWITCH) & (mode.sigma == 0.0))
+        jumps = jumps | (kind == SWITCH)
+    moved = ((kind >= VELOCITY) & (kind <= LOWER)) | (jumps & (mode.sigma == 0.0))
     sigma = motion_at(stop_gradient(constants), stop_gradient(new), after, kind)
     return after._replace(sigma=jnp.where(moved, sigma, mode.sigma))
-
-
-def _closed(before: jax.Array, after: jax.Array, stiffness: jax.Array) -> jax.Array:
-    """Whether a contact has closed; without stiffness there is no spring to meet."""
-    return after & ~before & (stiffness > 0.0)
 
 
 def take_step(
@@ -199,7 +193,7 @@ def take_step(
         left = jnp.where(left > 0.0, left, jnp.finfo(float).tiny)
     step = series(constants, state, mode, left)
     held = stop_gradient(step)
-    s, kind = first_event(stop_gradient(constants), mode, held, stop_gradient(state.b), trusted(held), active)
+    s, kind = first_event(stop_gradient(constants), mode, held, stop_gradient(state.gaps), trusted(held), active)
     whole = (kind == NONE) & (s >= 1.0) & held.last
     if switching is not None:
         kind = jnp.where(whole & switching, SWITCH, kind)
@@ -210,16 +204,15 @@ def take_step(
     finished = whole | ((at.t if switching is None else new.t) >= t_end)
     after = _mode_after(constants, mode, new, kind)
     steps = run.steps + active
-    finite = jnp.isfinite(at.d + at.w + at.X2 + at.v)
+    finite = jnp.isfinite(at.r + at.w + at.X2 + at.v)
     status = jnp.where(active & grazing, jnp.maximum(run.status, Status.GRAZING), run.status)
     status = jnp.where(active & ~finished & (steps >= max_steps), jnp.int32(Status.TOO_MANY_STEPS), status)
     status = jnp.where(active & ~finite, jnp.int32(Status.NOT_FINITE), status)
     moved = active & finite
-    contacts, back = run.contacts, run.contacts_back
-    if constants.k2 is not None:
-        contacts = contacts + (moved & _closed(mode.contact, after.contact, constants.k2))
-    if back is not None and mode.back is not None and after.back is not None and constants.k2_back is not None:
-        back = back + (moved & _closed(mode.back, after.back, constants.k2_back))
+    contacts, back = (
+        count + (moved & touching(constants, after, side) & ~touching(constants, mode, side))
+        for count, side in ((run.contacts, 1.0), (run.contacts_back, -1.0))
+    )
     state, mode = jax.tree.map(lambda x, y: jnp.where(moved, x, y), (new, after), (state, mode))
     return RunState(
         state,
@@ -240,20 +233,20 @@ def initial_lanes(
     X1, Y1, X2, Y2 = (jnp.asarray(x) for x in initial)
     rounding = 2.0 * jnp.finfo(float).eps * (jnp.abs(X1) + jnp.abs(X2))
 
-    def without_rounding(d: jax.Array, gap: jax.Array) -> jax.Array:
-        allowed = rounding + 2.0 * jnp.finfo(float).eps * gap
+    def without_rounding(contact: Force) -> jax.Array:
+        d = contact.side * (X1 - X2) - contact.reach
+        allowed = rounding + 2.0 * jnp.finfo(float).eps * contact.reach
         return jnp.where(jnp.abs(d) <= allowed, d - stop_gradient(d), d)
 
-    d = without_rounding((X1 - X2) - constants.G, constants.G)
-    b = None if constants.G_back is None else without_rounding((X1 - X2) + constants.G_back, constants.G_back)
-    state = CapsuleState(t, X1 - X2, d, Y1 - Y2, X2, Y2, constants.drive.state(t), b)
+    gaps = tuple(map(without_rounding, constants.contacts))
+    state = CapsuleState(t, X1 - X2, Y1 - Y2, X2, Y2, constants.drive.state(t), gaps)
     given = jnp.stack([*jax.tree.leaves(state), t_end])
     valid = jnp.all(jnp.isfinite(given), axis=0) & admissible(p, constants.drive, constants.law)
     valid = valid & constants.drive.covers(t, t_end)
-    zero = jnp.zeros(d.shape, jnp.int32)
+    zero = jnp.zeros(t.shape, jnp.int32)
     status = jnp.where(valid, jnp.int32(Status.OK), jnp.int32(Status.INVALID))
     mode = mode_at(stop_gradient(constants), stop_gradient(state))
-    return RunState(state, mode, valid & (t < t_end), status, zero, zero, zero, None if b is None else zero)
+    return RunState(state, mode, valid & (t < t_end), status, zero, zero, zero, zero)
 
 
 def march(
@@ -304,8 +297,8 @@ def run(
 
     lanes, samples = jax.lax.while_loop(lambda c: jnp.any(c[0].active), stretch, (lanes, samples))
     X1, Y1, X2, Y2 = (samples.values[:, i, :n] for i in range(4))
-    back = jnp.zeros_like(lanes.contacts) if lanes.contacts_back is None else lanes.contacts_back
-    return Trajectory(times, X1, Y1, X2, Y2, lanes.contacts, lanes.status, lanes.steps, lanes.events, back)
+    counts = lanes.contacts, lanes.status, lanes.steps, lanes.events, lanes.contacts_back
+    return Trajectory(times, X1, Y1, X2, Y2, *counts)
 
 
 def _run_folded(*lanes: Any) -> Trajectory:
@@ -337,8 +330,8 @@ def _folding(structure: Any) -> Callable[..., Trajectory]:
     return run_leaves
 
 
-def _is_own(part: Drive | FrictionLaw) -> bool:
-    """Whether a drive or law, and every law inside it, is one of this package."""
+def _is_own(part: Drive | FrictionLaw | Force) -> bool:
+    """Whether a drive, law or force, and every law inside it, is one of this package."""
     own = type(part).__module__.startswith("capsule_id.")
     return own and (not isinstance(part, Scaled) or _is_own(part.law))
 
@@ -368,8 +361,8 @@ def kernel(max_steps: int) -> Kernel:
             return _run(p, e, law, initial, times, t_end, bound)
         length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
         padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
-        # The samples of several lanes are scattered; a law or drive of the user may hold any operation.
-        single = L == 1 and _is_own(e) and _is_own(law)
+        # The samples of several lanes are scattered; a law, drive or force of the user may hold any operation.
+        single = L == 1 and all(map(_is_own, (e, law, *p.forces)))
         given = p, e, law, initial, padded, t_end, bound
         t = _run_single(*given)[0] if single else _run(*given)
         return t if n == length else _without_padding(t, n)

@@ -1,13 +1,15 @@
 """Taylor series of the motion inside one mode, and the changes of mode on a step."""
 
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental.jet import jet
 
+from capsule_id.errors import InputError
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.forces import spring_and_damper
+from capsule_id.physics.forces import Force, forces_of, total
 from capsule_id.physics.friction import (
     DEGREE,
     FrictionLaw,
@@ -69,17 +71,79 @@ def by_chain_rule(law: FrictionLaw, sigma: jax.Array, v: jax.Array) -> FrictionS
     return FrictionSeries(sigma * G[0][0], rate, extend)
 
 
+# forces: Their Taylor series, from the formulas of their classes.
+
+
+class Taylor:
+    """A power series whose coefficients follow from those of others, order by order.
+
+    It has +, - and * with series, numbers and arrays, and whole powers. Anything else done to it is a ``TypeError``.
+
+    rule : k -> coefficient k, asked once for each k in order        unit : (L,) 1.0, known at run time only
+    """
+
+    # Arithmetic of NumPy arrays is left to the methods below; a comparison is an error too.
+    __array_ufunc__ = __eq__ = __bool__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, rule: Callable[[int], Any], unit: jax.Array) -> None:
+        self.rule, self.unit, self.known = rule, unit, []
+
+    def __getitem__(self, k: int) -> Any:
+        while len(self.known) <= k:
+            self.known.append(self.rule(len(self.known)))
+        return self.known[k]
+
+    def __add__(self, other: Any) -> "Taylor":
+        if isinstance(other, Taylor):
+            return Taylor(lambda k: self[k] + other[k], self.unit)
+        return Taylor(lambda k: self[0] + other if k == 0 else self[k], self.unit)
+
+    def __mul__(self, other: Any) -> "Taylor":
+        if not isinstance(other, Taylor):
+            return Taylor(lambda k: self[k] * other, self.unit)
+        return Taylor(lambda k: divide(total(self[j] * other[k - j] for j in range(k + 1)), self.unit), self.unit)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __sub__(self, other: Any) -> "Taylor":
+        return self + -1.0 * other
+
+    def __rsub__(self, other: Any) -> "Taylor":
+        return -1.0 * self + other
+
+    def __pow__(self, n: Any) -> "Taylor":
+        if not isinstance(n, int) or n < 1:
+            return NotImplemented
+        return self if n == 1 else self * self ** (n - 1)
+
+
+def on_series(force: Force, d: Taylor, w: Taylor) -> Taylor:
+    """The force, N, along +X on the capsule, from the series of d and w.
+
+    Raises
+    ------
+    InputError
+        A formula that a Taylor series does not have: the force need not be analytic.
+    """
+    try:
+        found = force.side * (force.elastic(d) + force.damping(d, force.side * w))
+    except TypeError:
+        rule = "the exact engine takes forces made of +, - and * and whole powers (int) of d and w only"
+        raise InputError(rule, f"the formulas of {type(force).__name__}", 'use simulate with model="smooth"') from None
+    return found if isinstance(found, Taylor) else Taylor(lambda k: found if k == 0 else 0.0, d.unit)
+
+
 # taylor: Taylor series of the capsule's motion inside one mode, and how far they hold.
 #
-# Inside a mode (contact or not, stuck, forward or backward) the field is linear but for friction and the drive, so the
+# Inside a mode (contacts or not, stuck, forward or backward) the field is analytic and mostly linear, so the
 # coefficients follow from each other order by order. All arrays are (L,), a value per lane; a series is a list of
 # coefficients in the scaled time s = (t - t0)/h. Written in relative coordinates, which lose no digits when the capsule
 # has travelled far:
 #
-#     r = X1 - X2,  d = r - G (penetration of the support spring if positive),  w = r' = d' = Y1 - Y2,  X2,  v = Y2
+#     r = X1 - X2,  gaps: d = side r - G of each contact (its penetration if positive),  w = r' = Y1 - Y2,  X2,  v = Y2
 #
-# r and d are carried side by side: one is exactly 0 at the gap, the other keeps its digits where the gap is wide. So is
-# b = r + G_back where there is a back spring. What a capsule lacks is None: its terms are not in the compiled program.
+# r and each d are carried side by side: one is exactly 0 at the gap, the other keeps its digits where the gap is wide.
+# What a capsule lacks is None or missing: its terms are not in the compiled program.
 
 
 # A step ends where the last coefficients of the series, relative to the sum of all, would exceed this.
@@ -88,64 +152,55 @@ SERIES_TOLERANCE = 1e-9
 STEP_GUESS = 3.0
 # Leading coefficients that measure the size of a motion; later ones may be large only because the guess was.
 LEADING = 4
-# A gap that is infinite counts as this wide, m: no run reaches it.
-OUT_OF_REACH = 1e6
 # Sizes of motions, in m or m/s, are never smaller than this: it keeps their quotients away from underflow.
 VANISHING = 1e-150
 
 
 class Constants(NamedTuple):
-    """What is constant along a run, every leaf (L,), SI: parameters, drive, friction law and its break-away forces.
+    """What is constant along a run, every leaf (L,), SI: masses, forces, drive, friction law, its break-away forces.
 
     F_forward, F_backward : N; the capsule is stuck while Y2 = 0 and -F_backward <= force on it <= F_forward
-    k2, k2_back, k_cubic, c2, reaction : None where the spring, the term or the force is absent
+    reaction : None where the force is absent
     downhill : weights of rod and capsule along the slope, N, towards -X; None on level ground
     """
 
     m1: jax.Array
     m2: jax.Array
-    k1: jax.Array
-    k2: jax.Array | None
-    c: jax.Array
-    G: jax.Array
+    forces: tuple[Force, ...]
     drive: Drive
     law: FrictionLaw
     F_forward: jax.Array
     F_backward: jax.Array
-    k_cubic: jax.Array | None = None
-    c2: jax.Array | None = None
-    k2_back: jax.Array | None = None
-    G_back: jax.Array | None = None
     reaction: jax.Array | None = None
     downhill: tuple[jax.Array, jax.Array] | None = None
 
+    @property
+    def contacts(self) -> list[Force]:
+        """The forces with a gap, in the order of the state's gaps and the mode's contacts."""
+        return [force for force in self.forces if force.gap is not None]
+
 
 class CapsuleState(NamedTuple):
-    """Time (s), relative state (m, m/s), the drive's state there; every leaf (L,). b is None without a back spring."""
+    """Time (s), relative state (m, m/s), the drive's state there, penetrations of the contacts (m); every leaf (L,)."""
 
     t: jax.Array
     r: jax.Array
-    d: jax.Array
     w: jax.Array
     X2: jax.Array
     v: jax.Array
     drive: tuple[jax.Array, ...]
-    b: jax.Array | None = None
+    gaps: tuple[jax.Array, ...]
 
 
 class Mode(NamedTuple):
-    """Discrete choices: contact (bool), sigma (+1.0 forward, -1.0 backward, 0.0 stuck), every leaf (L,).
+    """Discrete choices: sigma (+1.0 forward, -1.0 backward, 0.0 stuck), contacts closed (bool); every leaf (L,)."""
 
-    back : (bool) contact with the back spring; None without one
-    """
-
-    contact: jax.Array
     sigma: jax.Array
-    back: jax.Array | None = None
+    contacts: tuple[jax.Array, ...]
 
 
 class StepSeries(NamedTuple):
-    """One step's series in s: w, v, d (as the state) and f, the force on the capsule; h (L,) s is the unit of time.
+    """One step's series in s: w, v, r (as the state) and f, the force on the capsule; h (L,) s is the unit of time.
 
     last : (L,) bool, s = 1 is the time at which the step had to end
     """
@@ -154,149 +209,125 @@ class StepSeries(NamedTuple):
     last: jax.Array
     w: Series
     v: Series
-    d: Series
+    r: Series
     f: Series
 
 
 def constants_of(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> Constants:
     """The constants of a run from lanes of parameters, drive and friction law."""
-    m1, m2, k1, c = (jnp.asarray(leaf) for leaf in (p.m1, p.m2, p.k1, p.c))
+    m1, m2 = jnp.asarray(p.m1), jnp.asarray(p.m2)
     still = jnp.zeros_like(m1)
     F_forward, F_backward = (jnp.broadcast_to(F, still.shape) for F in (law.forward(still), law.backward(still)))
-    k2, G = _contact(p.k2, p.G)
-    k2_back, G_back = _contact(p.k2_back, p.G_back)
-    c2 = None if k2 is None or p.c2 is None else jnp.where(k2 > 0.0, p.c2, 0.0)
     downhill = None
     if p.slope is not None:
         along = jnp.asarray(p.g * jnp.sin(p.slope))
         downhill = m1 * along, m2 * along
-    k_cubic = None if p.k_cubic is None else jnp.asarray(p.k_cubic)
-    general = (k_cubic, c2, k2_back, G_back, e.reaction, downhill)
-    return Constants(m1, m2, k1, k2, c, still if G is None else G, e, law, F_forward, F_backward, *general)
-
-
-def _contact(stiffness: Any, gap: Any) -> tuple[jax.Array | None, jax.Array | None]:
-    """Stiffness and gap of a spring, both None where it is absent; an infinite gap becomes a wide one."""
-    if stiffness is None or gap is None:
-        return None, None
-    within_reach = jnp.isfinite(gap)
-    return jnp.where(within_reach, stiffness, 0.0), jnp.where(within_reach, gap, OUT_OF_REACH)
+    forces = jax.tree.map(jnp.asarray, forces_of(p))
+    return Constants(m1, m2, forces, e, law, F_forward, F_backward, e.reaction, downhill)
 
 
 def step_rate(constants: Constants, state: CapsuleState, mode: Mode, friction_rate: jax.Array) -> jax.Array:
     """(L,) 1/s: inverse of a step of the order of the mode's fastest time scale, beyond which no series is worth it."""
     free = jnp.zeros_like(constants.m1) if constants.drive.prescribed else 1.0 / constants.m1
     compliance = free + jnp.where(mode.sigma != 0.0, 1.0 / constants.m2, 0.0)
-    stiffness = jnp.abs(tangent_stiffness(constants, mode, state.r))
-    oscillation = jnp.sqrt(stiffness * compliance)
-    damping = damping_of(constants, mode.contact)
+    stiffness, damping = slopes(constants, state, mode)
+    oscillation = jnp.sqrt(jnp.abs(stiffness) * compliance)
     return (oscillation + damping * compliance + constants.drive.rate(state.drive) + friction_rate) / STEP_GUESS
 
 
-def stiffness_of(constants: Constants, mode: Mode) -> jax.Array:
-    """(L,) N/m: df/dr in the mode, but for the cubic spring."""
-    stiffness = constants.k1
-    if constants.k2 is not None:
-        stiffness = stiffness + jnp.where(mode.contact, constants.k2, 0.0)
-    if constants.k2_back is not None and mode.back is not None:
-        stiffness = stiffness + jnp.where(mode.back, constants.k2_back, 0.0)
-    return stiffness
+def acting(constants: Constants, r: Any, gaps: Sequence[Any], mode: Mode) -> Iterator[tuple[Force, Any, Any]]:
+    """(force, its d, whether it acts) of every force, from r and the penetrations of the contacts."""
+    contacts = iter(zip(gaps, mode.contacts, strict=True))
+    for force in constants.forces:
+        yield (force, r, True) if force.gap is None else (force, *next(contacts))
 
 
-def tangent_stiffness(constants: Constants, mode: Mode, r: jax.Array) -> jax.Array:
-    """(L,) N/m: df/dr in the mode at r (L,)."""
-    stiffness = stiffness_of(constants, mode)
-    return stiffness if constants.k_cubic is None else stiffness + 3.0 * constants.k_cubic * r * r
-
-
-def damping_of(constants: Constants, contact: jax.Array) -> jax.Array:
-    """(L,) N s/m: df/dw in the mode."""
-    return constants.c if constants.c2 is None else constants.c + jnp.where(contact, constants.c2, 0.0)
+def terms(constants: Constants, state: CapsuleState, mode: Mode) -> list[jax.Array]:
+    """The parts of f in N in the mode: what the rod puts on the capsule, elastic and damping, force by force."""
+    return [
+        jnp.where(acts, force.side * part, 0.0)
+        for force, d, acts in acting(constants, state.r, state.gaps, mode)
+        for part in (force.elastic(d), force.damping(d, force.side * state.w))
+    ]
 
 
 def rod_force(constants: Constants, state: CapsuleState, mode: Mode) -> jax.Array:
-    """f in N in the mode: springs, supports and dampers, what the rod puts on the capsule."""
-    f = spring_and_damper(constants, state.r, state.w)
-    if constants.k2 is not None:
-        f = f + jnp.where(mode.contact, constants.k2, 0.0) * state.d
-    if constants.c2 is not None:
-        f = f + jnp.where(mode.contact, constants.c2, 0.0) * state.w
-    if constants.k2_back is not None and state.b is not None and mode.back is not None:
-        f = f + jnp.where(mode.back, constants.k2_back, 0.0) * state.b
-    return f
+    """f in N in the mode."""
+    return total(terms(constants, state, mode))
 
 
-def force_on_capsule(constants: Constants, f: jax.Array, drive: tuple[jax.Array, ...]) -> jax.Array:
-    """Force along the ground on the capsule, N, but for friction: f, the reaction of the drive, the slope."""
+def slopes(constants: Constants, state: CapsuleState, mode: Mode) -> tuple[jax.Array, jax.Array]:
+    """(L,) N/m and N s/m: df/dr and df/dw in the mode."""
+
+    def f(r: jax.Array, w: jax.Array, gaps: tuple[jax.Array, ...]) -> jax.Array:
+        return rod_force(constants, state._replace(r=r, w=w, gaps=gaps), mode)
+
+    one, none = jnp.ones_like(state.r), jnp.zeros_like(state.r)
+    sides = tuple(force.side * one for force in constants.contacts)
+    directions = (one, none, sides), (none, one, jax.tree.map(jnp.zeros_like, sides))
+    stiffness, damping = (jax.jvp(f, (state.r, state.w, state.gaps), along)[1] for along in directions)
+    return stiffness, damping
+
+
+def touching(constants: Constants, mode: Mode, side: float) -> jax.Array:
+    """(L,) bool: whether a contact on this side of the rod is closed."""
+    closed = jnp.zeros(mode.sigma.shape, bool)
+    for force, contact in zip(constants.contacts, mode.contacts, strict=True):
+        closed = closed | (contact & force.present) if force.side == side else closed
+    return closed
+
+
+def force_on_capsule(constants: Constants, f: Any, D: Any) -> Any:
+    """Force along the ground on the capsule, N, but for friction: f, the reaction of the drive D, the slope."""
     if constants.reaction is not None:
-        f = f - constants.reaction * constants.drive.value(drive)
+        f = f - constants.reaction * D
     return f if constants.downhill is None else f - constants.downhill[1]
 
 
-def rod_rate(constants: Constants, f: jax.Array, drive: tuple[jax.Array, ...]) -> jax.Array:
-    """Y1' in m/s^2."""
-    force = constants.drive.value(drive)
-    if constants.drive.prescribed:
-        return force
-    net = force - f
-    return (net if constants.downhill is None else net - constants.downhill[0]) / constants.m1
+def force_on_rod(constants: Constants, f: Any, D: Any) -> Any:
+    """Force along the ground on the rod, N: the drive D, -f, the slope."""
+    return D - f if constants.downhill is None else D - f - constants.downhill[0]
+
+
+def rod_rate(constants: Constants, f: jax.Array, D: jax.Array) -> jax.Array:
+    """Y1' in m/s^2; D is the drive's value."""
+    return D if constants.drive.prescribed else force_on_rod(constants, f, D) / constants.m1
 
 
 def series(constants: Constants, state: CapsuleState, mode: Mode, left: jax.Array) -> StepSeries:
     """Series of degree DEGREE about the state, in the mode; left (L,) s bounds the step."""
     sliding = mode.sigma != 0.0
-    stiffness, damping = stiffness_of(constants, mode), damping_of(constants, mode.contact)
     friction = friction_series(constants.law, mode.sigma, state.v, (constants.F_forward, constants.F_backward))
-    f0 = rod_force(constants, state, mode)
-    on_capsule = force_on_capsule(constants, f0, state.drive)
-    friction_rate = friction.rate((on_capsule - friction.start) / constants.m2, constants.m2)
+    f0, D0 = rod_force(constants, state, mode), constants.drive.value(state.drive)
+    friction_rate = friction.rate((force_on_capsule(constants, f0, D0) - friction.start) / constants.m2, constants.m2)
     guess = step_rate(constants, state, mode, jnp.where(sliding, friction_rate, 0.0))
     rate, rate_left = jax.lax.stop_gradient((guess, 1.0 / left))
     h = 1.0 / jnp.maximum(rate, rate_left)
     m1, m2 = divide(constants.m1, h), jnp.where(sliding, divide(constants.m2, h), jnp.inf)
-    D = constants.drive.series(state.drive, h, DEGREE + 1)
-    cubic = None if constants.k_cubic is None else _Cubic(constants, state.r)
-    d, w, v, f = [state.d], [state.w], [state.v], [f0]
-    # The force on the capsule; the list of f itself where nothing is added to f.
-    total = f if on_capsule is f0 else [on_capsule]
+    drive = constants.drive.series(state.drive, h, DEGREE + 1)
 
-    def extend(k: int) -> None:
-        """Coefficient k of the forces from those of d and w."""
-        f.append(stiffness * d[k] + damping * w[k])
-        if cubic is not None:
-            f[k] = f[k] + cubic.extend(d)
-        if total is not f:
-            total.append(f[k] if constants.reaction is None else f[k] - constants.reaction * D[k])
+    def of(start: jax.Array, rule: Callable[[int], Any]) -> Taylor:
+        return Taylor(lambda k: start if k == 0 else rule(k), jnp.where(left > 0.0, 1.0, 2.0))
 
-    for k in range(DEGREE):
-        if k > 0:
-            d.append(h * w[k - 1] * (1.0 / k))
-            extend(k)
-        F = friction.extend(v) if k > 0 else friction.start
-        v.append(divide(total[k] - F, m2 * (k + 1)))
-        if constants.drive.prescribed:
-            w.append(h * D[k] * (1.0 / (k + 1)) - v[k + 1])
-        else:
-            net = D[k] - f[k] if constants.downhill is None or k > 0 else D[k] - f[k] - constants.downhill[0]
-            w.append(divide(net, m1 * (k + 1)) - v[k + 1])
-    d.append(h * w[DEGREE - 1] * (1.0 / DEGREE))
-    extend(DEGREE)
-    return StepSeries(h, rate_left >= rate, w, v, d, total)
+    def next_v(k: int) -> jax.Array:
+        F = friction.extend(v.known[:k]) if k > 1 else friction.start
+        return divide(on_capsule[k - 1] - F, m2 * k)
 
+    def next_w(k: int) -> jax.Array:
+        rod = h * drive[k - 1] * (1.0 / k) if constants.drive.prescribed else divide(on_rod[k - 1], m1 * k)
+        return rod - v[k]
 
-class _Cubic:
-    """Series of k_cubic r^3 by two Cauchy products an order; the constant term is in f already."""
-
-    def __init__(self, constants: Constants, r: jax.Array) -> None:
-        # r^2 is kept over m2: see series.py on divisions.
-        self.m2, self.r, self.square = constants.m2, r, [divide(r * r, constants.m2)]
-        self.stiffness = jnp.asarray(constants.k_cubic) * constants.m2
-
-    def extend(self, d: Series) -> jax.Array:
-        """Coefficient k = len(d) - 1; r and d differ in their first coefficient only."""
-        r, k = [self.r, *d[1:]], len(d) - 1
-        self.square.append(divide(sum((r[j] * r[k - j] for j in range(1, k + 1)), r[0] * r[k]), self.m2))
-        return self.stiffness * sum((self.square[j] * r[k - j] for j in range(1, k + 1)), self.square[0] * r[k])
+    v, w = of(state.v, next_v), of(state.w, next_w)
+    r = of(state.r, lambda k: h * w[k - 1] * (1.0 / k))
+    gaps = [
+        of(d, lambda k, side=force.side: side * r[k]) for force, d in zip(constants.contacts, state.gaps, strict=True)
+    ]
+    parts = [(on_series(force, d, w), acts) for force, d, acts in acting(constants, r, gaps, mode)]
+    f = of(f0, lambda k: total(jnp.where(acts, part[k], 0.0) for part, acts in parts))
+    D = of(D0, drive.__getitem__)
+    on_capsule, on_rod = force_on_capsule(constants, f, D), force_on_rod(constants, f, D)
+    orders = [(w[k], v[k], r[k], on_capsule[k]) for k in range(DEGREE + 1)]
+    return StepSeries(h, rate_left >= rate, *map(list, zip(*orders, strict=True)))
 
 
 def size(p: Series, s: jax.Array | float = 1.0) -> jax.Array:
@@ -318,19 +349,20 @@ def advance(constants: Constants, state: CapsuleState, step: StepSeries, s: jax.
     t, way, X2 = state.t + dt, divide(mean(step.w, s), per), state.X2 + divide(mean(step.v, s), per)
     w, v = state.w + increase(step.w, s), state.v + increase(step.v, s)
     drive = constants.drive.advanced(state.drive, t, dt)
-    return CapsuleState(t, state.r + way, state.d + way, w, X2, v, drive, None if state.b is None else state.b + way)
+    gaps = tuple(d + force.side * way for force, d in zip(constants.contacts, state.gaps, strict=True))
+    return CapsuleState(t, state.r + way, w, X2, v, drive, gaps)
 
 
 # events: Changes of mode: where on a step the first one lies, and which mode follows.
 #
-# In a mode these functions must stay >= 0: the gap's (d in contact, -d out of it), that of the back gap, and, while
-# sliding, the velocity in the mode's direction, or, while stuck, F_forward - f and F_backward + f, f the force on the
-# capsule. Each is a linear combination of the series of the step, so it is a polynomial in s. What is absent is not
-# watched. Switching times of the drive are known: they end a step (``SWITCH``) and need no search.
+# In a mode these functions must stay >= 0: each contact's (d in contact, -d out of it), and, while sliding, the
+# velocity in the mode's direction, or, while stuck, F_forward - f and F_backward + f, f the force on the capsule. Each
+# is a linear combination of the series of the step, so it is a polynomial in s. What is absent is not watched.
+# Switching times of the drive are known: they end a step (``SWITCH``) and need no search.
 
 
-# Kinds of events.
-NONE, GAP, VELOCITY, UPPER, LOWER, BACK, SWITCH = 0, 1, 2, 3, 4, 5, 6
+# Kinds of events; that of contact i is GAP + i.
+NONE, VELOCITY, UPPER, LOWER, SWITCH, GAP = range(6)
 # The march arrives when its next leap is this small a part of the step, or, at a root that is crossed at a definite
 # rate, when a leap below SURE_LEAP agrees with Newton's to SURE_AGREEMENT: the correction in ``correct`` does the rest.
 LEAP_TOLERANCE = 1e-9
@@ -400,21 +432,26 @@ def _sure(p0: jax.Array, p1: jax.Array, tau: jax.Array) -> jax.Array:
 
 
 def first_event(
-    constants: Constants, mode: Mode, step: StepSeries, b: jax.Array | None, s_end: jax.Array, active: jax.Array
+    constants: Constants,
+    mode: Mode,
+    step: StepSeries,
+    gaps: tuple[jax.Array, ...],
+    s_end: jax.Array,
+    active: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """(s, kind): where the step ends and why; s = s_end and NONE if nothing happens before.
 
     Marches from the left, each leap to the root of a quadratic minorant of each event function on what is left of the
-    step, so no root can be passed, double ones included. b (L,) m: the back gap at the start of the step.
+    step, so no root can be passed, double ones included. gaps : penetrations (L,), m, at the start of the step.
     """
     sliding = mode.sigma != 0.0
     middle = 0.5 * (constants.F_forward - constants.F_backward)
     level = jnp.where(sliding, 0.0, 0.5 * (constants.F_forward + constants.F_backward))
-    gaps = []
-    if constants.k2 is not None:
-        gaps.append((GAP, _gap([jnp.where(mode.contact, x, -x) for x in step.d], s_end)))
-    if mode.back is not None and b is not None:
-        gaps.append((BACK, _gap([jnp.where(mode.back, -x, x) for x in (b, *step.d[1:])], s_end)))
+    watched = []
+    for force, d, contact in zip(constants.contacts, gaps, mode.contacts, strict=True):
+        inward = jnp.where(contact, 1.0, -1.0)
+        gap = [inward * d, *((inward * force.side) * x for x in step.r[1:])]
+        watched.append(_watched(_divided(gap, s_end), jnp.zeros_like(s_end), s_end))
     speed = _divided([mode.sigma * x for x in step.v], s_end)
     # While stuck level - (f - middle) and level + (f - middle), while sliding sigma Y2, written as level + sign * p.
     force = [step.f[0] - middle, *step.f[1:]]
@@ -429,7 +466,7 @@ def first_event(
         tau, sign = jnp.minimum(to_upper, to_lower), jnp.where(to_upper <= to_lower, 1.0, -1.0)
         sure = _sure(base + sign * p0, sign * p1, tau)
         which = jnp.where(sliding, VELOCITY, jnp.where(sign > 0.0, UPPER, LOWER))
-        for gap_kind, gap in reversed(gaps):
+        for gap_kind, gap in reversed(list(enumerate(watched, GAP))):
             g0, g1 = gap.at(s)
             to_gap = _leap(g0, g1, gap.rest - gap.p2)
             is_gap, tau = to_gap <= tau, jnp.minimum(to_gap, tau)
@@ -449,11 +486,6 @@ def first_event(
     return jnp.clip(s, SMALLEST_FRACTION * s_end, s_end), kind
 
 
-def _gap(p: Series, s_end: jax.Array) -> _Watched:
-    """The event function of a gap: p, without its root at the start of the step."""
-    return _watched(_divided(p, s_end), jnp.zeros_like(s_end), s_end)
-
-
 def motion_at(constants: Constants, state: CapsuleState, mode: Mode, kind: jax.Array) -> jax.Array:
     """(L,) sigma of the mode that follows from a state: the sign of v or, where v = 0, that of f if it breaks away.
 
@@ -462,9 +494,9 @@ def motion_at(constants: Constants, state: CapsuleState, mode: Mode, kind: jax.A
 
     f is the force on the capsule but for friction.
     """
-    spring_force = rod_force(constants, state, mode)
-    f = force_on_capsule(constants, spring_force, state.drive)
-    w_rate = rod_rate(constants, spring_force, state.drive)
+    spring_force, D = rod_force(constants, state, mode), constants.drive.value(state.drive)
+    f = force_on_capsule(constants, spring_force, D)
+    w_rate = rod_rate(constants, spring_force, D)
     f_rate = force_rate(constants, state, mode, w_rate)
     onset = (kind == UPPER) | (kind == LOWER)
     side = jnp.where(onset, jnp.where(kind == UPPER, 1.0, -1.0), jnp.sign(f))
@@ -482,7 +514,8 @@ def motion_at(constants: Constants, state: CapsuleState, mode: Mode, kind: jax.A
 
 def force_rate(constants: Constants, state: CapsuleState, mode: Mode, w_rate: jax.Array) -> jax.Array:
     """(L,) N/s: rate of the force on the capsule but for friction; w_rate (L,) m/s^2, the rate of w."""
-    rate = tangent_stiffness(constants, mode, state.r) * state.w + damping_of(constants, mode.contact) * w_rate
+    stiffness, damping = slopes(constants, state, mode)
+    rate = stiffness * state.w + damping * w_rate
     if constants.reaction is None:
         return rate
     return rate - constants.reaction * constants.drive.series(state.drive, jnp.ones_like(rate), 2)[1]
@@ -490,36 +523,23 @@ def force_rate(constants: Constants, state: CapsuleState, mode: Mode, w_rate: ja
 
 def _size_of_forces(constants: Constants, state: CapsuleState, mode: Mode) -> jax.Array:
     """(L,) N: sum of the magnitudes of the forces on the capsule, which its rounding scales with."""
-    terms = [constants.k1 * state.r, constants.c * state.w]
-    if constants.k_cubic is not None:
-        terms.append(constants.k_cubic * state.r**3)
-    if constants.k2 is not None:
-        terms.append(jnp.where(mode.contact, constants.k2, 0.0) * state.d)
-    if constants.c2 is not None:
-        terms.append(constants.c2 * state.w)
-    if constants.k2_back is not None and state.b is not None and mode.back is not None:
-        terms.append(jnp.where(mode.back, constants.k2_back, 0.0) * state.b)
+    forces = terms(constants, state, mode)
     if constants.reaction is not None:
-        terms.append(constants.reaction * constants.drive.value(state.drive))
+        forces.append(constants.reaction * constants.drive.value(state.drive))
     if constants.downhill is not None:
-        terms.append(constants.downhill[1])
-    return sum((jnp.abs(x) for x in terms[1:]), jnp.abs(terms[0]))
+        forces.append(constants.downhill[1])
+    return total(map(jnp.abs, forces))
 
 
 def mode_at(constants: Constants, state: CapsuleState) -> Mode:
-    """The mode that any state begins in: signs of d, b, v and, where they are 0, of their first rate that is not."""
-    meeting = (state.d > 0.0) | ((state.d == 0.0) & (state.w > 0.0))
-    if constants.k2 is None:
-        meeting = jnp.zeros_like(meeting)
-    leaning = None if state.b is None else (state.b < 0.0) | ((state.b == 0.0) & (state.w < 0.0))
-    sigma = motion_at(constants, state, Mode(meeting, jnp.zeros_like(state.v), leaning), jnp.full(state.d.shape, NONE))
-    free = Mode(jnp.zeros_like(meeting), sigma, None if leaning is None else jnp.zeros_like(leaning))
-    spring_force = rod_force(constants, state, free)
-    f = force_on_capsule(constants, spring_force, state.drive)
+    """The mode that any state begins in: signs of gaps, v and, where they are 0, of their first rate that is not."""
+    inward = [(d, force.side * state.w, force.side) for force, d in zip(constants.contacts, state.gaps, strict=True)]
+    meeting = tuple((d > 0.0) | ((d == 0.0) & (rate > 0.0)) for d, rate, _ in inward)
+    sigma = motion_at(constants, state, Mode(jnp.zeros_like(state.v), meeting), jnp.full(state.r.shape, NONE))
+    free = Mode(sigma, tuple(map(jnp.zeros_like, meeting)))
+    spring_force, D = rod_force(constants, state, free), constants.drive.value(state.drive)
+    f = force_on_capsule(constants, spring_force, D)
     a2 = jnp.where(sigma != 0.0, (f - sliding_friction(constants.law, sigma, state.v)) / constants.m2, 0.0)
-    w_rate = rod_rate(constants, spring_force, state.drive) - a2
-    touching = (state.d == 0.0) & (state.w == 0.0) & (w_rate > 0.0)
-    contact = meeting if constants.k2 is None else meeting | touching
-    if leaning is None or state.b is None:
-        return Mode(contact, sigma)
-    return Mode(contact, sigma, leaning | ((state.b == 0.0) & (state.w == 0.0) & (w_rate < 0.0)))
+    w_rate = rod_rate(constants, spring_force, D) - a2
+    touching = ((d == 0.0) & (rate == 0.0) & (side * w_rate > 0.0) for d, rate, side in inward)
+    return Mode(sigma, tuple(x | y for x, y in zip(meeting, touching, strict=True)))

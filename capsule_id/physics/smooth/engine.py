@@ -2,23 +2,23 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache, partial, reduce
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
-from capsule_id.physics.batches import NumberOrBatch
 from capsule_id.physics.drive import Drive, SwitchingDrive
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.forces import (
     Array,
     downhill,
+    forces_of,
+    rod_on_capsule,
     smooth_abs,
     smooth_heaviside,
     smooth_ramp,
-    spring_and_damper,
-    support_smooth,
+    total,
 )
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Trajectory, admissible
@@ -165,7 +165,7 @@ def _forces(
     p, e, _, widths = system
 
     def forces(t: jax.Array, r: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        f, D = _rod_on_capsule(p, widths, r, w), e.force_at(t, piece)
+        f, D = rod_on_capsule(p, r, w, widths.penetration), e.force_at(t, piece)
         on_rod = D - f if p.slope is None else D - f - downhill(p, p.m1)
         Y1_rate = D if e.prescribed else on_rod / p.m1
         f = f if e.reaction is None else f - e.reaction * D
@@ -174,28 +174,14 @@ def _forces(
     return forces
 
 
-def _rod_on_capsule(p: CapsuleParameters, widths: Smoothing, r: jax.Array, w: jax.Array) -> jax.Array:
-    f = spring_and_damper(p, r, w)
-    if p.k2 is not None:
-        G, within_reach = _finite(p.G)
-        f = f + support_smooth(jnp.where(within_reach, p.k2, 0.0), G, r, widths.penetration)
-        if p.c2 is not None:
-            damping = jnp.where(within_reach & (jnp.asarray(p.k2) > 0.0), p.c2, 0.0)
-            f = f + damping * w * smooth_heaviside(r - G, widths.penetration)
-    if p.k2_back is not None:
-        G, within_reach = _finite(p.G_back)
-        f = f - support_smooth(jnp.where(within_reach, p.k2_back, 0.0), G, -r, widths.penetration)
-    return f
-
-
-def _gap(gap: NumberOrBatch | None) -> jax.Array:
-    return jnp.asarray(jnp.inf if gap is None else gap)
-
-
-def _finite(gap: NumberOrBatch) -> tuple[jax.Array, jax.Array]:
-    """(a gap with 0 in the place of infinity, whether it is finite)."""
-    within_reach = jnp.isfinite(jnp.asarray(gap))
-    return jnp.where(within_reach, gap, 0.0), within_reach
+def _nearest(p: CapsuleParameters, side: float) -> jax.Array:
+    """(L,) m: the least gap of the contacts on a side of the rod, infinite without one."""
+    gaps = [
+        jnp.where(force.present, force.gap, jnp.inf)
+        for force in forces_of(p)
+        if force.gap is not None and force.side == side
+    ]
+    return reduce(jnp.minimum, gaps, jnp.full_like(p.m1, jnp.inf))
 
 
 def _valid(system: System) -> jax.Array:
@@ -212,13 +198,14 @@ def _problem(system: System, semantics: Semantics) -> Problem:
     # Rates of springs, damper, drive and friction, 1/s; the switch's own rate needs no small first step.
     resistance, slope = jax.jvp(law.forward, (jnp.zeros_like(p.m1),), (jnp.ones_like(p.m1),))
     friction_rate = 2.0 * p.g * jnp.abs(slope) / jnp.where(resistance > 0.0, resistance, jnp.inf)
-    stiffness = p.k1 + sum(jnp.asarray(k) for k in (p.k2, p.k2_back) if k is not None)
-    fastest = jnp.sqrt(stiffness * lightness) + p.c * lightness + e.frequency() + friction_rate
+    springs, d = [force.elastic for force in forces_of(p)], widths.penetration + jnp.zeros_like(p.m1)
+    stiffness = jax.jvp(lambda d: total(elastic(d) for elastic in springs), (d,), (jnp.ones_like(d),))[1]
+    fastest = jnp.sqrt(jnp.abs(stiffness) * lightness) + p.c * lightness + e.frequency() + friction_rate
     field = stick_slip_field if semantics == "stick-slip" else eq2_field
     return Problem(
         field=partial(field, system),
         piece_end=partial(_piece_end, e) if isinstance(e, SwitchingDrive) else None,
-        gaps=(_gap(p.G), _gap(p.G_back)),
+        gaps=(_nearest(p, 1.0), _nearest(p, -1.0)),
         first=FIRST_STEP / fastest,
         longest=DRIVE_ANGLE / e.frequency(),
         floors=(jnp.asarray(widths.velocity), jnp.asarray(widths.penetration)),
