@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.twin import RUNS, STEP, SyntheticRun, make_runs
 from capsule_id.experiments.forced_run.twin import SAMPLES as RECORDED
 from capsule_id.physics.drive import Excitation

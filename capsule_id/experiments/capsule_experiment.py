@@ -1,14 +1,12 @@
 """Experiments whose forward model is the capsule model: mixin, trials, and bench tests with ``forward = "capsule"``."""
 
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import ModuleType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, clock_parameters, no_design, stretch
@@ -20,15 +18,40 @@ from capsule_id.experiments.free_vibration.second_fit import starts_of_motion
 from capsule_id.experiments.friction import ground_of, ground_parameters
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, GroundExperiment, other_laws
 from capsule_id.experiments.misfit import Misfit, Moments
-from capsule_id.parameters import Prior, parameter
+from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.rig.model import Column, Rig, Table
-from capsule_id.views import Comparison, Facts, Finding
+from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.views import Facts, Finding
 
 # capsule experiment: Mixin for experiments whose forward model is the capsule model, exact or smoothed.
+
+
+def stated_parameters(
+    symbol: str,
+    stated: Quantity | None,
+    of: str = "",
+    kind: Literal["normal", "positive_normal"] = "positive_normal",
+) -> list[Parameter]:
+    """The parameter with the prior of a stated quantity; [] where nothing is stated, or an exact value."""
+    if stated is None or stated.sd == 0.0:
+        return []
+    return [parameter(symbol, of, Prior(kind, stated.value, stated.sd))]
+
+
+def lag_of(table: Table, rig: Rig) -> tuple[list[Parameter], float | None]:
+    """The parameter lag of a drive, with its stated prior or, where [model] sets it free, the default one; or [] and s."""
+    lag, is_free = table.settings.lag, table.settings.drive == "pulses" and "lag" in rig.model.free
+    rows = [parameter("lag")] if lag is None and is_free else stated_parameters("lag", lag)
+    return rows, None if rows else 0.0 if lag is None else lag.value
+
+
+def stated_starts(of: str, **quantities: Quantity | None) -> dict[str, Start]:
+    """Starts of ``stated_parameters`` by name."""
+    uncertain = {symbol: q for symbol, q in quantities.items() if q is not None and q.sd > 0.0}
+    return {f"{symbol}[{of}]": Start(q.value, 0.5 * q.sd / q.value) for symbol, q in uncertain.items()}
 
 
 class CapsuleForward(GroundExperiment):
@@ -101,73 +124,6 @@ class CapsuleForward(GroundExperiment):
         return {"model": "capsule", "law": self.friction.name, "other_laws": other_laws(self.friction)}
 
 
-# trials experiment: Base of experiments whose rows are trials at settings of the drive: a setting can be left out,
-# and new ones predicted.
-
-
-class TrialsExperiment(CapsuleForward):
-    """Trials of one table.
-
-    Attributes
-    ----------
-    distance : (n,) displacement of the capsule, m
-    settings : (settings, p) numbers of the drive, in an order of the kind's own
-    setting : (n, settings) 1 where a row belongs to a setting
-    time : (settings,) duration of a trial, s
-    """
-
-    distance: np.ndarray
-    settings: np.ndarray
-    setting: np.ndarray
-    time: np.ndarray
-
-    @abstractmethod
-    def settings_of(
-        self, columns: Mapping[str, Column]
-    ) -> tuple[Float[np.ndarray, "rows p"], Float[np.ndarray, " rows"]]:
-        """Settings in the rows of a table, and the durations of their trials, s."""
-
-    @abstractmethod
-    def setting_names(self) -> list[str]:
-        """A short name for every setting, with units."""
-
-    @abstractmethod
-    def new_trials(
-        self, draws: Sequence[ValuesBySymbol], settings: Float[np.ndarray, "rows p"], rng: np.random.Generator
-    ) -> Float[np.ndarray, "draws rows"]:
-        """Displacement, m, of a new trial in a new session at each draw of the parameters and each of ``settings``."""
-
-    @abstractmethod
-    def speed_panels(
-        self,
-        settings: Float[np.ndarray, "rows p"],
-        centre: Float[np.ndarray, " rows"],
-        limits: tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, " rows"] | None],
-        label: str,
-    ) -> tuple[Comparison, ...]:
-        """Panels of mean velocities: ``centre`` and ``limits`` of its band, mm/s, at ``settings``, and the trials."""
-
-    @abstractmethod
-    def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> Float[np.ndarray, "draws settings"]:
-        """Log-density of the readings of each setting given the parameters and all others; not finite where none."""
-
-    @abstractmethod
-    def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> Float[np.ndarray, "draws k"]:
-        """The numbers of every draw for which the likelihood runs the capsule; not finite where a run fails."""
-
-    @abstractmethod
-    def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: Float[np.ndarray, "draws k"]) -> Self:
-        """Return the same trials with an emulator of the motions, fitted to ``motions_of_draws`` of ``draws``."""
-
-    @abstractmethod
-    def without(self, setting: int) -> Self:
-        """Return the experiment without the trials of one setting."""
-
-    @abstractmethod
-    def motions_without(self, motions: Float[np.ndarray, "draws k"], setting: int) -> Float[np.ndarray, "draws m"]:
-        """Those of ``motions_of_draws`` that the experiment without one setting has."""
-
-
 # capsule bench: Bench tests with the capsule model as their forward model (``forward = "capsule"`` in rig.toml).
 #
 # The closed forms hold where the capsule stays at rest, and where the rod is locked to it. A rod released from farther
@@ -190,9 +146,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     Initial conditions and offset belong to the record. With ``spring`` and ``gap`` the rod may hit the support spring.
     """
 
-    gap: float
-    within_reach: bool = eqx.field(static=True)
-    gap_known: bool = eqx.field(static=True)
+    gap: float | None
 
     checks = ()
     tables = ()
@@ -200,15 +154,11 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         FreeVibration.__init__(self, table, rig, friction, DecayModel())
         self.set_model(table, rig, friction)
-        gap = table.settings.gap
-        self.within_reach = gap is not None
-        self.gap = FAR if gap is None else gap.value
-        self.gap_known = gap is None or gap.sd == 0.0
+        gap = table.settings.gap or Quantity(FAR)
+        self.gap = gap.value if gap.sd == 0.0 else None
         rows = [parameter("k1"), parameter("c"), *friction.parameters]
-        if gap is not None:
-            rows.append(parameter("k2", table.settings.spring))
-            if gap.sd > 0.0:
-                rows.append(parameter("G", table.label, Prior("positive_normal", gap.value, gap.sd)))
+        rows += [] if table.settings.gap is None else [parameter("k2", table.settings.spring)]
+        rows += stated_parameters("G", gap, table.label)
         rows += self.motion_parameters(self.rough_decrement())
         rows += [NOISE_SD.named(table.label, self.noise_prior()), *ground_parameters(table, rig)]
         rows += clock_parameters(table, rig)
@@ -222,26 +172,19 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     def model_name(self) -> str:
         return "capsule model"
 
-    def motion_of(self, theta: ValuesBySymbol) -> Any:
-        """(n,) x_rel of the model, m."""
-        p = self.parameters_of(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
+    def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
+        p = self.parameters_of(theta, theta.get("k2", 0.0), theta["G"] if self.gap is None else self.gap)
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
         times = jnp.multiply.outer(stretch(self.clock_rate, theta), self.time)
         t = self.simulated(theta, p, OFF, times, initial)
-        return t.X1 - t.X2
-
-    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        raw = self.values - xp.asarray(self.motion_of(theta))
-        return (Misfit(raw, self.reading_sd**2, 1.0, self.width * xp.ones((len(self.time), 1))),)
+        return self.values - xp.asarray(t.X1 - t.X2), xp.ones((self.n, 1))
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         return Experiment.summaries(self, theta, xp)
 
     def starts(self) -> dict[str, Start]:
         starts = super().starts() | starts_of_motion(self, self.rough_decrement())
-        if not self.gap_known:
-            starts[f"G[{self.label}]"] = Start(self.gap, 0.5 * self.table.settings.gap.sd / self.gap)
-        return starts
+        return starts | stated_starts(self.label, G=self.table.settings.gap)
 
 
 class CapsulePushes(CapsuleForward, DynamicFriction):

@@ -10,8 +10,8 @@ import pandas as pd
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.capsule_experiment import TrialsExperiment
 from capsule_id.experiments.kind import Registry, default_registry
+from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.leave_out import (
     LARGEST_SHAPE,
@@ -200,7 +200,7 @@ class _Variant:
 
     parameters: int
     draws: WeightedDraws
-    left_out: tuple[tuple[TrialsExperiment, list[LeftOut]], ...]
+    left_out: tuple[tuple[Progression, list[LeftOut]], ...]
     evidence: tuple[float, float]
     refits: int = 0
 
@@ -313,7 +313,7 @@ def compare_points(
 def _variants(rig: Rig, words: Sequence[str], registry: Registry | None) -> tuple[dict[str, ModelChoices], Registry]:
     """Variants by name, and the kinds that read ``rig``; an ``InputError`` where its progressions do not suffice."""
     choices, kinds = variants_of(rig, words), registry or default_registry()
-    made = [e for e in make_experiments(rig, "all", kinds) if isinstance(e, TrialsExperiment)]
+    made = [e for e in make_experiments(rig, "all", kinds) if isinstance(e, Progression)]
     if not made:
         remedy = "compare friction laws of bench tests in the report of fit-params"
         raise InputError("--compare needs a progression", "none", remedy)

@@ -8,7 +8,7 @@ import pandas as pd
 from jaxtyping import Float
 from scipy import stats
 
-from capsule_id.experiments.capsule_experiment import TrialsExperiment
+from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.marginal import MarginalPosterior, trials_of
 from capsule_id.inference.proposal import BlockProposal
 from capsule_id.inference.refinement import effective_size
@@ -149,7 +149,7 @@ class WeightedDraws:
     inside: np.ndarray
     values: list[dict[str, float]]
 
-    def of(self, e: TrialsExperiment) -> Float[np.ndarray, " m"]:
+    def of(self, e: Progression) -> Float[np.ndarray, " m"]:
         """Log-weights of the block that ``e`` depends on."""
         return self.log_weight[
             self.inside, next(self.block[row.name] for row in e.parameters if row.name in self.block)
@@ -221,13 +221,13 @@ def _log_normalisation(emulated: Emulation, random: np.random.RandomState) -> np
     return np.array([log_evidence(block, rng) for block in (emulated.target.parts(v) - density).T]).T
 
 
-def leave_settings_out(e: TrialsExperiment, draws: WeightedDraws) -> list[LeftOut]:
+def leave_settings_out(e: Progression, draws: WeightedDraws) -> list[LeftOut]:
     """Leave out every setting of ``e`` in turn."""
     density = e.densities_of_settings([e.local(values) for values in draws.values])
     return [_left_out(draws.of(e), one, draws, -1.0) for one in density.T]
 
 
-def leave_setting_out(draws: WeightedDraws, e: TrialsExperiment, setting: int, seed: int) -> LeftOut:
+def leave_setting_out(draws: WeightedDraws, e: Progression, setting: int, seed: int) -> LeftOut:
     """Leave out one setting of ``e`` by draws of the posterior without it.
 
     The density drawn from is adapted further, up to ``ADAPTATIONS`` times, while the shape is too large.
@@ -249,7 +249,7 @@ def _adapted(drawn_from: BlockProposal | Emulation) -> tuple[BlockProposal, Exac
     return (drawn_from.proposal, drawn_from.known) if isinstance(drawn_from, Emulation) else (drawn_from, None)
 
 
-def _without(draws: WeightedDraws, e: TrialsExperiment, setting: int) -> tuple[BlockProposal, ExactMotions | None]:
+def _without(draws: WeightedDraws, e: Progression, setting: int) -> tuple[BlockProposal, ExactMotions | None]:
     """What the adaptation to the posterior without one setting begins with."""
     first, known = _adapted(draws.drawn_from)
     if known is None:
@@ -284,7 +284,7 @@ def _left_out(log_weight: np.ndarray, density: np.ndarray, draws: WeightedDraws,
 SLOW = 0.5
 
 
-def left_out_predictions(e: TrialsExperiment, left_out: Sequence[LeftOut], seed: int) -> pd.DataFrame:
+def left_out_predictions(e: Progression, left_out: Sequence[LeftOut], seed: int) -> pd.DataFrame:
     """Compare every setting with its prediction by all other settings.
 
     Returns

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import wrightomega
 
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.experiments.capsule_experiment import TrialsExperiment
 from capsule_id.experiments.friction_model import EQUATION_1
+from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.curvature import BATCH, in_batches, require_width
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior, Scale
@@ -279,7 +279,7 @@ class MarginalPosterior:
     def can_be_emulated(self) -> bool:
         """Whether there are motions to compute, and all of them are trials of a few numbers each."""
         slow = [e for e in self.target.experiments if e.event_driven]
-        return bool(slow) and all(isinstance(e, TrialsExperiment) for e in slow)
+        return bool(slow) and all(isinstance(e, Progression) for e in slow)
 
     def motions(self, v: np.ndarray) -> list[np.ndarray]:
         """Motions of every experiment with trials at located u (w, dimension), (w, k) each."""
@@ -300,7 +300,7 @@ class MarginalPosterior:
         changed.grid = next(fine, self.grid)
         return changed
 
-    def _trials(self, v: np.ndarray) -> list[tuple[TrialsExperiment, list[ValuesBySymbol]]]:
+    def _trials(self, v: np.ndarray) -> list[tuple[Progression, list[ValuesBySymbol]]]:
         """Every experiment with trials, and its values by symbol at located u (w, dimension); scatters are 1."""
         u = np.zeros((len(v), len(self.names)))
         u[:, self._located] = v
@@ -394,9 +394,9 @@ def uniform_at(v: Float[np.ndarray, "w d"], number: int) -> Float[np.ndarray, "w
     return (np.frombuffer(hashes, np.uint64).reshape(len(v), number) >> 11) * 2.0**-53
 
 
-def trials_of(target: LogPosterior) -> list[TrialsExperiment]:
+def trials_of(target: LogPosterior) -> list[Progression]:
     """Its experiments with trials, whose motions can be emulated."""
-    return [e for e in target.experiments if isinstance(e, TrialsExperiment)]
+    return [e for e in target.experiments if isinstance(e, Progression)]
 
 
 def density_of(target: LogPosterior) -> Callable[[np.ndarray], np.ndarray]:

@@ -8,7 +8,7 @@ import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.capsule_experiment import TrialsExperiment
+from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.result import Result
 from capsule_id.rig.model import Column, Table
 from capsule_id.rig.tables import read_settings
@@ -49,7 +49,7 @@ def predict(result: Result, settings: str | Path, draws: int = DRAWS, seed: int 
         If nothing was sampled, no progression was fitted, ``draws`` is out of range, or the settings break a rule.
     """
     made = make_experiments(result.rig, "all", result.registry)
-    experiment = next((e for e in made if isinstance(e, TrialsExperiment) and e.label in result.observed), None)
+    experiment = next((e for e in made if isinstance(e, Progression) and e.label in result.observed), None)
     if experiment is None:
         raise InputError("a prediction needs a fit with a progression", "none", "add one to the rig and fit again")
     if result.posterior is None:

@@ -16,7 +16,7 @@ import pytest
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.inference.target import LogPosterior
 from tests.cli_tools import DATA
 from tests.forced_runs import NOISE, TRUTH, recorded
@@ -57,9 +57,10 @@ def density_of_run(run: ForcedRun, theta: ValuesBySymbol) -> float:
         "current": theta["I_d"] * cosine,
     }
     total = 0.0
-    for i, name in enumerate(run.channels):
-        r, n = run.values[i] - channels[name], len(run.time)
-        variance, offset = theta[f"noise_{name}"] ** 2 + run.reading_variance[i], run.widths[i] ** 2
+    for channel in run.channels:
+        name = channel.name
+        r, n = channel.values - channels[name], len(run.time)
+        variance, offset = theta[f"noise_{name}"] ** 2 + channel.reading_variance, channel.width**2
         quadratic = (r @ r - offset * np.sum(r) ** 2 / (variance + n * offset)) / variance
         total -= 0.5 * (quadratic + n * np.log(2.0 * np.pi * variance) + np.log1p(n * offset / variance))
     return float(total)

@@ -1,10 +1,19 @@
 """Density of trials by SciPy, with sums over the sessions that are integrated out."""
 
+from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
+
+from capsule_id.experiments.misfit import Misfit
+from capsule_id.experiments.progression.experiment import Progression
+
+
+def linear_misfit(e: Progression, theta: Mapping[str, float], X2: np.ndarray) -> Misfit:
+    """Misfit of the trials at the responses ``X2``, by NumPy."""
+    return e.trials_of(theta, X2, np).linear(e.distance, e.sessions, theta["trial_sd"], np)
 
 
 def integrated(

@@ -7,8 +7,8 @@ import pytest
 
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.forced_run.checks import growth
-from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.forced_run.experiment import growth
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives import Pulses, RecordedDrive
 from capsule_id.physics.model import CapsuleParameters, simulate
@@ -113,7 +113,7 @@ def test_the_recorded_current_is_the_drive(tmp_path: Path) -> None:
     current = np.interp(TIME, np.arange(0.0, 0.7, 0.05), 2.0 * rng.standard_normal(14))
     write(tmp_path, RecordedDrive(TIME, K * current), 0.0, current, 'drive = "recorded"\n')
     run = run_of(tmp_path)
-    assert "current" not in run.channels
+    assert "current" not in run.names
     assert not {"phase[run]", "I_d[run]"} & {row.name for row in run.parameters}
     assert largest_residual(run, {"K": K}) < 1.15
     assert largest_residual(run, {"K": 1.1 * K}) > 3.0

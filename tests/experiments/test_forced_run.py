@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from capsule_id.experiments.forced_run.experiment import SETTLING_PERIODS, ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.forced_run.experiment import SETTLING_PERIODS
 from capsule_id.experiments.forced_run.start_state import rough_start
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.model import simulate
@@ -27,10 +28,10 @@ def density(observed: np.ndarray, predicted: np.ndarray, covariance: np.ndarray,
 @pytest.mark.parametrize("number", [0, 1])
 def test_channels_are_independent_normal_densities_with_offsets_integrated_out(number: int) -> None:
     run = make(number)
-    observed = [recorded()[number].channels[name][:SAMPLES] for name in run.channels]
+    observed = [recorded()[number].channels[name][:SAMPLES] for name in run.names]
     expected = sum(
         density(y, seen, NOISE[f"noise_{name}"] ** 2 * np.eye(SAMPLES))
-        for name, y, seen in zip(run.channels, observed, channels(number), strict=True)
+        for name, y, seen in zip(run.names, observed, channels(number), strict=True)
     )
     assert float(run.log_likelihood(theta(number), np)) == pytest.approx(expected, rel=1e-9)
     assert float(run.log_likelihood(theta(number), jnp)) == pytest.approx(expected, rel=1e-9)

@@ -13,10 +13,10 @@ from scipy.special import logsumexp
 from capsule_id.api import read_rig
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.progression.declaration import MOST_TRIALS, OUTLIER_SHARE, TIMES, alternatives
-from capsule_id.experiments.progression.density import MIDDLE, NODES, Sessions, TrialGroups, TrialMisfit, linear_misfit
-from capsule_id.experiments.progression.experiment import Progression, new_trials
+from capsule_id.experiments.progression.density import MIDDLE, NODES, Sessions, TrialGroups, TrialMisfit
+from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference.checks.settings import outliers
-from tests.experiments.summed_sessions import integrated
+from tests.experiments.summed_sessions import integrated, linear_misfit
 from tests.inference.three_settings import THETA, three_settings
 from tests.rig.faults import fault_of
 
@@ -98,7 +98,7 @@ def test_an_outlying_trial_widens_nothing_else(tmp_path: Path) -> None:
     assert best_scatter(normal, 1e-4) > 5.0 * clean
     assert best_scatter(heavy, 1e-4) < 1.5 * clean
     X2 = np.asarray(heavy.responses(THETA))
-    misfit, plain = (linear_misfit(e, THETA, X2, np) for e in (heavy, normal))
+    misfit, plain = (linear_misfit(e, THETA, X2) for e in (heavy, normal))
     np.testing.assert_array_equal(misfit.scale, np.where(np.arange(heavy.n) == 4, TIMES, 1.0))
     np.testing.assert_array_equal(plain.scale, 1.0)
     np.testing.assert_allclose(misfit.fixed_variance / plain.fixed_variance, misfit.scale**2, rtol=0.2)
@@ -113,7 +113,7 @@ def test_new_trials_have_the_tails_of_the_model(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Progression, "displacements_of_draws", lambda *_: np.zeros((20_000, 3)))
     draws = 20_000 * [{**THETA, "discrepancy": 0.0}]
     sd = np.hypot(THETA["trial_sd"], np.sqrt(e.reading_variance))
-    z = new_trials(e, draws, e.settings, np.random.default_rng(0)) / sd
+    z = e.new_trials(draws, e.settings, np.random.default_rng(0)) / sd
     far = np.mean(np.abs(z) > 5.0)
     assert far == pytest.approx(0.0309 if tails == "heavy" else 0.0, abs=0.003)
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from capsule_id.experiments.forced_run import checks as predictability
-from capsule_id.experiments.forced_run.checks import LARGEST_GROWTH, check_predictable, growth
-from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run import experiment as predictability
+from capsule_id.experiments.forced_run.checks import check_predictable
+from capsule_id.experiments.forced_run.drives import ForcedRun
+from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, growth
 from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior

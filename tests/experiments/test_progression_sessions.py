@@ -26,13 +26,12 @@ from capsule_id.experiments.progression.density import (
     TrialGroups,
     TrialMisfit,
     _log_probability,
-    linear_misfit,
     parameters_of,
 )
 from capsule_id.experiments.progression.experiment import Progression, session_table
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
 from capsule_id.inference.checks.settings import outliers
-from tests.experiments.summed_sessions import integrated
+from tests.experiments.summed_sessions import integrated, linear_misfit
 from tests.inference.three_settings import THETA, three_settings
 
 
@@ -132,7 +131,7 @@ def test_a_misfit_stays_where_no_friction_explains_the_readings(tmp_path: Path) 
 
     def residuals(at_nodes: list[float]) -> np.ndarray:
         X2[lone] = place * np.array(at_nodes)
-        misfit = linear_misfit(e, theta, X2, np).at(theta["trial_sd"], np)
+        misfit = linear_misfit(e, theta, X2).at(theta["trial_sd"], np)
         assert misfit.design.shape[1] == 1 + len(e.settings)
         return np.abs(misfit.at_nuisance_mean(np)[0][own])
 
@@ -157,7 +156,7 @@ def test_a_misfit_is_about_the_z_that_is_most_probable(tmp_path: Path) -> None:
         X2[0] = np.mean(e.distance[own]) - away + np.array([-0.0275, -0.025, 0.0, 0.025, 0.0275])
         at = make_interp_spline(NODES, X2[0], k=1)(z)
         least = np.min(z**2 + np.sum((e.distance[own][:, None] - at) ** 2, axis=0) / variance)
-        rest, nuisances = linear_misfit(e, theta, X2, np).at(theta["trial_sd"], np).at_nuisance_mean(np)
+        rest, nuisances = linear_misfit(e, theta, X2).at(theta["trial_sd"], np).at_nuisance_mean(np)
         # On the outer line z is about 1.25 and held: its own cost is not among the nuisances.
         held = 1.25**2 if nuisances[0] == 0.0 else nuisances[0] ** 2
         assert np.sum(rest[own] ** 2) + held == pytest.approx(least, rel=1e-2)

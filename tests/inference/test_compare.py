@@ -14,8 +14,8 @@ from scipy.stats import multivariate_normal, norm
 from capsule_id.api import read_rig
 from capsule_id.cli import fit_params
 from capsule_id.errors import InputError
-from capsule_id.experiments.capsule_experiment import TrialsExperiment
 from capsule_id.experiments.kind import default_registry
+from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.experiments.progression.twin import RobotDesign, synthesize_robot
 from capsule_id.inference import compare, leave_out
 from capsule_id.inference.compare import Choice, _choose, _Variant, compare_models, compare_points
@@ -82,9 +82,7 @@ def test_two_progressions_are_named_in_the_predictions(rig: Rig) -> None:
 @pytest.mark.usefixtures("drawn")
 def test_the_models_that_the_readings_demand_are_compared(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a fit takes them from ``second_models``: here a stand-in leaves out one setting."""
-    monkeypatch.setattr(
-        compare, "second_models", lambda made, _: ([cast(TrialsExperiment, e).without(0) for e in made], [])
-    )
+    monkeypatch.setattr(compare, "second_models", lambda made, _: ([cast(Progression, e).without(0) for e in made], []))
     assert len(compare_models(rig, ["lag"]).predictions) == 2
 
 

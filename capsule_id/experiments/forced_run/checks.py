@@ -1,28 +1,29 @@
-"""Checks of a forced run: feasibility, predictability by one initial state, residuals that repeat with the excitation."""
+"""What the report says of fitted runs: feasible settings, predictable and repeating motions; tables and panels."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 from scipy import stats
 from scipy.integrate import solve_ivp
 
-from capsule_id.experiments.base import ValuesBySymbol
-from capsule_id.experiments.checks import LEVEL
-from capsule_id.experiments.context import Fitted
+from capsule_id.errors import InputError
+from capsule_id.experiments.base import ValuesBySymbol, axis_label, band
+from capsule_id.experiments.checks import LEVEL, autocorrelation
+from capsule_id.experiments.context import Fitted, RunRecord
+from capsule_id.experiments.forced_run.experiment import LARGEST_GROWTH, CapsuleRun, growth
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.forces import grazing_load, rod_acceleration, rod_on_capsule
 from capsule_id.physics.model import CapsuleParameters, Status, without_absent
+from capsule_id.records.motion import fit_mean_velocity, measured_motion
 from capsule_id.records.tones import stated_gap, stated_Omega, tone_at
-from capsule_id.rig.filters import median_step
+from capsule_id.records.view import view_record
+from capsule_id.rig.filters import choose_window, median_step, sampling_step, savitzky_golay, window_samples
 from capsule_id.rig.model import Table
-from capsule_id.views import Finding
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.forced_run.experiment import ForcedRun
-
+from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable
 
 # feasibility: Feasibility of a forced run: contact, motion of the capsule, sampling rate and length of the record.
 #
@@ -59,7 +60,7 @@ def stated_conditions(table: Table, K: float) -> RunConditions:
     return RunConditions(Omega, P_d, stated_gap(table).value)
 
 
-def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
+def check_feasible(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
     """Check that the settings of every run allow it to determine its parameters, at the point fit."""
     findings = []
     # The rule for contact and slip of a run from rest holds on level ground.
@@ -68,9 +69,26 @@ def check_feasible(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
         p, e = run.capsule(theta)
         assert isinstance(e, Excitation), "only runs with a harmonic force declare this check"
         conditions = RunConditions(run.Omega, float(e.P_d), float(p.G))  # pyright: ignore[reportArgumentType]
-        F_b = float(run.law(theta).forward(0.0))
-        findings += feasibility(run.table, theta, F_b, conditions)
+        findings += feasibility(run.table, theta, float(run.law(theta).forward(0.0)), conditions)
     return findings
+
+
+class Rest(NamedTuple):
+    """A run that starts from rest: its table, values by symbol, drive, break-away force, N, and the rod on a held capsule.
+
+    Attributes
+    ----------
+    grazing : amplitude of the drive at which the rod reaches the gap, N
+    reached, touches : see ``held_rod``
+    """
+
+    table: Table
+    theta: Mapping[str, float]
+    drive: RunConditions
+    F_b: float
+    grazing: float
+    reached: float
+    touches: bool
 
 
 def feasibility(
@@ -86,17 +104,54 @@ def feasibility(
     conditions : None: as stated
     """
     drive = conditions or stated_conditions(table, theta.get("K", np.nan))
-    reached, touches = held_rod(theta, drive)
-    without_contact = drive.P_d / float(grazing_load(theta["m1"], theta["k1"], theta["c"], 1.0, drive.Omega))
     grazing = float(grazing_load(theta["m1"], theta["k1"], theta["c"], drive.G, drive.Omega))
-    linear_force = without_contact * float(np.hypot(theta["k1"], theta["c"] * drive.Omega))
-    findings = []
-    if drive.P_d < grazing < np.inf and linear_force <= F_b:
-        facts = {"Omega": drive.Omega, "gap_mm": 1e3 * drive.G, "needed": grazing, "P_d": drive.P_d}
-        findings.append(Finding("runs.contact", "warn", facts, table.label))
-    if reached <= F_b:
-        findings.append(Finding("runs.slip", "warn", {"force": reached, "F_b": F_b}, table.label))
-    return [*findings, *_sampling(table, theta, touches and drive.P_d >= grazing), *_length(table, theta, drive)]
+    rest = Rest(table, theta, drive, F_b, grazing, *held_rod(theta, drive))
+    found = ((code, detect(rest)) for code, detect in DETECTORS.items())
+    return [Finding(code, "warn", facts, table.label) for code, facts in found if facts]
+
+
+def no_contact(run: Rest) -> Facts:
+    """The rod of a capsule that stays where it is does not reach the gap."""
+    drive, k1, c = run.drive, run.theta["k1"], run.theta["c"]
+    deflection = drive.P_d / float(grazing_load(run.theta["m1"], k1, c, 1.0, drive.Omega))
+    force = deflection * float(np.hypot(k1, c * drive.Omega))
+    if not drive.P_d < run.grazing < np.inf or force > run.F_b:
+        return {}
+    return {"Omega": drive.Omega, "gap_mm": 1e3 * drive.G, "needed": run.grazing, "P_d": drive.P_d}
+
+
+def no_slip(run: Rest) -> Facts:
+    """The rod does not push the capsule out of its place."""
+    return {} if run.reached > run.F_b else {"force": run.reached, "F_b": run.F_b}
+
+
+def sparse_contacts(run: Rest) -> Facts:
+    """A contact has few samples; the shortest contact is that with a sliding capsule."""
+    touch = contact_time(run.theta["m1"], run.theta["m2"], run.theta.get("k2", 0.0))
+    samples, enough = touch / median_step(run.table["time"]), SAMPLES_PER_CONTACT
+    if not (run.touches and run.drive.P_d >= run.grazing) or samples >= enough:
+        return {}
+    return {"contact_ms": 1e3 * touch, "samples": samples, "wanted": enough, "rate": enough / touch}
+
+
+def short_record(run: Rest) -> Facts:
+    """Few excitation periods are left after the transient."""
+    time, decay = run.table["time"], DECAY_TIMES * 2.0 * run.theta["m1"] / run.theta["c"]
+    period = 2.0 * np.pi / run.drive.Omega
+    settled = (float(time[-1] - time[0]) - decay) / period
+    if settled >= SETTLED_PERIODS:
+        return {}
+    seconds = decay + SETTLED_PERIODS * period
+    return {"periods": max(settled, 0.0), "decay": decay, "wanted": SETTLED_PERIODS, "seconds": seconds}
+
+
+#: Detectors of settings that do not determine the parameters, by code; each returns the facts, {} where there is no fault.
+DETECTORS: Mapping[str, Callable[[Rest], Facts]] = {
+    "runs.contact": no_contact,
+    "runs.slip": no_slip,
+    "runs.sampling": sparse_contacts,
+    "runs.length": short_record,
+}
 
 
 def held_rod(theta: Mapping[str, float], drive: RunConditions) -> tuple[float, bool]:
@@ -129,102 +184,10 @@ def contact_time(m1: float, m2: float, k2: float) -> float:
     return float(np.pi * np.sqrt(1.0 / ((1.0 / m1 + 1.0 / m2) * k2))) if k2 > 0.0 else np.inf
 
 
-def _sampling(table: Table, theta: Mapping[str, float], touches: bool) -> list[Finding]:
-    """Check the number of samples per contact; the shortest contact is that with a sliding capsule."""
-    step = median_step(table["time"])
-    touch = contact_time(theta["m1"], theta["m2"], theta.get("k2", 0.0))
-    if not touches or touch / step >= SAMPLES_PER_CONTACT:
-        return []
-    facts = {
-        "contact_ms": 1e3 * touch,
-        "samples": touch / step,
-        "wanted": SAMPLES_PER_CONTACT,
-        "rate": SAMPLES_PER_CONTACT / touch,
-    }
-    return [Finding("runs.sampling", "warn", facts, table.label)]
-
-
-def _length(table: Table, theta: Mapping[str, float], drive: RunConditions) -> list[Finding]:
-    """Check the number of excitation periods after the transient."""
-    time, start = table["time"], DECAY_TIMES * 2.0 * theta["m1"] / theta["c"]
-    period = 2.0 * np.pi / drive.Omega
-    settled = (float(time[-1] - time[0]) - start) / period
-    if settled >= SETTLED_PERIODS:
-        return []
-    facts = {
-        "periods": max(settled, 0.0),
-        "decay": start,
-        "wanted": SETTLED_PERIODS,
-        "seconds": start + SETTLED_PERIODS * period,
-    }
-    return [Finding("runs.length", "warn", facts, table.label)]
-
-
 # predictability: Test whether one initial state predicts the motion of a whole record.
 
 
-#: Largest growth factor of an initial error within the record, dimensionless. Above it one initial state cannot fit it.
-LARGEST_GROWTH = 1e3
-#: Target growth factor of an initial error within a part, dimensionless; shortest part, excitation periods.
-PART_GROWTH, PART_PERIODS = 30.0, 2.0
-
-#: Initial errors of the difference quotients, relative to the motion; factors up to this are read off; instants of a
-#: record at which they are read.
-STEP, MEASURABLE, INSTANTS = 1e-11, 1e8, 8
-
-
-def growth(run: "ForcedRun", theta: ValuesBySymbol) -> float:
-    """Largest growth factor of a small initial error at the end of the record, dimensionless; inf where it is not finite.
-
-    Positions are scaled by the amplitude of the motion, velocities by amplitude times Omega. Central differences come
-    from one batch of runs, because exact derivatives take ten times as long to compile. A factor above ``MEASURABLE``
-    within the record is extrapolated from there, because differences cannot outgrow the motion. Below 1e-3: rounding.
-    """
-    run = run.with_smoothing(None)  # the steps of the smoothed engine hide so small an error
-    size = np.array([1.0, run.Omega, run.Omega]) * run.rough.length
-    motion = run.motion(theta, np)
-    start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
-    x_rel, rate, Y2 = np.concatenate([start + STEP * np.diag(size), start - STEP * np.diag(size)]).T
-    time = np.asarray(run.true_time(theta))
-    instants = np.linspace(time[0], time[-1], INSTANTS + 1)[1:]
-    # As many samples as the record has: then one compiled program serves all batches of its motions.
-    times = np.union1d(time, instants)
-    t = run.simulated(theta, *run.capsule(theta), times, (x_rel, rate + Y2, np.zeros(6), Y2))
-    states = np.stack([t.x_rel, t.Y1 - t.Y2, t.Y2], axis=-1)[:, np.searchsorted(times, instants)]
-    states = states / (2.0 * STEP * size)
-    if not np.isfinite(states).all():
-        return float("inf")
-    factors = np.linalg.norm(np.swapaxes(states[:3] - states[3:], 0, 1), 2, axis=(1, 2))
-    last = int(np.argmax(factors > MEASURABLE)) if np.any(factors > MEASURABLE) else INSTANTS - 1
-    with np.errstate(over="ignore"):
-        return float(factors[last] ** (INSTANTS / (last + 1)))
-
-
-def predictable_parts(run: "ForcedRun", theta: ValuesBySymbol) -> "tuple[tuple[ForcedRun, ...], list[Finding]]":
-    """Divide ``run`` where it amplifies errors of its initial state too much at ``theta``; also return findings."""
-    if run.settled:
-        return (run,), []
-    factor = growth(run, theta)
-    if factor <= LARGEST_GROWTH:
-        return (run,), []
-    parts = run.parts(_part_length(run, factor))
-    if len(parts) == 1:
-        return parts, []
-    seconds = (run.time[-1] - run.time[0]) / len(parts)
-    facts = {"growth": factor, "parts": len(parts), "seconds": seconds}
-    return parts, [Finding("runs.cut", "warn", facts, run.label)]
-
-
-def _part_length(run: "ForcedRun", factor: float) -> float:
-    """Duration over which errors grow about ``PART_GROWTH`` times, s."""
-    shortest = PART_PERIODS * 2.0 * np.pi / run.Omega
-    duration = float(run.time[-1] - run.time[0])
-    if not np.isfinite(factor):
-        return shortest
-    return max(shortest, duration * np.log(PART_GROWTH) / np.log(factor))
-
-
-def check_predictable(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
+def check_predictable(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
     """Check that the motion of every run is predictable over its record, and complete."""
     findings = []
     for run in runs:
@@ -250,7 +213,7 @@ HARMONICS, SAMPLES_PER_HARMONIC = 10, 4
 FEWEST_PERIODS = 4
 
 
-def check_repeated(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
+def check_repeated(runs: Sequence[CapsuleRun], fit: Fitted) -> list[Finding]:
     """Check that the residuals of no record repeat with the excitation."""
     tests = [
         (run, label, *found)
@@ -268,7 +231,7 @@ def check_repeated(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[Finding]:
     return [Finding("runs.repeated", "ok", {"p": min(p for *_, p in tests)})]
 
 
-def repetition(run: "ForcedRun", residuals: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
+def repetition(run: CapsuleRun, residuals: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
     """F statistic of the harmonics of the excitation in ``residuals``, and its p-value; None for a short record."""
     assert run.cycles is not None, "a run has an excitation"
     cycles = run.cycles
@@ -283,3 +246,183 @@ def repetition(run: "ForcedRun", residuals: Float[np.ndarray, " n"]) -> tuple[fl
     own, whole = float(np.sum(rest**2)), float(np.sum((residuals - np.mean(residuals)) ** 2))
     F = (whole - own) / (2 * number) / max(own / freedom, np.finfo(float).tiny)
     return F, float(stats.f.sf(F, 2 * number, freedom))
+
+
+# tables: Tables of forced runs: nondimensional groups and predicted motion.
+
+
+#: Draws at which velocities are computed, and errors of a record's velocity drawn for each.
+VELOCITY_DRAWS, ERRORS = 50, 200
+
+
+def scaled_groups(runs: Sequence[CapsuleRun], fit: Fitted) -> list[ResultTable]:
+    """Return the paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
+
+    Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0. Omega0 = sqrt(k1/m1); F_b is the break-away force.
+    """
+    columns: dict[str, list[float]] = {}
+    for name, value in (item for v in fit.draws for run in runs for item in _groups(run, run.local(v)).items()):
+        columns.setdefault(name, []).append(value)
+    rows = {name: [np.mean(column), np.std(column, ddof=1)] for name, column in columns.items()}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["mean", "sd"]).rename_axis("group")
+    return [ResultTable("runs.groups", frame)] if rows else []
+
+
+def _groups(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float]:
+    p, e = run.capsule(theta)
+    m1, m2, k1, k2, c, G = (float(leaf) for leaf in (p.m1, p.m2, p.k1, p.k2, p.c, p.G))  # pyright: ignore[reportArgumentType]
+    Omega0, F_b = np.sqrt(k1 / m1), float(run.law(theta).forward(0.0))
+    length, of = F_b / k1, run.label
+    scales = {"N": ("F_b", F_b), "m/s": ("(Omega0 F_b/k1)", Omega0 * length)}
+    own = [(row.symbol, *scales[row.unit]) for row in run.friction.parameters if row.unit in scales]
+    return {
+        "Omega0, rad/s": Omega0,
+        "zeta": c / (2.0 * m1 * Omega0),
+        "m2/m1": m2 / m1,
+        **{f"{symbol} / {scale}": theta[symbol] / value for symbol, scale, value in own},
+        f"Omega/Omega0 [{of}]": run.Omega / Omega0,
+        f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore
+        **({f"k2/k1 [{run.spring}]": k2 / k1, f"G k1/F_b [{of}]": G / length} if run.spring is not None else {}),
+    }
+
+
+def predicted_motion(runs: Sequence[CapsuleRun], fit: Fitted) -> list[ResultTable]:
+    """Contacts and mean velocity of the capsule over the record: observed, point fit, 95 % interval of a new record.
+
+    Both velocities come from the estimator of ``capsule_id.records.motion``, the model's at the sample times.
+    """
+    rows = {run.label: _motion_row(run, fit) for run in runs}
+    return [ResultTable("runs.motion", pd.DataFrame.from_dict(rows, orient="index").rename_axis("run"))]
+
+
+def _motion_row(run: CapsuleRun, fit: Fitted) -> dict[str, object]:
+    """Motion of one record: its label, contacts, and mean velocities with the band of a new record."""
+    best, seen = run.motion(run.local(fit.values), np), measured_motion(run.table)
+    local = [run.local(draw) for draw in fit.draws[:VELOCITY_DRAWS]]
+    sample = run.motion(_stacked(local), np) if local else None
+    evidence, found = seen.evidence, seen.evidence.mean_velocity
+    period = evidence.repeat.period if evidence.repeat else None
+
+    def velocity(place: np.ndarray) -> float:
+        return 1e3 * fit_mean_velocity(run.time, place, 2.0 * np.pi / evidence.Omega, period).velocity
+
+    sd = 0.0 if found is None or not np.isfinite(found.velocity_sd) else 1e3 * found.velocity_sd
+    row: dict[str, object] = {"motion of the record": seen.label, "probability": seen.probability}
+    row["contacts, model"] = int(best.contacts)
+    if sample is not None:
+        low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
+        row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"
+    row["mean velocity, model, mm/s"] = velocity(np.asarray(best.X2))
+    if sample is not None:
+        error = sd * np.random.default_rng(0).standard_normal((ERRORS, 1))
+        velocities = error + np.array([velocity(place) for place in np.asarray(sample.X2)])
+        row["95 % band, mm/s"] = "{:.4g} to {:.4g}".format(*np.quantile(velocities, [0.025, 0.975]))
+    if found is not None:
+        row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
+    return row
+
+
+def _stacked(draws: Sequence[ValuesBySymbol]) -> dict[str, np.ndarray]:
+    """(draws,) values by symbol."""
+    return {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
+
+
+def second_fit_table(runs: Sequence[CapsuleRun], fit: Fitted) -> list[ResultTable]:
+    """Tables of the second fits of runs: coloured noise, and other friction laws; [] without one."""
+    del runs
+    found = {finding.code: finding.facts for finding in fit.findings}
+    tables = {"runs.second_fit": "fits", "runs.laws": "laws"}
+    return [
+        ResultTable(code, pd.DataFrame(found[code][rows]).set_index("fit"))
+        for code, rows in tables.items()
+        if code in found
+    ]
+
+
+# panels: Plot data of a forced run: every channel with its residuals, and the phase portrait.
+
+
+#: Channels that depend on the motion; the current is the drive itself.
+SHOWN = {"x_rel": "x_rel", "x_capsule": "capsule", "acceleration_rod": "rod's acceleration"}
+#: Largest number of posterior draws for a band; number of lags of an autocorrelation.
+BAND_DRAWS, LAGS = 50, 60
+#: Polynomial order of the Savitzky–Golay filter for the measured phase portrait.
+PORTRAIT_ORDER = 3
+
+
+def run_comparisons(run: CapsuleRun, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
+    """Return a panel per channel (prediction, 95 % band, residuals, autocorrelation), then the phase portrait.
+
+    ``theta`` is the point fit. Bands use at most ``BAND_DRAWS`` of ``draws`` and exclude the noise.
+    """
+    bands = run.predict(_stacked(draws[:BAND_DRAWS]), np) if draws else [None] * len(run.channels)
+    panels = []
+    for channel, part, seen, drawn in zip(
+        run.channels, run.scaled(theta, np), run.predict(theta, np), bands, strict=False
+    ):
+        if channel.name not in SHOWN:
+            continue
+        column, unit = run.table.columns[channel.name], run.table.columns[channel.name].to_display
+        residuals, nuisance = (np.asarray(x) for x in part.at_nuisance_mean(np))
+        fitted = channel.values - part.raw + part.design @ nuisance
+        # The band represents the uncertainty of the motion: offset and gain of a draw hardly differ from the fit.
+        limits = (None, None) if drawn is None else band((drawn + (fitted - seen)) * unit)
+        panels.append(
+            Comparison(
+                run.kind,
+                f"{run.label}_{channel.name}",
+                f"{run.label}: {SHOWN[channel.name]}",
+                "time [s]",
+                axis_label(column),
+                (Points(run.label, run.time, channel.values * unit),),
+                (Curve("this fit", run.time, fitted * unit, *limits),),
+                run.time,
+                residuals,
+                autocorrelation(residuals, min(LAGS, len(run.time) // 4)),
+                1.96 / float(np.sqrt(len(run.time))),
+            )
+        )
+    return (*panels, *(_portrait(run, theta) if "x_rel" in run.names else []))
+
+
+def _portrait(run: CapsuleRun, theta: ValuesBySymbol) -> list[Comparison]:
+    """Phase portrait, rate of x_rel by Savitzky–Golay against x_rel; [] for a record sampled unevenly."""
+    index, column = run.names.index("x_rel"), run.table.columns["x_rel"]
+    values, unit = column.values, column.to_display
+    motion = run.motion(theta, np)
+    offset = run.scaled(theta, np)[index].at_nuisance_mean(np)[1][0] * run.channels[index].width
+    x, y = np.asarray(motion.x_rel) + offset, np.asarray(motion.Y1 - motion.Y2)
+    try:
+        window = choose_window(run.time, values, PORTRAIT_ORDER)
+        recorded, fitted = (_filtered(run.time, side, window) for side in (values, x))
+    except InputError:
+        return []
+    curves = [
+        Curve("this fit", x * unit, y),
+        Curve("this fit through the same filter", fitted[0] * unit, fitted[1], role="alternative"),
+    ]
+    if run.spring is not None:
+        gap = (float(run.with_spring(theta).G) + offset) * unit  # pyright: ignore[reportArgumentType]
+        ends = np.array([y.min(), y.max()])
+        curves.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
+    label, points = f"{run.label}_phase_portrait", Points("record, Savitzky–Golay", recorded[0] * unit, recorded[1])
+    axes = axis_label(column), "rate of x_rel [m/s]"
+    return [Comparison("phase_portrait", label, f"{run.label}: phase portrait", *axes, (points,), tuple(curves))]
+
+
+def _filtered(time: np.ndarray, values: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed value and rate, without the half window at both ends, where the derivative is inaccurate."""
+    half = window_samples(window, sampling_step(time)) // 2
+    inside = slice(half, len(time) - half)
+    value, rate = (savitzky_golay(time, values, window, PORTRAIT_ORDER, derivative=n) for n in (0, 1))
+    return value[inside], rate[inside]
+
+
+def filtered_record(run: CapsuleRun, theta: ValuesBySymbol) -> RunRecord | None:
+    """The record through the paper's filter, and its drive; None where x_rel is not recorded, or not evenly."""
+    _, e = run.capsule(theta)
+    try:
+        view = view_record(run.table, K=theta["K"] if run.driven_by_current else None)
+    except InputError:
+        return None
+    return RunRecord(run.label, view, np.asarray(e.force_at(run.time)))

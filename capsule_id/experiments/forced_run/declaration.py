@@ -1,114 +1,159 @@
 """Forced runs: columns, settings, rules of the drive, template, lint and description of a record."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, make_dataclass
+from functools import partial
+from pkgutil import resolve_name
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import Estimate, Kind, Twin, Values, made_by
+from capsule_id.experiments.kind import Estimate, Kind, made_by
 from capsule_id.experiments.lint import lint_channel, lint_smooth, lint_times
 from capsule_id.parameters import Prior, nuisance, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, drive_power, phasor
 from capsule_id.records.tones import recorded_drive, stated_Omega
 from capsule_id.records.view import describe_run
 from capsule_id.rig.filters import median_step, sampling_step
-from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings, NameRule, QuantityRule
 from capsule_id.rig.tables import Entry
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE
 from capsule_id.views import Facts, Finding, Message, stated_p
 
-if TYPE_CHECKING:
-    from capsule_id.experiments.base import Experiment
-    from capsule_id.experiments.friction_model import FrictionModel
-
-
 # rules: Rules on the drive of a forced run: what each kind of drive needs, and what it does not have.
 
 
-#: Settings of pulses alone.
-OF_PULSES = ("duty", "P_on", "lag")
+#: Drives of a run: a harmonic force, a prescribed motion of the rod, pulses, K times the recorded current.
+HARMONIC, BASE, PULSES, RECORDED = DRIVES = ("harmonic", "base", "pulses", "recorded")
+FORCES = (HARMONIC, PULSES, RECORDED)
 
 
-def check_base(entry: "Entry[RunSettings]") -> None:
-    """Require x_base with drive = "base" and only there, and nothing that belongs to a force on the rod."""
+class DriveRule(NamedTuple):
+    """A rule on the settings and columns of an entry with one of ``drives``.
+
+    Attributes
+    ----------
+    found : from settings and columns; "" where the rule holds
+    place, rule, value, remedy : of the error; {drive}, {columns} and {found} are filled in
+    of_key : the place is the key, not its value
+    """
+
+    drives: tuple[str, ...]
+    found: Callable[[Any, Mapping[str, Column]], object]
+    place: str
+    rule: str
+    value: str
+    remedy: str
+    of_key: bool = False
+
+
+def check_drive(rules: Sequence[DriveRule], entry: Entry[Any]) -> None:
+    """Raise the error of the first of ``rules`` that the entry breaks."""
     settings, columns = entry.table.settings, entry.table.columns
-    if settings.drive != "base":
-        if "x_base" in columns:
-            rule, remedy = "x_base prescribes the motion of the rod", 'add drive = "base", or remove the column'
-            raise entry.error("", rule, "a force", remedy)
-        return
-    if "x_base" not in columns:
-        raise entry.error("drive", 'drive = "base" needs a column x_base', f"columns {' '.join(columns)}", "add it")
-    present = [name for name in ("acceleration_rod", "current") if name in columns]
-    if present:
-        rule = "a run with a prescribed rod has x_capsule, x_rel or both, and no other channel"
-        raise entry.error("drive", rule, f"columns {' '.join(columns)}", f"remove {' and '.join(present)}")
-    if settings.P_d is not None:
-        raise entry.error("P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True)
-    if settings.start == "settled":
-        rule, remedy = 'start = "settled" needs a harmonic force', 'write start = "auto"'
-        raise entry.error("start", rule, 'drive = "base"', remedy)
+    for rule in (rule for rule in rules if settings.drive in rule.drives):
+        if found := rule.found(settings, columns):
+            facts = {"drive": settings.drive, "columns": f"columns {' '.join(columns)}", "found": found}
+            place, text, value, remedy = (part.format(**facts) for part in rule[2:6])
+            raise entry.error(place, text, value, remedy, of_key=rule.of_key)
+
+
+def _frequencies(settings: Any, columns: Mapping[str, Column]) -> str:
+    """The stated frequencies, where there are both or none that is needed."""
+    stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
+    return "" if len(stated) == 1 or (settings.drive == BASE and not stated) else " and ".join(stated) or "none"
+
+
+def _uneven_base(settings: Any, columns: Mapping[str, Column]) -> str:
+    """What is uneven in the times of a base without a stated frequency."""
     if settings.Omega is None and settings.f is None:
         try:
-            sampling_step(entry.table["time"])
+            sampling_step(columns["time"].values)
         except InputError as error:
-            rule = "the frequency of a base sampled unevenly must be stated"
-            raise entry.error("", rule, error.value, 'add f = { value = ..., unit = "Hz" }') from None
+            return error.value
+    return ""
 
 
-def check_drive(entry: "Entry[RunSettings]") -> None:
-    """Require one frequency, and an amplitude from P_d or from the recorded current."""
-    settings, columns = entry.table.settings, entry.table.columns
-    stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
-    if settings.drive == "base" and not stated:
-        return
-    if len(stated) != 1:
-        rule = "forced_run must have Omega (rad/s) or f (Hz), not both"
-        raise entry.error("f" if stated else "", rule, " and ".join(stated) or "none", "state one of them")
-    if settings.drive == "base":
-        return
-    _check_other_drives(entry)
-    if settings.drive != "harmonic":
-        return
-    if settings.P_d is None and "current" not in columns:
-        rule = "forced_run must have P_d where current is not recorded"
-        remedy = 'add P_d = { value = ..., sd = ..., unit = "N" }'
-        raise entry.error("", rule, f"columns {' '.join(columns)}", remedy)
-    if "current" in columns and settings.P_d is not None and settings.P_d.sd == 0.0:
-        rule = "P_d beside a recorded current is a second reading of the same amplitude and must have an sd"
-        raise entry.error("P_d", rule, "none", "add sd = ... to it, or leave P_d out")
+def _present(*names: str) -> Callable[[Any, Mapping[str, Column]], str]:
+    """Finds the columns of ``names`` that the entry has."""
+    return lambda settings, columns: " and ".join(name for name in names if name in columns)
 
 
-def _check_other_drives(entry: "Entry[RunSettings]") -> None:
-    """Require a current with drive = "recorded", duty and P_on with pulses, and none of them elsewhere."""
-    settings, columns, drive = entry.table.settings, entry.table.columns, entry.table.settings.drive
-    if drive != "pulses":
-        for key in OF_PULSES:
-            if getattr(settings, key) is not None:
-                raise entry.error(key, f'only drive = "pulses" has {key}', key, f"remove {key}", of_key=True)
-    if drive == "harmonic":
-        return
-    if settings.P_d is not None:
-        raise entry.error("P_d", f'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True)
-    if settings.start == "settled":
-        rule, remedy = 'start = "settled" needs a harmonic force', 'write start = "auto"'
-        raise entry.error("start", rule, f'drive = "{drive}"', remedy)
-    if drive == "recorded":
-        if "current" not in columns or len(columns) < 3:
-            rule = 'drive = "recorded" needs the column current and another channel'
-            raise entry.error("drive", rule, f"columns {' '.join(columns)}", "add it")
-        return
-    if "current" in columns:
-        rule, remedy = "pulses have no column current", 'write drive = "recorded", or remove the column'
-        raise entry.error("drive", rule, f"columns {' '.join(columns)}", remedy)
-    for key in ("duty", "P_on"):
-        if getattr(settings, key) is None:
-            raise entry.error(
-                "drive", f'drive = "pulses" needs {key}', "none", f"add {key} = {{ value = ..., unit = ... }}"
-            )
+def _stated(key: str) -> Callable[[Any, Mapping[str, Column]], bool]:
+    """Finds whether a setting is stated."""
+    return lambda settings, columns: getattr(settings, key) is not None
+
+
+def _lacks(column: str, fewest: int = 0) -> Callable[[Any, Mapping[str, Column]], bool]:
+    """Finds whether the entry lacks ``column``, or has fewer columns than ``fewest``."""
+    return lambda settings, columns: column not in columns or len(columns) < fewest
+
+
+_IS_SETTLED = DriveRule(
+    (BASE,), lambda settings, columns: settings.start == "settled", "start",
+    'start = "settled" needs a harmonic force', 'drive = "{drive}"', 'write start = "auto"',
+)  # fmt: skip
+#: The rules on the drive of a forced run, in the order in which they are applied.
+DRIVE_RULES = (
+    DriveRule(
+        FORCES, _present("x_base"), "", "x_base prescribes the motion of the rod", "a force",
+        'add drive = "base", or remove the column',
+    ),
+    DriveRule((BASE,), _lacks("x_base"), "drive", 'drive = "base" needs a column x_base', "{columns}", "add it"),
+    DriveRule(
+        (BASE,), _present("acceleration_rod", "current"), "drive",
+        "a run with a prescribed rod has x_capsule, x_rel or both, and no other channel", "{columns}", "remove {found}",
+    ),
+    DriveRule((BASE,), _stated("P_d"), "P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True),
+    _IS_SETTLED,
+    DriveRule(
+        (BASE,), _uneven_base, "", "the frequency of a base sampled unevenly must be stated", "{found}",
+        'add f = {{ value = ..., unit = "Hz" }}',
+    ),
+    DriveRule(
+        DRIVES, lambda *entry: _frequencies(*entry) == "none", "", "forced_run must have Omega (rad/s) or f (Hz), not both",
+        "none", "state one of them",
+    ),
+    DriveRule(
+        DRIVES, _frequencies, "f", "forced_run must have Omega (rad/s) or f (Hz), not both", "{found}", "state one of them"
+    ),
+    *(
+        DriveRule(
+            (HARMONIC, RECORDED), _stated(key), key, f'only drive = "pulses" has {key}', key, f"remove {key}", of_key=True
+        )
+        for key in ("duty", "P_on", "lag")
+    ),
+    DriveRule(
+        (PULSES, RECORDED), _stated("P_d"), "P_d", 'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True
+    ),
+    _IS_SETTLED._replace(drives=(PULSES, RECORDED)),
+    DriveRule(
+        (RECORDED,), _lacks("current", 3), "drive",
+        'drive = "recorded" needs the column current and another channel', "{columns}", "add it",
+    ),
+    DriveRule(
+        (PULSES,), _present("current"), "drive", "pulses have no column current", "{columns}",
+        'write drive = "recorded", or remove the column',
+    ),
+    *(
+        DriveRule(
+            (PULSES,), lambda settings, columns, key=key: getattr(settings, key) is None, "drive",
+            f'drive = "pulses" needs {key}', "none", f"add {key} = {{{{ value = ..., unit = ... }}}}",
+        )
+        for key in ("duty", "P_on")
+    ),
+    DriveRule(
+        (HARMONIC,), lambda settings, columns: settings.P_d is None and "current" not in columns, "",
+        "forced_run must have P_d where current is not recorded", "{columns}",
+        'add P_d = {{ value = ..., sd = ..., unit = "N" }}',
+    ),
+    DriveRule(
+        (HARMONIC,), lambda settings, columns: "current" in columns and settings.P_d and settings.P_d.sd == 0.0, "P_d",
+        "P_d beside a recorded current is a second reading of the same amplitude and must have an sd", "none",
+        "add sd = ... to it, or leave P_d out",
+    ),
+)  # fmt: skip
 
 
 # lint: Findings on the readings of a forced run: its frequency, mislabelled columns, and those of any record.
@@ -243,24 +288,30 @@ CORRELATION = {
     for name, _, _ in _CHANNELS
 }  # fmt: skip
 
-Gain = Annotated[float | None, QuantityRule("1")]
-Delay = Annotated[float | None, QuantityRule("s")]
+#: Settings of the gains and delays of channels: ``<channel>_gain_sd`` and ``<channel>_delay_sd``, 1 and s.
+ChannelSettings: Any = make_dataclass(
+    "ChannelSettings",
+    [
+        (f"{name}_{error}_sd", Annotated[float | None, QuantityRule(unit)], None)
+        for error, unit in (("gain", "1"), ("delay", "s"))
+        for name, *_ in _CHANNELS
+    ],
+    bases=(GroundSettings,),
+    frozen=True,
+    kw_only=True,
+)
 #: Stiffness of the hard spring of the paper's Fig. 10, N/m; it has no static test.
 RUN_SPRINGS = {"hard": 59410.0}
 
 
-#: Module and class of the runs of each drive.
-RUNS_OF_DRIVES = {
-    "harmonic": "experiment:ForcedRun",
-    "base": "drives:BaseRun",
-    "pulses": "drives:PulseRun",
-    "recorded": "drives:RecordedRun",
-}
+#: Module with the classes of runs and of their twin, and the class of each drive.
+PLACE = "capsule_id.experiments.forced_run"
+RUNS_OF_DRIVES = {HARMONIC: "ForcedRun", BASE: "BaseRun", PULSES: "PulseRun", RECORDED: "RecordedRun"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunSettings(GroundSettings):
-    """Settings of a forced run, SI; ``<channel>_gain_sd`` and ``<channel>_delay_sd`` are sds of gain and delay."""
+class RunSettings(ChannelSettings):
+    """Settings of a forced run, SI; see ``ChannelSettings`` for sds of gain and delay."""
 
     drive: Literal["harmonic", "base", "pulses", "recorded"] = "harmonic"
     spring: Annotated[str | None, NameRule()] = None
@@ -275,14 +326,6 @@ class RunSettings(GroundSettings):
     start: Literal["auto", "stuck", "moving", "settled"] = "auto"
     noise: Literal["white", "ar1"] | None = None
     segment: Annotated[float | None, QuantityRule("s")] = None
-    x_rel_gain_sd: Gain = None
-    x_capsule_gain_sd: Gain = None
-    acceleration_rod_gain_sd: Gain = None
-    current_gain_sd: Gain = None
-    x_rel_delay_sd: Delay = None
-    x_capsule_delay_sd: Delay = None
-    acceleration_rod_delay_sd: Delay = None
-    current_delay_sd: Delay = None
 
     @property
     def angular_frequency(self) -> float:
@@ -316,18 +359,6 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
     if findings and guessed:
         findings.append(Finding("runs.rough", "warn", {"names": ", ".join(guessed)}, table.label))
     return findings
-
-
-def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
-    from capsule_id.experiments.forced_run.twin import measure
-
-    del rng
-    return measure(values, seed)
-
-
-def _make(table: Table[RunSettings], rig: Rig, friction: "FrictionModel") -> tuple["Experiment", ...]:
-    reference = RUNS_OF_DRIVES[table.settings.drive]
-    return made_by(f"capsule_id.experiments.forced_run.{reference}")(table, rig, friction)
 
 
 def _second_fit(facts: Facts) -> str:
@@ -514,10 +545,10 @@ KIND = Kind(
     optional=("x_base",),
     channels=tuple(NOISE),
     settings=RunSettings,
-    rules=(Entry.check_spring_with_gap, Entry.check_length, check_base, check_drive),
+    rules=(Entry.check_spring_with_gap, Entry.check_length, partial(check_drive, DRIVE_RULES)),
     masses=lambda table: ("m2",) if table.settings.drive == "base" else ("m1", "m2"),  # a prescribed rod needs no mass
     parameters=(CURRENT_AMPLITUDE, *NOISE.values(), *CORRELATION.values(), CAPSULE_START),
-    make=_make,
+    make=lambda table, *rig: made_by(f"{PLACE}.drives:{RUNS_OF_DRIVES[table.settings.drive]}")(table, *rig),
     template=TEMPLATE,
     informs="all of them together, and the gap",
     captions={
@@ -529,6 +560,6 @@ KIND = Kind(
     lint=(lint_run,),
     lint_rig=_lint_feasibility,
     describe=describe_run,
-    twin=_measure,
+    twin=lambda values, rng, seed: resolve_name(f"{PLACE}.twin:measure")(values, seed),
     truth={f"k2[{name}]": k2 for name, k2 in RUN_SPRINGS.items()},
 )

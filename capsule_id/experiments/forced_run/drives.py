@@ -3,47 +3,63 @@
 from types import ModuleType
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.experiments.base import Start, ValuesBySymbol, stretch
+from capsule_id.experiments.capsule_experiment import lag_of
 from capsule_id.experiments.context import RunRecord
 from capsule_id.experiments.forced_run.checks import (
+    check_feasible,
     check_predictable,
     check_repeated,
+    filtered_record,
+    predicted_motion,
+    run_comparisons,
+    scaled_groups,
+    second_fit_table,
 )
-from capsule_id.experiments.forced_run.experiment import ForcedRun, predicted_motion, second_fit_table
-from capsule_id.experiments.forced_run.start_state import (
-    RunStart,
-    rough_start,
-    slides,
-)
+from capsule_id.experiments.forced_run.experiment import CapsuleRun, before_samples
+from capsule_id.experiments.forced_run.start_state import RunStart, rough_start, slides
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives import Pulses, RecordedDrive, RodMotion
 from capsule_id.physics.forces import downhill, rod_on_capsule
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory
 from capsule_id.records.tones import relative_position
-from capsule_id.rig.model import Table
+from capsule_id.rig.model import Rig, Table
+from capsule_id.views import Comparison
 
-# runs: Runs with a drive that is not harmonic: pulses, or K times the recorded current.
+# runs: Runs by drive, with their checks, tables and panels. What the paper's protocol and figures take from a harmonic
+# force is left out of the others.
 
 
 #: Periods before the first sample from which pulses act: a lag forgets its start in a few periods.
 EARLIER_PERIODS = 50.0
 
 
-class OtherRun(ForcedRun):
-    """A run without a harmonic force: what the paper's protocol and figures take from one is left out."""
+class OtherRun(CapsuleRun):
+    """A run with any drive: the checks, tables and panels that need no harmonic force."""
 
     checks = (check_predictable, check_repeated)
     tables = (second_fit_table, predicted_motion)
 
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+        return self.comparisons(theta, draws)[0]
+
+    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
+        return run_comparisons(self, theta, draws)
+
+
+class ForcedRun(OtherRun):
+    """A run with a harmonic force."""
+
+    checks = (check_feasible, *OtherRun.checks)
+    tables = (*OtherRun.tables, scaled_groups)
+
     def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        del theta
-        return None
+        return filtered_record(self, theta)
 
 
 class RecordedRun(OtherRun):
@@ -63,7 +79,7 @@ class RecordedRun(OtherRun):
     has_phase = False
     inputs = ("current",)
 
-    def read_drive(self, table: Table) -> None:
+    def read_drive(self, table: Table, rig: Rig) -> None:
         self.current = table["current"]
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
@@ -71,9 +87,8 @@ class RecordedRun(OtherRun):
         return self.with_spring(theta), RecordedDrive(self.true_time(theta), force, self.reaction)
 
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
-        p = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.with_spring(theta))
-        force = xp.asarray(theta["K"])[..., None] * self.current
-        return (force - rod_on_capsule(p, x_rel, rate) - downhill(p, p.m1)) / p.m1
+        p, K = before_samples((self.with_spring(theta), theta["K"]), xp)
+        return (K * self.current - rod_on_capsule(p, x_rel, rate) - downhill(p, p.m1)) / p.m1
 
 
 class PulseRun(OtherRun):
@@ -81,24 +96,23 @@ class PulseRun(OtherRun):
 
     Attributes
     ----------
-    duty, P_on, lag : 1, N, s; stated, the last two where they are exact
+    duty, P_on, lag : 1, N, s; stated, None where they are parameters
     """
 
     duty: float
-    P_on: float
-    lag: float
+    P_on: float | None
+    lag: float | None
 
-    def read_drive(self, table: Table) -> None:
-        settings = table.settings
-        self.duty, self.P_on = settings.duty, settings.P_on.value
-        self.lag = 0.0 if settings.lag is None else settings.lag.value
+    def read_drive(self, table: Table, rig: Rig) -> None:
+        force = table.settings.P_on
+        self.duty, self.P_on = table.settings.duty, force.value if force.sd == 0.0 else None
+        self.lag = lag_of(table, rig)[1]
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
-        force, lag = theta.get("P_on", self.P_on), theta.get("lag", self.lag)
-        period = 2.0 * np.pi / self.Omega
-        return self.with_spring(theta), Pulses(
-            force, period, self.duty, phase=theta["phase"], lag=lag, reaction=self.reaction
-        )
+        force: Any = theta["P_on"] if self.P_on is None else self.P_on
+        lag: Any = theta["lag"] if self.lag is None else self.lag
+        wave = 2.0 * np.pi / self.Omega, self.duty
+        return self.with_spring(theta), Pulses(force, *wave, phase=theta["phase"], lag=lag, reaction=self.reaction)
 
     def simulated(
         self, theta: ValuesBySymbol, p: CapsuleParameters, e: Drive, times: ArrayLike, initial: Any = None
@@ -133,20 +147,20 @@ class BaseRun(OtherRun):
 
     prescribed = True
 
-    def read_drive(self, table: Table) -> None:
+    def read_drive(self, table: Table, rig: Rig) -> None:
         motion = RodMotion.through(table["time"], table["x_base"] - table["x_base"][0])
         self.base, self.base_rate = np.asarray(motion.X1), np.asarray(motion.Y1)
 
     @property
     def masses(self) -> tuple[str, ...]:
         # The rod's mass acts through the normal force alone.
-        return ("m2",) if self.normal_force_stated or self.rig.m1 is None else ("m1", "m2")
+        return ("m2",) if self.normal_force is not None or self.rig.m1 is None else ("m1", "m2")
 
     def first_state(self, table: Table) -> RunStart:
         relative = relative_position(table)
         assert relative is not None, "the reader requires x_capsule or x_rel beside x_base"
         # Friction is about as strong in both directions, so the spring is unextended near the mean.
-        seen = {name: table[name] for name in self.channels} | {"x_rel": relative[0] - np.mean(relative[0])}
+        seen = {name: table[name] for name in self.names} | {"x_rel": relative[0] - np.mean(relative[0])}
         return rough_start(table["time"], seen, self.Omega)
 
     def starts(self) -> dict[str, Start]:
@@ -172,5 +186,5 @@ class BaseRun(OtherRun):
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Any]:
         X1, time = jnp.add.outer(theta["x_start"], self.base), self.true_time(theta)
-        rate = jnp.multiply.outer(1.0 / stretch(self.clock_rate, theta), self.base_rate)
+        rate = jnp.multiply.outer(1.0 / stretch(self.clock and self.clock[0], theta), self.base_rate)
         return self.with_spring({"m1": 0.0, **theta}), RodMotion(time, X1, rate)

@@ -1,6 +1,5 @@
 """Likelihood of forced runs: the motor drives the capsule (paper, sections 3 and 4)."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, ClassVar
@@ -9,25 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 
-from capsule_id.errors import InputError
-from capsule_id.experiments.base import Start, ValuesBySymbol, axis_label, band, clock_parameters, stated_rate, stretch
-from capsule_id.experiments.capsule_experiment import CapsuleForward
+from capsule_id.experiments.base import Start, ValuesBySymbol, clock_parameters, stated_rate, stretch
+from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters, stated_starts
 from capsule_id.experiments.checks import autocorrelation
-from capsule_id.experiments.context import Fitted, RunRecord
-from capsule_id.experiments.forced_run.checks import (
-    check_feasible,
-    check_predictable,
-    check_repeated,
-    predictable_parts,
-)
 from capsule_id.experiments.forced_run.declaration import CAPSULE_START, CORRELATION, CURRENT_AMPLITUDE, NOISE
 from capsule_id.experiments.forced_run.start_state import (
-    PARABOLA_SAMPLES,
     AboutRun,
     RunStart,
-    corrected_start,
+    parts_of,
     rough_start,
 )
 from capsule_id.experiments.friction import ground_parameters
@@ -38,389 +27,55 @@ from capsule_id.physics.drive import Drive, Excitation
 from capsule_id.physics.forces import equilibrium, rod_acceleration
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory
-from capsule_id.records.motion import MeasuredMotion, fit_mean_velocity, measured_motion
 from capsule_id.records.tones import stated_gap, stated_Omega
-from capsule_id.records.view import view_record
-from capsule_id.rig.filters import choose_window, sampling_step, savitzky_golay, window_samples
 from capsule_id.rig.model import Rig, Table
-from capsule_id.rig.schema import SHORTEST_RECORD
-from capsule_id.views import Comparison, Curve, Facts, Finding, Points, ResultTable
+from capsule_id.views import Facts, Finding
 
-# parts: Multiple shooting: division of a record into parts, each with its own initial state.
-#
-# Where a motion amplifies small errors, one initial state cannot predict a whole record. It can predict a part of a few
-# periods. All parts share gap, drive, noise and delays.
+# channel: A recorded channel of a run, and the errors of its sensor.
 
 
-#: Separator between record label and number in the label of a part. File names do not contain it.
-PART_MARK = "~"
-#: Largest shift of a cut towards smooth motion, as a fraction of a part's length.
-LEEWAY = 0.3
+class Channel(eqx.Module):
+    """A recorded channel, and the errors of its sensor that enter linearly and are integrated out.
 
-
-def parts_of(table: Table, seconds: float) -> list[Table]:
-    """Divide the record into parts of about ``seconds``; return [``table``] if it is not longer."""
-    time = table["time"]
-    count = max(1, min(round((time[-1] - time[0]) / seconds), len(time) // SHORTEST_RECORD))
-    if count == 1:
-        return [table]
-    edges = _edges(table, count)
-    return [_part(table, i, slice(*edges[i : i + 2])) for i in range(count)]
-
-
-def _edges(table: Table, count: int) -> list[int]:
-    """First samples of ``count`` parts, and the end.
-
-    The state at a first sample comes from a parabola through the next samples. A cut therefore avoids samples where a
-    contact begins or ends, or where the capsule sticks or slips.
-    """
-    samples = len(table["time"])
-    length, rough = samples / count, _roughness(table)
-    edges = [0]
-    for i in range(1, count):
-        first, last = (int((i + side * LEEWAY) * length) for side in (-1.0, 1.0))
-        window = rough[max(first, edges[-1] + SHORTEST_RECORD) : last + 1]
-        edges.append(
-            max(first, edges[-1] + SHORTEST_RECORD) + int(np.argmin(window)) if len(window) else int(i * length)
-        )
-    return [*edges, samples]
-
-
-def _roughness(table: Table) -> np.ndarray:
-    """(n,) residual of a parabola through the samples from each one on, summed over positions, in units of noise."""
-    time, n = table["time"], PARABOLA_SAMPLES
-    total = np.zeros(len(time))
-    # One projection serves all samples. It is approximate for uneven sampling, which suffices to choose a cut.
-    design = np.vander(np.arange(n) - 0.5 * (n - 1), 3)
-    rest = np.eye(n) - design @ np.linalg.pinv(design)
-    for name in ("x_rel", "x_capsule"):
-        if name in table.columns and len(time) >= n:
-            windows = np.lib.stride_tricks.sliding_window_view(table[name], n)
-            miss = np.sqrt(np.sum((windows @ rest) ** 2, axis=1))
-            total[: len(miss)] += miss / max(float(np.median(miss)), 1e-300)
-            total[len(miss) :] = np.inf
-    return total
-
-
-def _part(table: Table, index: int, rows: slice) -> Table:
-    columns = {name: replace(column, values=column.values[rows]) for name, column in table.columns.items()}
-    return replace(table, label=f"{table.label}{PART_MARK}{index + 1}", columns=columns, rows=table.rows[rows])
-
-
-# nuisances: Parameters of a forced run with their priors and starting values.
-
-
-#: Default prior of a channel's noise, without reading error: log-normal, median 1 % of its range, factor 100.
-NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
-#: Default prior of the current's amplitude: log-normal about half its range.
-AMPLITUDE_FACTOR = 3.0
-#: sd of the normal prior of the drive's phase, rad; wide but proper.
-PHASE_WIDTH = np.pi
-
-
-def run_parameters(run: "ForcedRun", ranges: np.ndarray) -> tuple[Parameter, ...]:
-    """Return the parameters sampled for ``run``; ``ranges`` (channels,) of its readings, SI."""
-    of, whole, settings = run.label, run.about.record, run.table.settings
-    rows = [parameter("k1"), parameter("c"), *run.friction.parameters, *ground_parameters(run.table, run.rig)]
-    free = ("k_cubic",) if run.spring is None else ("k_cubic", "c2")
-    rows += [parameter(symbol) for symbol in free if symbol in run.rig.model.free]
-    rows += clock_parameters(run.table, run.rig)
-    if run.spring is not None:
-        rows.append(parameter("k2", run.spring))
-    if not run.gap_known:
-        rows.append(parameter("G", whole, Prior("positive_normal", settings.gap.value, settings.gap.sd)))
-    if run.driven_by_current:
-        amplitude = 0.5 * float(np.ptp(run.table["current"]))
-        rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
-    elif not run.drive_known:
-        rows.append(parameter("P_d", whole, Prior("positive_normal", run.drive, run.drive_sd)))
-    if "current" in run.inputs:
-        rows.append(parameter("K"))
-    if settings.P_on is not None and settings.P_on.sd > 0.0:
-        rows.append(parameter("P_on", prior=Prior("normal", settings.P_on.value, settings.P_on.sd)))
-    if settings.lag is not None and settings.lag.sd > 0.0:
-        rows.append(parameter("lag", prior=Prior("positive_normal", settings.lag.value, settings.lag.sd)))
-    elif settings.drive == "pulses" and settings.lag is None and "lag" in run.rig.model.free:
-        rows.append(parameter("lag"))
-    if run.has_phase and not run.prescribed:
-        rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
-    length = NUISANCE_WIDTH * run.rough.length
-    if not run.settled:
-        rows.append(parameter("x_start", of, Prior("normal", 0.0, length)))
-        if not run.prescribed:
-            rows.append(parameter("y_start", of, Prior("normal", 0.0, run.Omega * length)))
-    if run.moves:
-        rows.append(CAPSULE_START.named(of, Prior("normal", 0.0, run.Omega * length)))
-    for name, scale in zip(run.channels, ranges.tolist(), strict=True):
-        rows.append(NOISE[name].named(whole, Prior("lognormal", NOISE_MEDIAN * scale, NOISE_FACTOR)))
-    if run.coloured:
-        rows += [CORRELATION[name].named(whole) for name in run.channels]
-    return tuple(rows)
-
-
-def run_starts(run: "ForcedRun") -> dict[str, Start]:
-    """Starts of the nuisances from the record; other parameters start at bench estimates or prior centres."""
-    rough, of = run.rough, run.label
-    starts = _starts_of_record(run) if run.about.leads else {}
-    if not run.settled:
-        starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
-        starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * run.Omega * rough.length)
-    if run.moves:
-        starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * run.Omega * rough.length)
-    return starts
-
-
-def _starts_of_record(run: "ForcedRun") -> dict[str, Start]:
-    rough, of = run.rough, run.about.record
-    starts = {f"phase[{of}]": Start(rough.phase, 0.02)}
-    if not run.gap_known:
-        starts[f"G[{of}]"] = Start(run.gap, 0.5 * run.table.settings.gap.sd / run.gap)
-    if run.driven_by_current:
-        starts[f"I_d[{of}]"] = Start(rough.amplitude, 0.005)
-    elif not run.drive_known:
-        starts[f"P_d[{of}]"] = Start(run.drive, 0.5 * run.drive_sd / run.drive)
-    for name, noise in rough.noise.items():
-        starts[f"noise_{name}[{of}]"] = Start(noise, 0.1)
-    if run.coloured:
-        starts |= {f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in run.channels}
-    return starts
-
-
-def stated_sds(settings: Any, channels: Sequence[str], nuisance: str) -> tuple[np.ndarray, tuple[bool, ...]]:
-    """Stated sd of a gain or delay by channel, and whether it is stated."""
-    sds = [getattr(settings, f"{name}_{nuisance}_sd") for name in channels]
-    return np.array([sd or 0.0 for sd in sds]), tuple(sd is not None for sd in sds)
-
-
-# tables: Tables of forced runs: nondimensional groups and predicted motion.
-
-
-#: Draws at which velocities are computed, and errors of a record's velocity drawn for each.
-VELOCITY_DRAWS, ERRORS = 50, 200
-
-
-def scaled_groups(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
-    """Return the paper's nondimensional groups, mean and sd over the posterior draws; [] without a sample.
-
-    Lengths are scaled by F_b/k1, forces by F_b, times by 1/Omega0. Omega0 = sqrt(k1/m1); F_b is the break-away force.
-    """
-    if not fit.draws:
-        return []
-    columns: dict[str, list[float]] = {}
-    for values in fit.draws:
-        for run in runs:
-            for name, value in _groups(run, run.local(values)).items():
-                columns.setdefault(name, []).append(value)
-    rows = {name: [np.mean(column), np.std(column, ddof=1)] for name, column in columns.items()}
-    frame = pd.DataFrame.from_dict(rows, orient="index", columns=["mean", "sd"]).rename_axis("group")
-    return [ResultTable("runs.groups", frame)]
-
-
-def _groups(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
-    p, e = run.capsule(theta)
-    m1, m2, k1, k2, c, G = (float(leaf) for leaf in (p.m1, p.m2, p.k1, p.k2, p.c, p.G))  # pyright: ignore[reportArgumentType]
-    Omega0, F_b = np.sqrt(k1 / m1), float(run.law(theta).forward(0.0))
-    length, of = F_b / k1, run.label
-    scales = {"N": ("F_b", F_b), "m/s": ("(Omega0 F_b/k1)", Omega0 * length)}
-    own = [(row.symbol, *scales[row.unit]) for row in run.friction.parameters if row.unit in scales]
-    return {
-        "Omega0, rad/s": Omega0,
-        "zeta": c / (2.0 * m1 * Omega0),
-        "m2/m1": m2 / m1,
-        **{f"{symbol} / {scale}": theta[symbol] / value for symbol, scale, value in own},
-        f"Omega/Omega0 [{of}]": run.Omega / Omega0,
-        f"P_d/F_b [{of}]": float(e.P_d) / F_b,  # pyright: ignore
-        **({f"k2/k1 [{run.spring}]": k2 / k1, f"G k1/F_b [{of}]": G / length} if run.spring is not None else {}),
-    }
-
-
-def predicted_motion(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
-    """Contacts and mean velocity of the capsule over the record: observed, point fit, 95 % interval of a new record.
-
-    Both velocities come from the estimator of ``capsule_id.records.motion``, the model's at the sample times.
-    """
-    rows = {}
-    for run in runs:
-        best = run.motion(run.local(fit.values), np)
-        local = [run.local(draw) for draw in fit.draws[:VELOCITY_DRAWS]]
-        stacked = {name: np.array([theta[name] for theta in local]) for name in (local[0] if local else {})}
-        sample = run.motion(stacked, np) if local else None
-        seen = measured_motion(run.table)
-        row: dict[str, object] = {
-            "motion of the record": seen.label,
-            "probability": seen.probability,
-            "contacts, model": int(best.contacts),
-        }
-        if sample is not None:
-            low, high = int(np.min(sample.contacts)), int(np.max(sample.contacts))
-            row["contacts, draws"] = f"{low}" if low == high else f"{low} to {high}"
-        row |= _velocities(run, seen, np.asarray(best.X2), None if sample is None else np.asarray(sample.X2))
-        rows[run.label] = row
-    frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("run")
-    return [ResultTable("runs.motion", frame)]
-
-
-def _velocities(
-    run: "ForcedRun", seen: MeasuredMotion, best: np.ndarray, sample: np.ndarray | None
-) -> dict[str, object]:
-    """Mean velocity of the model, band of a new record, and the record's own with its standard error.
-
-    Parameters
+    Attributes
     ----------
-    best, sample : X2 of the point fit (n,) and of the draws (draws, n), m
+    values : (n,) SI
+    reading_variance : stated, SI
+    extent : range of the readings, SI; the prior of the offset is wide beside it
+    gain_sd, delay_sd : stated, 1 and s; None: the sensor has no such error
     """
-    evidence = seen.evidence
-    period = evidence.repeat.period if evidence.repeat else None
 
-    def velocity(place: np.ndarray) -> float:
-        return 1e3 * fit_mean_velocity(run.time, place, 2.0 * np.pi / evidence.Omega, period).velocity
+    name: str = eqx.field(static=True)
+    values: np.ndarray
+    reading_variance: float
+    extent: float
+    gain_sd: float | None
+    delay_sd: float | None
 
-    found = evidence.mean_velocity
-    sd = 0.0 if found is None or not np.isfinite(found.velocity_sd) else 1e3 * found.velocity_sd
-    row: dict[str, object] = {"mean velocity, model, mm/s": velocity(best)}
-    if sample is not None:
-        error = sd * np.random.default_rng(0).standard_normal((ERRORS, 1))
-        low, high = np.quantile(error + np.array([velocity(place) for place in sample]), [0.025, 0.975])
-        row["95 % band, mm/s"] = f"{low:.4g} to {high:.4g}"
-    if found is not None:
-        row["mean velocity, record, mm/s"] = f"{1e3 * found.velocity:.4g} ± {sd:.2g}"
-    return row
+    def __init__(self, table: Table, name: str) -> None:
+        column = table.columns[name]
+        self.name, self.values, self.reading_variance = name, column.values, column.reading_sd**2
+        # A constant channel has zero range, so its scale is the reading error, or 1e-9 in SI units.
+        self.extent = max(float(np.ptp(column.values)), column.reading_sd, 1e-9)
+        self.gain_sd, self.delay_sd = (getattr(table.settings, f"{name}_{error}_sd") for error in ("gain", "delay"))
 
+    @property
+    def width(self) -> float:
+        """sd of the prior of the offset, SI."""
+        return NUISANCE_WIDTH * self.extent
 
-# panels: Plot data of a forced run: every channel with its residuals, and the phase portrait.
-
-
-#: Channels that depend on the motion; the current is the drive itself.
-SHOWN = {"x_rel": "x_rel", "x_capsule": "capsule", "acceleration_rod": "rod's acceleration"}
-#: Largest number of posterior draws for a band; number of lags of an autocorrelation.
-BAND_DRAWS, LAGS = 50, 60
-#: Polynomial order of the Savitzky–Golay filter for the measured phase portrait.
-PORTRAIT_ORDER = 3
-
-
-def run_comparisons(run: "ForcedRun", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-    """Return a panel per channel (prediction, 95 % band, residuals, autocorrelation), then the phase portrait.
-
-    ``theta`` is the point fit. Bands use at most ``BAND_DRAWS`` of ``draws`` and exclude the noise.
-    """
-    predicted = run.predict(theta, np)
-    scaled = run.scaled(theta, np)
-    stacked = {name: np.array([draw[name] for draw in draws[:BAND_DRAWS]]) for name in (draws[0] if draws else {})}
-    bands = run.predict(stacked, np) if draws else []
-    panels = []
-    for i, name in enumerate(run.channels):
-        if name not in SHOWN:
-            continue
-        column, part = run.table.columns[name], scaled[i]
-        residuals, nuisance = part.at_nuisance_mean(np)
-        fitted = run.values[i] - part.raw + part.design @ nuisance
-        # The band represents the uncertainty of the motion: offset and gain of a draw hardly differ from the fit.
-        shift = fitted - predicted[i]
-        lower, upper = band((bands[i] + shift) * column.to_display) if draws else (None, None)
-        panels.append(
-            Comparison(
-                run.kind,
-                f"{run.label}_{name}",
-                f"{run.label}: {SHOWN[name]}",
-                "time [s]",
-                axis_label(column),
-                (Points(run.label, run.time, run.values[i] * column.to_display),),
-                (Curve("this fit", run.time, fitted * column.to_display, lower, upper),),
-                run.time,
-                np.asarray(residuals),
-                autocorrelation(np.asarray(residuals), min(LAGS, len(run.time) // 4)),
-                1.96 / float(np.sqrt(len(run.time))),
-            )
-        )
-    if "x_rel" in run.channels:
-        panels += _portrait(run, theta)
-    return tuple(panels)
-
-
-def _portrait(run: "ForcedRun", theta: ValuesBySymbol) -> list[Comparison]:
-    """Phase portrait, rate of x_rel by Savitzky–Golay against x_rel; [] for a record sampled unevenly."""
-    index = run.channels.index("x_rel")
-    values, unit = run.values[index], run.table.columns["x_rel"].to_display
-    motion = run.motion(theta, np)
-    offset = run.scaled(theta, np)[index].at_nuisance_mean(np)[1][0] * run.widths[index]
-    x, y = np.asarray(motion.x_rel) + offset, np.asarray(motion.Y1 - motion.Y2)
-    try:
-        window = choose_window(run.time, values, PORTRAIT_ORDER)
-        recorded, fitted = (_filtered(run.time, column, window) for column in (values, x))
-    except InputError:
-        return []
-    p, _ = run.capsule(theta)
-    lines = []
-    if run.spring is not None:
-        gap = (float(p.G) + offset) * unit  # pyright: ignore[reportArgumentType]
-        ends = np.array([y.min(), y.max()])
-        lines.append(Curve("support spring", np.array([gap, gap]), ends, role="paper"))
-    return [
-        Comparison(
-            "phase_portrait",
-            f"{run.label}_phase_portrait",
-            f"{run.label}: phase portrait",
-            axis_label(run.table.columns["x_rel"]),
-            "rate of x_rel [m/s]",
-            (Points("record, Savitzky–Golay", recorded[0] * unit, recorded[1]),),
-            (
-                Curve("this fit", x * unit, y),
-                Curve("this fit through the same filter", fitted[0] * unit, fitted[1], role="alternative"),
-                *lines,
-            ),
-        )
-    ]
-
-
-def _filtered(time: np.ndarray, values: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
-    """Smoothed value and rate, without the half window at both ends, where the derivative is inaccurate."""
-    half = window_samples(window, sampling_step(time)) // 2
-    inside = slice(half, len(time) - half)
-    value, rate = (savitzky_golay(time, values, window, PORTRAIT_ORDER, derivative=n) for n in (0, 1))
-    return value[inside], rate[inside]
-
-
-def filtered_record(run: "ForcedRun", theta: ValuesBySymbol) -> RunRecord | None:
-    """The record through the paper's filter, and its drive; None where x_rel is not recorded, or not evenly."""
-    _, e = run.capsule(theta)
-    try:
-        view = view_record(run.table, K=theta["K"] if run.driven_by_current else None)
-    except InputError:
-        return None
-    return RunRecord(run.label, view, np.asarray(e.force_at(run.time)))
-
-
-# second fit: Second fits of a run, where the residuals of the first one are correlated: starts of coloured noise, and
-# tables.
-#
-# A real sensor filters, and no model is exact, so that residuals of dense samples are hardly ever white. White
-# noise then gives intervals that are far too short.
-
-
-#: Largest lag-1 correlation of the noise at which a fit starts.
-LARGEST_CORRELATION = 0.99
-
-
-def coloured_starts(run: "ForcedRun", theta: ValuesBySymbol) -> dict[str, float]:
-    """Starts of the AR(1) noise of ``run`` by name, SI, from the residuals of a fit with white noise."""
-    values = {}
-    for name, (_, residuals) in zip(run.channels, run.records(theta), strict=True):
-        rho = float(np.clip(autocorrelation(residuals, 1)[0], 0.0, LARGEST_CORRELATION))
-        values[f"ar1_{name}[{run.about.record}]"] = float(np.arctanh(rho))
-        values[f"noise_{name}[{run.about.record}]"] = theta[f"noise_{name}"] * float(np.sqrt(1.0 - rho**2))
-    return values
-
-
-def second_fit_table(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTable]:
-    """Tables of the second fits of runs: coloured noise, and other friction laws; [] without one."""
-    del runs
-    found = {finding.code: finding.facts for finding in fit.findings}
-    tables = {"runs.second_fit": "fits", "runs.laws": "laws"}
-    return [
-        ResultTable(code, pd.DataFrame(found[code][rows]).set_index("fit"))
-        for code, rows in tables.items()
-        if code in found
-    ]
+    def misfit(self, seen: Any, time: np.ndarray, rho: Any, xp: ModuleType) -> Misfit:
+        """Misfit to the prediction ``seen`` (n,); ``rho`` : lag-1 correlation of the noise, None: white."""
+        columns = [self.width * xp.ones(len(time))]
+        if self.gain_sd is not None:
+            columns.append(self.gain_sd * seen)
+        if self.delay_sd is not None:
+            # First order in the delay suffices, because the delay is shorter than a sampling step.
+            columns.append(-self.delay_sd * xp.gradient(seen) / xp.gradient(xp.asarray(time)))
+        raw, design = self.values - seen, xp.stack(columns, axis=1)
+        if rho is None:
+            return Misfit(raw, self.reading_variance, 1.0, design)
+        return innovations(raw, self.reading_variance, design, rho, xp)
 
 
 # experiment: Likelihood of forced runs: the motor drives the capsule (paper, sections 3 and 4).
@@ -434,9 +89,22 @@ def second_fit_table(runs: "Sequence[ForcedRun]", fit: Fitted) -> list[ResultTab
 
 #: Excitation periods from rest after which the motion counts as periodic (start = "settled").
 SETTLING_PERIODS = 40
+#: Default prior of a channel's noise, without reading error: log-normal, median 1 % of its range, factor 100.
+NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
+#: Default prior of the current's amplitude: log-normal about half its range.
+AMPLITUDE_FACTOR = 3.0
+#: sd of the normal prior of the drive's phase, rad; wide but proper.
+PHASE_WIDTH = np.pi
+#: Largest lag-1 correlation of the noise at which a fit starts.
+LARGEST_CORRELATION = 0.99
 
 
-class ForcedRun(CapsuleForward):
+def before_samples(tree: Any, xp: ModuleType) -> Any:
+    """``tree`` with an axis for the samples behind the batch axis of its leaves."""
+    return jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], tree)
+
+
+class CapsuleRun(CapsuleForward):
     """One record of the driven capsule.
 
     The setting ``start`` in rig.toml selects the initial state: "stuck" (capsule at rest and held: Y2 = 0), "moving"
@@ -451,41 +119,28 @@ class ForcedRun(CapsuleForward):
 
     Attributes
     ----------
-    time, values : (n,) s and (channels, n) SI
-    widths : (channels,) sds of the offsets' priors, SI
-    gain_sd, delay_sd : (channels,) stated, 1 and s
-    reading_variance : (channels,) stated, SI
+    time : (n,) s
+    gap, force : gap, m, and amplitude of the drive, N; None where they are parameters
+    second_reading : amplitude of the drive beside that from the current, and its sd, N; None: there is none
     moves : factor of ``capsule_start``, 0 or 1, so that one program computes runs of both kinds
-    normal_force : stated, N; 0 where it is the weight
+    normal_force : stated, N; None: it is the weight
+    clock : 1 + the stated drift of the clock, and the middle of the whole record, s; None: an exact clock
     first : time of the first sample of the whole record, s
-    clock_rate, middle : 1 + the stated drift of the clock, and the middle of the whole record, s; None: an exact clock
     """
 
     about: AboutRun = eqx.field(static=True)
     time: np.ndarray
-    values: np.ndarray
+    channels: tuple[Channel, ...]
     Omega: float
-    gap: float
-    drive: float
-    drive_sd: float
-    widths: np.ndarray
-    gain_sd: np.ndarray
-    delay_sd: np.ndarray
-    reading_variance: np.ndarray
+    gap: float | None
+    force: float | None
+    second_reading: tuple[float, float] | None
     moves: float
-    normal_force: float
-    clock_rate: float | None
-    middle: float | None
+    normal_force: float | None
+    clock: tuple[float, float] | None
     first: float
-    channels: tuple[str, ...] = eqx.field(static=True)
     settled: bool = eqx.field(static=True)
-    gap_known: bool = eqx.field(static=True)
-    drive_known: bool = eqx.field(static=True)
-    normal_force_stated: bool = eqx.field(static=True)
-    has_gain: tuple[bool, ...] = eqx.field(static=True)
-    has_delay: tuple[bool, ...] = eqx.field(static=True)
     coloured: bool = eqx.field(static=True)
-    second_reading: bool = eqx.field(static=True)
 
     #: Whether the record prescribes the motion of the rod.
     prescribed: ClassVar[bool] = False
@@ -493,8 +148,6 @@ class ForcedRun(CapsuleForward):
     has_phase: ClassVar[bool] = True
     inputs: ClassVar[tuple[str, ...]] = ()
     time_series = True
-    checks = (check_feasible, check_predictable, check_repeated)
-    tables = (second_fit_table, predicted_motion, scaled_groups)
 
     def __init__(
         self,
@@ -516,83 +169,128 @@ class ForcedRun(CapsuleForward):
         capsule_rate : speed of the capsule at the first sample, m/s, 0 for stuck; None: as stated, or estimated
         coloured : whether the noise is AR(1), also where the settings leave it open
         """
-        self.read_drive(table)
-        settings, gap = table.settings, stated_gap(table)
+        self.read_drive(table, rig)
         self.set_model(table, rig, friction)
-        self.channels = tuple(name for name in NOISE if name in table.columns and name not in self.inputs)
-        self.time = table["time"]
-        self.clock_rate = stated_rate(table)
+        settings, gap = table.settings, stated_gap(table)
+        self.channels = tuple(
+            Channel(table, name) for name in NOISE if name in table.columns and name not in self.inputs
+        )
+        self.time, self.Omega = table["time"], stated_Omega(table)
         whole = next((other for other in rig.tables if other.label == part_of), table)["time"]
-        self.first = float(whole[0])
-        self.middle = None if self.clock_rate is None else 0.5 * float(whole[0] + whole[-1])
-        self.values = np.stack([table[name] for name in self.channels])
-        self.Omega = stated_Omega(table)
-        self.gap, self.gap_known = gap.value, gap.sd == 0.0
-        drive = settings.P_d if leads or not self.driven_by_current else None
-        self.drive, self.drive_sd = (0.0, 0.0) if drive is None else (drive.value, drive.sd)
-        self.drive_known = drive is None or drive.sd == 0.0
-        self.normal_force_stated = settings.normal_force is not None
-        self.normal_force = settings.normal_force or 0.0
-        reading_sd = np.array([table.columns[name].reading_sd for name in self.channels])
-        self.reading_variance = reading_sd**2
-        # A constant channel has zero range, so its scale is the reading error, or 1e-9 in SI units.
-        ranges = np.maximum(np.ptp(self.values, axis=1), np.maximum(reading_sd, 1e-9))
-        self.widths = NUISANCE_WIDTH * ranges
-        self.gain_sd, self.has_gain = stated_sds(settings, self.channels, "gain")
-        self.delay_sd, self.has_delay = stated_sds(settings, self.channels, "delay")
-        self.second_reading = self.driven_by_current and self.drive_sd > 0.0
+        rate, self.first = stated_rate(table), float(whole[0])
+        self.clock = None if rate is None else (rate, 0.5 * float(whole[0] + whole[-1]))
+        self.gap = gap.value if gap.sd == 0.0 else None
+        P_d, by_current = settings.P_d, "current" in self.names
+        self.second_reading = (P_d.value, P_d.sd) if P_d and P_d.sd > 0.0 and by_current and leads else None
+        self.force = None if by_current or (P_d and P_d.sd > 0.0) else P_d and P_d.value
+        self.normal_force = settings.normal_force
         self.coloured = coloured or settings.noise == "ar1"
         rough = self.first_state(table).at_rate(capsule_rate)
         is_open = settings.start == "auto" or not leads
         start = rough.kind if is_open else settings.start
-        self.settled = start == "settled"
-        self.moves = float(start == "moving")
+        self.settled, self.moves = start == "settled", float(start == "moving")
         self.about = AboutRun(table, rig, (), part_of or table.label, leads, start, is_open, rough)
-        self.about = replace(self.about, parameters=run_parameters(self, ranges))
+        self.about = replace(self.about, parameters=tuple(self._sampled()))
 
-    def read_drive(self, table: Table) -> None:
+    def read_drive(self, table: Table, rig: Rig) -> None:
         """Set the fields that a subclass has besides those of this class; ``__init__`` calls it first."""
 
     def first_state(self, table: Table) -> RunStart:
         """Starting values from the record."""
-        return rough_start(table["time"], {name: table[name] for name in self.channels}, self.Omega)
+        return rough_start(table["time"], {name: table[name] for name in self.names}, self.Omega)
+
+    def _sampled(self) -> list[Parameter]:
+        """The parameters of the run with their priors."""
+        of, whole, settings, free = self.label, self.about.record, self.table.settings, self.rig.model.free
+        rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
+        rows += [parameter(name) for name in ("k_cubic", "c2")[: 1 if self.spring is None else 2] if name in free]
+        rows += clock_parameters(self.table, self.rig)
+        rows += [] if self.spring is None else [parameter("k2", self.spring)]
+        rows += stated_parameters("G", settings.gap, whole)
+        if self.driven_by_current:
+            amplitude = 0.5 * float(np.ptp(self.table["current"]))
+            rows += [parameter("K"), CURRENT_AMPLITUDE.named(whole, Prior("lognormal", amplitude, AMPLITUDE_FACTOR))]
+        else:
+            rows += stated_parameters("P_d", settings.P_d, whole)
+        rows += [parameter("K")] if "current" in self.inputs else []
+        rows += [*stated_parameters("P_on", settings.P_on, kind="normal"), *lag_of(self.table, self.rig)[0]]
+        if self.has_phase and not self.prescribed:
+            rows.append(parameter("phase", whole, Prior("normal", 0.0, PHASE_WIDTH)))
+        length = NUISANCE_WIDTH * self.rough.length
+        position, rate = Prior("normal", 0.0, length), Prior("normal", 0.0, self.Omega * length)
+        rows += [] if self.settled else [parameter("x_start", of, position)]
+        rows += [] if self.settled or self.prescribed else [parameter("y_start", of, rate)]
+        rows += [CAPSULE_START.named(of, rate)] if self.moves else []
+        sds = [Prior("lognormal", NOISE_MEDIAN * channel.extent, NOISE_FACTOR) for channel in self.channels]
+        rows += [NOISE[name].named(whole, prior) for name, prior in zip(self.names, sds, strict=True)]
+        return [*rows, *(CORRELATION[name].named(whole) for name in self.names if self.coloured)]
+
+    def starts(self) -> dict[str, Start]:
+        """Starts of the nuisances from the record; other parameters start at bench estimates or prior centres."""
+        rough, of = self.rough, self.label
+        starts = self._starts_of_record() if self.about.leads else {}
+        starts[f"x_start[{of}]"] = Start(rough.x_rel, 0.03 * rough.length)
+        starts[f"y_start[{of}]"] = Start(rough.rate, 0.03 * self.Omega * rough.length)
+        starts[f"capsule_start[{of}]"] = Start(rough.capsule_rate, 0.03 * self.Omega * rough.length)
+        known = {row.name for row in self.parameters}
+        return {name: start for name, start in starts.items() if name in known}
+
+    def _starts_of_record(self) -> dict[str, Start]:
+        rough, of, settings = self.rough, self.about.record, self.table.settings
+        return {
+            f"phase[{of}]": Start(rough.phase, 0.02),
+            **stated_starts(of, G=settings.gap, P_d=settings.P_d),
+            f"I_d[{of}]": Start(rough.amplitude, 0.005),
+            **{f"noise_{name}[{of}]": Start(noise, 0.1) for name, noise in rough.noise.items()},
+            **{f"ar1_{name}[{of}]": Start(0.0, 0.1) for name in self.names},
+        }
+
+    # -- the same record, changed -----------------------------------------------------------------------------------
 
     @classmethod
-    def make(cls, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> "tuple[ForcedRun, ...]":
+    def make(cls, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> "tuple[CapsuleRun, ...]":
         """Make a run, or its parts where ``segment`` is stated."""
         run, seconds = cls(table, rig, friction), table.settings.segment
         return (run,) if seconds is None else run.parts(seconds)
 
-    def parts(self, seconds: float) -> "tuple[ForcedRun, ...]":
+    def parts(self, seconds: float) -> "tuple[CapsuleRun, ...]":
         """Divide the record into parts of about ``seconds``; return the run itself if it is not longer."""
         tables = parts_of(self.table, seconds)
-        made = (self._remade(table, self.about.leads and i == 0) for i, table in enumerate(tables))
+        made = (self._remade(table, None, leads=self.about.leads and i == 0) for i, table in enumerate(tables))
         return tuple(made) if len(tables) > 1 else (self,)
 
-    def restarted(self, capsule_rate: float) -> "ForcedRun":
+    def restarted(self, capsule_rate: float) -> "CapsuleRun":
         """Return the same record with this capsule speed at the first sample, m/s; 0: stuck."""
-        return self._remade(self.table, self.about.leads, capsule_rate)
+        return self._remade(self.table, capsule_rate)
 
-    def with_friction(self, friction: FrictionModel) -> "ForcedRun":
-        return self._remade(self.table, self.about.leads, self.rough.capsule_rate, friction=friction)
+    def with_friction(self, friction: FrictionModel) -> "CapsuleRun":
+        return self._remade(self.table, self.rough.capsule_rate, friction=friction)
 
-    def _remade(self, table: Table, leads: bool, rate: float | None = None, **changed: Any) -> "ForcedRun":
-        own = {"friction": self.friction, "part_of": self.about.record, "coloured": self.coloured, **changed}
-        return type(self)(table, self.rig, leads=leads, capsule_rate=rate, **own).with_smoothing(self.smoothing)
+    def with_coloured_noise(self, theta: ValuesBySymbol) -> "tuple[CapsuleRun, dict[str, float]] | None":
+        if self.coloured or self.table.settings.noise is not None:
+            return None
+        values = {}
+        for name, (_, residuals) in zip(self.names, self.records(theta), strict=True):
+            rho = float(np.clip(autocorrelation(residuals, 1)[0], 0.0, LARGEST_CORRELATION))
+            values[f"ar1_{name}[{self.about.record}]"] = float(np.arctanh(rho))
+            values[f"noise_{name}[{self.about.record}]"] = theta[f"noise_{name}"] * float(np.sqrt(1.0 - rho**2))
+        return self._remade(self.table, self.rough.capsule_rate, coloured=True), values
 
-    def noise_facts(self) -> Facts:
-        noise = "ar1" if self.coloured else self.table.settings.noise
-        return {**super().noise_facts(), "noise": noise, "spring": self.spring is not None}
+    def _remade(self, table: Table, capsule_rate: float | None, **changed: Any) -> "CapsuleRun":
+        about, own = self.about, {"friction": self.friction, "coloured": self.coloured, **changed}
+        own = {"part_of": about.record, "leads": about.leads, "capsule_rate": capsule_rate, **own}
+        return type(self)(table, self.rig, **own).with_smoothing(self.smoothing)
+
+    # -- what the record is -----------------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the channels that enter the likelihood."""
+        return tuple(channel.name for channel in self.channels)
 
     @property
     def shares_noise(self) -> str:
         return self.about.record
-
-    def with_coloured_noise(self, theta: ValuesBySymbol) -> "tuple[ForcedRun, dict[str, float]] | None":
-        if self.coloured or self.table.settings.noise is not None:
-            return None
-        leads, rate = self.about.leads, self.rough.capsule_rate
-        return self._remade(self.table, leads, rate, coloured=True), coloured_starts(self, theta)
 
     @property
     def excitation_period(self) -> float | None:
@@ -608,42 +306,55 @@ class ForcedRun(CapsuleForward):
 
     @property
     def driven_by_current(self) -> bool:
-        return "current" in self.channels
+        return "current" in self.names
 
     @property
     def observed(self) -> np.ndarray:
         """Readings channel by channel, then the stated P_d where the current is recorded too, SI."""
-        return np.concatenate([*self.values, [self.drive]] if self.second_reading else self.values)
+        return np.concatenate([*(channel.values for channel in self.channels), (self.second_reading or ())[:1]])
 
     @property
     def scatters(self) -> tuple[str | None, ...]:
-        own: tuple[str | None, ...] = tuple(f"noise_{name}" for name in self.channels)
+        own = tuple(f"noise_{name}" for name in self.names)
         return (*own, None) if self.second_reading else own
 
-    def starts(self) -> dict[str, Start]:
-        return run_starts(self)
+    def noise_facts(self) -> Facts:
+        noise = "ar1" if self.coloured else self.table.settings.noise
+        return {**super().noise_facts(), "noise": noise, "spring": self.spring is not None}
+
+    def excess_noise(self, theta: ValuesBySymbol) -> float:
+        # A record alone does not determine the level of coloured noise.
+        if self.coloured:
+            return 0.0
+        shown = {name: max(self.rough.noise[name], self.table.columns[name].reading_sd) for name in self.names}
+        return max(float(theta[f"noise_{name}"]) / sd for name, sd in shown.items())
+
+    def records(self, theta: ValuesBySymbol) -> list[tuple[str, np.ndarray]]:
+        parts = zip(self.names, self.scaled(theta, np), strict=False)  # a second reading of P_d is no record
+        return [(f"{self.label} {name}", np.asarray(part.at_nuisance_mean(np)[0])) for name, part in parts]
 
     # -- the motion and its recorded channels -----------------------------------------------------------------------
 
     def law(self, theta: ValuesBySymbol) -> FrictionLaw:
-        return super().law({**theta, NORMAL_FORCE: self.normal_force} if self.normal_force_stated else theta)
+        return super().law(theta if self.normal_force is None else {**theta, NORMAL_FORCE: self.normal_force})
 
     def capsule(self, theta: ValuesBySymbol) -> tuple[CapsuleParameters, Drive]:
         """Return parameters and drive of this run; leaves as in ``theta``."""
-        stated: Any = self.drive if self.drive_known else theta.get("P_d")
+        stated: Any = theta.get("P_d") if self.force is None else self.force
         force = theta["K"] * theta["I_d"] if self.driven_by_current else stated
         return self.with_spring(theta), Excitation(force, self.Omega, theta["phase"], self.reaction)
 
     def with_spring(self, theta: ValuesBySymbol) -> CapsuleParameters:
         """Parameters at ``theta`` with the support spring of this run; k2 = 0 where there is none."""
-        return self.parameters_of(theta, theta.get("k2", 0.0), self.gap if self.gap_known else theta["G"])
+        return self.parameters_of(theta, theta.get("k2", 0.0), theta["G"] if self.gap is None else self.gap)
 
     def true_time(self, theta: ValuesBySymbol) -> Any:
         """Times of the samples (..., n), s, with the drift of the clock at ``theta``."""
-        if self.middle is None:
+        if self.clock is None:
             return self.time
         # About the middle of the record the drift is nearly independent of the phase.
-        return self.middle + jnp.multiply.outer(stretch(self.clock_rate, theta), self.time - self.middle)
+        rate, middle = self.clock
+        return middle + jnp.multiply.outer(stretch(rate, theta), self.time - middle)
 
     def motion(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Trajectory:
         """Simulate the motion at the samples (n,), X2 = 0 at the first."""
@@ -667,70 +378,167 @@ class ForcedRun(CapsuleForward):
         """
         run = self.motion(theta, xp)
         x_rel, rate = xp.asarray(run.X1 - run.X2), xp.asarray(run.Y1 - run.Y2)
+        seen = {
+            "x_rel": lambda: x_rel,
+            "x_capsule": lambda: xp.asarray(run.X2),
+            "acceleration_rod": lambda: self.acceleration(theta, x_rel, rate, xp),
+            "current": lambda: self.current_of(theta, xp),
+        }
+        return [seen[name]() for name in self.names]
 
-        seen: list[Any] = []
-        for name in self.channels:
-            if name == "x_rel":
-                seen.append(x_rel)
-            elif name == "x_capsule":
-                seen.append(xp.asarray(run.X2))
-            elif name == "acceleration_rod":
-                seen.append(self.acceleration(theta, x_rel, rate, xp))
-            else:
-                # A batch axis of the leaves precedes the axis of the samples.
-                e, I_d = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], (self.capsule(theta)[1], theta["I_d"]))
-                assert isinstance(e, Excitation), "a current belongs to a harmonic drive"
-                seen.append(I_d * e.cosine(self.true_time(theta)))
-        return seen
+    def current_of(self, theta: ValuesBySymbol, xp: ModuleType) -> Any:
+        """Current at the samples, A."""
+        e, I_d = before_samples((self.capsule(theta)[1], theta["I_d"]), xp)
+        assert isinstance(e, Excitation), "a current belongs to a harmonic drive"
+        return I_d * e.cosine(self.true_time(theta))
 
     def acceleration(self, theta: ValuesBySymbol, x_rel: Any, rate: Any, xp: ModuleType) -> Any:
         """Acceleration of the rod at the samples, m/s^2, from x_rel (..., n), m, and its rate."""
-        p, e = jax.tree.map(lambda leaf: xp.asarray(leaf)[..., None], self.capsule(theta))
+        p, e = before_samples(self.capsule(theta), xp)
         return rod_acceleration(p, e, self.true_time(theta), x_rel, rate)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
         parts = []
-        for i, (name, seen) in enumerate(zip(self.channels, self.predict(theta, xp), strict=True)):
-            columns = [self.widths[i] * xp.ones(len(self.time))]
-            if self.has_gain[i]:
-                columns.append(self.gain_sd[i] * seen)
-            if self.has_delay[i]:
-                # First order in the delay suffices, because the delay is shorter than a sampling step.
-                columns.append(-self.delay_sd[i] * xp.gradient(seen) / xp.gradient(xp.asarray(self.time)))
-            raw, design = self.values[i] - seen, xp.stack(columns, axis=1)
-            if self.coloured:
-                parts.append(innovations(raw, self.reading_variance[i], design, xp.tanh(theta[f"ar1_{name}"]), xp))
-            else:
-                parts.append(Misfit(raw, self.reading_variance[i], 1.0, design))
-        if self.second_reading:
-            raw = self.drive - theta["K"] * theta["I_d"]
-            parts.append(Misfit(xp.reshape(raw, (1,)), self.drive_sd**2, 0.0, xp.zeros((1, 0))))
+        for channel, seen in zip(self.channels, self.predict(theta, xp), strict=True):
+            rho = xp.tanh(theta[f"ar1_{channel.name}"]) if self.coloured else None
+            parts.append(channel.misfit(seen, self.time, rho, xp))
+        if self.second_reading is not None:
+            stated, sd = self.second_reading
+            raw = stated - theta["K"] * theta["I_d"]
+            parts.append(Misfit(xp.reshape(raw, (1,)), sd**2, 0.0, xp.zeros((1, 0))))
         return tuple(parts)
 
-    # -- interface to the fit, the checks and the report -------------------------------------------------------------
-
-    def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[ForcedRun, ...], list[Finding]]":
+    def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[CapsuleRun, ...], list[Finding]]":
         return predictable_parts(self, theta)
 
-    def corrected_start(self, theta: ValuesBySymbol) -> "tuple[ForcedRun, dict[str, float]] | None":
+    def corrected_start(self, theta: ValuesBySymbol) -> "tuple[CapsuleRun, dict[str, float]] | None":
         return corrected_start(self, theta)
 
-    def excess_noise(self, theta: ValuesBySymbol) -> float:
-        # A record alone does not determine the level of coloured noise.
-        if self.coloured:
-            return 0.0
-        shown = [max(self.rough.noise[name], self.table.columns[name].reading_sd) for name in self.channels]
-        return max(float(theta[f"noise_{name}"]) / sd for name, sd in zip(self.channels, shown, strict=True))
 
-    def record_view(self, theta: ValuesBySymbol) -> RunRecord | None:
-        return filtered_record(self, theta)
+# state: The initial state of a run: whether it predicts the whole record, and whether the capsule rests in it.
+#
+# The first samples alone do not distinguish a slowly sliding capsule from one that is about to slip. Given the other
+# parameters, the later motion does. Both questions are put to the exact engine: the steps of the smoothed one hide
+# small changes of the state.
 
-    def records(self, theta: ValuesBySymbol) -> list[tuple[str, np.ndarray]]:
-        parts = zip(self.channels, self.scaled(theta, np), strict=False)  # a second reading of P_d is no record
-        return [(f"{self.label} {name}", np.asarray(part.at_nuisance_mean(np)[0])) for name, part in parts]
 
-    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        return self.comparisons(theta, draws)[0]
+#: Largest growth factor of an initial error within the record, dimensionless. Above it one initial state cannot fit it.
+LARGEST_GROWTH = 1e3
+#: Target growth factor of an initial error within a part, dimensionless; shortest part, excitation periods.
+PART_GROWTH, PART_PERIODS = 30.0, 2.0
+#: Initial errors of the difference quotients, relative to the motion; factors up to this are read off; instants of a
+#: record at which they are read.
+STEP, MEASURABLE, INSTANTS = 1e-11, 1e8, 8
+#: Trial speeds of the capsule at the first sample, m/s. Logarithmic spacing resolves slow and fast sliding.
+TRIAL_SPEEDS = np.concatenate([-np.geomspace(60e-3, 0.5e-3, 13), [0.0], np.geomspace(0.5e-3, 60e-3, 13)])
+#: Index of zero speed in ``TRIAL_SPEEDS``.
+ZERO_SPEED = 13
+#: Number of Gauss–Newton steps.
+GAUSS_NEWTON_STEPS = 5
+#: Steps of the difference quotients, and largest Gauss–Newton steps, of x_rel, m, and of the rod's speed, m/s.
+DIFFERENCE_STEPS, LARGEST_STEPS = np.array([1e-8, 1e-6]), np.array([[2e-4], [0.1]])
+#: Smallest increase in log-likelihood over a capsule at rest for which the capsule counts as moving.
+LOG_LIKELIHOOD_RATIO = 3.0
 
-    def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-        return run_comparisons(self, theta, draws)
+
+def growth(run: CapsuleRun, theta: ValuesBySymbol) -> float:
+    """Largest growth factor of a small initial error at the end of the record, dimensionless; inf where it is not finite.
+
+    Positions are scaled by the amplitude of the motion, velocities by amplitude times Omega. Central differences come
+    from one batch of runs, because exact derivatives take ten times as long to compile. A factor above ``MEASURABLE``
+    within the record is extrapolated from there, because differences cannot outgrow the motion. Below 1e-3: rounding.
+    """
+    run, size = run.with_smoothing(None), np.array([1.0, run.Omega, run.Omega]) * run.rough.length
+    motion = run.motion(theta, np)
+    start = np.array([float(motion.x_rel[0]), float(motion.Y1[0] - motion.Y2[0]), float(motion.Y2[0])])
+    x_rel, rate, Y2 = np.concatenate([start + STEP * np.diag(size), start - STEP * np.diag(size)]).T
+    time = np.asarray(run.true_time(theta))
+    instants = np.linspace(time[0], time[-1], INSTANTS + 1)[1:]
+    # As many samples as the record has: then one compiled program serves all batches of its motions.
+    times = np.union1d(time, instants)
+    t = run.simulated(theta, *run.capsule(theta), times, (x_rel, rate + Y2, np.zeros(6), Y2))
+    states = np.stack([t.x_rel, t.Y1 - t.Y2, t.Y2], axis=-1)[:, np.searchsorted(times, instants)] / (2.0 * STEP * size)
+    if not np.isfinite(states).all():
+        return float("inf")
+    factors = np.linalg.norm(np.swapaxes(states[:3] - states[3:], 0, 1), 2, axis=(1, 2))
+    last = int(np.argmax(factors > MEASURABLE)) if np.any(factors > MEASURABLE) else INSTANTS - 1
+    with np.errstate(over="ignore"):
+        return float(factors[last] ** (INSTANTS / (last + 1)))
+
+
+def predictable_parts(run: CapsuleRun, theta: ValuesBySymbol) -> tuple[tuple[CapsuleRun, ...], list[Finding]]:
+    """Divide ``run`` where it amplifies errors of its initial state too much at ``theta``; also return findings."""
+    factor = 0.0 if run.settled else growth(run, theta)
+    if factor <= LARGEST_GROWTH:
+        return (run,), []
+    duration = float(run.time[-1] - run.time[0])
+    # Errors grow about ``PART_GROWTH`` times within a part.
+    length = duration * np.log(PART_GROWTH) / np.log(factor) if np.isfinite(factor) else 0.0
+    parts = run.parts(max(PART_PERIODS * 2.0 * np.pi / run.Omega, length))
+    if len(parts) == 1:
+        return parts, []
+    facts = {"growth": factor, "parts": len(parts), "seconds": duration / len(parts)}
+    return parts, [Finding("runs.cut", "warn", facts, run.label)]
+
+
+def corrected_start(run: CapsuleRun, theta: ValuesBySymbol) -> tuple[CapsuleRun, dict[str, float]] | None:
+    """Replace the kind of initial state of ``run``; also return values by name from which a fit continues.
+
+    None: the initial state is stated, x_capsule is not recorded, or no other initial state fits better.
+    """
+    if not run.about.start_is_open or "x_capsule" not in run.names:
+        return None
+    better = better_start(run, theta)
+    if better is None:
+        return None
+    restarted = run.restarted(better["capsule_start"])
+    # A prescribed rod has no initial speed to sample, and a capsule at rest none either.
+    sampled = {row.symbol for row in restarted.parameters}
+    return restarted, {f"{symbol}[{run.label}]": value for symbol, value in better.items() if symbol in sampled}
+
+
+def better_start(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float] | None:
+    """Initial state, SI by symbol, that fits the whole record better than that of ``theta``; None: there is none.
+
+    capsule_start is 0 where it does not differ significantly from rest. For every trial speed, Gauss–Newton estimates
+    position and speed of the rod again, because they compensate much of the change. Other values are as in ``theta``.
+    """
+    moving, own = run.restarted(1.0).with_smoothing(None), float(theta.get("capsule_start", 0.0))
+    speeds = np.append(TRIAL_SPEEDS, own)
+    rod = np.full((2, len(speeds)), [[theta["x_start"]], [theta.get("y_start", 0.0) + own]])
+    offsets = np.array([[0.0, 0.0], [DIFFERENCE_STEPS[0], 0.0], [0.0, DIFFERENCE_STEPS[1]]])
+    best, where = np.full(len(speeds), np.inf), rod
+    for _ in range(GAUSS_NEWTON_STEPS):
+        miss = np.stack([_misses(moving, theta, *one, speeds) for one in rod + offsets[..., None]])
+        squares = np.sum(miss[0] ** 2, axis=1)
+        better = squares < best
+        best, where = np.where(better, squares, best), np.where(better, rod, where)
+        slope = (miss[1:] - miss[0]) / DIFFERENCE_STEPS[:, None, None]
+        normal = np.einsum("iln,jln->lij", slope, slope)
+        pull = np.einsum("iln,ln->li", slope, miss[0])
+        known = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(pull).all(axis=1)
+        normal, pull = np.where(known[:, None, None], normal, np.eye(2)), np.where(known[:, None], pull, 0.0)
+        step = -np.einsum("lij,lj->il", np.linalg.pinv(normal), pull)
+        rod = rod + np.clip(step, -LARGEST_STEPS, LARGEST_STEPS)
+    found = int(np.argmin(best))
+    if 0.5 * (best[ZERO_SPEED] - best[found]) < LOG_LIKELIHOOD_RATIO:
+        found = ZERO_SPEED
+    # The last speed is that of ``theta``.
+    same_kind = np.sign(speeds[found]) == (np.sign(own) if run.moves else 0.0)
+    if same_kind or (0.5 * (best[-1] - best[found]) < LOG_LIKELIHOOD_RATIO and speeds[found] != 0.0):
+        return None
+    x, Y1 = where[:, found].tolist()
+    speed = float(speeds[found])
+    return {"x_start": x, "y_start": Y1 - speed, "capsule_start": speed}
+
+
+def _misses(run: CapsuleRun, theta: ValuesBySymbol, x: np.ndarray, Y1: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """(lanes, readings) residuals of the channels that depend on the motion, without offsets, in units of noise."""
+    lanes = {name: np.full(len(x), value) for name, value in theta.items() if np.ndim(value) == 0}
+    seen = run.predict({**lanes, "x_start": x, "y_start": Y1 - speeds, "capsule_start": speeds}, np)
+    parts = []
+    for channel, model in zip(run.channels, seen, strict=True):
+        if channel.name != "current":
+            miss = (channel.values - model) / theta[f"noise_{channel.name}"]
+            parts.append(miss - np.mean(miss, axis=1, keepdims=True))
+    return np.concatenate(parts, axis=1)

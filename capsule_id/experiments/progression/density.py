@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,10 +18,6 @@ from capsule_id.experiments.emulator import Emulator
 from capsule_id.experiments.misfit import LOG_2PI, Misfit
 from capsule_id.experiments.progression.declaration import SESSIONS, alternatives
 from capsule_id.physics.batches import pool
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.progression.experiment import Progression
-
 
 # sessions: Sessions of a progression: how the friction of each one enters, and the runs of the capsule that follow.
 #
@@ -143,60 +139,6 @@ def parameters_of(
     found = np.full(len(settings), -1)
     found[chosen] = np.arange(len(chosen))
     return found
-
-
-# linear misfit: Misfit of the trials of a progression, linear about the most probable friction of each session.
-
-
-def linear_misfit(e: "Progression", theta: ValuesBySymbol, X2: Any, xp: ModuleType = jnp) -> Misfit:
-    """The misfit at the ``responses`` (cases, nodes), m, the motion of a session linear about its most probable z.
-
-    With heavy tails the outlying trials are those of the most probable alternative of each setting.
-    """
-    rows, columns = xp.asarray(e.sessions.rows), xp.asarray(e.sessions.columns)
-    usual = _relative_variance(e, theta, X2, xp)
-    start, slope, expected = _most_probable_lines(e, theta, xp.asarray(X2), 1.0 / usual, xp)
-    discrepancy = theta["discrepancy"] * e.setting * e.time[None]
-    design = xp.concatenate([(rows @ columns) * (slope @ columns)[None], discrepancy], axis=1)
-    variance = e.reading_variance + (theta["trial_scatter"] * (rows @ expected)) ** 2
-    return Misfit(e.distance - rows @ start, usual * variance, xp.sqrt(usual), design)
-
-
-def _relative_variance(e: "Progression", theta: ValuesBySymbol, X2: Any, xp: ModuleType) -> Any:
-    """(n,) variance of each trial relative to the usual one."""
-    groups = e.groups
-    if not e.heavy:
-        return xp.ones(e.n)
-    density = e.trials_of(theta, X2, xp).of_alternatives(xp.asarray(theta["trial_sd"]).reshape(1), xp)[0]
-    own = xp.asarray(e.setting) @ (xp.arange(len(e.settings))[:, None] == xp.asarray(groups.setting)[None])
-    best = xp.argmax(xp.where(own > 0.0, density[None], -xp.inf), axis=1)
-    return xp.take_along_axis(xp.asarray(groups.variance), best[None], axis=0)[0]
-
-
-def _most_probable_lines(
-    e: "Progression", theta: ValuesBySymbol, X2: Any, weight: Any, xp: ModuleType
-) -> tuple[Any, ...]:
-    """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m.
-
-    The slope is 0 where this z is at a kink: no small change of it explains more.
-
-    Parameters
-    ----------
-    weight : (n,) of each trial
-    """
-    start, slope = lines(X2, NODES, xp)
-    rows = xp.asarray(e.sessions.rows)
-    count = weight @ rows
-    r = ((weight * e.distance) @ rows / count)[:, None] - start
-    time = xp.asarray(e.time)[xp.asarray(e.sessions.setting).astype(int)][:, None]
-    variance = e.reading_variance + (theta["trial_scatter"] * X2[:, MIDDLE, None]) ** 2 + theta["trial_sd"] ** 2
-    w = variance / count[:, None] + (theta["discrepancy"] * time) ** 2
-    low, high = (xp.asarray(edge[None]) for edge in edges(NODES))
-    z = xp.clip(slope * r / (w + slope**2), low, high)
-    best = xp.argmin(z**2 + (r - slope * z) ** 2 / w, axis=1)[:, None]
-    expected, inside = start + slope * z, (z > low) & (z < high)
-    found = xp.where(inside, start, expected), xp.where(inside, slope, 0.0), expected
-    return tuple(xp.take_along_axis(x, best, axis=1)[:, 0] for x in found)
 
 
 # run emulator: Emulator of the runs of a progression.
@@ -368,6 +310,59 @@ class TrialMisfit:
         for shared in np.flatnonzero([own.shape[0] > 0 for own in groups.lone]):
             density = density + self._of_lone_sessions(int(shared), flat, (variance * moment, variance), xp)
         return density + xp.asarray(groups.log_share)[None]
+
+    def linear(self, distance: np.ndarray, sessions: Sessions, scatter: Any, xp: ModuleType = jnp) -> Misfit:
+        """Misfit of the trials, linear about the most probable friction of each session, at ``scatter``, m.
+
+        With heavy tails the outlying trials are those of the most probable alternative of each setting.
+
+        Parameters
+        ----------
+        distance : (n,) of the trials, m
+        """
+        rows, columns = xp.asarray(sessions.rows), xp.asarray(sessions.columns)
+        setting = xp.asarray(sessions.setting).astype(int)
+        usual = self._relative_variance(rows, setting, scatter, xp)
+        start, slope, expected = self._most_probable_lines(distance, rows, setting, 1.0 / usual, scatter, xp)
+        own = setting[:, None] == xp.arange(len(self.discrepancy))[None]
+        discrepancy = xp.asarray(self.discrepancy)[None] * (rows @ own)
+        design = xp.concatenate([(rows @ columns) * (slope @ columns)[None], discrepancy], axis=1)
+        variance = self.reading_variance + (self.trial_scatter * (rows @ expected)) ** 2
+        return Misfit(distance - rows @ start, usual * variance, xp.sqrt(usual), design)
+
+    def _relative_variance(self, rows: Any, setting: Any, scatter: Any, xp: ModuleType) -> Any:
+        """(n,) variance of each trial relative to the usual one, in the most probable alternative of its setting."""
+        groups = self.groups
+        if len(groups.log_share) == len(self.discrepancy):
+            return xp.ones(len(rows))
+        density = self.of_alternatives(xp.asarray(scatter).reshape(1), xp)[0]
+        own = rows @ (setting[:, None] == xp.asarray(groups.setting)[None])
+        best = xp.argmax(xp.where(own > 0.0, density[None], -xp.inf), axis=1)
+        return xp.take_along_axis(xp.asarray(groups.variance), best[None], axis=0)[0]
+
+    def _most_probable_lines(
+        self, distance: np.ndarray, rows: Any, setting: Any, weight: Any, scatter: Any, xp: ModuleType
+    ) -> tuple[Any, ...]:
+        """(cases,) value at z = 0 and slope of the line with the most probable z, and its displacement there, m.
+
+        The slope is 0 where this z is at a kink: no small change of it explains more.
+
+        Parameters
+        ----------
+        weight : (n,) of each trial
+        """
+        X2 = xp.asarray(self.X2)
+        start, slope = lines(X2, NODES, xp)
+        count = weight @ rows
+        r = ((weight * distance) @ rows / count)[:, None] - start
+        variance = self.reading_variance + (self.trial_scatter * X2[:, MIDDLE, None]) ** 2 + scatter**2
+        w = variance / count[:, None] + (xp.asarray(self.discrepancy)[setting] ** 2)[:, None]
+        low, high = (xp.asarray(edge[None]) for edge in edges(NODES))
+        z = xp.clip(slope * r / (w + slope**2), low, high)
+        best = xp.argmin(z**2 + (r - slope * z) ** 2 / w, axis=1)[:, None]
+        expected, inside = start + slope * z, (z > low) & (z < high)
+        found = xp.where(inside, start, expected), xp.where(inside, slope, 0.0), expected
+        return tuple(xp.take_along_axis(x, best, axis=1)[:, 0] for x in found)
 
     def _cases(self, index: Any, xp: ModuleType) -> tuple[Any, ...]:
         """``X2`` (..., nodes), mean, number, sum of weights, spread and measure of ``index`` (...)."""

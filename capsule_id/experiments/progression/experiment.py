@@ -1,6 +1,6 @@
 """Likelihood of progressions: displacement of the capsule after a number of drive periods, from rest."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, cast
@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, band
-from capsule_id.experiments.capsule_experiment import TrialsExperiment
+from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters
 from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.friction import ground_parameters
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
@@ -26,7 +26,6 @@ from capsule_id.experiments.progression.declaration import (
     TIMES,
     TRIAL_SCATTER,
     TRIAL_SD,
-    name_of,
     sessions_of,
     settings_of,
 )
@@ -36,7 +35,6 @@ from capsule_id.experiments.progression.density import (
     Sessions,
     TrialGroups,
     TrialMisfit,
-    linear_misfit,
     parameters_of,
 )
 from capsule_id.parameters import Parameter, Prior, parameter
@@ -88,158 +86,26 @@ def session_table(experiments: "Sequence[Progression]", fit: Fitted) -> list[Res
 DRAWS_OF_A_BATCH = 16
 
 
-def batched(
-    function: Callable[..., Any],
-    e: "Progression",
-    draws: Sequence[ValuesBySymbol],
-    s: np.ndarray,
-    settings: np.ndarray,
-) -> np.ndarray:
-    """``function(e, theta, s, settings)`` at every draw and row of ``s``, in batches of one size, on all cores."""
+def batched(function: Callable[..., Any], draws: Sequence[ValuesBySymbol], s: np.ndarray) -> np.ndarray:
+    """``function(theta, s)`` at every draw and row of ``s``, in batches of one size, on all cores; no s: ``function(theta)``.
+
+    ``function`` is a tree (``eqx.Partial``), so that all experiments of one structure share its program.
+    """
     symbols = tuple(name for name in draws[0] if np.ndim(draws[0][name]) == 0)
     rows = np.concatenate([np.array([[draw[name] for name in symbols] for draw in draws]), s], axis=1)
     padded = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % DRAWS_OF_A_BATCH, axis=0)])
     parts = np.split(padded, len(padded) // DRAWS_OF_A_BATCH)
-    found = pool().map(lambda part: np.asarray(_of_rows(function, e, symbols, part, settings)), parts)
+    found = pool().map(lambda part: np.asarray(_of_rows(function, symbols, part)), parts)
     return np.concatenate(list(found))[: len(rows)]
 
 
 @eqx.filter_jit
-def _of_rows(function: Callable[..., Any], e: "Progression", symbols: tuple[str, ...], rows: Any, settings: Any) -> Any:
+def _of_rows(function: Callable[..., Any], symbols: tuple[str, ...], rows: Any) -> Any:
     def one(row: Any) -> Any:
-        theta = dict(zip(symbols, row[: len(symbols)], strict=True))
-        return function(e, theta, row[len(symbols) :], settings)
+        theta, s = dict(zip(symbols, row[: len(symbols)], strict=True)), row[len(symbols) :]
+        return function(theta, s) if s.size else function(theta)
 
     return jax.vmap(one)(rows)
-
-
-# panels: Predictions of progressions and their panels: mean velocity against period, for every duty and amplitude.
-
-
-#: Symbols of the scatters.
-SCATTERS = ("session_sd", "trial_scatter", "trial_sd", "discrepancy")
-#: Draws of a band.
-BAND_DRAWS = 200
-#: Seed of the sessions and trials of a band.
-BAND_SEED = 0
-
-
-def new_trials(
-    e: "Progression", draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """(draws, rows) displacement, m, of a new trial in a new session at each row of ``settings`` (rows, 4).
-
-    Each row has a session, a discrepancy and a trial of its own.
-    """
-    time = settings[:, 0] * settings[:, 1]
-    z = rng.standard_normal((3, len(draws), len(settings)))
-    own = {name: np.array([draw[name] for draw in draws])[:, None] for name in SCATTERS}
-    X2 = e.displacements_of_draws(draws, own["session_sd"] * z[0], settings)
-    variance = e.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
-    if e.heavy:
-        variance = np.where(rng.uniform(size=variance.shape) < OUTLIER_SHARE, TIMES**2, 1.0) * variance
-    return X2 + own["discrepancy"] * time * z[1] + np.sqrt(variance) * z[2]
-
-
-def progression_panels(e: "Progression", theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-    """One panel per duty and amplitude: trials, the point fit, and the band of a new trial in a new session."""
-    settings = e.settings
-    speed = 1e3 / e.time
-    centre = np.asarray(e.displacements(theta, np.zeros(len(settings)), settings)) * speed
-    chosen = draws[:: max(1, len(draws) // BAND_DRAWS)]
-    trials = new_trials(e, chosen, settings, np.random.default_rng(BAND_SEED)) if chosen else np.empty((0, 0))
-    lower, upper = band(trials * speed if chosen else trials)
-    panels = speed_panels(e, settings, centre, (lower, upper), "this fit, 95 % band of a new trial")
-    residuals = np.asarray(e.residuals(theta, np))[: e.n]
-    rows = [_rows_of(e, group) for group in _groups(settings)]
-    period = e.setting @ (1e3 * settings[:, 0])
-    return tuple(
-        replace(panel, residual_x=period[own], residuals=residuals[own])
-        for panel, own in zip(panels, rows, strict=True)
-    )
-
-
-def speed_panels(
-    e: "Progression",
-    settings: np.ndarray,
-    centre: np.ndarray,
-    limits: tuple[np.ndarray | None, np.ndarray | None],
-    label: str,
-) -> tuple[Comparison, ...]:
-    """One panel per duty and amplitude of ``settings`` (rows, 4): mean velocity against period, and the trials there.
-
-    Parameters
-    ----------
-    centre, limits : (rows,) mean velocity and the limits of its band, mm/s
-    label : of the curve
-    """
-    speed, panels = 1e3 / e.time, []
-    for group in _groups(settings):
-        own = np.flatnonzero(np.all(settings[:, 2:] == group, axis=1))
-        own = own[np.argsort(settings[own, 0], kind="stable")]
-        lower, upper = (None if limit is None else limit[own] for limit in limits)
-        rows = _rows_of(e, group)
-        trials = Points(e.label, (e.setting @ (1e3 * e.settings[:, 0]))[rows], (e.distance * (e.setting @ speed))[rows])
-        amplitude = {"column": f", {group[1]:g} N", "current": f", {group[1]:g} A"}.get(e.amplitude_from, "")
-        duty = f", duty {100.0 * group[0]:g} %" if e.drive == "pulses" else ""
-        panels.append(
-            Comparison(
-                "progression",
-                e.label,
-                f"{e.label}{duty}{amplitude}: mean velocity",
-                "period [ms]",
-                "mean velocity [mm/s]",
-                (trials,) if len(rows) else (),
-                (Curve(label, 1e3 * settings[own, 0], centre[own], lower, upper),),
-            )
-        )
-    return tuple(panels)
-
-
-def _groups(settings: np.ndarray) -> np.ndarray:
-    """(groups, 2) duty and amplitude."""
-    return np.unique(settings[:, 2:], axis=0)
-
-
-def _rows_of(e: "Progression", group: np.ndarray) -> np.ndarray:
-    """Rows of the trials with the duty and amplitude of ``group``."""
-    own = np.flatnonzero(np.all(e.settings[:, 2:] == group, axis=1))
-    return np.flatnonzero(e.setting[:, own].any(axis=1))
-
-
-# starts: Starting points of the point fit of a progression, from the readings alone.
-
-
-#: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
-DAMPING_RATIO, FRICTION = 0.1, 0.3
-
-
-def starts_of(e: "Progression") -> dict[str, Start]:
-    """Start of every parameter by name."""
-    m1, m2 = e.rig.mass("m1"), e.rig.mass("m2")
-    k1 = m1 * (2.0 * np.pi / float(np.median(e.settings[:, 0]))) ** 2
-    largest = float(np.max(np.abs(e.distance)))
-    priors = {row.symbol: cast(Prior, row.prior) for row in e.parameters if row.prior}
-    starts = {
-        "k1": Start(k1, 0.7),
-        "c": Start(2.0 * DAMPING_RATIO * float(np.sqrt(k1 * m1)), 1.0),
-        "mu": Start(FRICTION, 0.5),
-        "mu_back": Start(FRICTION, 0.5),
-        "v_s": Start(0.3, 1.0),
-        "ratio": Start(0.7, 0.3),
-        "lag": Start(0.05 * float(np.median(e.settings[:, 0])), 1.0),
-        "session_sd": Start(0.05, 0.3),
-        **{f"{symbol}[{e.label}]": Start(0.0, 1.0) for symbol in e.sessions.symbols},
-        "trial_scatter": Start(0.05, 0.3),
-        f"trial_sd[{e.label}]": Start(max(0.01 * largest, float(np.sqrt(e.reading_variance))), 0.3),
-        f"discrepancy[{e.label}]": Start(0.5 * priors["discrepancy"].spread, 0.3),
-    }
-    for name in e.mirrored:
-        prior = priors[name]
-        friction = FRICTION * (m1 + m2) * e.rig.g.value
-        starts[name] = Start(prior.location if abs(prior.location) > prior.spread else friction, 0.5 * prior.spread)
-    known = {row.name for row in e.parameters}
-    return {name: start for name, start in starts.items() if name in known}
 
 
 # checks: Check of a fitted progression: how much of the motion the model leaves unexplained.
@@ -285,33 +151,42 @@ FRICTION_FORCES = ("mu", "mu_back", "viscous")
 OF_TRIALS = ("trial_scatter", "trial_sd", "discrepancy")
 #: Step of the derivative with respect to ``session_sd``, relative.
 SESSION_STEP = 0.1
+#: Draws of a band, and the seed of its sessions and trials.
+BAND_DRAWS, BAND_SEED = 200, 0
+#: Damping ratio and friction coefficient of the centre of the starting points, dimensionless.
+DAMPING_RATIO, FRICTION = 0.1, 0.3
 
 
-class Progression(TrialsExperiment):
+class Progression(CapsuleForward):
     """Trials of one table.
 
     Attributes
     ----------
+    distance : (n,) displacement of the capsule, m
     settings : (settings, 4) period, s, number of periods, duty, amplitude, N or A; see ``declaration.settings_of``
+    setting : (n, settings) 1 where a row belongs to a setting
+    time : (settings,) duration of a trial, s
     session : (n, sessions) 1 where a row belongs to it
     parameter : (sessions,) index of the parameter of a session, see ``parameters_of``
     reading_variance : m^2
-    force, lag : stated amplitude, N, and lag, s, where they are exact; else 0
-    has_lag : whether the lag is a parameter
+    force, lag : stated amplitude, N, else 0; lag, s, None where it is a parameter
     heavy : whether trials have heavy tails, see ``capsule_id.experiments.progression.declaration``
     emulator : of ``runs``; None: they are exact
     """
 
+    distance: np.ndarray
+    settings: np.ndarray
+    setting: np.ndarray
+    time: np.ndarray
     session: np.ndarray
     parameter: np.ndarray
     sessions: Sessions
     groups: TrialGroups
     reading_variance: float
     force: float
-    lag: float
+    lag: float | None
     drive: str = eqx.field(static=True)
     amplitude_from: str = eqx.field(static=True)
-    has_lag: bool = eqx.field(static=True)
     heavy: bool = eqx.field(static=True)
 
     checks = (check_discrepancy,)
@@ -321,40 +196,45 @@ class Progression(TrialsExperiment):
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
         self.set_model(table, rig, friction)
         self.emulator, self.drive = None, table.settings.drive
-        self.distance = table["distance"]
         self.reading_variance = table.columns["distance"].reading_sd ** 2
         rows, self.amplitude_from = settings_of(
             {name: column.values for name, column in table.columns.items()}, table.settings
         )
-        self.settings, index = np.unique(rows, axis=0, return_inverse=True)
-        self.setting, self.time = np.eye(len(self.settings))[index], self.settings[:, 0] * self.settings[:, 1]
-        self.session = sessions_of(table, rows)
-        self.parameter = parameters_of(self.setting, self.session)
-        self.sessions = Sessions(self.setting, self.session, self.parameter)
+        settings, index = np.unique(rows, axis=0, return_inverse=True)
+        setting, session = np.eye(len(settings))[index], sessions_of(table, rows)
         self.heavy = table.settings.tails == "heavy"
-        self.groups = TrialGroups(self.distance, self.sessions, self.heavy)
-        stated = {name: getattr(table.settings, name) for name in (AMPLITUDE[self.drive], "lag")}
-        exact = {name: q.value if q is not None and q.sd == 0.0 else 0.0 for name, q in stated.items()}
-        self.force, self.lag = exact[AMPLITUDE[self.drive]], exact["lag"]
-        stated_lag = stated["lag"]
-        free = "lag" in rig.model.free and self.drive == "pulses"
-        self.has_lag = free if stated_lag is None else stated_lag.sd > 0.0
+        for name, value in self._cases(table["distance"], settings, setting, session, parameters_of(setting, session)):
+            setattr(self, name, value)
+        stated = getattr(table.settings, AMPLITUDE[self.drive])
+        self.force = stated.value if stated is not None and stated.sd == 0.0 else 0.0
+        lag, self.lag = lag_of(table, rig)
         self.about = About(table, rig, ())
-        self.about = replace(self.about, parameters=self._sampled())
+        self.about = replace(self.about, parameters=self._sampled(lag))
 
-    def _sampled(self) -> tuple[Parameter, ...]:
+    def _cases(
+        self,
+        distance: np.ndarray,
+        settings: np.ndarray,
+        setting: np.ndarray,
+        session: np.ndarray,
+        parameter: np.ndarray,
+    ) -> Iterable[tuple[str, Any]]:
+        """Name and value of every field that depends on which trials there are."""
+        sessions = Sessions(setting, session, parameter)
+        yield from {"distance": distance, "settings": settings, "setting": setting}.items()
+        yield from {"session": session, "parameter": parameter, "sessions": sessions}.items()
+        yield from {
+            "time": settings[:, 0] * settings[:, 1],
+            "groups": TrialGroups(distance, sessions, self.heavy),
+        }.items()
+
+    def _sampled(self, lag: list[Parameter]) -> tuple[Parameter, ...]:
         settings, free = self.table.settings, self.rig.model.free
         rows = [parameter("k1"), parameter("c"), *self.friction.parameters, *ground_parameters(self.table, self.rig)]
         rows += [parameter("k_cubic")] if "k_cubic" in free else []
-        if self.amplitude_from == "current":
-            rows.append(parameter("K"))
-        elif self.amplitude_from == "prior":
-            name = AMPLITUDE[self.drive]
-            stated = getattr(settings, name)
-            rows.append(parameter(name, prior=Prior("normal", stated.value, stated.sd)))
-        if self.has_lag:
-            lag = settings.lag
-            rows.append(parameter("lag", prior=lag and Prior("positive_normal", lag.value, lag.sd)))
+        name = AMPLITUDE[self.drive]
+        rows += [parameter("K")] if self.amplitude_from == "current" else []
+        rows += stated_parameters(name, getattr(settings, name), kind="normal") + lag
         largest = float(np.max(np.abs(self.distance)))
         speed = float(np.max(np.abs(self.distance / (self.setting @ self.time))))
         floor = np.sqrt(self.reading_variance) + 1e-9
@@ -406,7 +286,9 @@ class Progression(TrialsExperiment):
         p = self.parameters_of(theta, 0.0, np.inf)
         if self.drive == "harmonic":
             return p, Excitation(force, 2.0 * np.pi / period, 0.0, self.reaction)
-        return p, Pulses(force, period, duty, lag=theta["lag"] if self.has_lag else self.lag, reaction=self.reaction)
+        return p, Pulses(
+            force, period, duty, lag=theta["lag"] if self.lag is None else self.lag, reaction=self.reaction
+        )
 
     def runs(self, theta: ValuesBySymbol) -> Any:
         """(runs,) X2 of the runs of ``sessions``, m."""
@@ -428,12 +310,14 @@ class Progression(TrialsExperiment):
         self, draws: Sequence[ValuesBySymbol], s: np.ndarray, settings: np.ndarray
     ) -> np.ndarray:
         """(draws, rows) X2, m, at each draw with friction multiplied by exp(s), s (draws, rows)."""
-        return batched(_displacements_at, self, draws, s, settings)
+        return batched(eqx.Partial(Progression.displacements, self, settings=settings), draws, s)
 
     def motions_of_draws(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
-        return batched(_runs_at, self, draws, np.zeros((len(draws), 0)), self.settings)
+        """The numbers of every draw for which the likelihood runs the capsule; not finite where a run fails."""
+        return batched(eqx.Partial(Progression.runs, self), draws, np.zeros((len(draws), 0)))
 
     def with_emulator(self, draws: Sequence[ValuesBySymbol], motions: np.ndarray) -> "Progression":
+        """Return the same trials with an emulator of the motions, fitted to ``motions_of_draws`` of ``draws``."""
         without = (*OF_TRIALS, "session_sd", *(row.symbol for row in SESSIONS))
         positive = {row.symbol: row.positive for row in self.parameters if row.symbol not in without}
         varied = {mass: True for mass in self.masses if len({draw[mass] for draw in draws}) > 1}
@@ -441,7 +325,8 @@ class Progression(TrialsExperiment):
         return eqx.tree_at(lambda e: e.emulator, self, emulator, is_leaf=lambda x: x is None)
 
     def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        return (linear_misfit(self, theta, self.responses(theta), xp),)
+        trials = self.trials_of(theta, self.responses(theta), xp)
+        return (trials.linear(self.distance, self.sessions, theta["trial_sd"], xp),)
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[TrialMisfit]:
         return (self.trials_of(theta, self.responses(theta), xp),)
@@ -470,7 +355,30 @@ class Progression(TrialsExperiment):
     # -- starting points and the report -------------------------------------------------------------------------------
 
     def starts(self) -> dict[str, Start]:
-        return starts_of(self)
+        m1, m2 = self.rig.mass("m1"), self.rig.mass("m2")
+        k1 = m1 * (2.0 * np.pi / float(np.median(self.settings[:, 0]))) ** 2
+        largest = float(np.max(np.abs(self.distance)))
+        priors = {row.symbol: cast(Prior, row.prior) for row in self.parameters if row.prior}
+        starts = {
+            "k1": Start(k1, 0.7),
+            "c": Start(2.0 * DAMPING_RATIO * float(np.sqrt(k1 * m1)), 1.0),
+            "mu": Start(FRICTION, 0.5),
+            "mu_back": Start(FRICTION, 0.5),
+            "v_s": Start(0.3, 1.0),
+            "ratio": Start(0.7, 0.3),
+            "lag": Start(0.05 * float(np.median(self.settings[:, 0])), 1.0),
+            "session_sd": Start(0.05, 0.3),
+            **{f"{symbol}[{self.label}]": Start(0.0, 1.0) for symbol in self.sessions.symbols},
+            "trial_scatter": Start(0.05, 0.3),
+            f"trial_sd[{self.label}]": Start(max(0.01 * largest, float(np.sqrt(self.reading_variance))), 0.3),
+            f"discrepancy[{self.label}]": Start(0.5 * priors["discrepancy"].spread, 0.3),
+        }
+        for name in self.mirrored:
+            prior = priors[name]
+            friction = FRICTION * (m1 + m2) * self.rig.g.value
+            starts[name] = Start(prior.location if abs(prior.location) > prior.spread else friction, 0.5 * prior.spread)
+        known = {row.name for row in self.parameters}
+        return {name: start for name, start in starts.items() if name in known}
 
     def excess_noise(self, theta: ValuesBySymbol) -> float:
         """Total error of a trial relative to its scatter, at the median setting."""
@@ -481,14 +389,30 @@ class Progression(TrialsExperiment):
     # -- settings left out and new ones -------------------------------------------------------------------------------
 
     def settings_of(self, columns: Mapping[str, Column]) -> tuple[np.ndarray, np.ndarray]:
+        """Settings in the rows of a table, (rows, 4), and the durations of their trials, (rows,) s."""
         rows, _ = settings_of({name: column.values for name, column in columns.items()}, self.table.settings)
         return rows, rows[:, 0] * rows[:, 1]
 
     def setting_names(self) -> list[str]:
-        return [name_of(row, self.drive, self.amplitude_from) for row in self.settings]
+        """A short name for every setting: period, duty and amplitude where they may differ, number of periods."""
+        duty = ", duty {2:g} %" if self.drive == "pulses" else ""
+        amplitude = {"column": ", {3:g} N", "current": ", {3:g} A"}.get(self.amplitude_from, "")
+        name, scale = "{0:g} ms" + duty + amplitude + ", {1:g} periods", np.array([1e3, 1.0, 100.0, 1.0])
+        return [name.format(*(scale * row)) for row in self.settings]
 
     def new_trials(self, draws: Sequence[ValuesBySymbol], settings: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return new_trials(self, draws, settings, rng)
+        """(draws, rows) displacement, m, of a new trial in a new session at each row of ``settings`` (rows, 4).
+
+        Each row has a session, a discrepancy and a trial of its own.
+        """
+        time = settings[:, 0] * settings[:, 1]
+        z = rng.standard_normal((3, len(draws), len(settings)))
+        own = {name: np.array([draw[name] for draw in draws])[:, None] for name in ("session_sd", *OF_TRIALS)}
+        X2 = self.displacements_of_draws(draws, own["session_sd"] * z[0], settings)
+        variance = self.reading_variance + own["trial_sd"] ** 2 + (own["trial_scatter"] * X2) ** 2
+        if self.heavy:
+            variance = np.where(rng.uniform(size=variance.shape) < OUTLIER_SHARE, TIMES**2, 1.0) * variance
+        return X2 + own["discrepancy"] * time * z[1] + np.sqrt(variance) * z[2]
 
     def speed_panels(
         self,
@@ -497,55 +421,91 @@ class Progression(TrialsExperiment):
         limits: tuple[np.ndarray | None, np.ndarray | None],
         label: str,
     ) -> tuple[Comparison, ...]:
-        return speed_panels(self, settings, centre, limits, label)
+        """One panel per duty and amplitude of ``settings`` (rows, 4): mean velocity against period, and the trials there.
+
+        Parameters
+        ----------
+        centre, limits : (rows,) mean velocity and the limits of its band, mm/s
+        label : of the curve
+        """
+        speed, panels = 1e3 / self.time, []
+        for group in _groups(settings):
+            own = np.flatnonzero(np.all(settings[:, 2:] == group, axis=1))
+            own = own[np.argsort(settings[own, 0], kind="stable")]
+            lower, upper = (None if limit is None else limit[own] for limit in limits)
+            rows = self._rows_of(group)
+            trials = Points(
+                self.label,
+                (self.setting @ (1e3 * self.settings[:, 0]))[rows],
+                (self.distance * (self.setting @ speed))[rows],
+            )
+            amplitude = {"column": f", {group[1]:g} N", "current": f", {group[1]:g} A"}.get(self.amplitude_from, "")
+            duty = f", duty {100.0 * group[0]:g} %" if self.drive == "pulses" else ""
+            panels.append(
+                Comparison(
+                    "progression",
+                    self.label,
+                    f"{self.label}{duty}{amplitude}: mean velocity",
+                    "period [ms]",
+                    "mean velocity [mm/s]",
+                    (trials,) if len(rows) else (),
+                    (Curve(label, 1e3 * settings[own, 0], centre[own], lower, upper),),
+                )
+            )
+        return tuple(panels)
+
+    def _rows_of(self, group: np.ndarray) -> np.ndarray:
+        """Rows of the trials with the duty and amplitude of ``group``."""
+        own = np.flatnonzero(np.all(self.settings[:, 2:] == group, axis=1))
+        return np.flatnonzero(self.setting[:, own].any(axis=1))
 
     def densities_of_settings(self, draws: Sequence[ValuesBySymbol]) -> np.ndarray:
+        """(draws, settings) log-density of the readings of each setting given the parameters and all others."""
         X2 = np.asarray(self.sessions.responses(self.motions_of_draws(draws)))
         pairs = zip(draws, X2, strict=True)
         return np.stack([self.trials_of(theta, own, np).of_settings(theta["trial_sd"], np) for theta, own in pairs])
 
     def without(self, setting: int) -> "Progression":
+        """Return the experiment without the trials of one setting."""
         kept = self.setting[:, setting] == 0.0
-        distance, membership = self.distance[kept], np.delete(self.setting[kept], setting, axis=1)
         some = self.session[kept].any(axis=0)
-        session, parameter = self.session[kept][:, some], self.parameter[some]
-        sessions = Sessions(membership, session, parameter)
+        settings, setting_of = np.delete(self.settings, setting, axis=0), np.delete(self.setting[kept], setting, axis=1)
+        left = dict(
+            self._cases(self.distance[kept], settings, setting_of, self.session[kept][:, some], self.parameter[some])
+        )
+        fields = (*left, "emulator")
         return eqx.tree_at(
-            lambda e: (
-                *(e.distance, e.settings, e.setting, e.session, e.parameter, e.sessions, e.groups, e.time, e.emulator),
-            ),
-            self,
-            (
-                distance,
-                np.delete(self.settings, setting, axis=0),
-                membership,
-                session,
-                parameter,
-                sessions,
-                TrialGroups(distance, sessions, self.heavy),
-                np.delete(self.time, setting),
-                None,
-            ),
-            is_leaf=lambda x: x is None,
+            lambda e: [getattr(e, name) for name in fields], self, [*left.values(), None], is_leaf=lambda x: x is None
         )
 
     def motions_without(self, motions: np.ndarray, setting: int) -> np.ndarray:
+        """Those of ``motions_of_draws`` that the experiment without one setting has."""
         return motions[:, np.asarray(self.sessions.setting_of_run) != setting]
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
         return self.comparisons(theta, draws)[0]
 
     def comparisons(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> tuple[Comparison, ...]:
-        return progression_panels(self, theta, draws)
+        """One panel per duty and amplitude: trials, the point fit, and the band of a new trial in a new session."""
+        settings = self.settings
+        speed = 1e3 / self.time
+        centre = np.asarray(self.displacements(theta, np.zeros(len(settings)), settings)) * speed
+        chosen = draws[:: max(1, len(draws) // BAND_DRAWS)]
+        trials = self.new_trials(chosen, settings, np.random.default_rng(BAND_SEED)) if chosen else np.empty((0, 0))
+        lower, upper = band(trials * speed if chosen else trials)
+        panels = self.speed_panels(settings, centre, (lower, upper), "this fit, 95 % band of a new trial")
+        residuals = np.asarray(self.residuals(theta, np))[: self.n]
+        rows = [self._rows_of(group) for group in _groups(settings)]
+        period = self.setting @ (1e3 * settings[:, 0])
+        return tuple(
+            replace(panel, residual_x=period[own], residuals=residuals[own])
+            for panel, own in zip(panels, rows, strict=True)
+        )
 
 
-def _displacements_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
-    return e.displacements(theta, s, settings)
-
-
-def _runs_at(e: Progression, theta: ValuesBySymbol, s: Any, settings: Any) -> Any:
-    del s, settings
-    return e.runs(theta)
+def _groups(settings: np.ndarray) -> np.ndarray:
+    """(groups, 2) duty and amplitude."""
+    return np.unique(settings[:, 2:], axis=0)
 
 
 @eqx.filter_jit

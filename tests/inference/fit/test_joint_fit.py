@@ -18,7 +18,7 @@ from scipy import optimize
 from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.inference import joint_fit as joint_starts
 from capsule_id.inference import joint_fit as module
 from capsule_id.inference.checks.posterior import check_starts

@@ -6,7 +6,7 @@ import pytest
 
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.forced_run.declaration import MESSAGES
-from capsule_id.experiments.forced_run.experiment import ForcedRun
+from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.twin import RunSetup, make_runs
 from capsule_id.inference import point_stage
 from capsule_id.inference.point_stage import cut_unpredictable
