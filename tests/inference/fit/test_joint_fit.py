@@ -41,8 +41,9 @@ from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling import laplace_proposal
 from capsule_id.inference.tables import smoothing_shift
 from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.rig.model import PriorOverride, Quantity
+from capsule_id.rig.model import Quantity
 from tests.experiments import bench
 from tests.forced_runs import TRUTH, recorded, table
 from tests.inference.three_settings import three_settings
@@ -55,7 +56,7 @@ KNOWN = ("k1", "c", "mu", "v_s", "K", "k2[stiff]")
 def fitted() -> tuple[LogPosterior, PointFit]:
     """One second of the second run, beside priors as wide as a bench leaves them, started 1 % off."""
     own = table(1, samples=1000)
-    priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
+    priors = {name: Prior("lognormal", TRUTH[name], 1.04) for name in KNOWN}
     rig = bench.rig(own, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
     target = LogPosterior(rig, [ForcedRun(own, rig)])
     rough = {name: 1.01 * TRUTH[name] for name in KNOWN}
