@@ -18,7 +18,7 @@ from capsule_id.experiments.base import Experiment, Start, Unavailable, ValuesBy
 from capsule_id.experiments.misfit import LOG_2PI
 from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
 from capsule_id.precision import COMPILE
-from capsule_id.rig.model import PriorOverride, Rig
+from capsule_id.rig.model import Rig
 
 # scales: Scatters of which only the product with other parameters changes the motion.
 
@@ -114,9 +114,9 @@ def prior_sd(row: Parameter) -> float:
     return prior.spread
 
 
-def override(row: Parameter, stated: PriorOverride | None) -> Parameter:
+def override(row: Parameter, stated: Prior | None) -> Parameter:
     """Return the row with the prior of ``rig.toml``, where one is stated."""
-    return row if stated is None else row.named(row.of, stated.prior)
+    return row if stated is None else row.named(row.of, stated)
 
 
 def covering_prior(name: str, priors: Sequence[Prior]) -> Prior:

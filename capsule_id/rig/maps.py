@@ -351,9 +351,8 @@ class _Part:
             if export.words is None:
                 rule = f"where takes numbers for a {export.path.suffix} file"
                 raise node.error(rule, "a text", "write a number, or export the file as CSV")
-            codes, texts = export.words(column)
-            self._require_rows(node, header, len(codes))
-            found.append(np.array(texts)[codes])
+            found.append(export.words(column))
+            self._require_rows(node, header, len(found[-1]))
             if differ := np.flatnonzero(found[-1] != found[0]).tolist():
                 rule, row = f"{shown(header)} must be the same in all files that have it", differ[0]
                 value = f"{shown(str(found[0][row]))} and {shown(str(found[-1][row]))}"

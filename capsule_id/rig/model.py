@@ -25,29 +25,6 @@ NO_DRIFT = Quantity(0.0)
 
 
 @dataclass(frozen=True)
-class PriorOverride:
-    """One line of ``[prior]``, SI: log-normal by ``median`` and ``factor`` (95 % within median/factor..median*factor),
-    for scatters half-normal by ``scale``, and for parameters of either sign normal by ``mean`` and ``sd``."""
-
-    median: float | None = None
-    factor: float | None = None
-    scale: float | None = None
-    mean: float | None = None
-    sd: float | None = None
-
-    @property
-    def prior(self) -> Prior:
-        """The stated density."""
-        if self.scale is not None:
-            return Prior("halfnormal", 0.0, self.scale)
-        if self.mean is not None and self.sd is not None:
-            return Prior("normal", self.mean, self.sd)
-        assert self.median is not None, "the schema requires median and factor"
-        assert self.factor is not None, "the schema requires median and factor"
-        return Prior("lognormal", self.median, self.factor)
-
-
-@dataclass(frozen=True)
 class ModelChoices:
     """The choices of ``[model]``.
 
@@ -169,7 +146,7 @@ class Rig:
     ----------
     m1, m2 : masses, kg (None: not stated)
     g : m/s^2
-    priors : overrides by parameter name (``k1``, ``k2[L60]``, ``tilt_sd``, ...)
+    priors : stated densities, SI, by parameter name (``k1``, ``k2[L60]``, ``tilt_sd``, ...)
     tables : in the order of ``rig.toml``
     files : sha256 of every file read, by relative path
     model : the choices of ``[model]``
@@ -182,7 +159,7 @@ class Rig:
     m1: Quantity | None
     m2: Quantity | None
     g: Quantity
-    priors: Mapping[str, PriorOverride]
+    priors: Mapping[str, Prior]
     tables: tuple[Table[Any], ...]
     files: Mapping[str, str]
     folder: Path

@@ -13,10 +13,10 @@ import numpy as np
 
 from capsule_id.console import stop_if_interrupted
 from capsule_id.errors import InputError, collecting, raise_all
-from capsule_id.parameters import Parameter
+from capsule_id.parameters import Parameter, Prior
 from capsule_id.rig.formats.text import TextFile
 from capsule_id.rig.maps import MAP_KEYS
-from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Table
+from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import (
     RIG_QUANTITIES,
     TABLE_KEYS,
@@ -122,7 +122,7 @@ def _read_document(folder: Path) -> tuple[Node, str]:
     return Node(document, (), document.data), hashlib.sha256(content).hexdigest()
 
 
-def _read_priors(root: Node, tables: Sequence[Table], parameters: Sequence[Parameter]) -> dict[str, PriorOverride]:
+def _read_priors(root: Node, tables: Sequence[Table], parameters: Sequence[Parameter]) -> dict[str, Prior]:
     """The entries of ``[prior]``, by parameter name; they may state the priors of ``parameters``."""
     entries = root.get("prior", {}).table("[prior]")
     rows = {row.symbol: row for row in parameters if row.prior_can_be_stated}
@@ -138,7 +138,7 @@ def _read_priors(root: Node, tables: Sequence[Table], parameters: Sequence[Param
             replace(entries, value={key: node.value}).refuse_unknown(known)
         row = rows["k2" if spring else key]
         assert row.prior is not None, "its prior can be stated"
-        priors[key] = node.prior(row.unit, row.prior.kind)
+        priors[key] = node.prior(row.unit, row.prior)
     return priors
 
 

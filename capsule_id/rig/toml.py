@@ -4,7 +4,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from math import inf, isfinite, pi
 from pathlib import Path
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.rig.model import PriorOverride, Quantity
+from capsule_id.parameters import Prior
+from capsule_id.rig.model import Quantity
 from capsule_id.rig.units import UnitError, factor_to_si, scale
 
 # domains: Intervals of admissible values.
@@ -64,12 +65,10 @@ KeyPath = tuple[str | int, ...]
 LARGEST_TEXT, DEEPEST_KEY = 1_000_000, 32
 
 _SHALLOW = "write the plain tables"
-_MULTILINE_BASIC = re.compile(r'"""(?:[^\\]|\\.)*?"""(?:"{0,2})', re.DOTALL)
-_MULTILINE_LITERAL = re.compile(r"'''.*?'''(?:'{0,2})", re.DOTALL)
-_BASIC = re.compile(r'"(?:[^"\\\n]|\\.)*"')
-_LITERAL = re.compile(r"'[^'\n]*'")
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-_BARE_VALUE = re.compile(r"[^,\]}#\n]+")
+_STRING = r""""(?:[^"\\\n]|\\.)*"|'[^'\n]*'"""
+_MULTILINE = r""""{3}(?:[^\\]|\\.)*?"{3}(?:"{0,2})|'{3}.*?'{3}(?:'{0,2})"""
+_KEY = re.compile(rf"{_STRING}|[A-Za-z0-9_-]+")
+_VALUE = re.compile(rf"(?s:{_MULTILINE})|{_STRING}|[^,\]}}#\n]+")
 _BLANK = re.compile(r"(?:[ \t\n]|#[^\n]*)*")
 _SPACES = re.compile(r"[ \t]*")
 
@@ -168,11 +167,9 @@ class _Scanner:
 
     def skip(self, pattern: re.Pattern[str]) -> str:
         """Move behind a match of ``pattern`` and return its text, which may be empty."""
-        match = pattern.match(self.text, self.position)
-        if match is None:
-            return ""
-        self.position = match.end()
-        return match[0]
+        start, match = self.position, pattern.match(self.text, self.position)
+        self.position = start if match is None else match.end()
+        return self.text[start : self.position]
 
     def header(self) -> KeyPath:
         """``[a.b]`` or ``[[a.b]]``; the path that the following keys belong to."""
@@ -197,20 +194,15 @@ class _Scanner:
         parts = []
         while True:
             self.skip(_SPACES)
-            offset = self.position
-            if self.text[offset] in "\"'":
-                token = self.skip(_BASIC if self.text[offset] == '"' else _LITERAL)
-                parts.append((tomllib.loads(f"key = {token}")["key"], offset))
-            else:
-                parts.append((self.skip(_BARE_KEY), offset))
+            offset, token = self.position, self.skip(_KEY)
+            parts.append((tomllib.loads(f"key = {token}")["key"] if token[0] in "\"'" else token, offset))
             self.skip(_SPACES)
             if not self.text.startswith(".", self.position):
                 return parts
             self.position += 1
 
-    def key_value(self, base: KeyPath) -> None:
+    def key_value(self, path: KeyPath) -> None:
         """``a.b = value``."""
-        path = base
         for name, offset in self.dotted_key():
             path = (*path, name)
             self.keys.setdefault(path, offset)
@@ -221,23 +213,13 @@ class _Scanner:
         """A string, array, inline table or bare word."""
         self.skip(_SPACES)
         self.values[path] = self.position
-        ahead = self.text[self.position : self.position + 3]
-        if ahead == '"""' or ahead == "'''":
-            self.skip(_MULTILINE_BASIC if ahead == '"""' else _MULTILINE_LITERAL)
-        elif ahead[0] in "\"'":
-            self.skip(_BASIC if ahead[0] == '"' else _LITERAL)
-        elif ahead[0] == "[":
-            self.items("]", path)
-        elif ahead[0] == "{":
-            self.items("}", path)
-        else:
-            self.skip(_BARE_VALUE)
-
-    def items(self, closing: str, path: KeyPath) -> None:
-        """The inside of an array or inline table."""
+        closing = {"[": "]", "{": "}"}.get(self.text[self.position])
+        if closing is None:
+            self.skip(_VALUE)
+            return
         self.position += 1
-        index = 0
         self.skip(_BLANK)
+        index = 0
         while not self.text.startswith(closing, self.position):
             if closing == "]":
                 self.value((*path, index))
@@ -417,15 +399,17 @@ class Node:
             raise stated.error(rule, shown(stated.value), "weigh or measure it, or leave it out")
         return Quantity(number, sd)
 
-    def prior(self, si: str, kind: str) -> PriorOverride:
+    def prior(self, si: str, default: Prior) -> Prior:
         """``{ median, factor, unit }``, ``{ scale, unit }`` or ``{ mean, sd, unit }``, by the kind of the default prior.
 
         A unit of 1 is optional.
         """
-        keys = PRIOR_KEYS[kind]
+        keys = PRIOR_KEYS[default.kind]
         self.table(f'{{ {"".join(f"{key} = ..., " for key in keys)}unit = "{si}" }}', (*keys, "unit"))
         factor = 1.0 if si == "1" and "unit" not in self else self.unit(si)
-        return PriorOverride(**{key: self._scaled(key, 1.0 if key == "factor" else factor, keys[key]) for key in keys})
+        stated = [self._scaled(key, 1.0 if key == "factor" else factor, domain) for key, domain in keys.items()]
+        location, spread = (0.0, *stated)[-2:]
+        return replace(default, location=location, spread=spread)
 
     def _scaled(self, key: str, factor: float, domain: Domain) -> float:
         """The number of ``key`` times ``factor``, finite and inside ``domain``."""

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsule_id.experiments.kind import default_registry
-from capsule_id.rig.model import Column, PriorOverride, Quantity, Rig, Table
+from capsule_id.parameters import Prior
+from capsule_id.rig.model import Column, Quantity, Rig, Table
 
 G = 9.81
 M1, M2 = 0.110, 0.530
@@ -32,7 +33,7 @@ def rig(
     *tables: Table,
     m1: Quantity = ROD,
     m2: Quantity = CAPSULE,
-    priors: Mapping[str, PriorOverride] | None = None,
+    priors: Mapping[str, Prior] | None = None,
 ) -> Rig:
     """A rig of these tables; masses are exact unless stated otherwise."""
     return Rig("bench", True, m1, m2, Quantity(G), priors or {}, tables, {}, Path("bench"))

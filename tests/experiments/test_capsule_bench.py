@@ -19,9 +19,10 @@ from capsule_id.experiments.friction_experiment import unit_law
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.physics.friction import slide_distance
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.rig.model import ModelChoices, PriorOverride, Quantity, Table
+from capsule_id.rig.model import ModelChoices, Quantity, Table
 from tests.experiments import bench
 from tests.scipy_capsule import simulate_scipy
 
@@ -55,7 +56,7 @@ def pushes(forward: str, speeds: np.ndarray = SPEEDS) -> Table:
 
 @cache
 def fitted(release: float, forward: str) -> PointStage:
-    known = {"mu": PriorOverride(MU, 1.02), "v_s": PriorOverride(V_S, 1.1)}
+    known = {"mu": Prior("lognormal", MU, 1.02), "v_s": Prior("lognormal", V_S, 1.1)}
     table = decay(release, forward)
     rig = bench.rig(table, priors=known)
     return fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)

@@ -10,10 +10,11 @@ from capsule_id.experiments.forced_run.checks import RunConditions, contact_time
 from capsule_id.experiments.forced_run.declaration import MESSAGES
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.rough_values import rough_values
+from capsule_id.parameters import Prior
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.forces import grazing_load
 from capsule_id.physics.model import CapsuleParameters, simulate
-from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
+from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.views import Finding
 
 TRUTH = {"m1": 0.11, "m2": 0.53, "k1": 1420.0, "c": 3.89, "mu": 0.66, "v_s": 0.3, "g": 9.81}
@@ -151,7 +152,7 @@ def test_rough_values_come_from_the_bench_tests_of_the_folder() -> None:
     assert estimate("K") == (2.0, False)
     stated = bench.rig(bench.table("motor_current", [bench.column("force", [0, 2]), bench.column("current", [0, 1])]))
     assert rough_values(stated)("K") == (pytest.approx(2.0), True)
-    assert rough_values(bench.rig(priors={"k1": PriorOverride(900.0, 2.0)}))("k1") == (900.0, False)
+    assert rough_values(bench.rig(priors={"k1": Prior("lognormal", 900.0, 2.0)}))("k1") == (900.0, False)
 
 
 def lint_runs(rig: Rig) -> dict[str, list[Finding]]:

@@ -24,7 +24,7 @@ from capsule_id.parameters import Parameter, Prior
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.friction import CoulombStribeck
 from capsule_id.physics.model import CapsuleParameters, simulate
-from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
+from capsule_id.rig.model import Quantity, Rig, Table
 from tests.experiments import bench
 from tests.rig.folder import RIG_TOML, write_folder
 
@@ -58,7 +58,7 @@ WEIGHT = (bench.M1 + bench.M2) * bench.G
 K2, GAP, OMEGA, P_D = 18960.0, 1e-3, 34.56, 4.0
 TILT_SD, DISTANCE_SD, NOISE = np.deg2rad(0.3), 0.3e-3, 2e-5
 #: k1, c and k2 are known to 2 %, so that few readings are enough.
-KNOWN = {name: PriorOverride(value, 1.04) for name, value in (("k1", bench.K1), ("c", bench.C), ("k2[L60]", K2))}
+KNOWN = {name: Prior("lognormal", value, 1.04) for name, value in (("k1", bench.K1), ("c", bench.C), ("k2[L60]", K2))}
 
 
 def tilts(rng: np.random.Generator) -> Table:
@@ -244,7 +244,7 @@ def test_a_kind_that_reads_mu_is_refused_beside_a_law() -> None:
 def test_the_prior_of_its_parameters_can_be_stated(tmp_path: Path) -> None:
     text = RIG_TOML.replace("[prior]\n", '[prior]\nF_s = { median = 4, factor = 2, unit = "N" }\n')
     folder = write_folder(tmp_path / "rig", text)
-    assert cid.read_rig(folder, friction=Lorentzian).priors["F_s"] == PriorOverride(4.0, 2.0)
+    assert cid.read_rig(folder, friction=Lorentzian).priors["F_s"] == Prior("lognormal", 4.0, 2.0)
     with pytest.raises(InputError, match="F_s"):
         cid.read_rig(folder)
 

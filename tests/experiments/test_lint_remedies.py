@@ -18,7 +18,7 @@ from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
 from capsule_id.parameters import TABLE, Parameter, Prior
 from capsule_id.report.messages import finding_text, messages_of
-from capsule_id.rig.model import PriorOverride, Quantity, Rig, Table
+from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.read import read_rig
 from capsule_id.views import Finding
 
@@ -126,11 +126,11 @@ def test_an_aliased_decay_fails_unless_a_prior_excludes_the_aliases(rate: float)
     stiffnesses = [finding.facts["k1"], *map(float, finding.facts["k1s"].split(", "))]
     assert min(abs(np.log(k1 / true)) for k1 in stiffnesses) < 0.1
     # The remedy: a prior that holds the frequency found, and no other.
-    narrow = {"k1": PriorOverride(finding.facts["k1"], 1.2)}
+    narrow = {"k1": Prior("lognormal", finding.facts["k1"], 1.2)}
     assert found(bench.rig(coarse(rate), priors=narrow), "decays.alias") == []
     # A prior that holds an alias instead does not make the frequency found right.
     if abs(np.log(finding.facts["k1"] / bench.K1)) > 0.5:
-        (again,) = found(bench.rig(coarse(rate), priors={"k1": PriorOverride(bench.K1, 1.2)}), "decays.alias")
+        (again,) = found(bench.rig(coarse(rate), priors={"k1": Prior("lognormal", bench.K1, 1.2)}), "decays.alias")
         assert again.level == "fail"
 
 
@@ -150,10 +150,10 @@ def test_a_pendulum_whose_k1_lies_outside_its_default_prior_is_not_called_aliase
     (finding,) = found(rig, "decays.alias")
     assert (finding.level, finding.parameters) == ("warn", ("k1",))
     ((median, factor),) = re.findall(r"k1 = \{ median = ([0-9.]+), factor = ([0-9]+),", text(finding))
-    stated = {"k1": PriorOverride(float(median), float(factor))}
+    stated = {"k1": Prior("lognormal", float(median), float(factor))}
     assert found(bench.rig(slow(40.0), priors=stated), "decays.alias") == []
     # Negative control: a stated prior that the record contradicts.
-    (against,) = found(bench.rig(slow(150.0), priors={"k1": PriorOverride(bench.K1, 10.0)}), "decays.alias")
+    (against,) = found(bench.rig(slow(150.0), priors={"k1": Prior("lognormal", bench.K1, 10.0)}), "decays.alias")
     assert against.level == "fail"
 
 

@@ -12,9 +12,9 @@ import capsule_id as cid
 from capsule_id.api import Fit
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.kind import default_registry
-from capsule_id.parameters import parameter
+from capsule_id.parameters import Prior, parameter
 from capsule_id.report.messages import finding_text, messages_of
-from capsule_id.rig.model import PriorOverride, Rig
+from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.views import Finding
 from tests.experiments import bench
@@ -71,7 +71,7 @@ def test_the_prior_that_the_text_of_an_aliased_decay_proposes_ends_the_finding(r
     ((median, factor),) = re.findall(
         r"k1 = \{ median = ([0-9.e+]+), factor = ([0-9.]+),", text("decays.alias", "fail", dict(finding.facts))
     )
-    stated = {"k1": PriorOverride(float(median), float(factor))}
+    stated = {"k1": Prior("lognormal", float(median), float(factor))}
     assert found(bench.rig(coarse(rate), priors=stated), "decays.alias") == []
 
 

@@ -10,7 +10,8 @@ from capsule_id.experiments.checks import refit
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.result import PointFit
 from capsule_id.inference.target import LogPosterior
-from capsule_id.rig.model import PriorOverride, Quantity, Rig
+from capsule_id.parameters import Prior
+from capsule_id.rig.model import Quantity, Rig
 from tests.experiments import bench
 from tests.experiments.test_slope import MU, N0, SLOPE, THETA, V_S, readings, run_table, slid
 
@@ -35,7 +36,7 @@ def fitted(kind: int, **ground: Quantity) -> PointFit:
         columns = {name: bench.column(name, values) for name, values in (("speed", speed), ("distance", distance))}
         table = replace(table, columns=columns)
     # v_s is known, so that mu alone follows the slope.
-    known = {"v_s": PriorOverride(median=V_S, factor=1.01)}
+    known = {"v_s": Prior("lognormal", V_S, 1.01)}
     return point_fit(target_of(bench.rig(table, priors=known)), 0, 1)
 
 

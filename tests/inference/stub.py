@@ -10,12 +10,12 @@ import numpy as np
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, no_design
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.inference.target import Scale
-from capsule_id.parameters import Parameter
-from capsule_id.rig.model import PriorOverride, Quantity, Rig, Settings, Table
+from capsule_id.parameters import Parameter, Prior
+from capsule_id.rig.model import Quantity, Rig, Settings, Table
 from capsule_id.views import Comparison
 
 
-def rig_without_tables(priors: Mapping[str, PriorOverride] | None = None) -> Rig:
+def rig_without_tables(priors: Mapping[str, Prior] | None = None) -> Rig:
     return Rig("bench", True, None, None, Quantity(9.81), priors or {}, (), {}, Path("bench"))
 
 

@@ -5,9 +5,9 @@ import pytest
 
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint
+from capsule_id.parameters import Prior
 from capsule_id.records import faults as aliasing
 from capsule_id.records.faults import RATES, aliases, sampling
-from capsule_id.rig.model import PriorOverride
 from tests.experiments import bench
 
 KINDS = default_registry()
@@ -94,7 +94,7 @@ def drawn(aliased: bool, jitter: str, seed: int) -> tuple[np.ndarray, np.ndarray
     return stamps, 1e-3 * (values + 10.0 ** rng.uniform(-3.0, -2.0) * rng.standard_normal(number)), k1, per_period
 
 
-def word(stamps: np.ndarray, values: np.ndarray, prior: PriorOverride | None = None) -> str:
+def word(stamps: np.ndarray, values: np.ndarray, prior: Prior | None = None) -> str:
     """What the findings on the readings leave of the trust in k1."""
     table = bench.table("free_vibration", [bench.column("time", stamps), bench.column("x_rel", values)])
     rig = bench.rig(table, priors=None if prior is None else {"k1": prior})
@@ -110,7 +110,7 @@ def words(aliased: bool, jitter: str, number: int) -> list[tuple[str, float]]:
     for seed in range(number):
         stamps, values, k1, per_period = drawn(aliased, jitter, seed)
         wrong = float(np.random.default_rng(seed).uniform(0.8, 1.25))
-        found.append((word(stamps, values, None if aliased else PriorOverride(wrong * k1, 1.5)), per_period))
+        found.append((word(stamps, values, None if aliased else Prior("lognormal", wrong * k1, 1.5)), per_period))
     return found
 
 

@@ -12,7 +12,8 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.readings import decay_window
 from capsule_id.experiments.kind import default_registry
-from capsule_id.rig.model import PriorOverride, Quantity, Table
+from capsule_id.parameters import Prior
+from capsule_id.rig.model import Quantity, Table
 from tests.rig.folder import RIG_TOML, TABLES, write_folder
 
 DEGREE = math.pi / 180.0
@@ -29,10 +30,10 @@ def test_everything_is_si(tmp_path: Path) -> None:
     assert (rig.name, rig.synthetic, rig.folder) == ("twin", True, tmp_path / "rig")
     assert (rig.m1, rig.m2, rig.g) == (Quantity(0.110, 0.0005), Quantity(0.530, 0.001), Quantity(9.81, 0.0))
     assert dict(rig.priors) == {
-        "k1": PriorOverride(median=1500.0, factor=3.0),
-        "k2[L60]": PriorOverride(median=20000.0, factor=10.0),
-        "tilt_sd": PriorOverride(scale=DEGREE),
-        "push_scatter": PriorOverride(scale=0.05),
+        "k1": Prior("lognormal", 1500.0, 3.0),
+        "k2[L60]": Prior("lognormal", 20000.0, 10.0),
+        "tilt_sd": Prior("halfnormal", 0.0, DEGREE),
+        "push_scatter": Prior("halfnormal", 0.0, 0.05),
     }
     assert [table.kind for table in rig.tables] == [
         "free_vibration",

@@ -150,8 +150,7 @@ class Export:
         missing marker; it raises ``InputError`` at the first other cell
     place : (row index or None for the header, column index) -> where the cell stands
     encoding : of a text
-    words : index of a column that ``Layout.words`` names -> (rows,) numbers of its texts, and the texts; None: the format
-        has no texts
+    words : index of a column that ``Layout.words`` names -> (rows,) its texts; None: the format has no texts
     """
 
     path: Path
@@ -161,7 +160,7 @@ class Export:
     values: Callable[[int], np.ndarray]
     place: Callable[[int | None, int], Place]
     encoding: str = "UTF-8"
-    words: Callable[[int], tuple[np.ndarray, tuple[str, ...]]] | None = None
+    words: Callable[[int], np.ndarray] | None = None
 
 
 # arrays: Makes an export of named arrays: the form of every format without lines.

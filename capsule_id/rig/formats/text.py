@@ -6,11 +6,12 @@ import gzip
 import io
 import json
 import re
+import sys
 import warnings
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -295,22 +296,25 @@ class Shape:
     trailing: bool = False
 
 
+@dataclass(frozen=True)
 class Rows:
-    """Numbers of some columns of a text; a column with another cell holds the error about it.
+    """Rows of a text, block by block.
 
-    Of the columns ``words`` the texts are kept too.
+    Attributes
+    ----------
+    numbers : of each column that is read: those of every block, or the error at its first cell that is no number
+    texts : of each column whose texts are kept
+    blocks : 1-based lines of the rows of every block
     """
 
-    def __init__(self, columns: Sequence[int], words: Sequence[int] = ()) -> None:
-        self._codes: dict[int, list[np.ndarray]] = {column: [] for column in words}
-        self._texts: dict[int, dict[str, int]] = {column: {} for column in words}
-        self._lines: list[np.ndarray] = []
-        self._columns: dict[int, list[np.ndarray] | InputError] = {column: [] for column in columns}
+    numbers: dict[int, list[np.ndarray | InputError]]
+    texts: dict[int, list[str]]
+    blocks: list[np.ndarray] = field(default_factory=list)
 
     @property
     def lines(self) -> np.ndarray:
         """(rows,) 1-based line of every row."""
-        return np.concatenate([np.empty(0, int), *self._lines])
+        return np.concatenate([np.empty(0, int), *self.blocks])
 
     def column(self, index: int) -> np.ndarray:
         """The numbers of a column, (rows,).
@@ -320,33 +324,16 @@ class Rows:
         InputError
             At the first cell that is neither a number nor a missing marker.
         """
-        column = self._columns[index]
-        if isinstance(column, InputError):
-            raise column
-        return np.concatenate([np.empty(0), *column])
+        parts = [np.empty(0)]
+        for part in self.numbers[index]:
+            if isinstance(part, InputError):
+                raise part
+            parts.append(part)
+        return np.concatenate(parts)
 
-    def words(self, index: int) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Numbers of the texts of a column, (rows,), and the texts."""
-        return np.concatenate([np.empty(0, int), *self._codes[index]]), tuple(self._texts[index])
-
-    def add_words(self, index: int, texts: Sequence[str]) -> None:
-        """Append texts to a column."""
-        known = self._texts[index]
-        self._codes[index].append(np.array([known.setdefault(text, len(known)) for text in texts], int))
-
-    def add_lines(self, numbers: np.ndarray | Sequence[int]) -> None:
-        """Append rows by their 0-based lines."""
-        self._lines.append(np.asarray(numbers, int) + 1)
-
-    def add(self, index: int, values: np.ndarray | InputError) -> None:
-        """Append numbers to a column; the first error of a column stays."""
-        column = self._columns[index]
-        if isinstance(column, InputError):
-            return
-        if isinstance(values, InputError):
-            self._columns[index] = values
-        else:
-            column.append(values)
+    def words(self, index: int) -> np.ndarray:
+        """The texts of a column, (rows,)."""
+        return np.array(self.texts[index])
 
 
 def is_comment(line: str) -> bool:
@@ -411,7 +398,7 @@ def _parse(text: bytes, delimiter: str | None, columns: list[int]) -> np.ndarray
 
 def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | None:
     """The rows of a text without missing, empty or other cells; None for any other text."""
-    rows = Rows(columns)
+    rows = Rows({column: [] for column in columns}, {})
     for number, text in file.blocks(shape.first):
         numbers: np.ndarray | list[int] = np.arange(number, number + occurrences("\n", text), dtype=np.int32)
         values = plain_block(text, shape, columns)
@@ -424,9 +411,9 @@ def plain_rows(file: TextFile, shape: Shape, columns: Sequence[int]) -> Rows | N
                 values = plain_block("\n".join([*lines, ""]).encode(), shape, columns)
         if values is None:
             return None
-        rows.add_lines(numbers)
+        rows.blocks.append(np.asarray(numbers, int) + 1)
         for index, column in enumerate(columns):
-            rows.add(column, values[:, index])
+            rows.numbers[column].append(values[:, index])
     return rows
 
 
@@ -450,16 +437,16 @@ def any_rows(
     InputError
         If a row has another number of cells than the first one.
     """
-    rows = Rows(columns, words)
+    rows = Rows({column: [] for column in columns}, {column: [] for column in words})
     marks = dict.fromkeys(columns, shape.decimal)
     for number, text in file.blocks(shape.first):
         kept = list(_rows_in(number, text))
         cells = [_cells(line, text, shape, file.path) for line, text in kept]
-        rows.add_lines([line for line, _ in kept])
+        rows.blocks.append(np.array([line for line, _ in kept], int) + 1)
         for column in columns:
             texts = [bare(row[column]) for row in cells]
             if column in words:
-                rows.add_words(column, texts)
+                rows.texts[column] += map(sys.intern, texts)
             marks[column] = marks[column] or decimal_mark(texts, missing)
 
             def place(k: int, column: int = column, kept: list[tuple[int, str]] = kept) -> Place:
@@ -467,9 +454,9 @@ def any_rows(
                 return file.path, line + 1, place_of_cell(text, shape.delimiter, column)
 
             try:
-                rows.add(column, read_column(texts, marks[column] or ".", missing, place))
+                rows.numbers[column].append(read_column(texts, marks[column] or ".", missing, place))
             except InputError as error:
-                rows.add(column, error)
+                rows.numbers[column].append(error)
     return rows
 
 

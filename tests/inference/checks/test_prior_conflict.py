@@ -16,7 +16,8 @@ from capsule_id.inference.checks.posterior import conflicts
 from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
-from capsule_id.rig.model import PriorOverride, Rig
+from capsule_id.parameters import Prior
+from capsule_id.rig.model import Rig
 from capsule_id.synthetic import synthesize
 from tests.experiments.bench import column, rig, table
 from tests.measured.folders import Entry, make_rig
@@ -31,7 +32,7 @@ def calibration(rng: np.random.Generator, median: float, K: float) -> SampledFit
     """A motor with exact currents and stated errors, and a prior of K."""
     force = K * CURRENT + FORCE_SD * rng.standard_normal(6)
     columns = [column("force", force, FORCE_SD), column("current", CURRENT, 1e-9)]
-    known = rig(table("motor_current", columns), priors={"K": PriorOverride(median, FACTOR)})
+    known = rig(table("motor_current", columns), priors={"K": Prior("lognormal", median, FACTOR)})
     target = LogPosterior(known, make_experiments(known))
     fit = point_fit(target, 0, 1)
     return SampledFit(target, fit, None, {**target.fixed, **fit.values})

@@ -42,8 +42,9 @@ from capsule_id.inference.result import PointFit
 from capsule_id.inference.sampling import laplace_proposal
 from capsule_id.inference.tables import check_engine, smoothing_shift
 from capsule_id.inference.target import HeldResiduals, LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.rig.model import ModelChoices, PriorOverride, Quantity
+from capsule_id.rig.model import ModelChoices, Quantity
 from tests.experiments import bench
 from tests.forced_runs import TRUTH, recorded, table
 from tests.inference.three_settings import three_settings
@@ -61,7 +62,7 @@ def fitted(
     ``widths`` : of the smoothed engine, where they are not the certified ones
     """
     own = table(1, samples=1000)
-    priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
+    priors = {name: Prior("lognormal", TRUTH[name], 1.04) for name in KNOWN}
     rig = bench.rig(own, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
     rig = replace(rig, model=ModelChoices(engine=engine))
     run = ForcedRun(own, rig)

@@ -11,8 +11,9 @@ from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.checks.verdict import check_whiteness
 from capsule_id.inference.point_stage import fit_points
 from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import Prior
 from capsule_id.report.messages import FIT_MESSAGES, finding_text
-from capsule_id.rig.model import PriorOverride, Quantity
+from capsule_id.rig.model import Quantity
 from capsule_id.views import Finding
 from tests.experiments import bench
 from tests.forced_runs import TRUTH
@@ -39,7 +40,7 @@ def whiteness_of(**departures: float) -> Finding:
     columns = [bench.column("time", time)]
     columns += [bench.column(name, y + NOISE_SD[name] * e) for (name, y), e in zip(exact.items(), noise, strict=True)]
     table = bench.table("forced_run", columns, "run_1", spring="medium", gap=Quantity(GAP, 2e-5), Omega=OMEGA)
-    priors = {name: PriorOverride(TRUTH[name], 1.04) for name in KNOWN}
+    priors = {name: Prior("lognormal", TRUTH[name], 1.04) for name in KNOWN}
     # The same shapes as in test_joint_fit.py: one compiled program serves both.
     rig = bench.rig(table, m1=Quantity(bench.M1, 2e-4), m2=Quantity(bench.M2, 5e-4), priors=priors)
     stage = fit_points(LogPosterior(rig, make_experiments(rig)), default_registry(), 0, sampled=False)

@@ -23,7 +23,6 @@ from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.static_friction import TILT_SD
 from capsule_id.inference.target import HeldResiduals, LogPosterior
 from capsule_id.parameters import TABLE, Parameter, Prior, parameter
-from capsule_id.rig.model import PriorOverride
 from capsule_id.synthetic import Truth, synthesize
 from tests.capsule_cases import jit_quickly
 from tests.inference.stub import Nothing, rig_without_tables
@@ -97,9 +96,9 @@ def test_stated_priors_that_differ_are_refused_and_one_in_rig_toml_settles_it() 
         InputError, match=r"share P_on must state one prior for it, normal 1, 2 and normal 3, 5 \(SI\), state"
     ):
         LogPosterior(rig_without_tables(), own)
-    settled = PriorOverride(mean=2.0, sd=1.0)
+    settled = Prior("normal", 2.0, 1.0)
     target = LogPosterior(replace(rig_without_tables(), priors={"P_on": settled}), own)
-    assert target.parameters[0].prior == settled.prior
+    assert target.parameters[0].prior == settled
 
 
 def test_joint_prior_is_the_sum() -> None:
@@ -237,7 +236,7 @@ def test_rigs_of_one_structure_do_not_share_numbers(tmp_path: Path) -> None:
 
 
 def test_overrides_replace_priors() -> None:
-    override = {"mu": PriorOverride(median=0.5, factor=2.0), "tilt_sd": PriorOverride(scale=0.01)}
+    override = {"mu": Prior("lognormal", 0.5, 2.0), "tilt_sd": Prior("halfnormal", 0.0, 0.01)}
     target = LogPosterior(rig_without_tables(override), [Nothing([parameter("mu"), TILT_SD])])
     assert [row.prior for row in target.parameters] == [Prior("lognormal", 0.5, 2.0), Prior("halfnormal", 0.0, 0.01)]
 
