@@ -46,74 +46,50 @@ A public name is imported at its first use, so ``import capsule_id`` does not im
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+# ruff: noqa: I001  (an import a module)
 if TYPE_CHECKING:
     __version__: str
-    from capsule_id.api import Fit as Fit
-    from capsule_id.api import compare as compare
-    from capsule_id.api import fit as fit
-    from capsule_id.api import load as load
-    from capsule_id.api import read_rig as read_rig
+    from capsule_id.api import Fit as Fit, compare as compare, fit as fit, load as load, read_rig as read_rig
     from capsule_id.errors import InputError as InputError
-    from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign
-    from capsule_id.experiments.progression.twin import synthesize_robot as synthesize_robot
+    from capsule_id.experiments.progression.twin import RobotDesign as RobotDesign, synthesize_robot as synthesize_robot
     from capsule_id.importing import propose_entry as propose_entry
-    from capsule_id.inference.compare import compare_models as compare_models
-    from capsule_id.inference.compare import compare_points as compare_points
+    from capsule_id.inference.compare import compare_models as compare_models, compare_points as compare_points
     from capsule_id.motions.bias import smoothing_bias as smoothing_bias
     from capsule_id.motions.operating import draws_diagram as draws_diagram
-    from capsule_id.motions.response import Response as Response
-    from capsule_id.motions.response import Settling as Settling
-    from capsule_id.motions.response import response as response
-    from capsule_id.motions.sweep import continuation as continuation
-    from capsule_id.motions.sweep import diagram as diagram
-    from capsule_id.motions.sweep import motion_map as motion_map
+    from capsule_id.motions.response import Response as Response, Settling as Settling, response as response
+    from capsule_id.motions.sweep import continuation as continuation, diagram as diagram, motion_map as motion_map
     from capsule_id.physics.drive import Excitation as Excitation
-    from capsule_id.physics.drives import Pulses as Pulses
-    from capsule_id.physics.drives import RecordedDrive as RecordedDrive
-    from capsule_id.physics.drives import RodMotion as RodMotion
+    from capsule_id.physics.drives import Pulses as Pulses, RecordedDrive as RecordedDrive, RodMotion as RodMotion
     from capsule_id.physics.energy import energy_balance as energy_balance
-    from capsule_id.physics.model import CapsuleParameters as CapsuleParameters
-    from capsule_id.physics.model import Status as Status
-    from capsule_id.physics.model import Trajectory as Trajectory
-    from capsule_id.physics.model import simulate as simulate
-    from capsule_id.physics.model import status_message as status_message
+    from capsule_id.physics.model import (
+        CapsuleParameters as CapsuleParameters,
+        Status as Status,
+        Trajectory as Trajectory,
+        simulate as simulate,
+        status_message as status_message,
+    )
     from capsule_id.physics.smooth.engine import Smoothing as Smoothing
     from capsule_id.synthetic import synthesize as synthesize
 
-_MODULE_OF = {
-    "CapsuleParameters": "capsule_id.physics.model",
-    "compare": "capsule_id.api",
-    "compare_models": "capsule_id.inference.compare",
-    "compare_points": "capsule_id.inference.compare",
-    "continuation": "capsule_id.motions.sweep",
-    "diagram": "capsule_id.motions.sweep",
-    "draws_diagram": "capsule_id.motions.operating",
-    "energy_balance": "capsule_id.physics.energy",
-    "Excitation": "capsule_id.physics.model",
-    "Fit": "capsule_id.api",
-    "fit": "capsule_id.api",
-    "InputError": "capsule_id.errors",
-    "load": "capsule_id.api",
-    "motion_map": "capsule_id.motions.sweep",
-    "propose_entry": "capsule_id.importing",
-    "Pulses": "capsule_id.physics.drives",
-    "read_rig": "capsule_id.api",
-    "RecordedDrive": "capsule_id.physics.drives",
-    "Response": "capsule_id.motions.response",
-    "response": "capsule_id.motions.response",
-    "RobotDesign": "capsule_id.experiments.progression.twin",
-    "RodMotion": "capsule_id.physics.drives",
-    "Settling": "capsule_id.motions.response",
-    "simulate": "capsule_id.physics.model",
-    "Smoothing": "capsule_id.physics.smooth.engine",
-    "smoothing_bias": "capsule_id.motions.bias",
-    "Status": "capsule_id.physics.model",
-    "status_message": "capsule_id.physics.model",
-    "synthesize": "capsule_id.synthetic",
-    "synthesize_robot": "capsule_id.experiments.progression.twin",
-    "Trajectory": "capsule_id.physics.model",
+#: The same names by module, where they are imported at their first use.
+_PUBLIC = {
+    "api": ("Fit", "compare", "fit", "load", "read_rig"),
+    "errors": ("InputError",),
+    "experiments.progression.twin": ("RobotDesign", "synthesize_robot"),
+    "importing": ("propose_entry",),
+    "inference.compare": ("compare_models", "compare_points"),
+    "motions.bias": ("smoothing_bias",),
+    "motions.operating": ("draws_diagram",),
+    "motions.response": ("Response", "Settling", "response"),
+    "motions.sweep": ("continuation", "diagram", "motion_map"),
+    "physics.drive": ("Excitation",),
+    "physics.drives": ("Pulses", "RecordedDrive", "RodMotion"),
+    "physics.energy": ("energy_balance",),
+    "physics.model": ("CapsuleParameters", "Status", "Trajectory", "simulate", "status_message"),
+    "physics.smooth.engine": ("Smoothing",),
+    "synthetic": ("synthesize",),
 }
-
+_MODULE_OF = {name: f"capsule_id.{module}" for module, names in _PUBLIC.items() for name in names}
 __all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]  (the imports above declare the names)
 
 

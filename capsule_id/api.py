@@ -52,7 +52,7 @@ from capsule_id.report.saved import load as load_fields
 from capsule_id.report.write import table_frame, write_result
 from capsule_id.rig import read
 from capsule_id.rig.model import Rig
-from capsule_id.views import Finding, ResultTable
+from capsule_id.views import Finding, Level, ResultTable
 
 # fitted: A finished fit as an object: words, tables, plots, simulations, files. ``fit`` and ``load`` return it.
 
@@ -76,13 +76,17 @@ class Fit(Result):
     @property
     def failed(self) -> list[str]:
         """Titles of the failed checks."""
-        messages = messages_of(self.registry)
-        return sorted({title_of(finding.code, messages) for finding in self.findings if finding.level == "fail"})
+        return sorted({title for level, title in self._titles if level == "fail"})
 
     @property
     def verdict(self) -> str:
         """The verdict in one line: trust, failed checks, number of warnings."""
-        return verdict_text(self.trust, self.failed, sum(finding.level == "warn" for finding in self.findings))
+        return verdict_text(self.trust, self._titles)
+
+    @property
+    def _titles(self) -> list[tuple[Level, str]]:
+        messages = messages_of(self.registry)
+        return [(finding.level, title_of(finding.code, messages)) for finding in self.findings]
 
     @property
     def remarks(self) -> list[str]:

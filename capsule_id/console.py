@@ -148,12 +148,9 @@ NOTEBOOK_WIDTH = 100
 def prepare() -> None:
     """Open missing standard streams, make standard output accept any character, and keep it free of libraries' remarks."""
     # The null device takes the number of a closed stream, so no data file gets this number.
-    if sys.stdin is None:
-        sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
-    if sys.stdout is None:
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
-    if sys.stderr is None:
-        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: PTH123, SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
     if not logging.getLogger().handlers:  # else a library's log goes to standard error, as on a matplotlibrc

@@ -56,6 +56,21 @@ class FolderError(InputError):
         return "\n".join([*lines, f"{len(self.errors)} errors"] if len(self.errors) > MOST_SHOWN else lines)
 
 
+def check_seed(seed: int) -> None:
+    """Refuse a negative ``--seed``."""
+    if seed < 0:
+        raise InputError("--seed must not be negative", str(seed), "give 0 or more")
+
+
+@contextmanager
+def refusing(rule: str, remedy: str, file: str | Path = "") -> Iterator[None]:
+    """Raise ``InputError`` where the operating system refuses what the body does."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(rule, str(error.strerror or error), remedy, file) from None
+
+
 @contextmanager
 def collecting(errors: list[InputError]) -> Iterator[None]:
     """Append an ``InputError`` of the body to ``errors`` instead of raising it."""

@@ -6,11 +6,12 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, refusing
 
 #: Files of a result directory. A directory with another file is never replaced.
 RESULT_FILES = frozenset({"parameters.json", "parameters.csv", "posterior.nc", "report.html", "figures"})
@@ -19,6 +20,7 @@ STATE, CHAINS = "state.json", "chains.h5"
 WORK_FILES = frozenset({STATE, "state.new", CHAINS, "chains.saved", "chains.saved-new"})
 #: The lock stands beside ``DIR.partial``: Windows renames no directory with an open file.
 PARTIAL, OLD, LOCK = ".partial", ".partial.old", ".partial.lock"
+_writable = partial(refusing, "the output directory must be writable", "choose another --out")
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)  # a file system without locks
 
 
@@ -39,37 +41,27 @@ def check_directory(directory: Path) -> None:
     if directory.name in ("", "..") or directory.name.endswith((PARTIAL, OLD, LOCK)):
         named = f"the output directory must have a name, which must not end in {PARTIAL}, {OLD} or {LOCK}"
         raise InputError(named, f"'{directory}'", remedy)
-    try:
-        if directory.is_symlink() or (directory.exists() and not directory.is_dir()):
-            raise InputError(rule, "it is a file or a link", remedy, directory)
-        _check_parents(directory, remedy)
-        names = {entry.name for entry in directory.iterdir()} if directory.exists() else set()
-    except OSError as error:
-        raise InputError("the output directory must be usable", str(error.strerror), remedy, directory) from None
+    with refusing("the output directory must be usable", remedy, directory):
+        names = _names_in(directory, rule, remedy)
+        check_parents(directory, "the output directory must be writable", directory)
     if names and not _is_result(directory):
         foreign = sorted(names - RESULT_FILES - WORK_FILES)
         raise InputError(rule, f"it holds {foreign[0]}" if foreign else "it is not one", remedy, directory)
+    _check_unfinished(directory, resume=False)
 
 
-def check_unfinished(directory: Path) -> None:
-    """Refuse ``directory`` where something else stands in the place of its unfinished work or of its older result.
-
-    Raises
-    ------
-    InputError
-        If it does.
-    """
-    with _writable(partial_directory(directory)):
-        _check_partial(partial_directory(directory), resume=False)
-        _check_old(directory)
+def check_parents(path: Path, rule: str, place: str | Path) -> None:
+    """Refuse a path whose folder is none, or cannot be written."""
+    parent = next((parent for parent in path.parents if parent.exists()), Path())
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(rule, f"{parent} is not", "choose another --out", place)
 
 
-def _check_parents(directory: Path, remedy: str) -> None:
-    for parent in directory.parents:
-        if parent.exists():
-            if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-                raise InputError("the output directory must be writable", f"{parent} is not", remedy, directory)
-            return
+def _names_in(directory: Path, rule: str, remedy: str) -> set[str]:
+    """Names of what ``directory`` holds; a file or a link in its place is refused."""
+    if directory.is_symlink() or (directory.exists() and not directory.is_dir()):
+        raise InputError(rule, "it is a file or a link", remedy, directory)
+    return {entry.name for entry in directory.iterdir()} if directory.exists() else set()
 
 
 def _is_result(directory: Path) -> bool:
@@ -104,31 +96,23 @@ def work_in_progress(directory: Path, fingerprint: Mapping[str, object], resume:
     with _locked(directory):
         new = not partial.exists()
         try:
+            _check_unfinished(directory, resume)
             with _writable(partial):
-                _check_partial(partial, resume)
-                _check_old(directory)
                 partial.mkdir(exist_ok=True)
             _recover(directory)
             if resume:
                 _check_fingerprint(partial, fingerprint)
             else:
-                _clear(partial)
-            _write_state(partial, fingerprint)
+                for path in partial.iterdir():
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+            text = json.dumps({"fingerprint": dict(fingerprint)}, indent=1)
+            (partial / "state.new").write_text(text, encoding="utf-8", newline="\n")
+            (partial / "state.new").replace(partial / STATE)
             yield partial
         except InputError:
             if new:
                 shutil.rmtree(partial, ignore_errors=True)
             raise
-
-
-@contextmanager
-def _writable(partial: Path) -> Iterator[None]:
-    """Refuse an output directory that the operating system refuses."""
-    try:
-        yield
-    except OSError as error:
-        rule, remedy = "the output directory must be writable", "choose another --out"
-        raise InputError(rule, str(error.strerror), remedy, partial) from None
 
 
 @contextmanager
@@ -158,24 +142,22 @@ def _locked(directory: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def _check_partial(partial: Path, resume: bool) -> None:
-    """Refuse a ``DIR.partial`` that is no unfinished run of this program."""
-    if resume and not partial.exists():
-        raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", partial)
+def _check_unfinished(directory: Path, resume: bool) -> None:
+    """Refuse a ``DIR.partial`` that is no unfinished run of this program, and a ``DIR.partial.old`` that is no result.
+
+    An older result lies there while it is replaced.
+    """
+    partial, old = partial_directory(directory), directory.with_name(directory.name + OLD)
     rule, remedy = "DIR.partial must be unfinished work", "move it away or choose another --out"
-    if partial.is_symlink() or (partial.exists() and not partial.is_dir()):
-        raise InputError(rule, "it is a file or a link", remedy, partial)
-    names = {entry.name for entry in partial.iterdir()} if partial.exists() else set()
-    foreign = sorted(names - RESULT_FILES - WORK_FILES)
-    if foreign or (names and not names & WORK_FILES):
-        raise InputError(rule, f"it holds {(foreign or sorted(names))[0]}", remedy, partial)
-
-
-def _check_old(directory: Path) -> None:
-    """Refuse a ``DIR.partial.old`` that is no older result; a result lies there while it is replaced."""
-    old = directory.with_name(directory.name + OLD)
-    if old.is_symlink() or (old.exists() and not (old.is_dir() and _is_result(old))):
-        raise InputError("DIR.partial.old must be an older result", "it is something else", "move it away", old)
+    with _writable(partial):
+        if resume and not partial.exists():
+            raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", partial)
+        names = _names_in(partial, rule, remedy)
+        foreign = sorted(names - RESULT_FILES - WORK_FILES)
+        if foreign or (names and not names & WORK_FILES):
+            raise InputError(rule, f"it holds {(foreign or sorted(names))[0]}", remedy, partial)
+        if old.is_symlink() or (old.exists() and not (old.is_dir() and _is_result(old))):
+            raise InputError("DIR.partial.old must be an older result", "it is something else", "move it away", old)
 
 
 def _recover(directory: Path) -> None:
@@ -185,14 +167,6 @@ def _recover(directory: Path) -> None:
         shutil.rmtree(old)
     elif old.exists():
         old.rename(directory)
-
-
-def _clear(partial: Path) -> None:
-    for path in partial.iterdir():
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
 
 
 def _check_fingerprint(partial: Path, fingerprint: Mapping[str, object]) -> None:
@@ -207,12 +181,6 @@ def _check_fingerprint(partial: Path, fingerprint: Mapping[str, object]) -> None
         if saved[key] != json.loads(json.dumps(value)):
             rule = f"--resume needs the same {key} as the interrupted run"
             raise InputError(rule, f"{key} changed", remedy, partial)
-
-
-def _write_state(partial: Path, fingerprint: Mapping[str, object]) -> None:
-    new = partial / "state.new"
-    new.write_text(json.dumps({"fingerprint": dict(fingerprint)}, indent=1), encoding="utf-8", newline="\n")
-    new.replace(partial / STATE)
 
 
 def publish(partial: Path, directory: Path) -> None:

@@ -30,6 +30,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def after_number(unit: str) -> str:
+    """A unit behind a number; nothing for a number without unit."""
+    return "" if unit == "1" else f" {unit}"
+
+
 def stated_p(p: float) -> str:
     """``p = 0.01``, or ``p < 1e-10`` for a smaller one: so far out, no distribution is known."""
     return f"p = {p:.2g}" if p >= SMALLEST_P else f"p < {SMALLEST_P:g}"

@@ -2,11 +2,10 @@
 
 import argparse
 import logging
-import os
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,12 +16,14 @@ from capsule_id.commands.capsule_options import (
     capsule_and_drive,
     capsule_values,
     fitted_values,
+    leaves_of,
     number,
 )
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
+from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import Progress, say
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
+from capsule_id.output import PARTIAL, check_parents
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, SWEPT
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
@@ -57,21 +58,17 @@ def prepare_store(out: Path, resume: bool) -> Path:
         raise InputError("the output must end in .nc", str(out), "change the suffix")
     if out.is_dir() or out.with_suffix(".png").is_dir():
         raise InputError("the output must be a file", f"{out} is a folder", "choose another --out")
-    parent = next(path for path in out.absolute().parents if path.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise InputError("the folder of the output must be writable", f"{parent} is not", "choose another --out")
+    check_parents(out.absolute(), "the folder of the output must be writable", "")
     if (out.parent / "parameters.json").exists():
         rule, remedy = "the output must not lie in a result of fit-params", "choose another --out"
         raise InputError(rule, f"{out.parent} is one", remedy, out)
-    store = out.with_name(out.name + ".partial")
+    store = out.with_name(out.name + PARTIAL)
     if resume and not (store / STORE_FILE).is_file():
         raise InputError("--resume needs an interrupted run", "there is none", "run without --resume", store)
     if store.exists() and not resume:
-        names = {path.name for path in store.iterdir()} if store.is_dir() else set()
-        if not store.is_dir() or (names and STORE_FILE not in names):
-            raise InputError(
-                "FILE.nc.partial must be unfinished work", "it is something else", "choose another --out", store
-            )
+        if not store.is_dir() or (any(store.iterdir()) and not (store / STORE_FILE).exists()):
+            rule, remedy = "FILE.nc.partial must be unfinished work", "choose another --out"
+            raise InputError(rule, "it is something else", remedy, store)
         shutil.rmtree(store)
     return store
 
@@ -86,24 +83,18 @@ def publish_pair(out: Path, data: "xr.Dataset", figure: "Figure") -> None:
     """
     from capsule_id.report.figures.style import png
 
-    picture = out.with_suffix(".png")
-    new = [path.with_name(f".{path.name}.new") for path in (out, picture)]
+    files = out, out.with_suffix(".png")
+    new = [path.with_name(f".{path.name}.new") for path in files]
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        data.to_netcdf(new[0], engine="h5netcdf")
-        new[1].write_bytes(png(figure))
-        new[0].replace(out)
-        new[1].replace(picture)
-    except OSError as error:
-        raise InputError("the output must be writable", str(error.strerror), "choose another --out", out) from None
+        with refusing("the output must be writable", "choose another --out", out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            data.to_netcdf(new[0], engine="h5netcdf")
+            new[1].write_bytes(png(figure))
+            for path, file in zip(new, files, strict=True):
+                path.replace(file)
     finally:
         for path in new:
             path.unlink(missing_ok=True)
-
-
-def remove_store(store: Path) -> None:
-    """Remove the finished blocks."""
-    shutil.rmtree(store, ignore_errors=True)
 
 
 # cluster: A Dask cluster for the blocks of a map or for rigs: threads or processes of this machine, or a running
@@ -114,46 +105,26 @@ def remove_store(store: Path) -> None:
 CONNECT_TIMEOUT = 10.0
 
 
-def client_of(scheduler: str | None) -> "AbstractContextManager[Client | None]":
-    """A context manager: a Dask client, or None to compute in this process."""
-    return nullcontext() if scheduler is None else cluster(scheduler)
-
-
 @contextmanager
-def cluster(scheduler: str) -> "Iterator[Client]":
-    """A client of a local cluster ("threads", "processes") or of the scheduler at an address. A local cluster ends with it.
+def client_of(scheduler: str | None) -> "Iterator[Client | None]":
+    """A Dask client, or None to compute in this process.
+
+    scheduler : "threads" or "processes" for a local cluster, which ends with the client, or the address of a scheduler
 
     Raises
     ------
     InputError
         If Dask is not installed, or no scheduler answers at the address.
     """
+    if scheduler is None:
+        yield None
+        return
     try:
-        import distributed  # noqa: F401
         from dask import config
+        from distributed import Client, LocalCluster
     except ImportError:
         remedy = "install capsule-id[maps], or remove --scheduler"
         raise InputError("--scheduler needs Dask", "distributed is not installed", remedy) from None
-    # A client that no scheduler answers does not restore the setting of Dask, and nothing could be computed later.
-    with config.set(scheduler=config.get("scheduler", None)), _client(scheduler) as client:
-        yield client
-
-
-@contextmanager
-def _client(scheduler: str) -> "Iterator[Client]":
-    from distributed import Client, LocalCluster
-
-    if scheduler not in ("threads", "processes"):
-        try:
-            client = Client(scheduler, timeout=CONNECT_TIMEOUT)
-        except (OSError, ValueError) as error:
-            rule = "--scheduler is threads, processes or the address of a Dask scheduler"
-            raise InputError(
-                rule, f"{scheduler}: {type(error).__name__}", "start the scheduler, or check the address"
-            ) from None
-        with client:
-            yield client
-        return
     # Each process computes with as many threads as there are cores; see physics/batches.py.
     processes = scheduler == "processes"
     local = {
@@ -162,8 +133,20 @@ def _client(scheduler: str) -> "Iterator[Client]":
         "dashboard_address": None,
         "silence_logs": logging.CRITICAL,
     }
-    with LocalCluster(**local) as workers, Client(workers) as client:
-        yield client
+    with ExitStack() as opened:
+        # A client that no scheduler answers does not restore the setting of Dask, and nothing could be computed later.
+        opened.enter_context(config.set(scheduler=config.get("scheduler", None)))
+        if processes or scheduler == "threads":
+            address: Any = opened.enter_context(LocalCluster(**local))
+        else:
+            address = scheduler
+        try:
+            client = Client(address, timeout=CONNECT_TIMEOUT)
+        except (OSError, ValueError) as error:
+            rule = "--scheduler is threads, processes or the address of a Dask scheduler"
+            value = f"{scheduler}: {type(error).__name__}"
+            raise InputError(rule, value, "start the scheduler, or check the address") from None
+        yield opened.enter_context(client)
 
 
 # bifurcate: ``capsule-id bifurcate``: the settled motions over one quantity or two, as NetCDF and as a figure.
@@ -246,12 +229,11 @@ def run(args: argparse.Namespace) -> int:
             remedy = "run fit-params on it, or give --result"
             raise InputError("DATA must have been fitted", f"no {args.result}", remedy)
     free = frozenset(_frequency_leaf(args) if axis.name == "f" else axis.name for axis in axes)
-    values = capsule_values(args, FIG_6_DEFAULTS, free | _names_from_posterior(args))
+    # The posterior supplies k2.
+    values = capsule_values(args, FIG_6_DEFAULTS, free | ({"k2"} if args.posterior is not None else set()))
     out = args.out if args.out is not None else _default_out(rig.name if rig is not None else None, axes)
     store = prepare_store(out, args.resume)
-    set_xla_options()
-    if not args.no_cache:
-        keep_programs()
+    prepare_jax(not args.no_cache)
     from capsule_id.physics.forces import warn_of_far_gap
     from capsule_id.report.figures.style import own_style
 
@@ -263,7 +245,7 @@ def run(args: argparse.Namespace) -> int:
         measured = _measured_points(args, rig, axes, values) if rig is not None else ()
         with own_style():
             publish_pair(out, data, draw(data, axes, measured, synthetic=rig is not None and rig.synthetic))
-    remove_store(store)
+    shutil.rmtree(store, ignore_errors=True)
     say(_summary_text(data, axes, out))
     return 0
 
@@ -303,11 +285,11 @@ def _dataset(
     )
     leaves: dict[str, Any] = dict(values)
     if args.posterior is not None:
-        spring = None if any(axis.name == "k2" for axis in axes) or args.k2 is not None else args.spring
-        draws = read_draws(
-            args.posterior, _whole_number("draws", args.draws or "100"), _whole_number("seed", args.seed), spring
-        )
-        if "k2" not in draws and args.k2 is None and all(axis.name != "k2" for axis in axes):
+        needs_k2 = args.k2 is None and all(axis.name != "k2" for axis in axes)
+        count, seed = _whole_number("draws", args.draws or "100"), _whole_number("seed", args.seed)
+        drawn = read_draws(args.posterior, count, seed)
+        draws = leaves_of(drawn, args.spring if needs_k2 else None, args.posterior)
+        if "k2" not in draws and needs_k2:
             raise InputError("k2 must be given", "the posterior has several springs or none", "add --spring or --k2")
         given = {name for name in LEAVES if getattr(args, name) is not None}
         leaves |= {name: column for name, column in draws.items() if name not in given}
@@ -319,16 +301,13 @@ def _dataset(
     if len(axes) == 2:
         return sweep.motion_map(p, e, x, settling=settling, **work)
     plain = {"settling": settling, "progress": work["progress"]}
-    if args.method in ("rest", "states"):
-        many = args.method == "states"
-        starts = (
-            sweep.spread_starts(p, e, _whole_number("states", args.states), _whole_number("seed", args.seed))
-            if many
-            else None
-        )
+    if args.method == "rest":
+        return sweep.diagram(p, e, over, grid, **plain)
+    if args.method == "states":
+        starts = sweep.spread_starts(p, e, _whole_number("states", args.states), _whole_number("seed", args.seed))
         return sweep.diagram(p, e, over, grid, starts=starts, **plain)
-    both = ("forward", "backward")
-    return sweep.continuation(p, e, over, grid, directions=both if args.method == "both" else (args.method,), **plain)
+    directions = ("forward", "backward") if args.method == "both" else (args.method,)
+    return sweep.continuation(p, e, over, grid, directions=directions, **plain)
 
 
 def _measured_points(
@@ -389,17 +368,28 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
         raise InputError(f"the {args.drive} drive has no {name}", f"--over or --with {name}", "change --drive")
     if len(names) < len(axes) or names == {"f", _frequency_leaf(args)}:
         raise InputError("a map needs two different quantities", f"{args.over} and {args.second}", "name another one")
-    blocks = len(axes) == 2 or args.posterior is not None
-    if args.posterior is not None and len(axes) == 2:
-        raise InputError("--posterior takes one quantity", "--with", "remove --posterior or --with")
-    if blocks and args.method != "rest":
-        raise InputError("maps and bands start from rest", f"--method {args.method}", "remove --method")
-    if args.scheduler is not None and not blocks:
-        raise InputError("--scheduler is for maps and bands", "one quantity", "remove it, or add --with or --posterior")
-    if args.resume and not blocks:
-        raise InputError("--resume is for maps and bands", "one quantity", "remove --resume")
-    if args.draws is not None and args.posterior is None:
-        raise InputError("--draws needs --posterior", "there is none", "add --posterior FILE")
+    bands = args.posterior is not None
+    blocks = len(axes) == 2 or bands
+    alone = "one quantity"
+    for wrong, rule, value, remedy in (
+        (bands and len(axes) == 2, "--posterior takes one quantity", "--with", "remove --posterior or --with"),
+        (
+            blocks and args.method != "rest",
+            "maps and bands start from rest",
+            f"--method {args.method}",
+            "remove --method",
+        ),
+        (
+            args.scheduler and not blocks,
+            "--scheduler is for maps and bands",
+            alone,
+            "remove it, or add --with or --posterior",
+        ),
+        (args.resume and not blocks, "--resume is for maps and bands", alone, "remove --resume"),
+        (args.draws and not bands, "--draws needs --posterior", "there is none", "add --posterior FILE"),
+    ):
+        if wrong:
+            raise InputError(rule, value, remedy)
     for name in sorted(names | ({_frequency_leaf(args)} if "f" in names else set())):
         if getattr(args, name, None) is not None:
             raise InputError(f"a varied {name} has no fixed value", f"--{name} is given", f"remove --{name}")
@@ -408,11 +398,6 @@ def _check_combination(args: argparse.Namespace, axes: Sequence[Axis]) -> None:
 def _frequency_leaf(args: argparse.Namespace) -> str:
     """The leaf that the frequency f stands for."""
     return "Omega" if args.drive == "harmonic" else "period"
-
-
-def _names_from_posterior(args: argparse.Namespace) -> frozenset[str]:
-    """Parameters that need no option because the posterior supplies them."""
-    return frozenset({"k2"}) if args.posterior is not None else frozenset()
 
 
 def _whole_number(name: str, text: str) -> int:

@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from capsule_id.errors import InputError
 from capsule_id.parameters import CAPSULE_LEAVES, DRIVES, LEAVES, TABLE_1
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from capsule_id.physics.drives import Pulses
     from capsule_id.physics.model import CapsuleParameters
 
+Value = TypeVar("Value")
 #: Name of the default friction law in the provenance of a result.
 EQUATION_1 = "eq. (1)"
 # From the paper's Table 1, or the default of the parameter table; other parameters have no default.
@@ -52,7 +53,7 @@ def capsule_values(
     InputError
         If a value is missing, no number or not admissible, belongs to another drive, or the result cannot be read.
     """
-    fitted = _fitted(args.result, args.spring) if args.result is not None else {}
+    fitted = leaves_of(fitted_values(args.result), args.spring) if args.result is not None else {}
     values = {}
     own = {*CAPSULE_LEAVES, *DRIVES[args.drive]}
     for name, leaf in LEAVES.items():
@@ -151,15 +152,21 @@ def fitted_values(directory: Path) -> dict[str, float]:
     return values
 
 
-def _fitted(directory: Path, spring: str | None) -> dict[str, float]:
-    """Fitted values by symbol; k2 is that of ``spring``."""
-    values = fitted_values(directory)
-    springs = [name[3:-1] for name in values if name.startswith("k2[")]
+def leaves_of(fitted: Mapping[str, Value], spring: str | None, file: str | Path = "") -> dict[str, Value]:
+    """Fitted values, or draws, by symbol of a leaf; k2 is that of ``spring``, or of the only one.
+
+    Raises
+    ------
+    InputError
+        If ``spring`` was not fitted.
+    """
+    leaves = {name: value for name, value in fitted.items() if name in LEAVES}
+    springs = [name[3:-1] for name in fitted if name.startswith("k2[")]
     if spring is None and len(springs) == 1:
         spring = springs[0]
     if spring is not None:
         if spring not in springs:
             remedy = f"choose from {', '.join(springs)}" if springs else "give --k2 instead"
-            raise InputError("--spring must be a fitted spring", spring, remedy)
-        values["k2"] = values[f"k2[{spring}]"]
-    return {name: value for name, value in values.items() if name in LEAVES}
+            raise InputError("--spring must be a fitted spring", spring, remedy, file)
+        leaves["k2"] = fitted[f"k2[{spring}]"]
+    return leaves

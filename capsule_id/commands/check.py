@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from capsule_id.console import say
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, refusing
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint, lint_settings
 from capsule_id.experiments.rough_values import rough_values
@@ -55,16 +55,13 @@ def _draw(rig: Rig, findings: Sequence[Finding], folder: Path) -> list[str]:
     from capsule_id.report.figures.fits import readings_figure
     from capsule_id.report.figures.style import mark, own_style, png
 
-    try:
+    with refusing("--figures DIR must be writable", "name another one", folder), own_style():
         folder.mkdir(parents=True, exist_ok=True)
-        with own_style():
-            for table in rig.tables:
-                figure = readings_figure(table, [found for found in findings if found.experiment == table.label])
-                if rig.synthetic:
-                    mark(figure, "SYNTHETIC")
-                (folder / f"{table.label}.png").write_bytes(png(figure))
-    except OSError as error:
-        raise InputError("--figures DIR must be writable", str(error.strerror), "name another one", folder) from None
+        for table in rig.tables:
+            figure = readings_figure(table, [found for found in findings if found.experiment == table.label])
+            if rig.synthetic:
+                mark(figure, "SYNTHETIC")
+            (folder / f"{table.label}.png").write_bytes(png(figure))
     return [f"figures: {len(rig.tables)} in {folder}"]
 
 

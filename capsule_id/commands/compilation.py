@@ -9,6 +9,7 @@ import os
 import platform
 import shutil
 import sys
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -40,15 +41,28 @@ def use_one_blas_thread() -> None:
         os.environ.setdefault(BLAS_THREADS, "1")
 
 
-def set_xla_options(loop: bool = True) -> None:
+def prepare_jax(cached: bool, loop: bool = True) -> None:
     """Set the options of XLA for this process, unless JAX is imported; those that the user has set stay.
 
+    cached : keep compiled programs in the user's cache directory too; JAX's own variables, where set, have precedence.
+        Processes share the cache under a file lock. Nothing is kept where the directory cannot be written
     loop : set ``XLA_LOOP_OPTION`` too
     """
+    if "jax" in sys.modules:
+        return
     for option in (XLA_EMITTER_OPTION, XLA_LOOP_OPTION)[: 1 + loop]:
         flags = os.environ.get("XLA_FLAGS", "")
-        if "jax" not in sys.modules and option.partition("=")[0] not in flags:
+        if option.partition("=")[0] not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
+    if not cached or DIRECTORY in os.environ:
+        return
+    directory = cache_directory()
+    with suppress(OSError):
+        directory.mkdir(parents=True, exist_ok=True)
+    if os.access(directory, os.W_OK | os.X_OK):
+        os.environ[DIRECTORY] = str(directory)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_CACHE))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(WORTH_KEEPING))
 
 
 def add_cache_argument(options: argparse._ActionsContainer) -> None:
@@ -56,24 +70,6 @@ def add_cache_argument(options: argparse._ActionsContainer) -> None:
     options.add_argument(
         "--no-cache", action="store_true", help="compile everything anew, and keep no compiled program"
     )
-
-
-def keep_programs() -> None:
-    """Keep compiled programs in the user's cache directory; JAX's own variables, where set, have precedence.
-
-    Processes share the cache under a file lock. Nothing is kept where the directory cannot be written.
-    """
-    if "jax" in sys.modules or DIRECTORY in os.environ:
-        return
-    directory = cache_directory()
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if os.access(directory, os.W_OK | os.X_OK):
-        os.environ[DIRECTORY] = str(directory)
-        os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_CACHE))
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(WORTH_KEEPING))
 
 
 def cache_directory() -> Path:

@@ -5,23 +5,16 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
+from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.commands.rigs import Options, fit_many, fit_one
 from capsule_id.console import Progress, say
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, check_seed
 from capsule_id.experiments import CHOICES
 from capsule_id.experiments.kind import Registry, default_registry
 from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.views import counted
-
-if TYPE_CHECKING:
-    pass
-from capsule_id.commands.rigs import Options, fit_many, fit_one
-
-# fit: ``fit-params DATA``: from one rig folder or several to parameters, posterior and report.
-
 
 DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 4000
 
@@ -96,12 +89,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_numbers(args: argparse.Namespace) -> None:
     """Refuse numbers that no fit has."""
-    if args.seed < 0:
-        raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
-    if args.max_steps < 1:
-        raise InputError("--max-steps must be positive", str(args.max_steps), "give 1 or more")
-    if args.ess < 1:
-        raise InputError("--ess must be positive", str(args.ess), "give 1 or more")
+    check_seed(args.seed)
+    for option, value in (("--max-steps", args.max_steps), ("--ess", args.ess)):
+        if value < 1:
+            raise InputError(f"{option} must be positive", str(value), "give 1 or more")
 
 
 def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> int:
@@ -114,9 +105,7 @@ def _compare(args: argparse.Namespace, rigs: Sequence[Rig], kinds: Registry) -> 
     if ignored:
         names = ", ".join(ignored).replace("_", "-")
         raise InputError("--compare prints tables, writes nothing and fits all experiments", names, f"remove {names}")
-    set_xla_options()
-    if not args.no_cache:
-        keep_programs()
+    prepare_jax(not args.no_cache)
     from capsule_id.inference.compare import compare_models, compare_points
 
     compare = compare_points if args.no_sample else compare_models

@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
+from capsule_id.commands.compilation import add_cache_argument, prepare_jax
 from capsule_id.console import say
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, check_seed, refusing
 from capsule_id.views import counted
 
 
@@ -27,8 +27,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If RESULT is none, holds no sample or no progression, the settings break a rule, or a file exists.
     """
-    if args.seed < 0:
-        raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
+    check_seed(args.seed)
     for option, file in (("--out", args.out), ("--figure", args.figure)):
         if file is not None:
             _check_new(option, file)
@@ -36,9 +35,7 @@ def run(args: argparse.Namespace) -> int:
         args.figure.suffix.lower() != ".png" or args.figure.resolve() == args.out.resolve()
     ):
         raise InputError("--figure must name a .png file of its own", args.figure.name, "write NAME.png", args.figure)
-    set_xla_options()
-    if not args.no_cache:
-        keep_programs()
+    prepare_jax(not args.no_cache)
     from capsule_id.api import load
     from capsule_id.inference.prediction import predict
     from capsule_id.report.figures.fits import side_by_side
@@ -51,20 +48,16 @@ def run(args: argparse.Namespace) -> int:
         with own_style():
             written.append(("--figure", args.figure, png(side_by_side(made.panels))))
     for option, file, content in written:
-        try:
+        with refusing(f"{option} must be writable", "name another file", file):
             file.write_bytes(content)
-        except OSError as error:
-            raise InputError(f"{option} must be writable", str(error.strerror), "name another file", file) from None
         say(f"wrote {file}: {counted(len(made.table), 'setting')}" if option == "--out" else f"wrote {file}")
     return 0
 
 
 def _check_new(option: str, file: Path) -> None:
     """Refuse a file that exists or cannot be made, before the predictions are computed."""
-    try:
+    with refusing(f"{option} must be writable", "name another file", file):
         taken, room = file.exists(), file.parent.is_dir()
-    except OSError as error:
-        raise InputError(f"{option} must be writable", str(error.strerror), "name another file", file) from None
     if taken:
         raise InputError(f"{option} must name a new file", "it exists", "choose another name", file)
     if not room:

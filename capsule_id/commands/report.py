@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -41,22 +42,16 @@ def run(args: argparse.Namespace) -> int:
     from capsule_id.report.columns import table_text, verdict_text
 
     frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("name")
-    failed = sorted({finding["check"] for finding in findings if finding["level"] == "fail"})
     texts = (f"{finding['level']:4} {finding['check']}: {finding['text']}" for finding in findings)
-    verdict = verdict_text(trust, failed, sum(finding["level"] == "warn" for finding in findings))
+    verdict = verdict_text(trust, [(finding["level"], finding["check"]) for finding in findings])
     say("\n".join([table_text(frame, synthetic=bool(saved["synthetic"])), *texts, verdict]))
     return 0 if clean else 3
 
 
 def _row(entry: dict[str, Any]) -> dict[str, Any]:
     """One row of the parameter table. The file has no standard error of the point fit."""
-    lower, upper = entry["ci95"] or (None, None)
     numbers = {key: entry[key] for key in ("value", "sd", "paper", "map", "mean", "median", "ess", "rhat")}
-    values = {key: float("nan") if value is None else float(value) for key, value in numbers.items()}
-    bounds = {
-        "lower": float("nan") if lower is None else float(lower),
-        "upper": float("nan") if upper is None else float(upper),
-    }
+    numbers["lower"], numbers["upper"] = entry["ci95"] or (None, None)
     words = {key: entry[key] for key in ("unit", "basis", "trust", "informed")}
-    words["quote"] = entry.get("quote", "sd")
-    return {**words, "meaning": "", "standard_error": float("nan"), **values, **bounds}
+    known = {key: math.nan if value is None else float(value) for key, value in numbers.items()}
+    return {**words, "quote": entry.get("quote", "sd"), "meaning": "", "standard_error": math.nan, **known}

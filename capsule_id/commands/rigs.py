@@ -6,16 +6,17 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capsule_id.commands.bifurcate import client_of
-from capsule_id.commands.compilation import keep_programs, set_xla_options
+from capsule_id.commands.compilation import prepare_jax
 from capsule_id.console import OnProgress, Progress, one_line, save_traceback, say, stop_if_interrupted
 from capsule_id.errors import InputError
 from capsule_id.experiments import Choice, make_experiments
 from capsule_id.experiments.kind import Registry, default_registry
-from capsule_id.output import CHAINS, WORK_FILES, check_directory, check_unfinished, publish, work_in_progress
+from capsule_id.output import CHAINS, WORK_FILES, check_directory, publish, work_in_progress
 from capsule_id.rig.model import Rig
 from capsule_id.views import counted
 
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from capsule_id.api import Fit
+
+#: Exit codes: a rig that cannot be fitted, a failed check, none of them.
+FAILED, NOT_CLEAN, CLEAN = 1, 3, 0
 
 
 @dataclass(frozen=True)
@@ -58,13 +62,6 @@ def check_output(directory: Path, options: Options) -> None:
         raise InputError(rule, "it holds posterior.nc", remedy, directory)
 
 
-def prepare_jax(options: Options, has_runs: bool) -> None:
-    """Set the options of XLA, before JAX loads, the heap, and the cache of programs."""
-    set_xla_options(loop=options.experiments != "bench" and has_runs)
-    if options.cached:
-        keep_programs()
-
-
 def fingerprint_of(rig: Rig, options: Options, kinds: Registry) -> Mapping[str, object]:
     """What an interrupted fit must have in common with the one that resumes it."""
     from capsule_id.inference.pipeline import PACKAGES, package_versions
@@ -91,18 +88,8 @@ def write_fit(
     from capsule_id.api import fit
     from capsule_id.report.write import write_result
 
-    store = folder / CHAINS
-    result = fit(
-        rig,
-        options.seed,
-        options.experiments,
-        options.budget,
-        store,
-        progress,
-        kinds,
-        ess=options.ess,
-        preliminary=preliminary,
-    )
+    words = options.seed, options.experiments, options.budget, folder / CHAINS, progress, kinds
+    result = fit(rig, *words, ess=options.ess, preliminary=preliminary)
     made = result.provenance.made[0], options.command
     result = replace(result, provenance=replace(result.provenance, made=made))
     progress(0, 1, "report")
@@ -128,7 +115,7 @@ def fit_one(
         If the input is bad; then nothing is written.
     """
     check_output(directory, options)
-    prepare_jax(options, rig.has_runs)
+    prepare_jax(options.cached, rig.has_runs and options.experiments != "bench")
     # JAX loads only now, so that a faulty folder is reported at once.
     from capsule_id.report.columns import table_text, wrapped
     from capsule_id.report.messages import messages_of
@@ -136,17 +123,17 @@ def fit_one(
 
     make_experiments(rig, options.experiments, kinds)
     messages_of(kinds)  # refuses conflicting messages before the fit
-    with work_in_progress(directory, fingerprint_of(rig, options, kinds), resume) as partial:
+    with work_in_progress(directory, fingerprint_of(rig, options, kinds), resume) as unfinished:
 
         def show_point(first: "Fit") -> None:
-            write_report(first, partial)
+            write_report(first, unfinished)
             table = [table_text(first.summary, synthetic=rig.synthetic), *wrapped(first.remarks)]
-            progress.note("\n".join([f"point fit, before the sample; report: {partial / 'report.html'}", *table]))
+            progress.note("\n".join([f"point fit, before the sample; report: {unfinished / 'report.html'}", *table]))
 
         # A fit of bench tests ends as soon.
         preliminary = show_point if rig.has_runs and options.experiments != "bench" else None
-        result = write_fit(rig, options, partial, kinds, progress, preliminary)
-        publish(partial, directory)
+        result = write_fit(rig, options, unfinished, kinds, progress, preliminary)
+        publish(unfinished, directory)
     report = directory / "report.html"
     if as_json:
         say((directory / "parameters.json").read_text(encoding="utf-8").rstrip())
@@ -154,14 +141,11 @@ def fit_one(
         table = table_text(result.summary, synthetic=rig.synthetic)
         changes = wrapped(result.remarks)
         say("\n".join([table, *changes, f"report: {report}", result.verdict]))
-    if result.clean:
-        return 0
-    print(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}", file=sys.stderr)
-    return 3
+    if not result.clean:
+        print(f"fit-params: verdict not clean: {', '.join(result.failed)}; see {report}", file=sys.stderr)
+    return CLEAN if result.clean else NOT_CLEAN
 
 
-#: Exit codes: a rig that cannot be fitted, a failed check, none of them.
-FAILED, NOT_CLEAN, CLEAN = 1, 3, 0
 #: Time between two looks at the tasks of a cluster, s.
 POLL = 0.1
 
@@ -200,8 +184,7 @@ def fit_many(
         raise InputError(rule, "it holds parameters.json", "choose another --out", root)
     for rig in rigs:
         check_output(root / rig.name, options)
-        check_unfinished(root / rig.name)
-    prepare_jax(options, any(rig.has_runs for rig in rigs))
+    prepare_jax(options.cached, any(rig.has_runs for rig in rigs) and options.experiments != "bench")
     from capsule_id.report.messages import messages_of
 
     messages_of(kinds)
@@ -209,28 +192,26 @@ def fit_many(
         make_experiments(rig, options.experiments, kinds)
     failures, unclean = list[str](), list[str]()
     with client_of(scheduler) as client:
-        outcomes = _in_process(rigs, options, kinds) if client is None else _on_cluster(client, rigs, options)
+        fits = ((rig, partial(fitted_rig, rig, options, kinds)) for rig in rigs)
         progress(0, len(rigs), "rigs")
-        for done, (rig, found) in enumerate(outcomes, start=1):
-            stop_if_interrupted()
+        for done, (rig, fitted) in enumerate(fits if client is None else _on_cluster(client, rigs, options), start=1):
             try:
-                if isinstance(found, Exception):
-                    raise found
+                found = fitted()
+                stop_if_interrupted()
                 _write(found, root / rig.name, fingerprint_of(rig, options, kinds))
-            except (InputError, OSError) as error:
-                failures.append(f"{rig.name} ({one_line(error)})")
             except Exception as error:  # the other rigs are fitted all the same
-                failures.append(f"{rig.name} ({one_line(error)}; {save_traceback(error)})")
+                stop_if_interrupted()
+                saved = "" if isinstance(error, InputError | OSError) else f"; {save_traceback(error)}"
+                failures.append(f"{rig.name} ({one_line(error)}{saved})")
             else:
                 say(f"{rig.name}: {found.verdict}; report: {root / rig.name / 'report.html'}{found.changes}")
                 unclean += [rig.name] * (not found.clean)
             progress(done, len(rigs), "rigs")
-    if not failures and not unclean:
-        return CLEAN
     parts = [f"verdict not clean: {', '.join(unclean)}"] * bool(unclean)
     parts += [f"{counted(len(failures), 'rig')} not fitted: {'; '.join(failures)}"] * bool(failures)
-    print(f"fit-params: {'; '.join(parts)}", file=sys.stderr)
-    return FAILED if failures else NOT_CLEAN
+    if parts:
+        print(f"fit-params: {'; '.join(parts)}", file=sys.stderr)
+    return FAILED if failures else NOT_CLEAN if unclean else CLEAN
 
 
 def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> FittedRig:
@@ -241,7 +222,7 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
     RuntimeError
         If the fit is interrupted: a thread of a worker must not end by ``KeyboardInterrupt``.
     """
-    prepare_jax(options, rig.has_runs)
+    prepare_jax(options.cached, rig.has_runs and options.experiments != "bench")
     from capsule_id.report.columns import wrapped
 
     kinds = kinds or default_registry()
@@ -260,32 +241,22 @@ def fitted_rig(rig: Rig, options: Options, kinds: Registry | None = None) -> Fit
     return FittedRig(files, changes, result.verdict, result.clean)
 
 
-def _in_process(rigs: Sequence[Rig], options: Options, kinds: Registry) -> Iterator[tuple[Rig, FittedRig | Exception]]:
-    for rig in rigs:
-        yield rig, _outcome(lambda rig=rig: fitted_rig(rig, options, kinds))
-
-
-def _on_cluster(client: "Client", rigs: Sequence[Rig], options: Options) -> Iterator[tuple[Rig, FittedRig | Exception]]:
+def _on_cluster(
+    client: "Client", rigs: Sequence[Rig], options: Options
+) -> Iterator[tuple[Rig, Callable[[], FittedRig]]]:
     """Results as they arrive. The scheduler gives the rig of a worker that dies to another one."""
     tasks = {client.submit(fitted_rig, rig, options, pure=False): rig for rig in rigs}
     while tasks:
         # A wait for the next result would not notice an interruption.
         stop_if_interrupted()
         for task in [task for task in tasks if task.done()]:
-            yield tasks.pop(task), _outcome(task.result)
+            yield tasks.pop(task), task.result
         time.sleep(POLL)
 
 
-def _outcome(result: Callable[[], FittedRig]) -> FittedRig | Exception:
-    try:
-        return result()
-    except Exception as error:
-        return error
-
-
 def _write(found: FittedRig, directory: Path, fingerprint: Mapping[str, object]) -> None:
-    with work_in_progress(directory, fingerprint, resume=False) as partial:
+    with work_in_progress(directory, fingerprint, resume=False) as unfinished:
         for name, content in found.files.items():
-            (partial / name).parent.mkdir(exist_ok=True)
-            (partial / name).write_bytes(content)
-        publish(partial, directory)
+            (unfinished / name).parent.mkdir(exist_ok=True)
+            (unfinished / name).write_bytes(content)
+        publish(unfinished, directory)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capsule_id.commands.capsule_options import add_capsule_arguments, capsule_and_drive, capsule_values, number
-from capsule_id.commands.compilation import add_cache_argument, keep_programs, set_xla_options
-from capsule_id.errors import InputError
+from capsule_id.commands.compilation import add_cache_argument, prepare_jax
+from capsule_id.errors import InputError, refusing
 from capsule_id.views import counted
 
 if TYPE_CHECKING:
@@ -60,9 +60,7 @@ def run(args: argparse.Namespace) -> int:
     widths = {name: number(name, getattr(args, name)) for name in WIDTHS if getattr(args, name) is not None}
     if widths and args.model == "exact":
         raise InputError("the exact model has no widths", f"--{next(iter(widths))}", "remove it, or add --model smooth")
-    set_xla_options()
-    if not args.no_cache:
-        keep_programs()
+    prepare_jax(not args.no_cache)
     import numpy as np
 
     from capsule_id.physics.forces import warn_of_far_gap
@@ -86,15 +84,13 @@ def run(args: argparse.Namespace) -> int:
     warn_of_far_gap(p.G, t.x_rel)
     held = np.isin(times, grid)
     columns = {"time": times[held]} | {name: np.asarray(getattr(t, name))[held] for name in (*STATE, "x_rel")}
-    try:
+    with refusing("the output must be writable", "choose another name", args.out):
         write_motion(args.out, columns, values | {"model": args.model, "semantics": args.semantics})
-        if args.figure is not None:
+    if args.figure is not None:
+        with refusing("the output must be writable", "choose another name", args.figure):
             _draw(args.figure, t, np.isin(times, section), values["G"])
-    except OSError as error:
-        raise InputError("the output must be writable", str(error), "choose another name") from None
-    numbers = (samples, "sample"), (int(t.contacts), "contact"), (int(t.events), "event")
-    counts = [counted(number, noun) for number, noun in numbers]
-    print(f"wrote {args.out}: {counts[0]} of {end:g} s, {counts[1]}, {counts[2]}")
+    events = f"{counted(int(t.contacts), 'contact')}, {counted(int(t.events), 'event')}"
+    print(f"wrote {args.out}: {counted(samples, 'sample')} of {end:g} s, {events}")
     return 0
 
 
@@ -137,14 +133,14 @@ def _draw(path: Path, t: "Trajectory", section: "np.ndarray", G: float) -> None:
     """Draw time histories and phase plane. ``section`` marks the samples at the initial phase of the drive."""
     import numpy as np
 
-    from capsule_id.report.figures.fits import MotionView, overview, overview_size
+    from capsule_id.report.figures.fits import MotionView, overview
     from capsule_id.report.figures.style import new_figure, own_style, png
 
     x_rel, rate = np.asarray(t.x_rel), np.asarray(t.Y1 - t.Y2)
     channels = {"x_capsule": np.asarray(t.X2), "x_rel": x_rel}
     view = MotionView(np.asarray(t.times), channels, x_rel, rate, x_rel[section], rate[section], G)
     with own_style():
-        overview(view, figure := new_figure(*overview_size(view)))
+        overview(view, figure := new_figure(10.0, 4.8))
         path.write_bytes(png(figure))
 
 

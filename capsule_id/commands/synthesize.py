@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from capsule_id.console import say
-from capsule_id.errors import InputError
+from capsule_id.errors import InputError, check_seed, refusing
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,8 +29,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         If DIR is not empty, or a value cannot be set.
     """
-    if args.seed < 0:
-        raise InputError("--seed must not be negative", str(args.seed), "give 0 or more")
+    check_seed(args.seed)
     if args.robot:
         return _robot(args)
     from capsule_id.experiments.kind import default_registry
@@ -38,10 +37,8 @@ def run(args: argparse.Namespace) -> int:
 
     truth = Truth().with_kinds(kind for kind in default_registry().values() if kind.bench or args.runs)
     truth = truth.with_values(dict(_assignment(text) for text in args.set))
-    try:
+    with refusing("DIR must be writable", "name another one", args.directory):
         synthesize(args.directory, args.seed, truth, args.name, args.runs)
-    except OSError as error:
-        raise InputError("DIR must be writable", str(error.strerror), "name another one", args.directory) from None
     say(
         f"wrote {args.directory} (SYNTHETIC, seed {args.seed}) and {args.directory.resolve().name}.truth.json beside it"
     )

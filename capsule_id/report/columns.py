@@ -15,7 +15,7 @@ import pandas as pd
 
 from capsule_id.inference.result import Posterior, Result
 from capsule_id.parameters import is_stated, symbol_of
-from capsule_id.views import Trust, counted
+from capsule_id.views import Level, Trust, after_number, counted
 
 # typography: How numbers, units and parameter names are set: one rule each, for every table and figure.
 
@@ -64,7 +64,7 @@ def prefix_for(unit: str, *magnitudes: float) -> tuple[float, str]:
     """
     sizes = [abs(size) for size in magnitudes if size != 0 and math.isfinite(size)]
     low, high = min(sizes, default=1.0), max(sizes, default=1.0)
-    if (_PREFIX_BELOW <= low and high < _PREFIX_ABOVE) or not _PREFIXABLE.match(unit):
+    if (low >= _PREFIX_BELOW and high < _PREFIX_ABOVE) or not _PREFIXABLE.match(unit):
         return 1.0, unit
     power = min(max(3 * math.floor(math.log10(high) / 3), min(_PREFIXES)), max(_PREFIXES))
     while low * 10.0**-power < _PREFIX_BELOW and power > min(_PREFIXES):
@@ -170,18 +170,13 @@ class Row:
         return self.number(column, None if least is None or own is None else max(least, min(own, least + 2)))
 
     @property
-    def after_number(self) -> str:
-        """The unit behind a number; nothing for a number without unit."""
-        return "" if self.unit == "1" else f" {self.unit}"
-
-    @property
     def concise(self) -> str:
         """Value and sd as ``1422.4(27) N/m``: the digits in parentheses count in the last place of the value."""
         sd, places = float(self.values["sd"]) * self.scale, self.decimals
         if self.skewed or places is None or decimals_for(sd) is None:
-            return (self.quoted if self.skewed else self.number("value")) + self.after_number
+            return (self.quoted if self.skewed else self.number("value")) + after_number(self.unit)
         digits = fixed(round(sd * 10.0 ** max(places, 0)), min(places, 0))
-        return f"{self.number('value')}({digits}){self.after_number}"
+        return f"{self.number('value')}({digits}){after_number(self.unit)}"
 
 
 def table_rows(frame: pd.DataFrame) -> list[Row]:
@@ -355,11 +350,16 @@ def wrapped(texts: Sequence[str], width: int | None = None) -> list[str]:
     return [line for text in texts for line in textwrap.wrap(text, max(width, 20), break_on_hyphens=False)]
 
 
-def verdict_text(trust: Trust, failed: Sequence[str], warned: int) -> str:
-    """The verdict in one line: titles of the ``failed`` checks, number of warnings. Console and report have these words."""
-    found = f"failed: {', '.join(failed)}" if failed else "no check failed"
+def verdict_text(trust: Trust, findings: Sequence[tuple[Level, str]]) -> str:
+    """The verdict in one line, from level and title of the findings: the failed checks, the number of warnings.
+
+    Console and report have these words.
+    """
+    failed = ", ".join(sorted({title for level, title in findings if level == "fail"}))
+    found = f"failed: {failed}" if failed else "no check failed"
     if trust == "not judged" and not failed:
         found += ", but not every number could be checked"
+    warned = [level for level, _ in findings].count("warn")
     return f"verdict: {trust}; {found}" + (f"; {counted(warned, 'warning')}" if warned else "")
 
 

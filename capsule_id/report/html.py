@@ -36,7 +36,7 @@ from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png
 from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, title_of
 from capsule_id.report.sentences import AUTHORS, PUBLISHED, TITLE, bibtex, latex_table, methods_paragraph, next_steps
-from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, counted
+from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, after_number, counted
 
 # gallery: All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``.
 
@@ -241,11 +241,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             checks=_checks(result.findings, titles),
             findings=[(finding, titles[finding.code], finding_text(finding, messages)) for finding in worst_first],
             words=_WORDS,
-            verdict=verdict_text(
-                result.trust,
-                sorted({titles[finding.code] for finding in result.findings if finding.level == "fail"}),
-                sum(finding.level == "warn" for finding in result.findings),
-            ),
+            verdict=verdict_text(result.trust, [(found.level, titles[found.code]) for found in result.findings]),
             starts=_starts(result),
             notes=[_note(note, messages) for note in result.notes],
             terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
@@ -312,7 +308,7 @@ def _environment() -> Environment:
         "symbol_parts": symbol_parts,
         "number": _number,
         "embed": lambda picture: "data:image/png;base64," + base64.b64encode(picture.png).decode("ascii"),
-        "counted": counted,
+        "after_number": after_number,
     }
     return environment
 

@@ -6,7 +6,7 @@ from typing import Literal
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.lint import TONE
 from capsule_id.experiments.kind import Registry
-from capsule_id.views import Facts, Finding, Level, Message, ResultTable, counted, filled_in, stated_p
+from capsule_id.views import Facts, Finding, Level, Message, ResultTable, after_number, counted, filled_in, stated_p
 
 # terms: The statistical terms of the report, each in one sentence.
 
@@ -110,7 +110,7 @@ def _conflict(facts: Facts) -> str:
 
 def _modes(facts: Facts) -> str:
     """The modes of a parameter with their weights, or how far its maximum lies from the sample."""
-    name, unit = facts["name"], "" if facts["unit"] == "1" else f" {facts['unit']}"
+    name, unit = facts["name"], after_number(facts["unit"])
     prior = f", or state what you know of the rig as a prior of {facts['key']} in [prior]" if facts["key"] else ""
     if "modes" in facts:
         seen = " and ".join(f"{value:.4g}{unit} with weight {weight:.2f}" for value, weight in facts["modes"])
@@ -466,11 +466,6 @@ def _drift(facts: Facts) -> str:
     return f"While the amplitude falls from {large:.2g} to {small:.2g} m, {' and '.join(parts)}."
 
 
-def _after_number(unit: str) -> str:
-    """A unit behind a number; nothing for a number without unit."""
-    return "" if unit == "1" else f" {unit}"
-
-
 def _outliers(facts: Facts) -> str:
     """The lines of the file, how far they stand off, and what they do to the estimates."""
     lines = [str(line) for line in facts["lines"]]
@@ -478,7 +473,7 @@ def _outliers(facts: Facts) -> str:
     where = f"lines {', '.join(lines[:-1])} and {lines[-1]} stand up to" if several else f"line {lines[0]} stands"
     more = f" At most {facts['most']} rows are named: look at the whole table." if len(lines) == facts["most"] else ""
     change = "; ".join(
-        f"{name} = {value:.5g}{_after_number(unit)} with {'them' if several else 'it'}, {without:.5g} without"
+        f"{name} = {value:.5g}{after_number(unit)} with {'them' if several else 'it'}, {without:.5g} without"
         for name, unit, value, without in facts["estimates"]
     )
     return (
@@ -489,7 +484,7 @@ def _outliers(facts: Facts) -> str:
 
 def _tables_disagree(facts: Facts) -> str:
     """The estimate of each table, and what to do."""
-    unit = _after_number(facts["unit"])
+    unit = after_number(facts["unit"])
     estimates = ", ".join(f"{value:.4g}{unit} by {label}" for label, value in facts["estimates"])
     return (
         f"expected tables that agree; found {facts['name']} = {estimates} ({stated_p(facts['p'])}). It depends on "

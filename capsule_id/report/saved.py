@@ -5,7 +5,7 @@ A tree of frozen dataclasses becomes JSON; its arrays are saved beside it. The d
 
 import json
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -28,7 +28,10 @@ _TREE = "tree"
 
 def save(result: Result, directory: Path) -> None:
     """Write ``SAVED`` into ``directory``, which has a folder ``figures``. The registry is not saved."""
-    light = replace(result, pointwise=None, prior={}, posterior=_without_draws(result))
+    posterior = result.posterior
+    if posterior is not None:
+        posterior = replace(posterior, draws=np.zeros(0), lp=np.zeros(0))
+    light = replace(result, pointwise=None, prior={}, posterior=posterior)
     arrays: dict[str, np.ndarray] = {}
     kept = {field.name: getattr(light, field.name) for field in fields(Result) if field.name != "registry"}
     text = json.dumps(_encode(kept, arrays)).encode("utf-8")
@@ -62,40 +65,44 @@ def load(directory: Path, registry: Registry) -> dict[str, Any]:
     return {**kept, "registry": registry}
 
 
-def _without_draws(result: Result) -> Any:
-    nothing = np.zeros(0)
-    return None if result.posterior is None else replace(result.posterior, draws=nothing, lp=nothing)
-
-
 def _encode(value: object, arrays: dict[str, np.ndarray]) -> Any:
     """``value`` for JSON. Dicts of one entry tag what JSON does not know; arrays go to ``arrays``."""
 
     def inner(item: object) -> Any:
         return _encode(item, arrays)
 
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        arrays[f"a{len(arrays)}"] = value
-        return {"array": f"a{len(arrays) - 1}"}
-    if isinstance(value, Path):
-        return {"path": value.as_posix()}
-    if isinstance(value, pd.DataFrame):
-        return {"frame": _parts_of_frame(value, inner)}
-    if isinstance(value, type):
-        return {"class": [value.__module__, value.__qualname__]}
-    if is_dataclass(value):
-        kind = type(value)
-        own = {field.name: inner(getattr(value, field.name)) for field in fields(value)}
-        return {"object": [kind.__module__, kind.__qualname__, own]}
-    if isinstance(value, Mapping):
-        return {"map": [[inner(key), inner(item)] for key, item in value.items()]}
-    if isinstance(value, list):
-        return [inner(item) for item in value]
-    if isinstance(value, Sequence | np.ndarray):
-        return {"tuple": [inner(item) for item in value]}
+    match value:
+        case np.generic():
+            return inner(value.item())
+        case None | bool() | int() | float() | str():
+            return value
+        case np.ndarray() if value.dtype != object:
+            name = f"a{len(arrays)}"
+            arrays[name] = value
+            return {"array": name}
+        case Path():
+            return {"path": value.as_posix()}
+        case pd.DataFrame():
+            index = None if isinstance(value.index, pd.RangeIndex) else inner(value.index.tolist())
+            columns = [[inner(name), str(column.dtype), inner(column.tolist())] for name, column in value.items()]
+            return {"frame": [index, inner(value.index.name), len(value), columns]}
+        case type():
+            return {"class": [value.__module__, value.__qualname__]}
+        case _ if is_dataclass(value):
+            kind = type(value)
+            return {
+                "object": [
+                    kind.__module__,
+                    kind.__qualname__,
+                    {field.name: inner(getattr(value, field.name)) for field in fields(value)},
+                ]
+            }
+        case Mapping():
+            return {"map": [[inner(key), inner(item)] for key, item in value.items()]}
+        case list():
+            return [inner(item) for item in value]
+        case Sequence() | np.ndarray():
+            return {"tuple": [inner(item) for item in value]}
     return str(value)  # a fact of another type: its text is all that a message needs
 
 
@@ -105,21 +112,30 @@ def _decode(node: Any, arrays: Mapping[str, np.ndarray], roots: set[str]) -> Any
     def inner(item: Any) -> Any:
         return _decode(item, arrays, roots)
 
-    if isinstance(node, list):
-        return [inner(item) for item in node]
-    if not isinstance(node, dict):
-        return node
-    ((tag, item),) = node.items()
-    readers: dict[str, Callable[[Any], Any]] = {
-        "class": lambda names: _class(names, roots),
-        "object": lambda names: _class(names[:2], roots)(**{key: inner(part) for key, part in names[2].items()}),
-        "array": lambda name: _read_only(arrays[name]),
-        "path": Path,
-        "frame": lambda parts: _frame(parts, inner),
-        "map": lambda pairs: {inner(key): inner(part) for key, part in pairs},
-        "tuple": lambda parts: tuple(inner(part) for part in parts),
-    }
-    return readers[tag](item)
+    match node:
+        case list():
+            return [inner(item) for item in node]
+        case {"array": name}:
+            values = arrays[name]
+            values.setflags(write=False)
+            return values
+        case {"path": path}:
+            return Path(path)
+        case {"frame": [index, name, rows, columns]}:
+            labels = pd.RangeIndex(rows) if index is None else pd.Index(inner(index))
+            read = {inner(key): pd.Series(inner(values), labels, dtype) for key, dtype, values in columns}
+            return pd.DataFrame(read, labels).rename_axis(inner(name))
+        case {"class": names}:
+            return _class(names, roots)
+        case {"object": [*names, own]}:
+            return _class(names, roots)(**{key: inner(part) for key, part in own.items()})
+        case {"map": pairs}:
+            return {inner(key): inner(part) for key, part in pairs}
+        case {"tuple": parts}:
+            return tuple(inner(part) for part in parts)
+        case dict():
+            raise ValueError(f"unknown tag {', '.join(node)}")
+    return node
 
 
 def _class(names: Sequence[str], roots: set[str]) -> Any:
@@ -131,22 +147,3 @@ def _class(names: Sequence[str], roots: set[str]) -> Any:
     if not is_dataclass(kind):
         raise ValueError(f"{module}.{name} is no dataclass")
     return kind
-
-
-def _read_only(values: np.ndarray) -> np.ndarray:
-    values.setflags(write=False)
-    return values
-
-
-def _parts_of_frame(frame: pd.DataFrame, inner: Callable[[object], Any]) -> dict[str, Any]:
-    index = None if isinstance(frame.index, pd.RangeIndex) else inner(frame.index.tolist())
-    columns = [[inner(name), str(column.dtype), inner(column.tolist())] for name, column in frame.items()]
-    return {"index": index, "name": inner(frame.index.name), "rows": len(frame), "columns": columns}
-
-
-def _frame(parts: Mapping[str, Any], inner: Callable[[Any], Any]) -> pd.DataFrame:
-    index = pd.RangeIndex(parts["rows"]) if parts["index"] is None else pd.Index(inner(parts["index"]))
-    columns = {
-        inner(name): pd.Series(inner(values), index=index, dtype=dtype) for name, dtype, values in parts["columns"]
-    }
-    return pd.DataFrame(columns, index=index).rename_axis(inner(parts["name"]))

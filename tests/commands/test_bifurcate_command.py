@@ -103,7 +103,9 @@ def _posterior(path: Path, draws: int = 6) -> dict[str, np.ndarray]:
     k2 = np.array([5e3, 3e4]) * (1.0 + 0.01 * rng.standard_normal((2, draws, 2)))
     variables = {name: (("chain", "draw"), x) for name, x in drawn.items()}
     spring = {"k2": (("chain", "draw", "spring"), k2), "K": (("chain", "draw"), np.ones((2, draws)))}
-    data = xr.Dataset(variables | spring, {"spring": ["soft", "stiff"]})
+    # The gaps of the runs of a fit: the diagram has the gap of the option. (Before: an internal failure, or run_2's gap.)
+    gaps = {"G": (("chain", "draw", "G_of"), np.full((2, draws, 2), 5e-3))}
+    data = xr.Dataset(variables | spring | gaps, {"spring": ["soft", "stiff"], "G_of": ["run_1", "run_2"]})
     xr.DataTree.from_dict({"posterior": data}).to_netcdf(path, engine="h5netcdf")
     return drawn | {"k2": k2}
 

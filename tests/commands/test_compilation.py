@@ -23,14 +23,14 @@ def test_users_xla_options_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
         ("--xla_cpu_use_fusion_emitters=true", f"--xla_cpu_use_fusion_emitters=true {loop}"),
     ):
         monkeypatch.setenv("XLA_FLAGS", before)
-        compilation.set_xla_options()
+        compilation.prepare_jax(cached=False)
         # jaxlib 0.11 and later have no emitter option: its place is empty then.
         assert compilation.os.environ["XLA_FLAGS"].split() == after.split()
     monkeypatch.setenv("XLA_FLAGS", "")
-    compilation.set_xla_options(loop=False)
+    compilation.prepare_jax(cached=False, loop=False)
     assert compilation.os.environ["XLA_FLAGS"] == emitter
     monkeypatch.setattr(compilation, "sys", SimpleNamespace(modules={"jax": None}))
-    compilation.set_xla_options()
+    compilation.prepare_jax(cached=False)
     assert compilation.os.environ["XLA_FLAGS"] == emitter
 
 
@@ -81,10 +81,10 @@ def variables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, str]
 
 def test_a_cache_that_cannot_be_written_is_left_out(variables: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "capsule-id").write_text("")
-    compilation.keep_programs()
+    compilation.prepare_jax(cached=True)
     assert compilation.DIRECTORY not in variables
     (tmp_path / "capsule-id").unlink()
-    compilation.keep_programs()  # negative control
+    compilation.prepare_jax(cached=True)  # negative control
     assert Path(variables[compilation.DIRECTORY]).parent == tmp_path / "capsule-id"
 
 
@@ -92,7 +92,7 @@ def test_the_users_own_cache_is_left_alone(variables: dict[str, str], tmp_path: 
     own = tmp_path / "own"
     own.mkdir()
     variables[compilation.DIRECTORY] = str(own)
-    compilation.keep_programs()
+    compilation.prepare_jax(cached=True)
     assert variables[compilation.DIRECTORY] == str(own)
     assert compilation.discard_damaged(f"{compilation.DAMAGED} for x: error").startswith(compilation.DAMAGED)
     assert own.exists()

@@ -12,7 +12,7 @@ import pytest
 
 from capsule_id.cli import fit_params
 from capsule_id.commands import rigs as many_rigs
-from capsule_id.commands.bifurcate import cluster
+from capsule_id.commands.bifurcate import client_of
 from tests.cli_tools import listing, small_rig
 
 TABLES = {"tilts": ("static_friction",), "spring": ("support_spring_soft",)}
@@ -150,7 +150,8 @@ def test_a_study_of_many_rigs_survives_the_death_of_a_worker(
     names = [f"rig{i}" for i in range(12)]
     for name in names:
         small_rig(here / name, name, TABLES["tilts"])
-    with cluster("processes") as client:
+    with client_of("processes") as client:
+        assert client is not None
         pids = list(client.run(os.getpid).values())
         assert len(pids) >= 2, "with one worker there is nobody to take over"
         write, written = many_rigs._write, list[str]()

@@ -43,12 +43,14 @@ def test_loud_line(result: Result, synthetic: bool) -> None:
 
 
 def test_the_verdict_is_one_line_with_the_word_and_the_failed_checks() -> None:
-    assert verdict_text("trusted", [], 0) == "verdict: trusted; no check failed"
-    assert verdict_text("trusted", [], 8) == "verdict: trusted; no check failed; 8 warnings"
-    failed = ["linearity", "outliers"]
-    assert verdict_text("not trusted", failed, 0) == "verdict: not trusted; failed: linearity, outliers"
-    assert verdict_text("not trusted", failed, 1) == "verdict: not trusted; failed: linearity, outliers; 1 warning"
-    assert verdict_text("not judged", [], 0).startswith("verdict: not judged; no check failed, but ")
+    assert verdict_text("trusted", [("ok", "outliers")]) == "verdict: trusted; no check failed"
+    warned = [("warn", "outliers")] * 8
+    assert verdict_text("trusted", warned) == "verdict: trusted; no check failed; 8 warnings"
+    failed = [("fail", "outliers"), ("fail", "linearity"), ("fail", "outliers")]
+    assert verdict_text("not trusted", failed) == "verdict: not trusted; failed: linearity, outliers"
+    said = verdict_text("not trusted", [*failed, *warned[:1]])
+    assert said == "verdict: not trusted; failed: linearity, outliers; 1 warning"
+    assert verdict_text("not judged", []).startswith("verdict: not judged; no check failed, but ")
 
 
 @pytest.mark.parametrize("width", [200, 110, 80, 60])

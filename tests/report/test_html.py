@@ -132,7 +132,7 @@ def test_the_first_screen_has_value_trust_and_next_step(result: Result, unclean:
     assert "Quote trusted numbers only." in first
     clean = Page(page.partition("<nav")[0] + "</body></html>").text
     warned = sum(finding.level == "warn" for finding in result.findings)
-    assert f"V{verdict_text('trusted', [], warned)[1:]}." in clean
+    assert f"V{verdict_text('trusted', [('warn', 'a')] * warned)[1:]}." in clean
     assert 'class="untrusted"' not in page
 
 
