@@ -23,7 +23,7 @@ from capsule_id.commands.rigs import Options, fit_many, fit_one
 # fit: ``fit-params DATA``: from one rig folder or several to parameters, posterior and report.
 
 
-DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 4000
+DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
