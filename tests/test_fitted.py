@@ -279,7 +279,11 @@ def test_arviz_needs_no_arguments(capsule: Fit, tmp_path: Path) -> None:
             )
             shapes = np.asarray(loo.pareto_k)
         (found,) = [finding for finding in capsule.findings if finding.code == "readings.decisive"]
-        assert abs(np.sum(shapes > found.facts["limit"]) - found.facts["far"]) <= 3  # ArviZ counts effective draws
+        named = found.facts["rows"]
+        each = [(label, int(row) + 1) for label, rows in pointwise.rows.items() for row in rows]
+        decisive = [one for one, shape in zip(each, shapes, strict=True) if shape > found.facts["limit"]]
+        assert decisive
+        assert all(f"{label} reading {row} (" in named for label, row in decisive), (decisive, named)
         data = capsule.to_arviz()
         plot = getattr(arviz, "plot_ppc", None) or arviz.plot_ppc_dist  # pyright: ignore
         plot(data)

@@ -16,7 +16,7 @@ from capsule_id.rig.model import Rig
 from capsule_id.rig.read import read_rig
 from capsule_id.views import counted
 
-DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 4000
+DEFAULT_MAX_STEPS, DEFAULT_ESS = 20_000, 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

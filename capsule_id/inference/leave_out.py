@@ -82,11 +82,18 @@ def _log_mean(logarithm: Float[np.ndarray, " m"]) -> float:
     return float(np.logaddexp.reduce(logarithm) - np.log(len(logarithm)))
 
 
-def smoothed_weights(log_weight: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " m"], float]:
-    """Normalised log-weights with a smoothed upper tail, and the Pareto shape of that tail; inf where it has no tail."""
+def smoothed_weights(
+    log_weight: Float[np.ndarray, " m"], relative: float = 1.0
+) -> tuple[Float[np.ndarray, " m"], float]:
+    """Normalised log-weights with a smoothed upper tail, and the Pareto shape of that tail; inf where it has no tail.
+
+    Parameters
+    ----------
+    relative : effective size of the sample over the number of its weights; the tail is shorter where it is larger
+    """
     x = log_weight - np.max(log_weight)
     order = np.argsort(x, kind="stable")
-    size = int(np.ceil(min(0.2 * len(x), 3.0 * np.sqrt(len(x)))))
+    size = int(np.ceil(min(0.2 * len(x), 3.0 * np.sqrt(len(x) / relative))))
     cutoff = max(x[order[-size - 1]], np.log(np.finfo(float).tiny))
     tail = order[x[order] > cutoff]
     shape = np.inf

@@ -179,8 +179,10 @@ def make_result(
     rng = np.random.default_rng(seed)
     predictive = {e.label: e.predictive_p([e.local(d) for d in checked.draws], rng) for e in target.experiments}
     summary, nuisances = parameter_tables(checked, registry)
-    pointwise = None if posterior is None else _pointwise(target, posterior, rng)
-    findings = (*checked.findings, *([] if pointwise is None else [decisive_readings(pointwise)]))
+    pointwise, findings = None, checked.findings
+    if posterior is not None:
+        pointwise = _pointwise(target, posterior, rng)
+        findings = (*findings, decisive_readings(pointwise, posterior.draws))
     views = (e.record_view(e.local(checked.values)) for e in target.experiments if panels)
     return kind(
         rig=target.rig,

@@ -31,7 +31,7 @@ from capsule_id.inference.moves import (
     pooled_time,
     split_rhat,
 )
-from capsule_id.inference.proposal import BlockProposal, block_proposal
+from capsule_id.inference.proposal import WEAK, BlockProposal, block_proposal
 from capsule_id.inference.refinement import (
     LARGEST_MAP,
     NO_MASS,
@@ -410,12 +410,13 @@ MIN_WALKERS, WALKERS_PER_PARAMETER = 32, 2
 #: over the walkers of all ensembles, 128 or more. Its standard error at this length is 10 % or less (Sokal 1997,
 #: eq. 3.19).
 LENGTH_IN_TAU = 20.0
-#: Convergence requires this bulk and tail effective sample size for every parameter, unless stated.
-DEFAULT_ESS = 4000.0
+#: Convergence requires this bulk and tail effective sample size for every parameter, unless stated: the standard error
+#: of an sd is then 2.2 % of it.
+DEFAULT_ESS = 1000.0
 #: Convergence requires a split R-hat of at most this for every parameter.
 MAX_RHAT = 1.01
 #: Stored draws of an ensemble before the first convergence check, and between later checks: so many, or this part of all.
-FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 60, 20, 5
+FIRST_CHECK, CHECK_EVERY, CHECK_SHARE = 40, 10, 5
 #: Work of all evaluations of the default budget, and of one measurement of the pilot, at most, in readings: some 20 s
 #: and 5 s on two cores.
 MOST_WORK, PILOT_WORK = 1e9, 2.5e8
@@ -445,6 +446,8 @@ FIRST = "block independence + differential evolution"
 DELAYED, DELAYED_STEPS = "delayed acceptance + differential evolution", 20
 #: Largest number of corrections of an emulator, and states of the pilot that each of them learns from.
 CORRECTIONS, STATES = 3, 3
+#: The Laplace approximation is not adapted at autocorrelation times below this, in steps.
+PLAIN_TAU = 4.0
 #: The pilot of an adapted proposal stops, and an emulator is not corrected, at autocorrelation times below this, in steps.
 GOOD_TAU = 10.0
 #: Delayed acceptance is not measured again, and other kinds of moves are not tried, below this, in steps.
@@ -610,8 +613,19 @@ class _Pilot(NamedTuple):
 
 
 def _proposed(target: Target, random: np.random.RandomState) -> _Pilot:
-    """Moves by an adapted proposal."""
-    proposal = adapted_proposal(target, random)
+    """Moves by the Laplace approximation, or by a proposal adapted from it where they are slow or a term may be absent.
+
+    A chain hardly shows whether it has missed the tail of such a term; rounds of weighted draws find it.
+    """
+    if np.max(np.diag(target.covariance)) < WEAK**2:
+        plain = _moved(target, laplace_proposal(target)[0], random)
+        if _longest_time(plain.ensemble) < PLAIN_TAU and np.max(np.std(plain.ensemble.chain, axis=(0, 1))) < WEAK:
+            return plain
+    return _moved(target, adapted_proposal(target, random), random)
+
+
+def _moved(target: Target, proposal: BlockProposal, random: np.random.RandomState) -> _Pilot:
+    """Moves by ``proposal``, and walkers that they have moved."""
     moves = block_move(proposal)
     walkers = Ensemble(target.parts, _initial(target, proposal, random), moves)
     return _Pilot(proposal, FIRST, moves, walkers.run(PILOT_STEPS))

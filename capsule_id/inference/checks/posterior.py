@@ -19,6 +19,7 @@ from capsule_id.inference.checks.settings import DIFFERENCE, SMALLEST_SCATTER, S
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.least_squares import linearised
 from capsule_id.inference.leave_out import LARGEST_SHAPE, smoothed_weights
+from capsule_id.inference.moves import geyer_size
 from capsule_id.inference.result import PointFit, Pointwise, Posterior
 from capsule_id.inference.target import HeldResiduals, LogPosterior, prior_of
 from capsule_id.parameters import Parameter, is_stated
@@ -523,14 +524,19 @@ def check_statistics(s: SampledFit, known: Collection[str] = ()) -> list[Finding
     return findings or [Finding("residuals.statistics", "ok", {"number": judged})] * bool(judged)
 
 
-def decisive_readings(pointwise: Pointwise) -> Finding:
-    """Name the readings without which the sample cannot predict them, because they decide a parameter."""
-    named, number = [], 0
+def decisive_readings(pointwise: Pointwise, draws: np.ndarray) -> Finding:
+    """Name the readings without which the sample cannot predict them, because they decide a parameter.
+
+    The shape of a term is the larger one of two tails, whose lengths are those for independent weights, and for weights
+    of a sample ``draws`` (ensemble, draw, walker, d) with its effective size, as ArviZ has it.
+    """
+    size, named, number = float(np.mean(geyer_size(draws))), list[tuple[float, str, int]](), 0
     for label, density in pointwise.log_likelihood.items():
         terms = density.reshape(-1, density.shape[-1]).T
-        shapes = [smoothed_weights(-own)[1] for own in terms]
-        number += len(shapes)
-        named += [(shape, label, int(row) + 1) for shape, row in zip(shapes, pointwise.rows[label], strict=True)]
-    far = sorted((one for one in named if one[0] > LARGEST_SHAPE), reverse=True)
-    rows = ", ".join(f"{label} reading {row} ({shape:.2f})" for shape, label, row in far)
-    return Finding("readings.decisive", "ok", {"number": number, "far": len(far), "rows": rows, "limit": LARGEST_SHAPE})
+        number += len(terms)
+        for own, row in zip(terms, pointwise.rows[label], strict=True):
+            shape = max(smoothed_weights(-own, relative)[1] for relative in (1.0, size / len(own)))
+            named += [(shape, label, int(row) + 1)] if shape > LARGEST_SHAPE else []
+    rows = ", ".join(f"{label} reading {row} ({shape:.2f})" for shape, label, row in sorted(named, reverse=True))
+    facts = {"number": number, "far": len(named), "rows": rows, "limit": LARGEST_SHAPE}
+    return Finding("readings.decisive", "ok", facts)

@@ -17,13 +17,16 @@ from tests.inference.stub import Gaussian
 
 #: Largest |z| of the 16 numbers tested at once: false alarm in 1 of 1000.
 LIMIT = 4.0
+#: Effective size of most samples here.
+SIZE = 4000.0
 SD = np.array([1e-3, 0.05, 1.0, 20.0])
 CORRELATION = np.array([[1.0, 0.95, 0.0, 0.3], [0.95, 1.0, 0.0, 0.3], [0.0, 0.0, 1.0, -0.5], [0.3, 0.3, -0.5, 1.0]])
 KNOWN = Gaussian(np.array([5.0, -1.0, 0.0, 100.0]), CORRELATION * np.outer(SD, SD))
 
 
 def draw(seed: int, budget: int = 20_000, store: Path | None = None, target: Gaussian = KNOWN) -> Posterior:
-    return sample(target, seed, budget, store)
+    """More draws than by default: the z-tests see smaller faults then."""
+    return sample(target, seed, budget, store, ess=SIZE)
 
 
 def scores(draws: np.ndarray, known: Gaussian) -> np.ndarray:
@@ -52,7 +55,7 @@ def test_known_gaussian(posterior: Posterior) -> None:
     assert np.max(np.abs(scores(posterior.draws, KNOWN))) < LIMIT
     assert np.all(posterior.rhat <= MAX_RHAT)
     assert np.all(posterior.draws.shape[1] > LENGTH_IN_TAU * posterior.tau)
-    assert np.min([posterior.ess_bulk, posterior.ess_tail]) >= DEFAULT_ESS
+    assert np.min([posterior.ess_bulk, posterior.ess_tail]) >= SIZE
 
 
 def test_blocks_are_accepted_one_by_one() -> None:
@@ -126,6 +129,26 @@ def test_log_density_belongs_to_the_draws(posterior: Posterior) -> None:
     np.testing.assert_allclose(posterior.lp.ravel(), KNOWN.parts(flat)[:, 0], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(("sd", "off", "few"), [(0.1, 0.0, True), (1.0, 0.0, False), (0.1, 2.0, False)])
+def test_the_laplace_approximation_is_adapted_only_where_it_has_to_be(
+    monkeypatch: pytest.MonkeyPatch, sd: float, off: float, few: bool
+) -> None:
+    """It is where a term may be absent, and where it is far off; elsewhere a sample takes half the evaluations."""
+    target = Gaussian(np.zeros(4), sd**2 * (0.5 + 0.5 * np.eye(4)))
+    target.centre, target.covariance = off * np.full(4, sd), target.sigma
+    parts, numbers = target.parts, list[int]()
+    monkeypatch.setattr(target, "parts", lambda v: numbers.append(len(v)) or parts(v))
+    pilot(target, 1)
+    assert (sum(numbers) < 2100) == few
+    numbers.clear()
+    found = sample(target, 1)
+    assert found.converged
+    assert np.min([found.ess_bulk, found.ess_tail]) >= DEFAULT_ESS
+    assert np.max(np.abs(scores(found.draws, target))) < LIMIT
+    if few:
+        assert sum(numbers) < 12_000
+
+
 class WithScatter(Gaussian):
     """A further parameter that the sampler integrates out: normal about the first one, with sd ``OWN``."""
 
@@ -146,7 +169,7 @@ class WithScatter(Gaussian):
 def test_a_walker_that_stays_keeps_its_scatters() -> None:
     """The joint draws have the joint distribution."""
     target = WithScatter(KNOWN.mean, KNOWN.sigma)
-    posterior = sample(target, 3)
+    posterior = draw(3, target=target)
     draws = posterior.draws
     z = (draws[..., -1] - draws[..., 0]) / target.OWN
     flat = draws[..., :-1].reshape(-1, target.dimension)
