@@ -105,7 +105,7 @@ class Problem(NamedTuple):
     """What a run is made of besides its inputs; every array is (L,) or ()."""
 
     field: Callable[..., Field]  # of a time (L,), s, or of nothing: the field on the drive's piece that holds there
-    piece_end: Callable[[jax.Array], jax.Array] | None  # (L,) s -> (L,) s: the next time at which a step must end
+    piece_end: Callable[[jax.Array], Any]  # (L,) s -> (L,) s: the next time at which a step must end
     gaps: tuple[jax.Array, jax.Array]  # m: a closing is r - gap, or -r - back gap, turning from negative
     first: jax.Array  # s: length of the first step tried
     longest: jax.Array  # s: no step is longer (infinity: no bound)
@@ -160,7 +160,7 @@ def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int
     t, y = lanes.t, lanes.y
     active = (t < end) & (lanes.status == Status.OK)
     h = jnp.minimum(lanes.h, problem.longest)
-    target = end if problem.piece_end is None else jnp.minimum(end, problem.piece_end(t))
+    target = jnp.minimum(end, problem.piece_end(t))
     # A rest shorter than a hundredth of a step is taken along, so that no sliver of a step is left at the end.
     last = h * 1.01 >= target - t
     h = jnp.where(active, jnp.where(last, target - t, h), 1.0)
