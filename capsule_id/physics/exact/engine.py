@@ -361,7 +361,7 @@ def kernel(max_steps: int) -> Kernel:
         length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
         padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
         # The samples of several lanes are scattered; a law, drive or force of the user may hold any operation.
-        single = L == 1 and all(map(_is_own, (e, law, *p.forces)))
+        single = L == 1 and all(map(_is_own, (e, law, *(p.forces or ()))))
         given = p, e, law, initial, padded, t_end, bound
         t = _run_single(*given)[0] if single else _run(*given)
         return t if n == length else _without_padding(t, n)
