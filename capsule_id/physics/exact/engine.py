@@ -2,17 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.lax import stop_gradient
 
-from capsule_id.physics.batches import is_traced
+from capsule_id.physics.batches import folded, is_traced
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact.dense import WIDTH, Samples, read_off, row_of, samples_at
@@ -300,42 +299,13 @@ def run(
     return Trajectory(times, X1, Y1, X2, Y2, *counts)
 
 
-def _run_folded(*lanes: Any) -> Trajectory:
-    """``run``, whose lanes take in the axis of a ``jax.vmap``; every argument as there."""
-    leaves, structure = jax.tree.flatten(lanes)
-    return _folding(structure)(*leaves)
-
-
-@cache
-def _folding(structure: Any) -> Callable[..., Trajectory]:
-    """``run`` of leaves: a tree that holds None cannot be batched and differentiated at once."""
-
-    @custom_vmap
-    def run_leaves(*leaves: jax.Array) -> Trajectory:
-        return run(*jax.tree.unflatten(structure, leaves))
-
-    @run_leaves.def_vmap
-    def _fold(size: int, batched: list[bool], *leaves: jax.Array) -> tuple[Trajectory, Trajectory]:
-        """Fold a new axis into the lanes: a loop inside a loop over lanes would copy its buffers at every step."""
-        if not any(batched):
-            out = run(*jax.tree.unflatten(structure, leaves))
-            return out, jax.tree.map(lambda _: False, out)
-        full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)]
-        L = full[0].shape[1]
-        lanes = [x.reshape(size * L, *x.shape[2:]) for x in full]
-        out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), run_leaves(*lanes))
-        return out, jax.tree.map(lambda _: True, out)
-
-    return run_leaves
-
-
 def _is_own(part: Drive | FrictionLaw | Force) -> bool:
     """Whether a drive, law or force, and every law inside it, is one of this package."""
     own = type(part).__module__.startswith("capsule_id.")
     return own and (not isinstance(part, Scaled) or _is_own(part.law))
 
 
-_run = jax.jit(_run_folded)
+_run = jax.jit(folded(run))
 _run_single = as_one_function(run)
 
 
