@@ -139,7 +139,7 @@ def _work(drive: Drive, state: CapsuleState, step: StepSeries, t: jax.Array) -> 
         Y2 = horner(step.v, s)
         driven = horner(step.w, s) + Y2
         driven = driven if drive.reaction is None else driven - drive.reaction * Y2
-        return drive.value(drive.advanced(state.drive, state.t + since, since)) * driven
+        return drive.series(state.drive, state.t + since, 1.0, 1)[0] * driven
 
     return dt * jnp.sum(_WEIGHT[:, None] * jax.vmap(power)(jnp.asarray(_NODE)), axis=0)
 

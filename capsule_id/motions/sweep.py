@@ -375,7 +375,8 @@ def provenance(
     """Attributes: every parameter that is not swept, and how the motions were settled."""
     swept = {swept_leaf(name, e) for name in over}
     given = {**vars(p), **vars(e)}
-    held = {name: float(np.asarray(x)) for name, x in given.items() if name not in swept and x is not None}
+    held = {name: x for name, x in given.items() if name not in swept and x is not None}
+    held = {name: str(x) if name == "forces" else float(np.asarray(x)) for name, x in held.items()}
     return {**held, **asdict(settling), "method": method, "model": "exact", "semantics": "stick-slip"}
 
 

@@ -17,6 +17,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
 from numpy.typing import ArrayLike
 
 from capsule_id.errors import InputError
@@ -134,6 +135,37 @@ def run_lanes(
 
     results = [run(chunks[0])] if len(chunks) == 1 else list(pool().map(run, chunks))
     return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate([np.asarray(x) for x in parts])[:size]), *results)
+
+
+def folded(run: Callable[..., Result]) -> Callable[..., Result]:
+    """``run``, all of whose leaves have lanes (L, ...), in such a way that the axis of a ``jax.vmap`` joins the lanes.
+
+    A loop inside a loop over lanes would copy its buffers at every step.
+    """
+
+    def call(*args: Any) -> Result:
+        # A tree that holds None cannot be batched and differentiated at once.
+        leaves, structure = jax.tree.flatten(args)
+
+        @custom_vmap
+        def on_leaves(*leaves: jax.Array) -> Any:
+            return run(*jax.tree.unflatten(structure, leaves))
+
+        @on_leaves.def_vmap
+        def _(size: int, batched: list[bool], *leaves: jax.Array) -> tuple[Any, Any]:
+            if not any(batched):
+                out = on_leaves(*leaves)
+                return out, jax.tree.map(lambda _: False, out)
+            full = [
+                x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)
+            ]
+            out = on_leaves(*(x.reshape(-1, *x.shape[2:]) for x in full))
+            out = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), out)
+            return out, jax.tree.map(lambda _: True, out)
+
+        return on_leaves(*leaves)
+
+    return call
 
 
 @lru_cache(maxsize=1)

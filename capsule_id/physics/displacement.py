@@ -5,17 +5,14 @@ displacement each. After every block the lanes that go on are sorted by their st
 that few lanes wait for slower ones.
 """
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
 from jax.lax import stop_gradient
 
-from capsule_id.physics.batches import CHUNK
+from capsule_id.physics.batches import CHUNK, folded
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Status, simulate, without_absent
@@ -71,36 +68,14 @@ def displacement(
     """
     p, e = without_absent(p, e)
     lanes = jnp.shape(period)[0]
-    tree = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (lanes,)), (p, e, law, r0))
-    leaves, structure = jax.tree.flatten((*tree, jnp.asarray(period, float), jnp.asarray(count, float)))
-    return _folding(structure)(*leaves)
+    given = (p, e, law, r0, period, count)
+    return _run(*jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (lanes,)), given))
 
 
-@cache
-def _folding(structure: Any) -> Callable[..., Displacement]:
-    """The run of leaves (L,); the axis of a ``jax.vmap`` joins the lanes."""
-
-    @custom_vmap
-    def run(*leaves: Any) -> Displacement:
-        return _in_chunks(structure, leaves)
-
-    @run.def_vmap
-    def _fold(size: int, batched: list[bool], *leaves: Any) -> tuple[Displacement, Displacement]:
-        if not any(batched):
-            return _in_chunks(structure, leaves), Displacement(False, False)
-        full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)]
-        out = run(*(x.reshape(-1) for x in full))
-        return Displacement(*(x.reshape(size, -1) for x in out)), Displacement(True, True)
-
-    return jax.jit(run)
-
-
-def _in_chunks(structure: Any, leaves: tuple[Any, ...]) -> Displacement:
-    """Run lanes (L,), ``CHUNK`` at a time, until none goes on."""
-    lanes = leaves[0].shape[0]
-    *system, r0, period, count = jax.tree.unflatten(
-        structure, [jnp.pad(x, (0, -lanes % CHUNK), "edge") for x in leaves]
-    )
+def _in_chunks(*given: Any) -> Displacement:
+    """Run lanes (L,), ``CHUNK`` at a time, until none goes on; arguments as those of ``displacement``."""
+    lanes = given[-1].shape[0]
+    *system, r0, period, count = jax.tree.map(lambda x: jnp.pad(x, (0, -lanes % CHUNK), "edge"), given)
     zero = jnp.zeros_like(period)
     active = (count > 0.0) & (jnp.arange(len(zero)) < lanes)
     state = _Lane(zero, (r0 + zero, zero, zero, zero), active, jnp.zeros(zero.shape, jnp.int32), stop_gradient(period))
@@ -139,3 +114,6 @@ def _block(lane: _Lane, p: CapsuleParameters, e: Drive, law: FrictionLaw, period
     status = jnp.where(lane.active, jnp.maximum(lane.status, t.status), lane.status)
     active = lane.active & (status <= Status.GRAZING) & ~repeats & (done < count)
     return _Lane(done, state, active, status, t.steps / jnp.maximum(ahead, 1.0))
+
+
+_run = jax.jit(folded(_in_chunks))

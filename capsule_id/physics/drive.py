@@ -6,7 +6,7 @@ drives: ``capsule_id.physics.drives``.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +19,22 @@ from capsule_id.precision import require_float64
 require_float64()
 
 
+Piece = tuple[jax.Array, ...]
+
+
 class Drive(Protocol):
     """A force on the rod as a function of time, analytic in time on each of its pieces.
 
-    prescribed : the drive states the motion of the rod, not the force on it: ``force_at``, ``value`` and ``series`` then
-        are the acceleration of the rod, m/s^2
+    parameters : the rows of the leaves, each with the sign that it admits
+    prescribed : the drive states the motion of the rod, not the force on it: ``force_at`` and ``series`` then are the
+        acceleration of the rod, m/s^2
     reaction : share of the force that pushes the capsule back, 1; None: 0
+
+    What stands here is a drive of one piece, whose class adds ``force_at`` and ``series``.
     """
 
     parameters: ClassVar[tuple[Parameter, ...]]
-    prescribed: ClassVar[bool]
+    prescribed: ClassVar[bool] = False
 
     @property
     def reaction(self) -> Any: ...
@@ -40,37 +46,32 @@ class Drive(Protocol):
         """
         ...
 
-    def frequency(self) -> jax.Array:
-        """(L,) rad/s, how fast the force changes; 0 where only pieces are known."""
+    def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
+        """Coefficients 0 .. order - 1 of the force in N about t (L,) on a piece, in the scaled time s = (t' - t)/h."""
         ...
+
+    def frequency(self) -> Any:
+        """(L,) or () rad/s, how fast the force changes; 0 where only pieces are known."""
+        return jnp.zeros(())
 
     def covers(self, begin: Any, end: Any) -> Any:
         """(L,) bool: whether the drive is well-formed and defined from begin to end (L,), s; NumPy and JAX."""
-        ...
+        return begin <= end
 
-    def rate(self, state: tuple[jax.Array, ...]) -> jax.Array:
-        """(L,) 1/s, how fast the force changes from this state on: it bounds the first guess of a step."""
-        ...
+    def rate(self, piece: Piece, t: jax.Array) -> Any:
+        """(L,) or () 1/s, how fast the force changes from t (L,) on: it bounds the first guess of a step."""
+        del piece, t
+        return 0.0
 
-    def state(self, t: jax.Array) -> tuple[jax.Array, ...]:
-        """What the exact engine carries along at the time t (L,); every entry (L,)."""
-        ...
+    def piece(self, t: jax.Array) -> Piece:
+        """What holds on the piece at the time t (L,); every entry (L,). The last one is the time at which it ends, s,
+        differentiable, infinite for the last piece. Empty: there is one piece alone."""
+        del t
+        return ()
 
-    def advanced(self, state: tuple[jax.Array, ...], t: jax.Array, dt: jax.Array) -> tuple[jax.Array, ...]:
-        """The state at t (L,), after a step of dt (L,) s on one piece."""
-        ...
-
-    def value(self, state: tuple[jax.Array, ...]) -> jax.Array:
-        """(L,) force in N in this state."""
-        ...
-
-    def shifted(self, state: tuple[jax.Array, ...], dt: jax.Array) -> tuple[jax.Array, ...]:
-        """First-order change of the state over dt (L,), s: it carries the tangent of an event's time."""
-        ...
-
-    def series(self, state: tuple[jax.Array, ...], h: jax.Array, order: int) -> Series:
-        """Coefficients 0 .. order - 1 of the force in N, in the scaled time s = (t - t0)/h."""
-        ...
+    def following(self, piece: Piece) -> Piece:
+        """The next piece."""
+        return piece
 
 
 class PeriodicDrive(Drive, Protocol):
@@ -87,22 +88,9 @@ class PeriodicDrive(Drive, Protocol):
         ...
 
 
-@runtime_checkable
-class SwitchingDrive(Drive, Protocol):
-    """What a drive of several pieces adds: steps end where pieces meet."""
-
-    def next_switch(self, state: tuple[jax.Array, ...]) -> jax.Array:
-        """(L,) s, the time at which the piece of this state ends, infinite for the last one; differentiable."""
-        ...
-
-    def switched(self, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        """The state at the start of the next piece, from that at the end of this one."""
-        ...
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Excitation:
+class Excitation(Drive):
     """The drive P_d cos(Omega t + phase) on the rod: P_d in N, Omega in rad/s, phase in rad; leaves () or (batch,).
 
     reaction : share of the force that pushes the capsule back, 1: 0 for a force from outside, 1 for an actuator
@@ -115,7 +103,6 @@ class Excitation:
     reaction: NumberOrBatch | None = 0.0
 
     parameters: ClassVar[tuple[Parameter, ...]] = tuple(TABLE[name] for name in DRIVES["harmonic"])
-    prescribed: ClassVar[bool] = False
 
     @property
     def period(self) -> Any:
@@ -127,57 +114,31 @@ class Excitation:
         """|P_d|, N."""
         return abs(self.P_d)
 
-    def cosine(self, t: Any) -> Any:
-        """cos(Omega t + phase) at the times t, s."""
-        angle = self.Omega * t + self.phase
-        return array_module(angle).cos(angle)
-
     def force_at(self, t: Any, piece: Any = None) -> Any:
         """P_d cos(Omega t + phase), N."""
         del piece
-        return self.P_d * self.cosine(t)
+        angle = self.Omega * t + self.phase
+        return self.P_d * array_module(angle).cos(angle)
 
-    def frequency(self) -> jax.Array:
+    def frequency(self) -> Any:
         """|Omega|."""
         return jnp.abs(self.Omega)
 
-    def covers(self, begin: Any, end: Any) -> Any:
-        """True: a tone has no beginning."""
-        return begin <= end
-
-    def rate(self, state: tuple[jax.Array, ...]) -> jax.Array:
+    def rate(self, piece: Piece, t: jax.Array) -> Any:
         """|Omega|."""
-        del state
+        del piece, t
         return jnp.abs(self.Omega)
 
-    def state(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Cosine and sine of the drive's angle."""
-        return cos_sin(self.Omega * t + self.phase)
-
-    def advanced(self, state: tuple[jax.Array, ...], t: jax.Array, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Cosine and sine at t."""
-        del state, dt
-        return self.state(t)
-
-    def value(self, state: tuple[jax.Array, ...]) -> jax.Array:
-        """P_d cos(Omega t + phase), N."""
-        return jnp.asarray(self.P_d * state[0])
-
-    def shifted(self, state: tuple[jax.Array, ...], dt: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The change of cosine and sine over dt, to first order."""
-        cosine, sine = jax.lax.stop_gradient(state)
-        angle = jax.lax.stop_gradient(self.Omega) * dt
-        return state[0] - sine * angle, state[1] + cosine * angle
-
-    def series(self, state: tuple[jax.Array, ...], h: jax.Array, order: int) -> Series:
+    def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
         """The coefficients follow from D'' = -Omega^2 D."""
-        _, sine = state
+        del piece
+        cosine, sine = cos_sin(self.Omega * t + self.phase)
         angle = jnp.asarray(self.Omega * h)
         turn = -(angle**2)
-        D: Series = [self.value(state), jnp.asarray(-self.P_d * angle * sine)]
+        D: Series = [jnp.asarray(self.P_d * cosine), jnp.asarray(-self.P_d * angle * sine)]
         for k in range(2, order):
             D.append(D[k - 2] * turn * (1.0 / (k * (k - 1))))
-        return D
+        return D[:order]
 
 
 # pi/2 in two parts, the first with 33 bits so that its multiples are exact; sine and cosine on |x| <= pi/4 (fdlibm).

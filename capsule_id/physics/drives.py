@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from capsule_id.errors import InputError
 from capsule_id.parameters import DRIVES, TABLE, Parameter
 from capsule_id.physics.batches import NumberOrBatch, Record, array_module
+from capsule_id.physics.drive import Drive, Piece
 from capsule_id.physics.friction import DEGREE, Series
 
 # pulses: Pulses of a coil: P_on and P_off in turn, through a first-order lag (the coil's L/R).
@@ -21,12 +22,10 @@ SHORTEST_LAG = 1e-12
 # A transient below this part of |P_on| + |P_off| has ended.
 ENDED = 1e-18
 
-PulseState = tuple[jax.Array, ...]
-
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Pulses:
+class Pulses(Drive):
     """The drive lag D' = u - D on the rod, u = P_on while frac(t/period + phase/(2 pi)) < duty, else P_off.
 
     P_on, P_off : N        period, lag : s        duty : 1        phase : rad; leaves () or (batch,)
@@ -38,7 +37,7 @@ class Pulses:
     At lag = 0 the derivative in lag is one-sided: that of a delay of the switching times by lag. It leaves out the
     transient of the start, and how a capsule breaks away during a transient.
 
-    The engine carries the number of the half-period, even while on, and the transient D - u.
+    A piece is the number of the half-period, even while on, and where there is a lag the transient D - u at a time.
     """
 
     P_on: NumberOrBatch
@@ -50,7 +49,6 @@ class Pulses:
     reaction: NumberOrBatch | None = 0.0
 
     parameters: ClassVar[tuple[Parameter, ...]] = tuple(TABLE[name] for name in DRIVES["pulses"])
-    prescribed: ClassVar[bool] = False
 
     @property
     def amplitude(self) -> Any:
@@ -95,19 +93,15 @@ class Pulses:
     def _safe_lag(self, xp: Any) -> Any:
         return xp.where(self._lagging(), self._time_constant(), self.period)
 
-    def frequency(self) -> jax.Array:
-        """0: the pieces bound the steps."""
-        return jnp.zeros_like(jnp.asarray(self.period))
-
     def covers(self, begin: Any, end: Any) -> Any:
         """Whether the run begins at t = 0 or later."""
         return (begin >= 0.0) & (begin <= end)
 
-    def rate(self, state: PulseState) -> jax.Array:
+    def rate(self, piece: Piece, t: jax.Array) -> Any:
         """1/lag while the transient lasts; the smaller it is, the less its high orders matter."""
         if self.lag is None:
-            return jnp.zeros_like(state[0])
-        share = jnp.abs(state[1]) / self._size()
+            return 0.0
+        share = jnp.abs(self._transient(piece, t)) / self._size()
         lasts = self._lagging() & (share > 0.0)
         # XLA vectorises exponential and logarithm, but no power.
         root = jnp.exp(jnp.log(jnp.where(lasts, share, 1.0)) * (1.0 / DEGREE))
@@ -117,8 +111,8 @@ class Pulses:
         size = jnp.abs(self.P_on) + jnp.abs(self.P_off)
         return jnp.where(size > 0.0, size, 1.0)
 
-    def state(self, t: jax.Array) -> PulseState:
-        """The number of the half-period, and the transient where there is a lag."""
+    def piece(self, t: jax.Array) -> Piece:
+        """The number of the half-period; with a lag a time and the transient then; the end."""
         x = t / self.period + self._turn()
         cycle = jnp.floor(x)
         half = 2.0 * cycle + jnp.where(x - cycle < self.duty, 0.0, 1.0)
@@ -126,9 +120,22 @@ class Pulses:
         for _ in range(2):
             half = jnp.where(self._end(half) <= t, half + 1.0, half)
         if self.lag is None:
-            return (half,)
+            return half, self._end(half)
         transient = self.force_at(t, self._middle(half)) - self._level(half)
-        return half, jnp.where(self._lagging(), transient, 0.0)
+        return half, t, jnp.where(self._lagging(), transient, 0.0), self._end(half)
+
+    def following(self, piece: Piece) -> Piece:
+        """The next half-period; D is continuous where there is a lag."""
+        half = piece[0] + 1.0
+        if self.lag is None:
+            return half, self._end(half)
+        transient = self._transient(piece, piece[-1]) + self._level(piece[0]) - self._level(half)
+        return half, piece[-1], jnp.where(self._lagging(), transient, 0.0), self._end(half)
+
+    def _transient(self, piece: Piece, t: jax.Array) -> jax.Array:
+        """D - u at t, N: it decays."""
+        transient = piece[2] * jnp.exp((piece[1] - t) / self._safe_lag(jnp))
+        return jnp.where(jnp.abs(transient) > ENDED * self._size(), transient, 0.0)
 
     def _middle(self, half: jax.Array) -> jax.Array:
         """The middle of a piece, s."""
@@ -149,60 +156,27 @@ class Pulses:
             end = end + jnp.where(self._lagging(), 0.0, self.lag)
         return jnp.where((self.duty > 0.0) & (self.duty < 1.0), end, jnp.inf)
 
-    def advanced(self, state: PulseState, t: jax.Array, dt: jax.Array) -> PulseState:
-        """The transient decays."""
-        del t
-        if self.lag is None:
-            return state
-        transient = state[1] * jnp.exp(-dt / self._safe_lag(jnp))
-        return state[0], jnp.where(jnp.abs(transient) > ENDED * self._size(), transient, 0.0)
-
-    def value(self, state: PulseState) -> jax.Array:
-        """D, N."""
-        u = self._level(state[0])
-        return u if self.lag is None else u + state[1]
-
-    def shifted(self, state: PulseState, dt: jax.Array) -> PulseState:
-        """The change of the transient over dt, to first order."""
-        if self.lag is None:
-            return state
-        return state[0], state[1] - jax.lax.stop_gradient(state[1] / self._safe_lag(jnp)) * dt
-
-    def series(self, state: PulseState, h: jax.Array, order: int) -> Series:
+    def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
         """Constant, and the transient's exponential."""
-        D = [self.value(state)]
+        level = self._level(piece[0])
         if self.lag is None:
-            return D + [jnp.zeros_like(D[0])] * (order - 1)
-        term, ratio = state[1], -h / self._safe_lag(jnp)
+            return [level] + [jnp.zeros_like(level)] * (order - 1)
+        terms, ratio = [self._transient(piece, t)], -h / self._safe_lag(jnp)
         for k in range(1, order):
-            term = term * ratio * (1.0 / k)
-            D.append(term)
-        return D
-
-    def next_switch(self, state: PulseState) -> jax.Array:
-        """The end of this half-period."""
-        return self._end(state[0])
-
-    def switched(self, state: PulseState) -> PulseState:
-        """The next half-period; D is continuous where there is a lag."""
-        half = state[0] + 1.0
-        if self.lag is None:
-            return (half,)
-        jump = self._level(half) - self._level(state[0])
-        return half, jnp.where(self._lagging(), state[1] - jump, 0.0)
+            terms.append(terms[-1] * ratio * (1.0 / k))
+        return [level + terms[0], *terms[1:]]
 
 
 # recorded: Drives that are given by a record: a force, or the motion of the rod itself.
 
 
-State = tuple[jax.Array, ...]
 Samples = np.ndarray | jax.Array  # (n,) or (batch, n)
 
 
-class _Lines(Record):
+class _Lines(Record, Drive):
     """A drive whose value is a straight line between known times, with or without jumps there.
 
-    The engine carries the number of the piece, the value, its slope, and the end of the piece.
+    A piece is its number, its begin, the value there, its slope, and its end.
     """
 
     times: Samples
@@ -211,7 +185,7 @@ class _Lines(Record):
         """Begin of a piece, the value there, and its slope."""
         raise NotImplementedError
 
-    def _piece(self, t: Any) -> Any:
+    def _index(self, t: Any) -> Any:
         """Index of the last time at or before t (...), at most that of the last piece; times (..., n)."""
         xp = array_module(self.times, t)
         t = xp.asarray(t)
@@ -220,12 +194,8 @@ class _Lines(Record):
 
     def force_at(self, t: Any, piece: Any = None) -> Any:
         """The value on the line that holds at the time ``piece``, N, or m/s^2 where the motion is prescribed."""
-        begin, value, slope = self._line(self._piece(t if piece is None else piece))
+        begin, value, slope = self._line(self._index(t if piece is None else piece))
         return value + slope * (t - begin)
-
-    def frequency(self) -> jax.Array:
-        """0: the pieces bound the steps."""
-        return jnp.zeros(self.times.shape[:-1])
 
     def covers(self, begin: Any, end: Any) -> Any:
         """Whether the samples are finite, times increase, and the run stays within them."""
@@ -235,47 +205,23 @@ class _Lines(Record):
             fine = fine & xp.isfinite(getattr(self, name)).all(axis=-1)
         return fine & (begin <= end) & (times[..., 0] <= begin) & (end <= times[..., -1])
 
-    def rate(self, state: State) -> jax.Array:
-        """0: a straight line needs no short step."""
-        return jnp.zeros_like(state[0])
+    def piece(self, t: jax.Array) -> Piece:
+        """The line at t."""
+        return self._at(self._index(jax.lax.stop_gradient(t)))
 
-    def state(self, t: jax.Array) -> State:
-        """Number of the piece, value, slope and end of the piece."""
-        index = self._piece(jax.lax.stop_gradient(t))
-        begin, value, slope = self._line(index)
-        return self._state(index, value + slope * (t - begin), slope)
+    def following(self, piece: Piece) -> Piece:
+        """The next line."""
+        return self._at(piece[0].astype(int) + 1)
 
-    def _state(self, index: jax.Array, value: jax.Array, slope: jax.Array) -> State:
+    def _at(self, index: jax.Array) -> Piece:
         last = index >= self.times.shape[-1] - 2
         end = jnp.where(last, jnp.finfo(float).max, _sample(self.times, index + 1))
-        return index.astype(float), value, slope, end
+        return index.astype(float), *self._line(index), end
 
-    def advanced(self, state: State, t: jax.Array, dt: jax.Array) -> State:
-        """Along the line."""
-        del t
-        return state[0], state[1] + state[2] * dt, state[2], state[3]
-
-    def value(self, state: State) -> jax.Array:
-        """The value, N or m/s^2."""
-        return state[1]
-
-    def shifted(self, state: State, dt: jax.Array) -> State:
-        """The change of the value over dt, to first order."""
-        return state[0], state[1] + jax.lax.stop_gradient(state[2]) * dt, state[2], state[3]
-
-    def series(self, state: State, h: jax.Array, order: int) -> Series:
+    def series(self, piece: Piece, t: jax.Array, h: Any, order: int) -> Series:
         """A straight line."""
-        return [state[1], state[2] * h, *[jnp.zeros_like(h)] * (order - 2)]
-
-    def next_switch(self, state: State) -> jax.Array:
-        """The end of this piece."""
-        return state[3]
-
-    def switched(self, state: State) -> State:
-        """The begin of the next piece."""
-        index = state[0].astype(int) + 1
-        _, value, slope = self._line(index)
-        return self._state(index, value, slope)
+        _, begin, value, slope, _ = piece
+        return [value + slope * (t - begin), slope * h, *[jnp.zeros_like(t)] * (order - 2)][:order]
 
 
 @jax.tree_util.register_dataclass
@@ -294,7 +240,6 @@ class RecordedDrive(_Lines):
 
     samples: ClassVar[tuple[str, ...]] = ("times", "force")
     parameters: ClassVar[tuple[Parameter, ...]] = (TABLE["reaction"],)
-    prescribed: ClassVar[bool] = False
 
     def _line(self, index: Any) -> tuple[Any, Any, Any]:
         begin, force = _sample(self.times, index), _sample(self.force, index)
@@ -361,7 +306,7 @@ class RodMotion(_Lines):
 
     def rod(self, t: Any) -> tuple[Any, Any]:
         """Position and velocity of the rod at the times t, m and m/s."""
-        begin, x, y, half, sixth = self._cubic(self._piece(t))
+        begin, x, y, half, sixth = self._cubic(self._index(t))
         tau = t - begin
         return x + tau * (y + tau * (half + tau * sixth)), y + tau * (2.0 * half + tau * 3.0 * sixth)
 

@@ -213,7 +213,7 @@ def forces_of(p: Any) -> tuple[Force, ...]:
         found.append(Spring(p.k2, p.c2, p.G))
     if p.k2_back is not None and p.G_back is not None:
         found.append(Spring(p.k2_back, None, p.G_back, back=True))
-    return (*found, *p.forces)
+    return (*found, *(p.forces or ()))
 
 
 def rod_on_capsule(p: Any, r: Any, w: Any, penetration: Any = None) -> Any:

@@ -91,7 +91,7 @@ class CapsuleParameters:
     mu_back: NumberOrBatch | None = None
     ratio: NumberOrBatch = 0.5
     viscous: NumberOrBatch = 0.0
-    forces: tuple[Force, ...] = ()
+    forces: tuple[Force, ...] | None = None
 
 
 AnyDrive = TypeVar("AnyDrive", bound=Drive)
@@ -126,7 +126,7 @@ def admissible(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> jax.Array:
     own = tuple(row for symbol, row in CAPSULE_LEAVES.items() if symbol not in _OWN_FRICTION)
     leaves = [
         (row, getattr(owner, row.symbol))
-        for owner, rows in ((p, own), *((part, part.parameters) for part in (e, law, *p.forces)))
+        for owner, rows in ((p, own), *((part, part.parameters) for part in (e, law, *(p.forces or ()))))
         for row in rows
     ]
     still = jnp.zeros_like(jnp.asarray(p.m1))

@@ -2,18 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.lax import stop_gradient
 
-from capsule_id.physics.batches import is_traced
-from capsule_id.physics.drive import Drive, SwitchingDrive
+from capsule_id.physics.batches import folded, is_traced
+from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact.dense import WIDTH, Samples, read_off, row_of, samples_at
 from capsule_id.physics.exact.taylor import (
@@ -29,6 +28,7 @@ from capsule_id.physics.exact.taylor import (
     StepSeries,
     advance,
     constants_of,
+    drive_at,
     first_event,
     force_on_capsule,
     force_rate,
@@ -124,7 +124,7 @@ def correct(
 
     s, at : the located time and the state there, in the mode before the event
     """
-    spring_force, D = rod_force(constants, at, mode), constants.drive.value(at.drive)
+    spring_force, D = rod_force(constants, at, mode), drive_at(constants, at)
     f = force_on_capsule(constants, spring_force, D)
     acceleration = (f - sliding_friction(constants.law, mode.sigma, at.v)) / constants.m2
     a2 = jnp.where(mode.sigma != 0.0, acceleration, 0.0)
@@ -140,17 +140,15 @@ def correct(
         meets = kind == GAP + i
         g, rate = jnp.where(meets, at.gaps[i], g), jnp.where(meets, force.side * at.w, rate)
         typical = jnp.where(meets, size(step.w, s), typical)
-    if isinstance(constants.drive, SwitchingDrive):
+    if at.drive:
         switch = kind == SWITCH
-        g = jnp.where(switch, at.t - constants.drive.next_switch(at.drive), g)
+        g = jnp.where(switch, at.t - at.drive[-1], g)
         rate, typical = jnp.where(switch, 1.0, rate), jnp.where(switch, 1.0, typical)
     rate, a2, w_rate, before, typical = stop_gradient((rate, a2, w_rate, at, typical))
     grazing = (kind != NONE) & ~(jnp.abs(rate) > GRAZING_RATE * typical)
     dt = -g / jnp.where((kind == NONE) | grazing, jnp.inf, rate)
-    drive = constants.drive.shifted(at.drive, dt)
-    if isinstance(constants.drive, SwitchingDrive):
-        following = constants.drive.switched(drive)
-        drive = tuple(jnp.where(kind == SWITCH, x, y) for x, y in zip(following, drive, strict=True))
+    following = constants.drive.following(at.drive)
+    drive = tuple(jnp.where(kind == SWITCH, x, y) for x, y in zip(following, at.drive, strict=True))
     way = before.w * dt
     gaps = tuple(
         jnp.where(kind == GAP + i, 0.0, at.gaps[i] + force.side * way) for i, force in enumerate(constants.contacts)
@@ -171,7 +169,7 @@ def _mode_after(constants: Constants, mode: Mode, new: CapsuleState, kind: jax.A
     )
     after = Mode(mode.sigma, contacts)
     jumps = kind >= GAP
-    if constants.reaction is not None and isinstance(constants.drive, SwitchingDrive):
+    if constants.reaction is not None:
         jumps = jumps | (kind == SWITCH)
     moved = ((kind >= VELOCITY) & (kind <= LOWER)) | (jumps & (mode.sigma == 0.0))
     sigma = motion_at(stop_gradient(constants), stop_gradient(new), after, kind)
@@ -185,8 +183,8 @@ def take_step(
     state, mode, active = run.state, run.mode, run.active
     left = t_end - stop_gradient(state.t)
     switching = None
-    if isinstance(constants.drive, SwitchingDrive):
-        switch = stop_gradient(constants.drive.next_switch(state.drive))
+    if state.drive:
+        switch = stop_gradient(state.drive[-1])
         switching = switch < t_end
         piece = switch - stop_gradient(state.t)
         left = jnp.where(switching, jnp.maximum(piece, SHORTEST_PIECE * jnp.abs(switch)), left)
@@ -239,7 +237,7 @@ def initial_lanes(
         return jnp.where(jnp.abs(d) <= allowed, d - stop_gradient(d), d)
 
     gaps = tuple(map(without_rounding, constants.contacts))
-    state = CapsuleState(t, X1 - X2, Y1 - Y2, X2, Y2, constants.drive.state(t), gaps)
+    state = CapsuleState(t, X1 - X2, Y1 - Y2, X2, Y2, constants.drive.piece(t), gaps)
     given = jnp.stack([*jax.tree.leaves(state), t_end])
     valid = jnp.all(jnp.isfinite(given), axis=0) & admissible(p, constants.drive, constants.law)
     valid = valid & constants.drive.covers(t, t_end)
@@ -301,42 +299,13 @@ def run(
     return Trajectory(times, X1, Y1, X2, Y2, *counts)
 
 
-def _run_folded(*lanes: Any) -> Trajectory:
-    """``run``, whose lanes take in the axis of a ``jax.vmap``; every argument as there."""
-    leaves, structure = jax.tree.flatten(lanes)
-    return _folding(structure)(*leaves)
-
-
-@cache
-def _folding(structure: Any) -> Callable[..., Trajectory]:
-    """``run`` of leaves: a tree that holds None cannot be batched and differentiated at once."""
-
-    @custom_vmap
-    def run_leaves(*leaves: jax.Array) -> Trajectory:
-        return run(*jax.tree.unflatten(structure, leaves))
-
-    @run_leaves.def_vmap
-    def _fold(size: int, batched: list[bool], *leaves: jax.Array) -> tuple[Trajectory, Trajectory]:
-        """Fold a new axis into the lanes: a loop inside a loop over lanes would copy its buffers at every step."""
-        if not any(batched):
-            out = run(*jax.tree.unflatten(structure, leaves))
-            return out, jax.tree.map(lambda _: False, out)
-        full = [x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)]
-        L = full[0].shape[1]
-        lanes = [x.reshape(size * L, *x.shape[2:]) for x in full]
-        out = jax.tree.map(lambda x: x.reshape(size, L, *x.shape[1:]), run_leaves(*lanes))
-        return out, jax.tree.map(lambda _: True, out)
-
-    return run_leaves
-
-
 def _is_own(part: Drive | FrictionLaw | Force) -> bool:
     """Whether a drive, law or force, and every law inside it, is one of this package."""
     own = type(part).__module__.startswith("capsule_id.")
     return own and (not isinstance(part, Scaled) or _is_own(part.law))
 
 
-_run = jax.jit(_run_folded)
+_run = jax.jit(folded(run))
 _run_single = as_one_function(run)
 
 
@@ -362,7 +331,7 @@ def kernel(max_steps: int) -> Kernel:
         length = next(size for k in range(32) if (size := SHORTEST * 4**k) >= n)
         padded = np.concatenate([times, np.full((L, length - n), np.inf)], axis=1)
         # The samples of several lanes are scattered; a law, drive or force of the user may hold any operation.
-        single = L == 1 and all(map(_is_own, (e, law, *p.forces)))
+        single = L == 1 and all(map(_is_own, (e, law, *(p.forces or ()))))
         given = p, e, law, initial, padded, t_end, bound
         t = _run_single(*given)[0] if single else _run(*given)
         return t if n == length else _without_padding(t, n)

@@ -181,7 +181,7 @@ class Constants(NamedTuple):
 
 
 class CapsuleState(NamedTuple):
-    """Time (s), relative state (m, m/s), the drive's state there, penetrations of the contacts (m); every leaf (L,)."""
+    """Time (s), relative state (m, m/s), the piece of the drive, penetrations of the contacts (m); every leaf (L,)."""
 
     t: jax.Array
     r: jax.Array
@@ -232,7 +232,14 @@ def step_rate(constants: Constants, state: CapsuleState, mode: Mode, friction_ra
     compliance = free + jnp.where(mode.sigma != 0.0, 1.0 / constants.m2, 0.0)
     stiffness, damping = slopes(constants, state, mode)
     oscillation = jnp.sqrt(jnp.abs(stiffness) * compliance)
-    return (oscillation + damping * compliance + constants.drive.rate(state.drive) + friction_rate) / STEP_GUESS
+    return (
+        oscillation + damping * compliance + constants.drive.rate(state.drive, state.t) + friction_rate
+    ) / STEP_GUESS
+
+
+def drive_at(constants: Constants, state: CapsuleState) -> jax.Array:
+    """(L,) N: the drive, or the acceleration of a prescribed rod, m/s^2."""
+    return constants.drive.series(state.drive, state.t, 1.0, 1)[0]
 
 
 def acting(constants: Constants, r: Any, gaps: Sequence[Any], mode: Mode) -> Iterator[tuple[Force, Any, Any]]:
@@ -298,13 +305,13 @@ def series(constants: Constants, state: CapsuleState, mode: Mode, left: jax.Arra
     """Series of degree DEGREE about the state, in the mode; left (L,) s bounds the step."""
     sliding = mode.sigma != 0.0
     friction = friction_series(constants.law, mode.sigma, state.v, (constants.F_forward, constants.F_backward))
-    f0, D0 = rod_force(constants, state, mode), constants.drive.value(state.drive)
+    f0, D0 = rod_force(constants, state, mode), drive_at(constants, state)
     friction_rate = friction.rate((force_on_capsule(constants, f0, D0) - friction.start) / constants.m2, constants.m2)
     guess = step_rate(constants, state, mode, jnp.where(sliding, friction_rate, 0.0))
     rate, rate_left = jax.lax.stop_gradient((guess, 1.0 / left))
     h = 1.0 / jnp.maximum(rate, rate_left)
     m1, m2 = divide(constants.m1, h), jnp.where(sliding, divide(constants.m2, h), jnp.inf)
-    drive = constants.drive.series(state.drive, h, DEGREE + 1)
+    drive = constants.drive.series(state.drive, state.t, h, DEGREE + 1)
 
     def of(start: jax.Array, rule: Callable[[int], Any]) -> Taylor:
         return Taylor(lambda k: start if k == 0 else rule(k), jnp.where(left > 0.0, 1.0, 2.0))
@@ -348,9 +355,8 @@ def advance(constants: Constants, state: CapsuleState, step: StepSeries, s: jax.
     per = 1.0 / dt
     t, way, X2 = state.t + dt, divide(mean(step.w, s), per), state.X2 + divide(mean(step.v, s), per)
     w, v = state.w + increase(step.w, s), state.v + increase(step.v, s)
-    drive = constants.drive.advanced(state.drive, t, dt)
     gaps = tuple(d + force.side * way for force, d in zip(constants.contacts, state.gaps, strict=True))
-    return CapsuleState(t, state.r + way, w, X2, v, drive, gaps)
+    return CapsuleState(t, state.r + way, w, X2, v, state.drive, gaps)
 
 
 # events: Changes of mode: where on a step the first one lies, and which mode follows.
@@ -494,7 +500,7 @@ def motion_at(constants: Constants, state: CapsuleState, mode: Mode, kind: jax.A
 
     f is the force on the capsule but for friction.
     """
-    spring_force, D = rod_force(constants, state, mode), constants.drive.value(state.drive)
+    spring_force, D = rod_force(constants, state, mode), drive_at(constants, state)
     f = force_on_capsule(constants, spring_force, D)
     w_rate = rod_rate(constants, spring_force, D)
     f_rate = force_rate(constants, state, mode, w_rate)
@@ -518,14 +524,14 @@ def force_rate(constants: Constants, state: CapsuleState, mode: Mode, w_rate: ja
     rate = stiffness * state.w + damping * w_rate
     if constants.reaction is None:
         return rate
-    return rate - constants.reaction * constants.drive.series(state.drive, jnp.ones_like(rate), 2)[1]
+    return rate - constants.reaction * constants.drive.series(state.drive, state.t, 1.0, 2)[1]
 
 
 def _size_of_forces(constants: Constants, state: CapsuleState, mode: Mode) -> jax.Array:
     """(L,) N: sum of the magnitudes of the forces on the capsule, which its rounding scales with."""
     forces = terms(constants, state, mode)
     if constants.reaction is not None:
-        forces.append(constants.reaction * constants.drive.value(state.drive))
+        forces.append(constants.reaction * drive_at(constants, state))
     if constants.downhill is not None:
         forces.append(constants.downhill[1])
     return total(map(jnp.abs, forces))
@@ -537,7 +543,7 @@ def mode_at(constants: Constants, state: CapsuleState) -> Mode:
     meeting = tuple((d > 0.0) | ((d == 0.0) & (rate > 0.0)) for d, rate, _ in inward)
     sigma = motion_at(constants, state, Mode(jnp.zeros_like(state.v), meeting), jnp.full(state.r.shape, NONE))
     free = Mode(sigma, tuple(map(jnp.zeros_like, meeting)))
-    spring_force, D = rod_force(constants, state, free), constants.drive.value(state.drive)
+    spring_force, D = rod_force(constants, state, free), drive_at(constants, state)
     f = force_on_capsule(constants, spring_force, D)
     a2 = jnp.where(sigma != 0.0, (f - sliding_friction(constants.law, sigma, state.v)) / constants.m2, 0.0)
     w_rate = rod_rate(constants, spring_force, D) - a2

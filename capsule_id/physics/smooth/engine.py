@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from capsule_id.physics.drive import Drive, SwitchingDrive
+from capsule_id.physics.drive import Drive
 from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.forces import (
     Array,
@@ -204,7 +204,7 @@ def _problem(system: System, semantics: Semantics) -> Problem:
     field = stick_slip_field if semantics == "stick-slip" else eq2_field
     return Problem(
         field=partial(field, system),
-        piece_end=partial(_piece_end, e) if isinstance(e, SwitchingDrive) else None,
+        piece_end=partial(_piece_end, e),
         gaps=(_nearest(p, 1.0), _nearest(p, -1.0)),
         first=FIRST_STEP / fastest,
         longest=DRIVE_ANGLE / e.frequency(),
@@ -214,9 +214,9 @@ def _problem(system: System, semantics: Semantics) -> Problem:
     )
 
 
-def _piece_end(e: SwitchingDrive, t: jax.Array) -> jax.Array:
-    """(L,) s, the first switching time of the drive after t (L,)."""
-    return e.next_switch(e.state(t))
+def _piece_end(e: Drive, t: jax.Array) -> Any:
+    """(L,) s, the first switching time of the drive after t (L,); infinite without one."""
+    return (jnp.inf, *e.piece(t))[-1]
 
 
 @lru_cache(maxsize=32)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from capsule_id.physics.batches import folded
 from capsule_id.physics.model import Status
 
 # rosenbrock: One step of RODAS3, the solver of the smoothed model: state, linear algebra, error estimate, step control.
@@ -105,7 +106,7 @@ class Problem(NamedTuple):
     """What a run is made of besides its inputs; every array is (L,) or ()."""
 
     field: Callable[..., Field]  # of a time (L,), s, or of nothing: the field on the drive's piece that holds there
-    piece_end: Callable[[jax.Array], jax.Array] | None  # (L,) s -> (L,) s: the next time at which a step must end
+    piece_end: Callable[[jax.Array], Any]  # (L,) s -> (L,) s: the next time at which a step must end
     gaps: tuple[jax.Array, jax.Array]  # m: a closing is r - gap, or -r - back gap, turning from negative
     first: jax.Array  # s: length of the first step tried
     longest: jax.Array  # s: no step is longer (infinity: no bound)
@@ -160,7 +161,7 @@ def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int
     t, y = lanes.t, lanes.y
     active = (t < end) & (lanes.status == Status.OK)
     h = jnp.minimum(lanes.h, problem.longest)
-    target = end if problem.piece_end is None else jnp.minimum(end, problem.piece_end(t))
+    target = jnp.minimum(end, problem.piece_end(t))
     # A rest shorter than a hundredth of a step is taken along, so that no sliver of a step is left at the end.
     last = h * 1.01 >= target - t
     h = jnp.where(active, jnp.where(last, target - t, h), 1.0)
@@ -209,40 +210,18 @@ def segment(
 ) -> tuple[jax.Array, MarchState]:
     """Try up to ``length`` steps; the rows (t, X1, Y1, X2, Y2) on the way, and where the lanes then stand.
 
-    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of system is (L, ...). Under ``jax.vmap`` the
-    new axis joins the lanes: batching the loop itself would copy all rows in every step.
+    Rows: (length + 1, 5, L), infinite past the last step tried. Every leaf of system is (L, ...).
     """
 
-    # A tree that holds None cannot be batched and differentiated at once: the system goes in as its leaves.
-    leaves, structure = jax.tree.flatten(system)
+    def turned(lanes: MarchState) -> MarchState:
+        return lanes._replace(y=lanes.y.T)
 
-    @jax.custom_batching.custom_vmap
-    def march(leaves: list[jax.Array], end: jax.Array, lanes: MarchState) -> tuple[jax.Array, MarchState]:
-        return _segment(build(jax.tree.unflatten(structure, leaves)), end, lanes, max_steps, length)
+    def lanes_first(system: Any, end: jax.Array, lanes: MarchState) -> tuple[jax.Array, MarchState]:
+        rows, lanes = _segment(build(system), end, turned(lanes), max_steps, length)
+        return jnp.moveaxis(rows, -1, 0), turned(lanes)
 
-    @march.def_vmap
-    def _(size: int, batched: Any, *given: Any) -> tuple[Any, Any]:
-        def whole(leaf: jax.Array, has_axis: bool) -> jax.Array:
-            return leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
-
-        def join(leaf: jax.Array, has_axis: bool) -> jax.Array:
-            leaf = jnp.moveaxis(whole(leaf, has_axis), 0, -2)
-            return leaf.reshape(*leaf.shape[:-2], -1)
-
-        def join_first(leaf: jax.Array, has_axis: bool) -> jax.Array:
-            leaf = whole(leaf, has_axis)
-            return leaf.reshape(-1, *leaf.shape[2:])
-
-        def split(leaf: jax.Array) -> jax.Array:
-            return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], size, -1), -2, 0)
-
-        # Lanes stand first in the system, whose records have samples behind them, and last in states.
-        system = jax.tree.unflatten(structure, map(join_first, given[0], batched[0]))
-        end, lanes = jax.tree.map(join, given[1:], tuple(batched)[1:])
-        result = jax.tree.map(split, segment(build, system, end, lanes, max_steps, length))
-        return result, jax.tree.map(lambda _: True, result)
-
-    return march(leaves, end, lanes)
+    rows, lanes = folded(lanes_first)(system, end, turned(lanes))
+    return jnp.moveaxis(rows, 0, -1), turned(lanes)
 
 
 def _segment(
