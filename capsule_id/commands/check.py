@@ -6,9 +6,9 @@ from pathlib import Path
 
 from capsule_id.console import say
 from capsule_id.errors import InputError, refusing
+from capsule_id.experiments import rough_values
 from capsule_id.experiments.kind import default_registry
 from capsule_id.experiments.lint import lint, lint_settings
-from capsule_id.experiments.rough_values import rough_values
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.rig.filters import sampling_step
 from capsule_id.rig.model import Rig, Table

@@ -1,10 +1,12 @@
 """Experiments: a folder per kind with one declaration; this module handles all experiments of a rig together."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.kind import Kind, Registry, Values, default_registry, own_panels
+from capsule_id.experiments.kind import Estimate, Kind, Registry, Values, default_registry, own_panels
+from capsule_id.parameters import symbol_of
 from capsule_id.rig.model import Rig, Table
 
 if TYPE_CHECKING:
@@ -92,6 +94,36 @@ def paper_estimates(experiments: Sequence["Experiment"], registry: Registry | No
     for paper, together in _by_shared(lambda kind: kind.paper, experiments, registry):
         estimates |= paper(together)
     return estimates
+
+
+def rough_values(rig: Rig, registry: Registry | None = None) -> Estimate:
+    """Return a function from parameter name to (rough value, SI; whether it comes from a bench test of ``rig``).
+
+    The sources in order of preference are: the kind's rough value, the paper's estimate, the median of the stated
+    prior, that of the default prior. The first call evaluates the bench tests.
+    """
+    kinds = registry or default_registry()
+
+    @cache
+    def known() -> dict[str, float]:
+        experiments = make_experiments(rig, "bench", kinds) if select_tables(rig, "bench") else ()
+        values = paper_estimates(experiments, kinds)
+        for name, kind in kinds.items():
+            values |= kind.rough([e for e in experiments if e.kind == name], rig)
+        return values
+
+    def estimate(name: str) -> tuple[float, bool]:
+        value = known().get(name, 0.0)
+        if value > 0.0:
+            return value, True
+        stated = rig.priors.get(name)
+        if stated is not None and stated.median is not None:
+            return stated.median, False
+        default = kinds.parameters[symbol_of(name)].prior
+        assert default is not None, f"{name} has a default prior"
+        return default.location, False
+
+    return estimate
 
 
 def compare(

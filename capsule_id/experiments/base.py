@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,16 +12,13 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import block_diag
 
+from capsule_id.experiments.context import Check, RunRecord, TableMaker
 from capsule_id.experiments.misfit import Misfit, Moments, ScaledMisfit
 from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.precision import require_float64
 from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.views import Comparison, Facts, Finding
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.friction_model import FrictionModel
-    from capsule_id.physics.smooth.engine import Smoothing
-from capsule_id.experiments.context import Check, RunRecord, TableMaker
 
 # base: Base class of experiments: their interface to inference and to the report.
 #
@@ -100,14 +97,34 @@ class Experiment(eqx.Module):
     checks: ClassVar[tuple[Check, ...]] = ()
     tables: ClassVar[tuple[TableMaker, ...]] = ()
 
+    #: Whether the sd of every misfit is known, so that chi-square tests the fit.
+    scale_known: ClassVar[bool] = False
+    #: Symbol of the scatter of each of ``misfits``; None where its sd is known.
+    scatters: ClassVar[tuple[str | None, ...]] = (None,)
+    #: Normal force of every trial, N, and its friction coefficient, (n,) each, where the force is stated row by row.
+    loads: ClassVar[tuple[np.ndarray, np.ndarray] | None] = None
+    #: Whether readings have several scatters at once; then a point fit takes them from ``profile`` together.
+    has_joint_scatters: ClassVar[bool] = False
+    #: Names of the parameters of which only the product with a scatter changes the motion, by name of that scatter.
+    scaled_by: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    #: Names of positive parameters that the products of ``scaled_by`` multiply, by their exponentials.
+    balanced: ClassVar[tuple[str, ...]] = ()
+    #: Names of the parameters whose sign is unknown: the point fit tries both.
+    mirrored: ClassVar[tuple[str, ...]] = ()
+    #: Symbols of the masses that the likelihood reads.
+    masses: ClassVar[tuple[str, ...]] = ()
+    #: Time of every reading of a channel in periods of the motion, (n,); None without a period.
+    cycles: ClassVar[np.ndarray | None] = None
+
     # Equinox makes every method that is looked up a tree of its own, in 0.1 ms. NumPy code calls methods far more often.
     __getattribute__ = object.__getattribute__
 
     @classmethod
-    def make(cls, table: Table, rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":
+    def make(cls, table: Table, rig: Rig, friction: Any) -> "tuple[Experiment, ...]":
         """Make the experiments of one table: one, or several parts of a divided record.
 
-        ``friction`` is the law that the experiments of a fit share; a kind without a sliding capsule ignores it.
+        ``friction``, a ``FrictionModel``, is the law that the experiments of a fit share; a kind without a sliding capsule
+        ignores it.
         """
         del friction
         return (cls(table, rig),)  # type: ignore[call-arg, arg-type]  # pyright: ignore
@@ -148,50 +165,10 @@ class Experiment(eqx.Module):
         """Time of an evaluation of the likelihood, in units of that of one reading."""
         return self.n
 
-    @property
-    def scale_known(self) -> bool:
-        """Whether the sd of every misfit is known, so that chi-square tests the fit."""
-        return False
-
-    @property
-    def scatters(self) -> tuple[str | None, ...]:
-        """Symbol of the scatter of each of ``misfits``; None where its sd is known."""
-        return (None,)
-
-    @property
-    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Normal force of every trial, N, and its friction coefficient, (n,) each, where the force is stated row by row."""
-        return None
-
     def alternatives(self, theta: ValuesBySymbol) -> dict[str, np.ndarray]:
         """Effect (n,) on the readings, SI, of what a setting that varies can show beside the law, by name of the setting."""
         del theta
         return {}
-
-    @property
-    def has_joint_scatters(self) -> bool:
-        """Whether readings have several scatters at once; then a point fit takes them from ``profile`` together."""
-        return False
-
-    @property
-    def scaled_by(self) -> dict[str, tuple[str, ...]]:
-        """Names of the parameters of which only the product with a scatter changes the motion, by name of that scatter."""
-        return {}
-
-    @property
-    def balanced(self) -> tuple[str, ...]:
-        """Names of positive parameters that the products of ``scaled_by`` multiply, by their exponentials."""
-        return ()
-
-    @property
-    def mirrored(self) -> tuple[str, ...]:
-        """Names of the parameters whose sign is unknown: the point fit tries both."""
-        return ()
-
-    @property
-    def masses(self) -> tuple[str, ...]:
-        """Symbols of the masses that the likelihood reads."""
-        return ()
 
     def local(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Select values by symbol from values by name."""
@@ -292,20 +269,13 @@ class Experiment(eqx.Module):
         return float(np.mean(stats.chi2.sf(squares, self.n)))
 
     @classmethod
-    def second_models(
-        cls, records: "Sequence[Any]", readings: "Sequence[Finding]" = ()
-    ) -> "tuple[list[Any], list[Finding]]":
+    def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
         """Replace the models that ``records``, all of this class, contradict and that the settings leave open.
 
         ``readings`` are the findings on the readings.
         """
         del readings
         return list(records), []
-
-    @property
-    def cycles(self) -> np.ndarray | None:
-        """Time of every reading of a channel in periods of the motion, (n,); None without a period."""
-        return None
 
     def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[Experiment, ...], list[Finding]]":
         """Divide the experiment where one initial state cannot predict all of it at ``theta``; also return findings."""
@@ -337,7 +307,7 @@ class Experiment(eqx.Module):
         del theta
         return 0.0
 
-    def with_smoothing(self, widths: "Smoothing | None") -> Self:
+    def with_smoothing(self, widths: Smoothing | None) -> Self:
         """Return the same readings with the smoothed capsule model of ``widths``; unchanged without a capsule model."""
         del widths
         return self

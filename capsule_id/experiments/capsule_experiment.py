@@ -1,6 +1,6 @@
 """Experiments whose forward model is the capsule model: mixin, trials, and bench tests with ``forward = "capsule"``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any, Literal, Self
 
@@ -9,18 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, clock_parameters, no_design, stretch
+from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol, clock_parameters, stretch
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
 from capsule_id.experiments.free_vibration.experiment import DecayAbout, FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
 from capsule_id.experiments.free_vibration.second_fit import starts_of_motion
-from capsule_id.experiments.friction import ground_of, ground_parameters
-from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, GroundExperiment, other_laws
+from capsule_id.experiments.friction_model import (
+    EQUATION_1,
+    FrictionModel,
+    GroundExperiment,
+    ground_of,
+    ground_parameters,
+    other_laws,
+)
 from capsule_id.experiments.misfit import Misfit, Moments
+from capsule_id.experiments.point_test import PointTest
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation
-from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import CapsuleParameters, Trajectory, simulate
 from capsule_id.physics.smooth.engine import Smoothing
 from capsule_id.rig.model import Quantity, Rig, Table
@@ -116,10 +122,6 @@ class CapsuleForward(GroundExperiment):
         model = "exact" if self.smoothing is None else "smooth"
         return simulate(p, e, times, initial, model=model, smoothing=self.smoothing, friction=self.law(theta))
 
-    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
-        """The friction law at ``theta``, N."""
-        return self.friction.force({**theta, **self.ground_at(theta)})
-
     def noise_facts(self) -> Facts:
         return {"model": "capsule", "law": self.friction.name, "other_laws": other_laws(self.friction)}
 
@@ -200,18 +202,17 @@ class CapsulePushes(CapsuleForward, DynamicFriction):
     checks = ()
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        DynamicFriction.__init__(self, table, rig, friction)
         self.set_model(table, rig, friction)
-        self.horizon = SLIDES * 2.0 * self.distance / self.speed + REST
-        self.about = About(table, rig, (parameter("k1"), parameter("c"), *self.parameters))
+        PointTest.__init__(self, table, rig, friction)
+        self.horizon = SLIDES * 2.0 * self.observed / self.readings["speed"] + REST
 
-    def slide(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> Any:
+    def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
+        return (parameter("k1"), parameter("c"), *DynamicFriction.own_parameters(self, table))
+
+    def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
         """(n,) slide distance of the capsule, m."""
-        still, v = xp.zeros(self.n), xp.asarray(self.speed)
-        times = xp.stack([xp.zeros(self.n), xp.asarray(self.horizon)], axis=1)
+        v = jnp.asarray(x["speed"])
+        still, end = jnp.zeros_like(v), jnp.asarray(self.horizon)
+        times = jnp.stack([still, end], axis=1)
         t = self.simulated(theta, self.parameters_of(theta, 0.0, FAR), OFF, times, (still, v, still, v))
-        return xp.asarray(t.X2)[:, -1]
-
-    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        _, variance, change = self.locked_slide(theta)
-        return (Misfit(self.distance - self.slide(theta, xp), variance, change, no_design(self.n, xp)),)
+        return t.X2[:, -1]

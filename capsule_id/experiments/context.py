@@ -2,15 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from capsule_id.records.view import RecordView
 from capsule_id.views import Finding, ResultTable
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.base import Experiment
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,7 @@ class Fitted(Protocol):
     @property
     def findings(self) -> Sequence[Finding]: ...
 
-    def tension(self, one: Sequence["Experiment"], other: Sequence["Experiment"]) -> Tension:
+    def tension(self, one: Sequence[Any], other: Sequence[Any]) -> Tension:
         """Likelihood-ratio test that two groups of experiments share their parameters."""
         ...
 

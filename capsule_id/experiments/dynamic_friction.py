@@ -1,34 +1,32 @@
 """Pushes: an initial speed and the distance slid, rod locked to the capsule (paper, section 2.2)."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from types import ModuleType
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, Literal, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from capsule_id.experiments.base import About, Start, ValuesBySymbol, no_design
+from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.friction import (
     CAPTIONS,
     MASSES_OF_FREE,
     MESSAGES,
+    FrictionExperiment,
     SurfaceSettings,
-    Track,
     check_scatter,
     friction_estimates,
     friction_panels,
-    ground_of,
-    ground_parameters,
     lint_slides,
-    track_of,
+    unit_law,
+    weight_along,
 )
-from capsule_id.experiments.friction_experiment import FrictionExperiment
-from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.friction_variants import CHECKS, TABLES
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.lint import lint_reading_errors
-from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Prior, scatter
+from capsule_id.physics.batches import array_module
+from capsule_id.physics.friction import FrictionLaw, normal_force, slide_distance
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule
 from capsule_id.rig.tables import Entry
@@ -103,9 +101,6 @@ def pushes(
     The surface's mu scatters by ``surface_scatter`` (relative) from push to push. Each argument is one quantity of the
     protocol, so there are more than six.
     """
-    from capsule_id.experiments.friction_experiment import unit_law
-    from capsule_id.physics.friction import slide_distance
-
     surface = mu * (1.0 + surface_scatter * rng.standard_normal(len(speeds)))
     distance = slide_distance(unit_law(1.0, v_s), 1.0 / g, speeds) / surface
     return {
@@ -167,6 +162,48 @@ KIND = Kind(
 )
 
 
+# inclined: A capsule that slides along a slope: what brakes it, and the coefficient that a slide shows.
+
+
+#: A slide downhill is braked by this share of its friction at least. It then lasts far beyond any reading.
+LEAST_BRAKING = 1e-3
+
+
+class Track(NamedTuple):
+    """Normal force and weight along the slope, against the motion, per mass, m/s^2."""
+
+    normal: Any
+    along: Any
+
+    def braking(self, friction: Any) -> Any:
+        """What brakes a slide, per normal force, from its coefficient of friction, 1."""
+        return array_module(friction).maximum(friction + self.along / self.normal, LEAST_BRAKING * friction)
+
+    def distance(self, law: FrictionLaw, speed: Any) -> Any:
+        """Distance, m, of a slide from ``speed`` (n,), m/s, to rest; ``law`` is the friction coefficient."""
+        return self._slide(lambda u: self.braking(law.forward(u)), speed)
+
+    def change(self, law: FrictionLaw, speed: Any) -> Any:
+        """Change of ``distance`` per relative change of mu, m, with the sign changed."""
+        return self._slide(lambda u: self.braking(law.forward(u)) ** 2 / law.forward(u), speed)
+
+    def _slide(self, forward: Callable[[Any], Any], speed: Any) -> Any:
+        braked: Any = SimpleNamespace(forward=forward)
+        return slide_distance(braked, 1.0 / self.normal, speed)
+
+    def coefficient(self, speed: Any, distance: Any) -> Any:
+        """The paper's coefficient v^2/(2gd) of a slide, with the weight along the slope taken off, 1."""
+        braking = speed**2 / (2.0 * self.normal * distance)
+        return array_module(braking).maximum(braking - self.along / self.normal, LEAST_BRAKING * braking)
+
+
+def track_of(theta: ValuesBySymbol, ground: Mapping[str, Any], backward: bool) -> Track:
+    """The track of a slide; theta has g and, where ``ground`` has N0, m1 and m2."""
+    mass = theta["m1"] + theta["m2"] if "N0" in ground else 1.0
+    normal = normal_force(mass, 0.0, theta["g"], ground.get("slope"), ground.get("N0")) / mass
+    return Track(normal, weight_along(1.0, theta["g"], ground, backward))
+
+
 # experiment: Pushes: an initial speed and the distance slid, rod locked to the capsule (paper, section 2.2).
 
 
@@ -178,63 +215,49 @@ class DynamicFriction(FrictionExperiment):
     mu from push to push. The last one is first order (d is proportional to 1/mu).
     """
 
-    speed: np.ndarray
-    distance: np.ndarray
-    speed_sd: float
-    distance_sd: float
-
-    role = "dynamic"
-
-    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        self.friction = friction = replace(friction, direction=table.settings.direction)
-        self.about = About(table, rig, (*friction.parameters, PUSH_SCATTER, *ground_parameters(table, rig)))
-        self.ground = ground_of(table)
-        self.speed, self.distance = table["speed"], table["distance"]
-        self.speed_sd = table.columns["speed"].reading_sd
-        self.distance_sd = table.columns["distance"].reading_sd
+    role, reading, scatter = "dynamic", "distance", PUSH_SCATTER
+    checks, tables = CHECKS, TABLES
 
     @property
     def masses(self) -> tuple[str, ...]:
         return ("m1", "m2") if "N0" in self.ground else super().masses
 
-    @property
-    def scatters(self) -> tuple[str]:
-        return ("push_scatter",)
-
-    @property
-    def observed(self) -> np.ndarray:
-        return self.distance
-
-    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        distance, variance, change = self.locked_slide(theta)
-        return (Misfit(self.distance - distance, variance, change, no_design(self.n, xp)),)
-
     def track(self, theta: ValuesBySymbol) -> Track:
         """Normal force and weight along the slope at ``theta``."""
         return track_of(theta, self.ground_at(theta), self.backward)
 
-    def locked_slide(self, theta: ValuesBySymbol) -> tuple[Any, Any, Any]:
-        """Slide with the rod locked: distance, m, its variance from reading errors, m^2, its change with mu, m; (n,)."""
-        law, track = self.friction.coefficient({**theta, **self.ground_at(theta)}), self.track(theta)
-        slope = self.speed / (track.normal * track.braking(law).forward(self.speed))
-        variance = self.distance_sd**2 + (slope * self.speed_sd) ** 2
-        return track.distance(law, self.speed), variance, track.change(law, self.speed)
+    def coefficient(self, theta: ValuesBySymbol) -> FrictionLaw:
+        """The friction coefficient at ``theta``."""
+        return self.friction.coefficient({**theta, **self.ground_at(theta)})
 
-    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points by the paper's formula: mu = v^2/(2gd) at the initial speed."""
-        return self.speed, self.stated_track.coefficient(self.speed, self.distance)
+    def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        return self.track(theta).distance(self.coefficient(theta), x["speed"])
+
+    def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
+        """In closed form: NumPy residuals then need no compiled program."""
+        track, speed = self.track(theta), self.readings["speed"]
+        return {"speed": speed / (track.normal * track.braking(self.coefficient(theta).forward(speed)))}
+
+    def change(self, theta: ValuesBySymbol) -> Any:
+        return self.track(theta).change(self.coefficient(theta), self.readings["speed"])
 
     @property
     def stated_track(self) -> Track:
         """``track`` at the stated values."""
-        stated = {name: self.rig.mass(name) for name in ("m1", "m2")} if "N0" in self.ground else {}
-        return self.track({**stated, **self.stated_ground, "g": self.rig.g.value})
+        return self.track(self.stated)
+
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points by the paper's formula: mu = v^2/(2gd) at the initial speed."""
+        speed = self.readings["speed"]
+        return speed, self.stated_track.coefficient(speed, self.observed)
+
+    def paper_coefficient(self, law: FrictionLaw) -> Any:
+        speed, track = self.readings["speed"], self.stated_track
+        return track.coefficient(speed, track.distance(law, speed))
 
     def point_errors(self) -> tuple[np.ndarray, float]:
-        relative = np.hypot(self.distance_sd / self.distance, 2.0 * self.speed_sd / self.speed)
+        speed, mu = self.paper_points()
+        relative = np.hypot(self.sds["distance"] / self.observed, 2.0 * self.sds["speed"] / speed)
         # The reading shows friction and the weight along the slope together.
-        track, mu = self.stated_track, self.paper_points()[1]
-        return relative * (1.0 if track.along is None else 1.0 + track.along / (track.normal * mu)), 1.0
-
-    def starts(self) -> dict[str, Start]:
-        return {**self.rough_starts(), "push_scatter": Start(0.02, 0.3)}
+        track = self.stated_track
+        return relative * (1.0 + track.along / (track.normal * mu)), 1.0

@@ -1,33 +1,33 @@
-"""Friction of a fit: slopes, the law and its parameters, shared declarations, and variants of the law."""
+"""Friction experiments: shared declarations, the paper's protocol, one panel, pulls, and the consistency of the surface."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import warnings
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal
 
-import jax
+import equinox as eqx
 import numpy as np
-from scipy import special
+from scipy.optimize import OptimizeWarning, curve_fit
 
 from capsule_id.errors import InputError
-from capsule_id.experiments.base import ValuesBySymbol
+from capsule_id.experiments.base import Start, ValuesBySymbol, band
+from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, has_stated_load
 from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_rows
-from capsule_id.experiments.misfit import LOG_2PI
-from capsule_id.parameters import QUANTILE_975, Parameter, Prior, parameter
+from capsule_id.experiments.point_test import FRICTION, PointTest
+from capsule_id.parameters import Parameter
 from capsule_id.physics.batches import array_module
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force, slide_distance
-from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings
 from capsule_id.rig.tables import Entry
 from capsule_id.rig.toml import POSITIVE
-from capsule_id.views import Finding, Message, counted
+from capsule_id.views import Comparison, Curve, Finding, Message, Points, counted
 
-if TYPE_CHECKING:
-    from capsule_id.experiments.friction_experiment import FrictionExperiment
-    from capsule_id.views import Comparison
-from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed
-
-# friction: Shared declarations of friction experiments: eq. (1), the paper's fit, one panel, one rule on readings.
+# declarations: Settings, columns, rules and messages that friction experiments share.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,13 +68,6 @@ def check_normal_force(entry: Entry[Any]) -> None:
             raise entry.error(
                 key, f"{key} must not stand beside the column normal_force", "both", f"remove {key}", True
             )
-
-
-def has_stated_load(table: Table[Any]) -> bool:
-    """Whether pulls state their normal force, which then holds N0 too."""
-    return isinstance(table.settings, PullSettings) and (
-        "normal_force" in table.columns or getattr(table.settings, "normal_force", None) is not None
-    )
 
 
 def check_load(entry: Entry[Any]) -> None:
@@ -149,26 +142,6 @@ MESSAGES = {
 }
 
 
-def friction_estimates(experiments: Sequence["FrictionExperiment"]) -> Values:
-    """Estimate mu and v_s as in the paper: fit eq. (1) to the points of all friction experiments."""
-    from capsule_id.experiments.friction_experiment import paper_friction_fit
-
-    points = [e.paper_points() for e in experiments]
-    speed, coefficient = (np.concatenate(parts) for parts in zip(*points, strict=True))
-    return paper_friction_fit(speed, coefficient)
-
-
-def friction_panels(
-    experiments: Sequence["FrictionExperiment"], values: Values, draws: Sequence[Values]
-) -> tuple["Comparison"]:
-    """Return one panel for all friction experiments."""
-    from capsule_id.experiments.friction_experiment import friction_comparison
-
-    # Local values differ in scatters only. Merged, they contain mu and v_s if any experiment has both.
-    points: list[Values] = [{k: v for e in experiments for k, v in e.local(p).items()} for p in (values, *draws)]
-    return (friction_comparison(list(experiments), points[0], points[1:]),)
-
-
 def check_scatter(tables: Sequence[Table[Any]]) -> None:
     """Reject equal readings without reading error: a scatter of 0 makes the posterior improper.
 
@@ -188,103 +161,215 @@ def check_scatter(tables: Sequence[Table[Any]]) -> None:
         raise InputError(rule, counted(len(rows), "row"), f"state {name}_resolution", tables[0].file)
 
 
-# inclined: A capsule that slides along a slope: what brakes it, and the coefficient that a slide shows.
+# paper: The paper's estimate of eq. (1), and its panel: coefficient against velocity (Fig. 2).
 
 
-#: A slide downhill is braked by this share of its friction at least. It then lasts far beyond any reading.
-LEAST_BRAKING = 1e-3
+#: Lower bound of v_s in the paper's fit, m/s.
+LOWEST_V_S = 1e-6
+#: Largest v_s that readings tell, in units of their largest speed: far above it eq. (1) is level.
+LARGEST_V_S = 100.0
+#: Ratio of the largest to the smallest value of a setting from which it varies; another ratio of kinetic to static friction.
+VARIED, OTHER_RATIO = 1.2, 0.6
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Braking:
-    """Friction and the weight along the slope, per normal force, 1."""
-
-    law: FrictionLaw
-    along: Any
-
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
-
-    def forward(self, speed: Any) -> Any:
-        """What brakes the recorded slide."""
-        friction = self.law.forward(speed)
-        return array_module(friction).maximum(friction + self.along, LEAST_BRAKING * friction)
-
-    def backward(self, speed: Any) -> Any:
-        """As ``forward``: a slide has one direction."""
-        return self.forward(speed)
+def varies(setting: np.ndarray) -> bool:
+    """Whether positive values (n,) of a setting are not those of one setting."""
+    return bool(np.max(setting) > VARIED * np.min(setting) > 0.0)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class _Sensitivity(Braking):
-    """Resistance whose slide distance is the relative change of that of ``Braking`` with mu, with the sign changed."""
-
-    def forward(self, speed: Any) -> Any:
-        return super().forward(speed) ** 2 / self.law.forward(speed)
+def unit_law(mu: Any, v_s: Any) -> CoulombStribeck:
+    """Return eq. (1) for a normal force of 1 N: its resistance is the friction coefficient, its mass is 1/g."""
+    return CoulombStribeck(mu, 1.0, v_s)
 
 
-def _acting_ground(table: Table[Any]) -> dict[str, Quantity]:
-    """Stated slope and N0 that act on the readings."""
-    held = has_stated_load(table)
-    return {name: stated for name, stated in table.settings.ground.items() if name != "N0" or not held}
+def paper_friction_fit(speed: np.ndarray, coefficient: np.ndarray) -> dict[str, float]:
+    """Fit eq. (1) by least squares to points (speed, coefficient), as in the paper; static points have speed 0.
 
-
-def ground_of(table: Table[Any]) -> dict[str, float | None]:
-    """Slope, rad, and N0, N, where they differ from level ground and the weight alone; None: sampled, with its sd."""
-    return {name: None if stated.sd else stated.value for name, stated in _acting_ground(table).items()}
-
-
-def ground_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
-    """Parameters for slope and N0 where an sd is stated, with a normal prior.
-
-    Equal statements of several experiments are one quantity; that of [rig] has no bracket.
+    Return mu and, with at least one sliding point, v_s. v_s is left out where its standard error exceeds its value or
+    readings show no fall with speed. Everything is left out where the fit does not converge or ends at its lower bound of
+    v_s: mu is then not determined either.
     """
-    rows = []
-    for name, stated in _acting_ground(table).items():
-        if stated.sd:
-            same = (other.label for other in rig.tables if getattr(other.settings, name, None) == stated)
-            of = "" if stated == getattr(rig, name) else next(same, table.label)
-            rows.append(parameter(name, of, Prior("normal", stated.value, stated.sd)))
-    return tuple(rows)
+    sliding = speed > 0.0
+    if not sliding.any():
+        return {"mu": float(np.mean(coefficient))}
+    if len(np.unique(speed)) < 2:
+        return {}
+    start = (float(np.max(coefficient)), float(np.median(speed[sliding])))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", OptimizeWarning)
+            (mu, v_s), covariance = curve_fit(
+                lambda v, mu, v_s: unit_law(mu, v_s).forward(v),
+                speed,
+                coefficient,
+                p0=start,
+                bounds=([0.0, LOWEST_V_S], [np.inf, np.inf]),
+            )
+    except RuntimeError:
+        return {}
+    if v_s < 1.01 * LOWEST_V_S:
+        return {}
+    # Two points determine both values, without a standard error.
+    known = v_s <= LARGEST_V_S * np.max(speed) and (len(speed) == 2 or np.sqrt(covariance[1, 1]) <= v_s)
+    return {"mu": float(mu), "v_s": float(v_s)} if known else {"mu": float(mu)}
 
 
-class Track(NamedTuple):
-    """Normal force and weight along the slope, against the motion, per mass, m/s^2; None: level ground."""
+def friction_comparison(
+    experiments: "Sequence[FrictionExperiment]", theta: ValuesBySymbol, draws: Sequence[ValuesBySymbol]
+) -> Comparison:
+    """Plot data of friction coefficient against velocity: readings, the paper's curve, this fit (paper, Fig. 2)."""
+    laws = list(dict.fromkeys(e.friction for e in experiments))
+    friction = laws[0]
+    points = [Points(e.label, *e.paper_points(), role=e.role) for e in experiments]
+    top = max(float(np.max(p.x)) for p in points)
+    speed = np.linspace(0.0, 1.15 * top if top > 0 else 1.0, 161)
 
-    normal: Any
-    along: Any
+    def curve(friction: FrictionModel, values: ValuesBySymbol) -> np.ndarray:
+        # Tilts alone do not determine the sliding friction, so their line is horizontal.
+        known = all(row.symbol in values for row in friction.parameters)
+        return np.asarray(friction.coefficient(values).forward(speed if known else 0.0 * speed))
 
-    def braking(self, law: FrictionLaw) -> FrictionLaw:
-        """What brakes a slide with the friction coefficient ``law``, per normal force, 1."""
-        return law if self.along is None else Braking(law, self.along / self.normal)
+    curves = []
+    for law in laws:
+        lower, upper = band(np.array([curve(law, draw) for draw in draws]))
+        name = f"this fit, {law.name}" + (f", {law.direction}" if len(laws) > 1 else "")
+        curves.append(Curve(name, speed, curve(law, theta), lower, upper))
+    paper = paper_friction_fit(np.concatenate([p.x for p in points]), np.concatenate([p.y for p in points]))
+    if "v_s" in paper:
+        curves.append(Curve("the paper's fit", speed, unit_law(**paper).forward(speed), role="paper"))
+    if any(e.role == "dynamic" for e in experiments) and not any(e.ground for e in experiments):
+        reading = np.maximum(speed[1:], 1e-3 * speed[-1])
+        distance = slide_distance(friction.coefficient(theta), 1.0 / theta["g"], reading)
+        expected = reading**2 / (2.0 * theta["g"] * distance)
+        curves.append(Curve("this fit, read as v²/(2gd)", reading, expected, role="alternative"))
+    return Comparison(
+        "friction",
+        "friction",
+        "Friction coefficient against velocity",
+        "velocity [m/s]",
+        "friction coefficient [1]",
+        tuple(points),
+        tuple(curves),
+    )
 
-    def distance(self, law: FrictionLaw, speed: Any) -> Any:
-        """Distance, m, of a slide from ``speed`` (n,), m/s, to rest; ``law`` is the friction coefficient."""
-        return slide_distance(self.braking(law), 1.0 / self.normal, speed)
 
-    def change(self, law: FrictionLaw, speed: Any) -> Any:
-        """Change of ``distance`` per relative change of mu, m, with the sign changed."""
-        if self.along is None:
-            return self.distance(law, speed)
-        return slide_distance(_Sensitivity(law, self.along / self.normal), 1.0 / self.normal, speed)
-
-    def coefficient(self, speed: Any, distance: Any) -> Any:
-        """The paper's coefficient v^2/(2gd) of a slide, with the weight along the slope taken off, 1."""
-        braking = speed**2 / (2.0 * self.normal * distance)
-        if self.along is None:
-            return braking
-        return array_module(braking).maximum(braking - self.along / self.normal, LEAST_BRAKING * braking)
+def friction_estimates(experiments: "Sequence[FrictionExperiment]") -> Values:
+    """Estimate mu and v_s as in the paper: fit eq. (1) to the points of all friction experiments."""
+    points = [e.paper_points() for e in experiments]
+    speed, coefficient = (np.concatenate(parts) for parts in zip(*points, strict=True))
+    return paper_friction_fit(speed, coefficient)
 
 
-def track_of(theta: ValuesBySymbol, ground: Mapping[str, Any], backward: bool) -> Track:
-    """The track of a slide; theta has g and, where ``ground`` has N0, m1 and m2."""
-    g = theta["g"]
-    if not ground:
-        return Track(g, None)
-    mass = theta["m1"] + theta["m2"] if "N0" in ground else 1.0
-    normal = normal_force(mass, 0.0, g, ground.get("slope"), ground.get("N0")) / mass
-    return Track(normal, weight_along(1.0, g, ground, backward) if "slope" in ground else None)
+def friction_panels(
+    experiments: "Sequence[FrictionExperiment]", values: Values, draws: Sequence[Values]
+) -> tuple[Comparison]:
+    """Return one panel for all friction experiments."""
+    # Local values differ in scatters only. Merged, they contain mu and v_s if any experiment has both.
+    points: list[Values] = [{k: v for e in experiments for k, v in e.local(p).items()} for p in (values, *draws)]
+    return (friction_comparison(experiments, points[0], points[1:]),)
+
+
+# experiment: What friction experiments share, and whether they agree on the surface.
+
+
+def check_one_surface(experiments: "Sequence[FrictionExperiment]", fit: Fitted) -> list[Finding]:
+    """Check that tilts and slides agree on the coefficient at break-away."""
+    tilts = [e for e in experiments if e.role == "static"]
+    slides = [e for e in experiments if e.role != "static" and tilts and e.friction == tilts[0].friction]
+    if not tilts or not slides:
+        return []
+    found, friction = fit.tension(tilts, slides), tilts[0].friction
+    by_tilting, by_sliding = (friction.coefficient(values).forward(0.0) for values in (found.one, found.other))
+    facts = {
+        "tilts": ", ".join(e.label for e in tilts),
+        "slides": ", ".join(e.label for e in slides),
+        "mu_tilts": float(by_tilting),
+        "mu_slides": float(by_sliding),
+        "p": found.p,
+    }
+    if not found.p >= LEVEL:  # nor where there is no p-value
+        return [Finding("friction.one_surface", "fail", facts, tilts[0].label)]
+    return [Finding("friction.one_surface", "ok", facts)]
+
+
+class FrictionExperiment(PointTest):
+    """A friction experiment; all of them share the friction law, the paper's protocol and one panel."""
+
+    role: ClassVar[Literal["static", "dynamic", "sliding"]]
+    reads = (FRICTION,)
+
+    def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
+        return (
+            (*self.friction.parameters_at_rest, self.scatter)
+            if self.role == "static"
+            else super().own_parameters(table)
+        )
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        """None for eq. (1) at rest: its break-away coefficient is mu."""
+        return () if self.role == "static" and self.friction.law is CoulombStribeck else self.friction.masses
+
+    @property
+    def speeds_known(self) -> bool:
+        """Whether each reading has a speed, so that laws that depend on it can be compared."""
+        return self.role == "static" or "speed" in self.table.columns
+
+    @property
+    def backward(self) -> bool:
+        """Whether the capsule slides away from the support spring, which is downhill for slope > 0."""
+        return self.friction.direction == "backward"
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """What ``local`` selects beside the sampled parameters, slope and N0, as stated."""
+        return {
+            **{name: getattr(self.rig, name).value for name in self.masses},
+            **self.stated_ground,
+            "g": self.rig.g.value,
+        }
+
+    @property
+    def stated_normal_force(self) -> float:
+        """N of the stated masses."""
+        return normal_force(self.rig.mass("m1"), self.rig.mass("m2"), self.rig.g.value, **self.stated_ground)
+
+    def alternatives(self, theta: ValuesBySymbol) -> dict[str, np.ndarray]:
+        """The speed shows another ratio of eq. (1), which acts as a constant force does; constant friction: a fall."""
+        speed, friction = self.paper_points()[0], self.friction
+        if friction.law is not CoulombStribeck or "ratio" in friction.free:
+            return {}
+        if not varies(speed):
+            return {"speeds": np.zeros(self.n)}
+        other = {"v_s": float(np.median(speed))} if friction.constant else {"ratio": OTHER_RATIO}
+        free = () if friction.constant else ("ratio",)
+        changed = self.with_friction(replace(friction, constant=False, free=(*friction.free, *free)))
+        return {"speeds": self.misfit(theta).raw - changed.misfit({**theta, **other}).raw}
+
+    @abstractmethod
+    def point_errors(self) -> tuple[Any, Any]:
+        """Relative sd of the paper's points from the reading errors, and per unit of the scatter; () or (n,) each."""
+
+    @abstractmethod
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Speed, m/s, and friction coefficient by the paper's formulas, (n,) each."""
+
+    def paper_coefficient(self, law: FrictionLaw) -> Any:
+        """The paper's coefficients (..., n) where ``law``, with leaves (..., 1, 1), is the friction coefficient."""
+        return law.forward(self.paper_points()[0][:, None])[..., 0]
+
+    def starts(self) -> dict[str, Start]:
+        """Starts of mu and v_s from the paper's estimates; another law starts at its prior medians."""
+        speed, coefficient = self.paper_points()
+        mu = Start(float(np.max(coefficient)), 0.3)
+        sliding = {} if self.role == "static" else {"v_s": Start(float(np.median(speed)), 0.5)}
+        return {"mu": mu, "mu_back": mu, **sliding, self.scatter.symbol: Start(0.02, 0.3)}
+
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+        return friction_comparison([self], theta, draws)
+
+
+# pulls: Forces that overcome friction, at rest or at a held speed.
 
 
 def weight_along(mass: Any, g: Any, ground: Mapping[str, Any], backward: bool) -> Any:
@@ -295,235 +380,96 @@ def weight_along(mass: Any, g: Any, ground: Mapping[str, Any], backward: bool) -
     return -uphill if backward else uphill
 
 
-# friction variants: Variants of the friction law, compared by their marginal likelihoods on the friction experiments.
-#
-# The readings are the paper's points, (speed, coefficient), with relative errors. Few points leave several modes, where
-# differences of maxima mislead. So each variant is integrated over its priors, by sequential Monte Carlo (Del Moral,
-# Doucet & Jasra 2006): particles move from the prior to the posterior through powers of the likelihood.
-# If the law in use is right, its marginal likelihood is ``FACTOR`` times smaller than another one's with probability at
-# most 1/FACTOR (Markov's inequality, for parameters drawn from the prior).
+class Pulls(FrictionExperiment):
+    """Forces N mu(v), with the weight along the slope, or coefficients mu(v); speed 0 at break-away.
 
-
-#: Ratio of marginal likelihoods above which a variant is rejected, and above which data tell it from the best.
-FACTOR, TELLING = 100.0, 10.0
-#: Number of particles, Metropolis steps between two powers, and the part of the particles that a power must keep.
-PARTICLES, MOVES, KEPT = 1000, 6, 0.5
-#: Smallest relative error of a reading: rounding of equal readings.
-SMALLEST_ERROR = 1e-6
-#: Number of permutations of the runs test.
-PERMUTATIONS = 4000
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One friction law fitted to the friction experiments.
+    N is that of the weight, or stated for all trials or for each. On a slope a stated N comes from weights, whose part
+    along the slope is N tan(slope), or presses without weight beside the weight of capsule and rod. Reading errors of
+    speed and N count too, through the law and the coefficient; the scatter is relative to mu.
 
     Attributes
     ----------
-    line : what ``[model]`` of rig.toml must say
-    values, sds : posterior means and standard deviations of the law's parameters, SI, by symbol
-    log_likelihood : the largest of the sample
-    evidence : log marginal likelihood
-    bic : Schwarz's criterion
-    lack_of_fit : p-value of the residuals' order, see ``order_p``
+    of_weights : whether the stated normal force comes from weights
     """
 
-    model: FrictionModel
-    values: Mapping[str, float]
-    sds: Mapping[str, float]
-    log_likelihood: float
-    evidence: float
-    bic: float
-    lack_of_fit: float
+    of_weights: bool = eqx.field(static=True)
+
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        PointTest.__init__(self, table, rig, friction)
+        self.of_weights = table.settings.load_is == "weight"
+        force, along = self.observed, np.broadcast_to(self.stated_along, self.n)
+        if "slope" in self.ground and np.all(force <= along):
+            row = int(np.argmax(force - along))
+            rule = f"a force must exceed the weight along the slope, {along[row]:.4g} N"
+            remedy = "correct slope, direction or load_is"
+            raise InputError(rule, f"{force[row]:.4g} N", remedy, table.file, int(table.rows[row]))
+
+    def read(self, table: Table) -> tuple[dict[str, Any], dict[str, Any]]:
+        readings, sds = super().read(table)
+        stated = getattr(table.settings, "normal_force", None)
+        load = {} if stated is None else {"normal_force": np.asarray(stated)}
+        return {"speed": np.zeros(len(table.rows)), **load, **readings}, sds
 
     @property
-    def line(self) -> str:
-        return model_lines(self.model)
-
-
-def model_lines(model: FrictionModel) -> str:
-    """What ``[model]`` must say for the law ``model``."""
-    lines = ['friction = "constant"'] if model.constant else []
-    if model.free:
-        lines.append("free = [" + ", ".join(f'"{symbol}"' for symbol in model.free) + "]")
-    return ", and on the next line ".join(lines) or 'friction = "stribeck"'
-
-
-def candidates(experiments: "Sequence[FrictionExperiment]") -> list[FrictionModel]:
-    """Return the laws that the experiments can tell apart, the law in use included, the simplest first."""
-    in_use = replace(experiments[0].friction, direction="both")
-    models = [FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",))]
-    # A viscous part over a normal force of every row is refused, so it is not proposed either.
-    per_row = any("normal_force" in e.table.columns for e in experiments if e.role == "sliding")
-    if experiments[0].rig.m1 is not None and experiments[0].rig.m2 is not None and not per_row:
-        models += [FrictionModel(free=("viscous",), constant=True), FrictionModel(free=("ratio", "viscous"))]
-    if len({e.friction.direction for e in experiments}) > 1:
-        models += [replace(model, free=("mu_back", *model.free)) for model in models]
-    return sorted({in_use, *models}, key=lambda m: (len(m.parameters), not m.constant, m.free))
-
-
-@runtime_checkable
-class Slide(Protocol):
-    """A friction experiment that records slide distances."""
+    def reading(self) -> str:  # type: ignore[override]  # pyright: ignore
+        return "force" if "force" in self.readings else "coefficient"
 
     @property
-    def stated_track(self) -> Track: ...
+    def weighed(self) -> bool:
+        """Whether the reading is a force that depends on the masses."""
+        alone = "normal_force" in self.readings and ("slope" not in self.ground or self.of_weights)
+        return self.reading == "force" and not alone
 
+    @property
+    def masses(self) -> tuple[str, ...]:
+        return ("m1", "m2") if self.weighed else super().masses
 
-class VariantPoints:
-    """The paper's points of all friction experiments, and their density under a law."""
+    @property
+    def loads(self) -> tuple[np.ndarray, np.ndarray] | None:
+        load = self.readings.get("normal_force", np.zeros(1))
+        return (load, self.paper_points()[1]) if load.size > 1 else None
 
-    def __init__(self, experiments: "Sequence[FrictionExperiment]") -> None:
-        self.experiments = tuple(experiments)
-        points = [e.paper_points() for e in experiments]
-        self.speed = np.concatenate([speed for speed, _ in points])
-        self.logs = [np.log(coefficient) for _, coefficient in points]
-        self.errors = [e.point_errors() for e in experiments]
-        rig = experiments[0].rig
-        weighed = rig.m1 is not None and rig.m2 is not None
-        self.normal_forces = [e.stated_normal_force if weighed else np.nan for e in experiments]
-        self.priors = {name: stated.prior for name, stated in rig.priors.items()}
+    def alternatives(self, theta: ValuesBySymbol) -> dict[str, np.ndarray]:
+        """The load shows a constant force beside the friction, 1 N."""
+        loads = {"loads": np.ones(self.n)} if self.loads is not None and np.ptp(self.loads[0]) > 0.0 else {}
+        return {**super().alternatives(theta), **loads}
 
-    def rows(self, model: FrictionModel) -> list[Parameter]:
-        """The law's parameters, then the scatters, with the priors of the fit."""
-        scatters = {row.symbol: row for e in self.experiments for row in e.parameters if row.symbol == e.scatters[0]}
-        rows = [*model.parameters, *scatters.values()]
-        return [row if row.name not in self.priors else row.named(row.of, self.priors[row.name]) for row in rows]
+    def along(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        """Weight along the slope, N, () or (n,), positive where it opposes the motion; it changes no coefficient."""
+        if "slope" not in self.ground or self.reading != "force":
+            return 0.0
+        ground = self.ground_at(theta)
+        if not self.of_weights:
+            return weight_along(theta["m1"] + theta["m2"], theta["g"], ground, self.backward)
+        uphill = x["normal_force"] * array_module(ground["slope"]).tan(ground["slope"])
+        return -uphill if self.backward else uphill
 
-    def scaled(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Differences of log-coefficients and their sd, (s, n) each, at ``theta``: (s,) by symbol."""
-        known = {row.symbol: theta[row.symbol] for row in model.parameters} | (CONSTANT if model.constant else {})
-        viscous = known.pop("viscous", None)
-        raw, sd = [], []
-        for e, logs, (reading, per_scatter), N in zip(
-            self.experiments, self.logs, self.errors, self.normal_forces, strict=True
-        ):
-            axes = (1, 2) if isinstance(e, Slide) else (1,)
-            own = {**known, "viscous": 0.0 if viscous is None else viscous / N}
-            law = CoulombStribeck(
-                N=1.0,
-                **{name: value if np.ndim(value) == 0 else np.expand_dims(value, axes) for name, value in own.items()},
-            )
-            law = Reversed(law) if e.friction.direction == "backward" else law
-            speed = e.paper_points()[0]
-            if isinstance(e, Slide):
-                expected = e.stated_track.coefficient(speed, e.stated_track.distance(law, speed))
-            else:
-                expected = law.forward(speed)
-            scatter = theta[str(e.scatters[0])][:, None] * per_scatter
-            raw.append(logs - np.log(expected))
-            sd.append(np.sqrt(reading**2 + scatter**2 + SMALLEST_ERROR**2) * np.ones(len(logs)))
-        return np.concatenate(raw, axis=1), np.concatenate(sd, axis=1)
+    @property
+    def stated_along(self) -> np.ndarray:
+        """``along`` as stated, () or (n,) N."""
+        return np.asarray(self.along(self.stated, self.readings))
 
-    def log_likelihood(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(s,) natural log-density of the log-coefficients."""
-        raw, sd = self.scaled(model, theta)
-        value = -0.5 * np.sum((raw / sd) ** 2 + LOG_2PI + 2.0 * np.log(sd), axis=1)
-        return np.where(np.isfinite(value), value, -np.inf)
+    def resistance(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        """Friction, N, or its coefficient."""
+        of_weight = self.reading == "force" and "normal_force" not in x
+        law = self.law(theta) if of_weight else self.friction.coefficient({**theta, **self.ground_at(theta)})
+        return x.get("normal_force", 1.0) * law.forward(x["speed"])
 
+    def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        return self.resistance(theta, x) + self.along(theta, x)
 
-def fit_variant(points: VariantPoints, model: FrictionModel, seed: int, particles: int = PARTICLES) -> Variant:
-    """Fit one law; the same seed gives the same numbers."""
-    rows = points.rows(model)
+    def change(self, theta: ValuesBySymbol) -> Any:
+        return self.resistance(theta, self.readings)
 
-    def theta_of(z: np.ndarray) -> dict[str, np.ndarray]:
-        return {row.symbol: _from_normal(row, z[:, i]) for i, row in enumerate(rows)}
+    def paper_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points by the paper's formula: mu = force/N, without the weight along the slope, or the coefficient."""
+        of_weight = self.reading == "force" and "normal_force" not in self.readings
+        load = self.stated_normal_force if of_weight else self.readings.get("normal_force", 1.0)
+        return self.readings["speed"], (self.observed - self.stated_along) / load
 
-    def density(z: np.ndarray) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            return points.log_likelihood(model, theta_of(z))
-
-    z, values, evidence = sequential_monte_carlo(density, len(rows), np.random.default_rng(seed), particles)
-    theta, best = theta_of(z), int(np.argmax(values))
-    raw, sd = points.scaled(model, {name: column[best : best + 1] for name, column in theta.items()})
-    own = {row.symbol: theta[row.symbol] for row in model.parameters}
-    # Readings at one speed have no order in speed; that of their rows is another check's.
-    order = np.lexsort((np.random.default_rng(seed).random(len(points.speed)), points.speed))
-    return Variant(
-        model,
-        {name: float(np.mean(column)) for name, column in own.items()},
-        {name: float(np.std(column)) for name, column in own.items()},
-        float(values[best]),
-        evidence,
-        len(rows) * float(np.log(len(points.speed))) - 2.0 * float(values[best]),
-        order_p((raw / sd)[0][order], np.random.default_rng(seed)),
-    )
-
-
-def sequential_monte_carlo(
-    density: Callable[[np.ndarray], np.ndarray], dimension: int, rng: np.random.Generator, particles: int
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Sample the posterior of a standard normal prior; return particles (s, d), log-likelihoods (s,), log evidence."""
-    z = rng.standard_normal((particles, dimension))
-    value, power, evidence = density(z), 0.0, 0.0
-    while power < 1.0:
-        step = _next_step(value, 1.0 - power)
-        weight = np.exp(step * (value - np.max(value)))
-        evidence += float(np.log(np.mean(weight)) + step * np.max(value))
-        power += step
-        mean = np.average(z, axis=0, weights=weight)
-        root = np.linalg.cholesky(
-            np.cov((z - mean).T, aweights=weight).reshape(dimension, dimension) + 1e-10 * np.eye(dimension)
-        )
-        position = (rng.random() + np.arange(particles)) / particles * np.sum(weight)
-        chosen = np.minimum(np.searchsorted(np.cumsum(weight), position), particles - 1)
-        z, value = _metropolis(density, (z[chosen], value[chosen]), power, root, rng)
-    return z, value, evidence
-
-
-def _metropolis(
-    density: Callable[[np.ndarray], np.ndarray],
-    particles: tuple[np.ndarray, np.ndarray],
-    power: float,
-    root: np.ndarray,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Move ``particles``, z (s, d) with their log-likelihoods (s,), by ``MOVES`` steps of the Metropolis rule.
-
-    root : (d, d) Cholesky factor of the covariance of z
-    """
-    z, value = particles
-    for scale in np.geomspace(1.0, 0.1, MOVES):
-        proposed = z + scale * 2.38 / np.sqrt(z.shape[1]) * rng.standard_normal(z.shape) @ root.T
-        new = density(proposed)
-        change = power * (new - value) - 0.5 * np.sum(proposed**2 - z**2, axis=1)
-        accepted = np.log(rng.random(len(z))) < change
-        z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
-    return z, value
-
-
-def order_p(residuals: np.ndarray, rng: np.random.Generator) -> float:
-    """Permutation p-value of the sum of products of neighbouring residuals (n,), in the order of speed.
-
-    Neighbours of one sign show a curve that misses the readings. The test is exact for exchangeable residuals.
-    """
-
-    def statistic(r: np.ndarray) -> np.ndarray:
-        return np.sum(r[..., 1:] * r[..., :-1], axis=-1)
-
-    shuffled = rng.permuted(np.tile(residuals, (PERMUTATIONS, 1)), axis=1)
-    return float((1 + np.sum(statistic(shuffled) >= statistic(residuals))) / (1 + PERMUTATIONS))
-
-
-def _next_step(value: np.ndarray, largest: float) -> float:
-    """Largest increase of the power that keeps ``KEPT`` of the particles effective."""
-
-    def effective(step: float) -> float:
-        weight = np.exp(step * (value - np.max(value)))
-        return float(np.sum(weight) ** 2 / np.sum(weight**2) / len(value))
-
-    low, high = 0.0, largest
-    if effective(high) >= KEPT:
-        return high
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if effective(middle) >= KEPT else (low, middle)
-    return max(low, 1e-9)
-
-
-def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:
-    """Values of a parameter whose prior is that of a standard normal ``z``."""
-    prior = row.prior if row.prior is not None else Prior("lognormal", 1.0, 10.0)
-    if prior.kind == "halfnormal":
-        return prior.spread * special.ndtri(0.5 * (1.0 + special.ndtr(z)))
-    return prior.location * np.exp(np.log(prior.spread) / QUANTILE_975 * z)
+    def point_errors(self) -> tuple[np.ndarray, float]:
+        """The reading error of the speed is left out: it enters through the slope of the law."""
+        net = self.observed - self.stated_along
+        share = self.observed / net if self.of_weights else 1.0
+        of_load = share * self.sds.get("normal_force", 0.0) / self.readings.get("normal_force", 1.0)
+        return np.hypot(self.sds[self.reading] / net, of_load), 1.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import equinox as eqx
 import jax
@@ -10,13 +10,9 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
-from capsule_id.parameters import Parameter, Prior
-from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force
-from capsule_id.rig.model import ModelChoices, Rig, Table
-
-if TYPE_CHECKING:
-    pass
-
+from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, normal_force, scaled
+from capsule_id.rig.model import ModelChoices, Quantity, Rig, Table
 
 # friction model: Friction law of a fit: its sampled parameters, and the law at given values.
 
@@ -29,31 +25,6 @@ CONSTANT = {"ratio": 1.0, "v_s": 1.0}
 PRIOR_DRAWS = 64
 #: Relative changes of the break-away force below this are rounding.
 ROUNDING = 1e-9
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class PerWeight:
-    """A law divided by the weight of capsule and rod: its resistance is the friction coefficient, 1.
-
-    Attributes
-    ----------
-    law : resistance in N
-    weight : (m1 + m2) g, N
-    """
-
-    law: FrictionLaw
-    weight: Any
-
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
-
-    def forward(self, speed: Any) -> Any:
-        """Coefficient of a capsule that slides towards positive X2, 1."""
-        return self.law.forward(speed) / self.weight
-
-    def backward(self, speed: Any) -> Any:
-        """Coefficient of a capsule that slides towards negative X2, 1."""
-        return self.law.backward(speed) / self.weight
 
 
 @jax.tree_util.register_dataclass
@@ -191,7 +162,7 @@ class FrictionModel:
         # Without masses only the break-away coefficient is read, and nothing viscous acts at rest.
         if self.is_proportional or (self.law is CoulombStribeck and not {"m1", "m2"} <= set(theta)):
             return self._at(theta, 1.0)
-        return PerWeight(self.force(theta), _weight(theta))
+        return scaled(self.force(theta), 1.0 / _weight(theta))
 
     def _at(self, theta: ValuesBySymbol, N: Any) -> FrictionLaw:
         # Parameters that tilts do not sample have no effect at rest, so any value is valid there.
@@ -225,6 +196,14 @@ def other_laws(friction: FrictionModel) -> tuple[str, ...]:
     return (*constant, *ratio)
 
 
+def model_lines(model: FrictionModel) -> str:
+    """What ``[model]`` must say for the law ``model``."""
+    lines = ['friction = "constant"'] if model.constant else []
+    if model.free:
+        lines.append("free = [" + ", ".join(f'"{symbol}"' for symbol in model.free) + "]")
+    return ", and on the next line ".join(lines) or 'friction = "stribeck"'
+
+
 #: Default friction law: eq. (1) of the paper.
 EQUATION_1 = FrictionModel()
 
@@ -245,6 +224,41 @@ def friction_of(rig: Rig, law: type[FrictionLaw] | None = None) -> FrictionModel
         rule, remedy = "a friction law of its own replaces [model]", "remove friction and free from [model]"
         raise InputError(rule, f"both {law.__name__} and [model]", remedy, rig.folder / "rig.toml")
     return FrictionModel(law)
+
+
+# ground: Slope of the track, and a force that presses the capsule down besides the weight.
+
+
+def has_stated_load(table: Table[Any]) -> bool:
+    """Whether pulls state their normal force, which then holds N0 too."""
+    settings = table.settings
+    stated = "normal_force" in table.columns or getattr(settings, "normal_force", None) is not None
+    return stated and hasattr(settings, "load_is")
+
+
+def _acting_ground(table: Table[Any]) -> dict[str, Quantity]:
+    """Stated slope and N0 that act on the readings."""
+    held = has_stated_load(table)
+    return {name: stated for name, stated in table.settings.ground.items() if name != "N0" or not held}
+
+
+def ground_of(table: Table[Any]) -> dict[str, float | None]:
+    """Slope, rad, and N0, N, where they differ from level ground and the weight alone; None: sampled, with its sd."""
+    return {name: None if stated.sd else stated.value for name, stated in _acting_ground(table).items()}
+
+
+def ground_parameters(table: Table[Any], rig: Rig) -> tuple[Parameter, ...]:
+    """Parameters for slope and N0 where an sd is stated, with a normal prior.
+
+    Equal statements of several experiments are one quantity; that of [rig] has no bracket.
+    """
+    rows = []
+    for name, stated in _acting_ground(table).items():
+        if stated.sd:
+            same = (other.label for other in rig.tables if getattr(other.settings, name, None) == stated)
+            of = "" if stated == getattr(rig, name) else next(same, table.label)
+            rows.append(parameter(name, of, Prior("normal", stated.value, stated.sd)))
+    return tuple(rows)
 
 
 class SurfaceExperiment(Experiment):
@@ -279,6 +293,10 @@ class GroundExperiment(SurfaceExperiment):
     def ground_at(self, theta: ValuesBySymbol) -> dict[str, Any]:
         """Slope, rad, and N0, N, at ``theta``, where they are not 0."""
         return {name: theta[name] if value is None else value for name, value in self.ground.items()}
+
+    def law(self, theta: ValuesBySymbol) -> FrictionLaw:
+        """The friction law at ``theta``, N."""
+        return self.friction.force({**theta, **self.ground_at(theta)})
 
     @property
     def stated_ground(self) -> dict[str, float]:

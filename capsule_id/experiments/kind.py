@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
-from importlib.util import find_spec
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,12 +14,11 @@ from capsule_id.errors import InputError
 from capsule_id.parameters import Parameter
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import KindRule, parameter_rows
-from capsule_id.views import Finding, Message
+from capsule_id.views import Comparison, Finding, Message
 
 if TYPE_CHECKING:
     from capsule_id.experiments.base import Experiment
     from capsule_id.experiments.friction_model import FrictionModel
-    from capsule_id.views import Comparison
 
 
 # kind: Declaration of one kind of experiment: its complete interface to the rest of the package.
@@ -69,7 +67,7 @@ class Twin:
     truth: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
-def own_panels(experiments: Sequence["Experiment"], values: Values, draws: Sequence[Values]) -> Iterable["Comparison"]:
+def own_panels(experiments: Sequence["Experiment"], values: Values, draws: Sequence[Values]) -> Iterable[Comparison]:
     """Return the panels of experiments without shared panels, one after the other."""
     for e in experiments:
         yield from e.comparisons(e.local(values), [e.local(draw) for draw in draws])
@@ -123,7 +121,7 @@ class Kind(KindRule):
     check: Callable[[Sequence[Table[Any]]], None] = field(default=lambda tables: None)
     paper: Callable[[Sequence[Any]], Values] = field(default=lambda experiments: {})
     rough: Callable[[Sequence[Any], Rig], Values] = field(default=lambda experiments, rig: {})
-    panels: Callable[[Sequence[Any], Values, Sequence[Values]], Iterable["Comparison"]] = own_panels
+    panels: Callable[[Sequence[Any], Values, Sequence[Values]], Iterable[Comparison]] = own_panels
     twin: Callable[[Values, np.random.Generator, int], Twin] | None = None
     truth: Values = field(default_factory=dict)
 
@@ -231,10 +229,8 @@ def _joined(what: str, declared: Iterable[tuple[str, Mapping[str, Declared]]]) -
 
 def _built_in(name: str) -> Kind:
     """The declaration of a built-in kind."""
-    place = f"{__package__}.{name}"
-    spec = find_spec(place)
-    folder = spec is not None and spec.submodule_search_locations is not None
-    return import_module(f"{place}.declaration" if folder else place).KIND
+    place = import_module(f"{__package__}.{name}")
+    return place.KIND if hasattr(place, "KIND") else import_module(f"{place.__name__}.declaration").KIND
 
 
 @cache

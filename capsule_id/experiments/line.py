@@ -1,6 +1,6 @@
 """Calibration lines: shared declarations, the line y = y0 + slope x, and its lack of fit."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, ClassVar
@@ -11,16 +11,18 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, axis_label, band
+from capsule_id.experiments.base import Start, ValuesBySymbol
 from capsule_id.experiments.checks import LEVEL, refit
 from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
 from capsule_id.experiments.kind import Values
 from capsule_id.experiments.lint import lint_reading_errors, lint_rows
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit
+from capsule_id.experiments.point_test import PointTest
 from capsule_id.parameters import Parameter, Prior, parameter
-from capsule_id.rig.model import Column, Rig, Table
+from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.tables import Entry
-from capsule_id.views import Comparison, Curve, Finding, Message, Points, ResultTable
+from capsule_id.views import Comparison, Curve, Finding, Message, ResultTable
 
 # line: Shared declarations of calibration lines: rule on reading errors, the paper's straight line, lint.
 
@@ -172,7 +174,7 @@ def check_linearity(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
         # One outlier can tilt the whole line. The outlier check reports it, so it is excluded here.
         slope = refit(e, theta, left_out)[e.symbol][0]
         if slope <= 0.0:
-            facts = {"name": e.slope.name, "slope": slope, "unit": e.slope.unit, "x": e.x_name, "y": e.y_name}
+            facts = {"name": e.slope.name, "slope": slope, "unit": e.slope.unit, "x": e.x_name, "y": e.reading}
             findings.append(Finding("lines.rise", "fail", facts, e.label))
             continue
         bend, p = curvature_test(e, theta, left_out)
@@ -187,11 +189,11 @@ def check_scatter(lines: "Sequence[Line]", fit: Fitted) -> list[Finding]:
     del fit
     findings = []
     for e in lines:
-        column = e.y_column
+        column = e.table.columns[e.reading]
         if e.errors_known or (e.n > 2 and e.step == 0.0) or (column.sd is not None and e.n < 3):
             continue
         code = "lines.two_rows" if e.n < 3 else "lines.step"
-        facts = {"y": e.y_name, "unit": column.unit, "step": e.step * column.to_display, "name": e.slope.name}
+        facts = {"y": e.reading, "unit": column.unit, "step": e.step * column.to_display, "name": e.slope.name}
         findings.append(Finding(code, "warn", facts, e.label, (e.slope.name,)))
     return findings
 
@@ -236,54 +238,59 @@ def line_table(lines: "Sequence[Line]", fit: Fitted) -> list[ResultTable]:
     return [ResultTable("lines.slopes", pd.DataFrame(rows).set_index("table"))]
 
 
-class Line(Experiment):
+class Line(PointTest):
     """A line y against x; subclasses name the columns and the slope.
 
     Attributes
     ----------
-    x, y : (n,) readings, SI
-    x_sd, y_sd : stated reading errors, SI
     width : sd of the intercept's prior, SI
     sd_ratio : stated ratio of both errors; None: not stated
     step : step of the last digit of y, SI, where it exceeds the scatter about the line and no error of y is stated; else 0
-    symbol : symbol of the slope
     errors_known : whether both reading errors are stated
     """
 
-    x: np.ndarray
-    y: np.ndarray
-    x_sd: float
-    y_sd: float
     width: float
     sd_ratio: float | None
     step: float
-    symbol: str = eqx.field(static=True)
-    x_name: str = eqx.field(static=True)
-    y_name: str = eqx.field(static=True)
     errors_known: bool = eqx.field(static=True)
 
+    #: Column of x, and symbol of the slope.
+    x_name: ClassVar[str]
+    symbol: ClassVar[str]
     #: SI unit of y.
     unit_of_y: ClassVar[str] = "N"
+    relative = False
     estimates_may_be_negative = True
     checks = (check_linearity, check_replicates, check_scatter)
     tables = (line_table,)
 
-    def __init__(self, table: Table, rig: Rig, x: str, y: str, slope: Parameter, sd_ratio: float | None) -> None:
-        self.x_name, self.y_name, self.symbol = x, y, slope.symbol
-        x_column, y_column = table.columns[x], table.columns[y]
-        self.x, self.y = x_column.values, y_column.values
-        self.x_sd, self.y_sd = x_column.reading_sd, y_column.reading_sd
-        size = float(np.ptp(self.y))
-        self.width = NUISANCE_WIDTH * size
-        self.sd_ratio = sd_ratio
-        self.errors_known = x_column.sd is not None and y_column.sd is not None
-        step = y_column.unstated_step
+    def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
+        y = table.columns[self.reading]
+        self.width, self.sd_ratio = NUISANCE_WIDTH * float(np.ptp(y.values)), table.settings.sd_ratio
+        self.errors_known = all(table.columns[name].sd is not None for name in (self.x_name, self.reading))
+        super().__init__(table, rig, friction)
+        step = y.unstated_step
         self.step = step if self.ordinary_line()[2] < step / np.sqrt(12.0) else 0.0
-        self.y_sd = max(self.y_sd, self.step / np.sqrt(12.0))
-        factor = SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
-        row = parameter("scatter", table.label, Prior("lognormal", SCATTER_MEDIAN * size, factor))
-        scatter = replace(row, unit=self.unit_of_y)
-        self.about = About(table, rig, (slope,) if self.errors_known else (slope, scatter))
+        self.sds = {**self.sds, self.reading: max(self.sds[self.reading], self.step / np.sqrt(12.0))}
+
+    def slope_of(self, table: Table) -> Parameter:
+        """Row of the slope."""
+        del table
+        return parameter(self.symbol)
+
+    def own_parameters(self, table: Table) -> tuple[Parameter, ...]:
+        slope, factor = self.slope_of(table), SCATTER_FACTOR if self.n > 2 else SCATTER_FACTOR_OF_FEW
+        prior = Prior("lognormal", SCATTER_MEDIAN * float(np.ptp(self.y)), factor)
+        scatter = replace(parameter("scatter", table.label, prior), unit=self.unit_of_y)
+        return (slope,) if self.errors_known else (slope, scatter)
+
+    @property
+    def x(self) -> np.ndarray:
+        return self.readings[self.x_name]
+
+    @property
+    def y(self) -> np.ndarray:
+        return self.observed
 
     @property
     def slope(self) -> Parameter:
@@ -298,14 +305,6 @@ class Line(Experiment):
         return (None,) if self.errors_known else ("scatter",)
 
     @property
-    def x_column(self) -> Column:
-        return self.table.columns[self.x_name]
-
-    @property
-    def y_column(self) -> Column:
-        return self.table.columns[self.y_name]
-
-    @property
     def errors(self) -> str:
         """Error model in words, for the report."""
         if self.errors_known:
@@ -318,27 +317,25 @@ class Line(Experiment):
         """Additional columns of the table of calibration lines, name with unit -> number."""
         return {}
 
-    @property
-    def observed(self) -> np.ndarray:
-        return self.y
+    def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        return theta[self.symbol] * x[self.x_name]
 
-    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        slope, design = theta[self.symbol], self.width * xp.ones((self.n, 1))
-        # Readings scatter in y, and in x where the ratio of both errors is stated.
-        across = 0.0 if self.sd_ratio is None else (slope / self.sd_ratio) ** 2
-        estimated = 0.0 if self.errors_known else 1.0
-        fixed, scale = self.y_sd**2 + slope**2 * self.x_sd**2, estimated * xp.sqrt(1.0 + across)
-        # The ratio of both errors must not depend on the scatter: its density would then have no upper limit at 0.
-        ordinate = None
+    def slopes(self, theta: ValuesBySymbol) -> Mapping[str, Any]:
+        return {self.x_name: theta[self.symbol]}
+
+    def design(self, n: int, xp: ModuleType = jnp) -> Any:
+        return self.width * xp.ones((n, 1))
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit, ...]:
+        (plain,) = super().misfits(theta, xp)
         if self.errors_known:
-            ordinate = self.y_sd**2, 0.0
-        elif self.sd_ratio is not None:
-            ordinate = fixed / (1.0 + across), 1.0
-        return (Misfit(self.y - slope * self.x, fixed, scale, design, ordinate),)
-
-    def intercept(self, theta: ValuesBySymbol) -> float:
-        """Conditional mean of y0, SI."""
-        return float(self.nuisance_mean(theta)[0] * self.width)
+            return (replace(plain, scale=0.0, ordinate=(self.sds[self.reading] ** 2, 0.0)),)
+        if self.sd_ratio is None:
+            return (plain,)
+        # Readings scatter in x too. The ratio of both errors must not depend on the scatter: its density would then have
+        # no upper limit at 0.
+        total = 1.0 + (theta[self.symbol] / self.sd_ratio) ** 2
+        return (replace(plain, scale=xp.sqrt(total), ordinate=(plain.fixed_variance / total, 1.0)),)
 
     def ordinary_line(self) -> tuple[float, float, float]:
         """Slope, intercept and residual sd of ordinary least squares, the paper's fit; slope 0 at one level of x."""
@@ -356,28 +353,8 @@ class Line(Experiment):
         return starts
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        x_unit, y_unit = self.x_column.to_display, self.y_column.to_display
-        low, high = np.min(self.x), np.max(self.x)
-        x = np.linspace(low - 0.04 * (high - low), high + 0.04 * (high - low), 60)
-
-        def line(values: ValuesBySymbol) -> np.ndarray:
-            return (self.intercept(values) + values[self.symbol] * x) * y_unit
-
-        lower, upper = band(np.array([line(draw) for draw in draws]))
-        slope, intercept, _ = self.ordinary_line()
-        curves = (
-            Curve("this fit", x * x_unit, line(theta), lower, upper),
-            Curve("the paper's fit", x * x_unit, (intercept + slope * x) * y_unit, role="paper"),
-        )
-        y_error = np.full(self.n, self.y_column.sd * y_unit) if self.y_column.sd else None
-        return Comparison(
-            self.kind,
-            self.label,
-            f"{self.label}: {self.y_column.name} against {self.x_column.name}",
-            axis_label(self.x_column),
-            axis_label(self.y_column),
-            (Points(self.label, self.x * x_unit, self.y * y_unit, y_error),),
-            curves,
-            self.x * x_unit,
-            self.residuals(theta, np)[: self.n],
-        )
+        panel, (slope, intercept, _) = super().comparison(theta, draws), self.ordinary_line()
+        x, columns = panel.curves[0].x, self.table.columns
+        paper = intercept + slope * x / columns[self.x_name].to_display
+        curve = Curve("the paper's fit", x, paper * columns[self.reading].to_display, role="paper")
+        return replace(panel, curves=(*panel.curves, curve))

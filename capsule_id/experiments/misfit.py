@@ -91,14 +91,14 @@ def conditional_draw(ay: np.ndarray, aa: np.ndarray, rng: np.random.Generator) -
 
 @dataclass(frozen=True)
 class ScaledMisfit:
-    """A misfit at one value of its scatter.
+    """A misfit at one value of its scatter, or at several, (...).
 
     Attributes
     ----------
-    raw : (n,) measured minus predicted
-    sd : (n,) its standard deviation
+    raw : (..., n) measured minus predicted
+    sd : (..., n) its standard deviation
     design : (n, p) effect of the linear nuisances, each scaled to a standard normal prior
-    log_measure : (n,) contribution of an integrated true abscissa to the log-density of each reading
+    log_measure : (..., n) contribution of an integrated true abscissa to the log-density of each reading
     """
 
     raw: Any
@@ -107,9 +107,14 @@ class ScaledMisfit:
     log_measure: Any
 
     def moments(self) -> tuple[Any, Any, Any]:
-        """Moments y'y, A'y, A'A in units of the noise."""
-        y, a = self.raw / self.sd, self.design / self.sd[:, None]
-        return y @ y, a.T @ y, a.T @ a
+        """Moments y'y, A'y, A'A in units of the noise, (...), (..., p), (..., p, p)."""
+        y, a = self.raw / self.sd, self.design[(None,) * (self.sd.ndim - 1)] / self.sd[..., None]
+        return (y**2).sum(-1), (y[..., None] * a).sum(-2), a.swapaxes(-1, -2) @ a
+
+    def log_density(self, xp: ModuleType = jnp) -> Any:
+        """Natural, normalised log-density of the readings, nuisances integrated out; (...)."""
+        measure = xp.sum(self.log_measure - xp.log(self.sd), axis=-1)
+        return marginal_log_density(*self.moments(), self.sd.shape[-1], xp) + measure
 
     def at_nuisance_mean(self, xp: ModuleType = jnp) -> tuple[Any, Any]:
         """Residuals (n,) in units of the noise at the conditional mean of the nuisances, and that mean (p,)."""
@@ -200,11 +205,17 @@ class Misfit:
     ordinate: tuple[Any, Any] | None = None
 
     def at(self, scatter: Any, xp: ModuleType = jnp) -> ScaledMisfit:
-        """Return the misfit at one value of the scatter, ()."""
-        one = xp.ones(self.raw.shape[0])
-        variance = _variance(self.fixed_variance, self.scale, scatter) * one
-        own = variance if self.ordinate is None else _variance(*self.ordinate, scatter) * one
-        return ScaledMisfit(self.raw, xp.sqrt(variance), self.design, 0.5 * xp.log(variance / own))
+        """Return the misfit at values of the scatter, (...)."""
+        scatter, n = xp.asarray(scatter)[..., None], self.raw.shape[0]
+
+        def wide(x: Any) -> Any:
+            return xp.broadcast_to(x, (*(1,) * (scatter.ndim - 1), n))
+
+        variance = _variance(wide(self.fixed_variance), wide(self.scale), scatter)
+        own = variance
+        if self.ordinate is not None:
+            own = _variance(wide(self.ordinate[0]), wide(self.ordinate[1]), scatter)
+        return ScaledMisfit(wide(self.raw), xp.sqrt(variance), self.design, 0.5 * xp.log(variance / own))
 
     def summary(self) -> "Misfit | Moments":
         """Return the moments where all readings have one variance, else the misfit."""
@@ -216,21 +227,7 @@ class Misfit:
 
     def log_density(self, scatter: Any, xp: ModuleType = jnp) -> Any:
         """Natural, normalised log-density of the readings at ``scatter`` (...), nuisances integrated out; (...)."""
-        scatter, n = xp.asarray(scatter)[..., None], self.raw.shape[0]
-        leading = (1,) * (scatter.ndim - 1)
-        raw, fixed, scale = (xp.broadcast_to(x, (*leading, n)) for x in (self.raw, self.fixed_variance, self.scale))
-        variance = _variance(fixed, scale, scatter)
-        own = variance
-        if self.ordinate is not None:
-            fixed, scale = (xp.broadcast_to(x, (*leading, n)) for x in self.ordinate)
-            own = _variance(fixed, scale, scatter)
-        log_scale = -0.5 * xp.sum(xp.log(own), axis=-1)
-        yy = xp.sum(raw**2 / variance, axis=-1)
-        if self.design.shape[1] == 0:
-            return log_scale - 0.5 * (n * LOG_2PI + yy)
-        weighted = xp.broadcast_to(self.design, (*leading, *self.design.shape)) / variance[..., None]
-        ay, aa = xp.sum(raw[..., None] * weighted, axis=-2), xp.swapaxes(weighted, -1, -2) @ self.design
-        return marginal_log_density(yy, ay, aa, n, xp) + log_scale
+        return self.at(scatter, xp).log_density(xp)
 
 
 def _sum_of_others(parts: np.ndarray) -> np.ndarray:

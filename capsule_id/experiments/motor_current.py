@@ -7,8 +7,7 @@ import numpy as np
 
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.line import MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.parameters import parameter
-from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import ColumnRule, QuantityRule
 
 # declaration: Motor current: columns, settings, template and twin.
@@ -80,5 +79,4 @@ KIND = Kind(
 class MotorCurrent(Line):
     """Force against current: F = F0 + K I."""
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        super().__init__(table, rig, "current", "force", parameter("K"), table.settings.sd_ratio)
+    x_name, reading, symbol = "current", "force", "K"

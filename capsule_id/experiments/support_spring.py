@@ -12,8 +12,8 @@ from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.line import MESSAGES as LINE_MESSAGES
 from capsule_id.experiments.line import Line, line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.parameters import parameter
-from capsule_id.rig.model import Quantity, Rig, Settings, Table
+from capsule_id.parameters import Parameter, parameter
+from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
 
@@ -147,15 +147,11 @@ def check_cantilever(springs: "Sequence[SupportSpring]", fit: Fitted) -> list[Fi
 class SupportSpring(Line):
     """F = F0 + k2[spring] x."""
 
+    x_name, reading, symbol = "deflection", "force", "k2"
     checks = (*Line.checks, check_cantilever)
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        slope = parameter("k2", table.settings.spring)
-        super().__init__(table, rig, "deflection", "force", slope, table.settings.sd_ratio)
-
-    @property
-    def spring(self) -> str:
-        return self.table.settings.spring
+    def slope_of(self, table: Table) -> Parameter:
+        return parameter(self.symbol, table.settings.spring)
 
     @property
     def length(self) -> Quantity | None:

@@ -6,7 +6,7 @@ from typing import Annotated
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.experiments.line import MESSAGES, Line, line_estimates, lint_line, refuse_idle_sd_ratio
 from capsule_id.parameters import Parameter, Prior
-from capsule_id.rig.model import Rig, Settings, Table
+from capsule_id.rig.model import Settings, Table
 from capsule_id.rig.schema import ColumnRule, QuantityRule
 
 # declaration: Force transducer: columns, settings and template. Its readings are counts, volts or any other number.
@@ -61,8 +61,7 @@ KIND = Kind(
 class Transducer(Line):
     """Reading against force: r = r0 + sensitivity F."""
 
-    unit_of_y = "1"
+    x_name, reading, symbol, unit_of_y = "force", "reading", "sensitivity", "1"
 
-    def __init__(self, table: Table, rig: Rig) -> None:
-        row = SENSITIVITY.named(table.label)
-        super().__init__(table, rig, "force", "reading", row, table.settings.sd_ratio)
+    def slope_of(self, table: Table) -> Parameter:
+        return SENSITIVITY.named(table.label)

@@ -12,8 +12,7 @@ from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments, paper_estimates, select_tables
 from capsule_id.experiments.base import Experiment
 from capsule_id.experiments.checks import Whiteness, correlated_records
-from capsule_id.experiments.friction import model_lines
-from capsule_id.experiments.friction_model import FrictionModel, SurfaceExperiment
+from capsule_id.experiments.friction_model import FrictionModel, SurfaceExperiment, model_lines
 from capsule_id.experiments.kind import Registry
 from capsule_id.inference.joint_fit import joint_fit
 from capsule_id.inference.marginal import MarginalPosterior

@@ -15,7 +15,7 @@ from capsule_id.experiments.capsule_experiment import CapsuleDecay, CapsuleForwa
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.checks import check_free_decay
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.friction_experiment import unit_law
+from capsule_id.experiments.friction import unit_law
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.point_stage import PointStage, fit_points
 from capsule_id.inference.target import LogPosterior
@@ -117,10 +117,10 @@ def test_a_record_that_hits_the_spring_is_described() -> None:
 def test_a_ringing_rod_shortens_the_slide() -> None:
     """By 11 % at 0.1 m/s and 3 % at 0.2 m/s; a rod that is stiff to its capsule is a locked one."""
     e = CapsulePushes(pushes("capsule"), bench.rig())
-    np.testing.assert_allclose(np.asarray(e.slide(TRUTH, np)), e.distance, rtol=1e-7)
+    np.testing.assert_allclose(np.asarray(e.predict(TRUTH, e.readings)), e.observed, rtol=1e-7)
     locked = slide_distance(unit_law(MU, V_S), 1.0 / bench.G, SPEEDS)
-    assert np.round(100.0 * (e.distance / locked - 1.0)[:2]).tolist() == [-11.0, -3.0]
-    stiff = np.asarray(e.slide(TRUTH | {"k1": 1e7, "c": 1e3}, np))
+    assert np.round(100.0 * (e.observed / locked - 1.0)[:2]).tolist() == [-11.0, -3.0]
+    stiff = np.asarray(e.predict(TRUTH | {"k1": 1e7, "c": 1e3}, e.readings))
     np.testing.assert_allclose(stiff, locked, rtol=1e-4)
 
 
@@ -140,9 +140,9 @@ def test_pushes_read_by_the_closed_form_are_biased() -> None:
 
 def test_the_smoothed_model_converges_to_the_exact_one() -> None:
     e = CapsulePushes(pushes("capsule"), bench.rig())
-    exact = np.asarray(e.slide(TRUTH, np))
+    exact = np.asarray(e.predict(TRUTH, e.readings))
     errors = [
-        np.max(np.abs(np.asarray(e.with_smoothing(Smoothing(velocity=v)).slide(TRUTH, np)) / exact - 1.0))
+        np.max(np.abs(np.asarray(e.with_smoothing(Smoothing(velocity=v)).predict(TRUTH, e.readings)) / exact - 1.0))
         for v in (4e-3, 1e-3)
     ]
     assert errors[1] < 0.5 * errors[0] < 0.05

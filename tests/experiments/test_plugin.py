@@ -2,12 +2,16 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
+from scipy import stats
 
 from capsule_id import experiments
 from capsule_id.api import read_rig
@@ -16,21 +20,28 @@ from capsule_id.experiments import kind as registry
 from capsule_id.experiments.kind import GROUP, Registry, default_registry
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
+from capsule_id.physics.friction import FrictionLaw
 from tests import cli_tools
+from tests.experiments.test_foreign_law import TRUTH, Lorentzian
 
 #: The kinds without the package, made before a test installs it.
 KINDS = default_registry()
 PLUGIN = Path(__file__).with_name("rolling_rig")
+#: The kind of the guide.
+RECIPE = re.findall(
+    r"```python\n(.*?)```", (cli_tools.ROOT / "capsule_id/guide/extending.md").read_text("utf-8"), re.S
+)[0]
 SPEEDS = (0.1, 0.2, 0.3, 0.4, 0.5)
 #: Measured force, N: c_rr (m1 + m2) g = 0.0628 N at c_rr = 0.01, and a scatter of 1 mN.
 FORCES = (0.0638, 0.0618, 0.0628, 0.0633, 0.0623)
 
 
 def install(site: Path, target: str = "rolling_rig:KIND") -> Path:
-    """``site`` as ``pip install --target`` leaves it: the package, and metadata with its entry point."""
+    """``site`` as ``pip install --target`` leaves it: the packages, and metadata with an entry point."""
     info = site / "rolling_rig-0.1.dist-info"
     info.mkdir(parents=True)
     shutil.copytree(PLUGIN, site / "rolling_rig", ignore=shutil.ignore_patterns("__pycache__"))
+    (site / "towing_rig.py").write_text(RECIPE, encoding="utf-8")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: rolling-rig\nVersion: 0.1\n", encoding="utf-8")
     (info / "entry_points.txt").write_text(f"[{GROUP}]\nrolling_resistance = {target}\n", encoding="utf-8")
     return site
@@ -105,7 +116,7 @@ def test_it_is_fitted_and_reported(site: Path, folder: Path, tmp_path: Path) -> 
 def load(site: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     """The default registry, made anew with the package in ``site`` installed."""
     monkeypatch.syspath_prepend(site)
-    for name in [name for name in sys.modules if name.split(".")[0] == "rolling_rig"]:
+    for name in [name for name in sys.modules if name.split(".")[0] in ("rolling_rig", "towing_rig")]:
         monkeypatch.delitem(sys.modules, name)
     return default_registry.__wrapped__()
 
@@ -147,6 +158,61 @@ def test_a_faulty_package_is_named(
     assert str(caught.value).startswith("rolling-rig: the experiment kind rolling_resistance of an installed package")
     assert fault in caught.value.value
     assert caught.value.remedy == "update the package rolling-rig, or uninstall it"
+
+
+@pytest.fixture
+def towing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
+    """The registry with the kind of the guide, which ignores what the friction law is."""
+    assert len([line for line in RECIPE.splitlines() if line.strip()]) <= 20
+    return load(install(tmp_path / "site", "towing_rig:KIND"), monkeypatch)
+
+
+def towed(folder: Path, n: int = 40) -> Path:
+    """A rig folder with pulls of ``TRUTH`` at ``n`` speeds, with a scatter of 1 %."""
+    folder.mkdir()
+    speed = np.geomspace(0.01, 1.0, n)
+    pull = TRUTH.forward(speed) * (1.0 + 0.01 * np.random.default_rng(2).standard_normal(n))
+    rows = "\n".join(f"{v},{F}" for v, F in zip(speed, pull, strict=True))
+    (folder / "towing.csv").write_text(f"speed [m/s],pull [N]\n{rows}\n", encoding="utf-8")
+    masses = "\n".join(f'm{k} = {{ value = {m}, sd = 1e-4, unit = "kg" }}' for k, m in ((1, 0.11), (2, 0.53)))
+    errors = 'speed_sd = { value = 2, unit = "mm/s" }\npull_sd = { value = 10, unit = "mN" }'
+    entry = f'[[experiment]]\nkind = "towing"\nfile = "towing.csv"\n{errors}'
+    (folder / "rig.toml").write_text(f'[rig]\nname = "towed"\n{masses}\n{entry}\n', encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("law", [None, Lorentzian])
+def test_the_kind_of_the_guide_follows_the_friction_law_by_name(
+    towing: Registry, tmp_path: Path, law: type[FrictionLaw] | None
+) -> None:
+    """Before: a kind of another package had to read mu, and a law of the user's own beside it was refused."""
+    rig = read_rig(towed(tmp_path / "rig"), towing)
+    (e,) = experiments.make_experiments(rig, registry=towing, friction=law)
+    weight, v = 0.64 * rig.g.value, e.table["speed"]
+    if law is None:
+        own = {"mu": 0.6, "v_s": 0.1}
+        force = 0.3 * weight * (1.0 + np.exp(-v / 0.1))
+        slope = -0.3 * weight * np.exp(-v / 0.1) / 0.1
+    else:
+        own = vars(TRUTH)
+        force = TRUTH.forward(v)
+        slope = -2.0 * v / TRUTH.v_0**2 * (TRUTH.F_s - TRUTH.F_c) / (1.0 + (v / TRUTH.v_0) ** 2) ** 2
+    assert [row.symbol for row in e.parameters] == [*own, "towing_scatter"]
+    theta = {**own, "towing_scatter": 0.02, "m1": 0.11, "m2": 0.53, "g": rig.g.value}
+    sd = np.sqrt(0.01**2 + (0.002 * slope) ** 2 + (0.02 * force) ** 2)
+    expected = np.sum(stats.norm.logpdf(e.observed, force, sd))
+    for xp in (np, jnp):
+        assert float(e.log_likelihood(theta, xp)) == pytest.approx(expected, rel=1e-10)
+    (panel,) = experiments.compare([e], theta, [theta, theta], towing)
+    assert (panel.kind, len(panel.curves[0].y)) == ("towing", 60)
+
+
+@pytest.mark.full
+def test_the_kind_of_the_guide_recovers_a_law_of_the_users_own(towing: Registry, tmp_path: Path) -> None:
+    rig = read_rig(towed(tmp_path / "rig"), towing)
+    fit = point_fit(LogPosterior(rig, experiments.make_experiments(rig, registry=towing, friction=Lorentzian)), 0)
+    for name, truth in vars(TRUTH).items():
+        assert abs(fit.values[name] - truth) < 4.0 * fit.standard_errors[name] < 0.4 * truth
 
 
 @pytest.mark.full

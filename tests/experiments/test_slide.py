@@ -6,7 +6,7 @@ import pytest
 from bench import G
 from scipy import integrate, special
 
-from capsule_id.experiments.friction_experiment import paper_friction_fit, unit_law
+from capsule_id.experiments.friction import paper_friction_fit, unit_law
 from capsule_id.physics.friction import slide_distance
 
 MU, V_S = 0.66, 0.30

@@ -19,8 +19,7 @@ from capsule_id.experiments.forced_run.start_state import (
     parts_of,
     rough_start,
 )
-from capsule_id.experiments.friction import ground_parameters
-from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel
+from capsule_id.experiments.friction_model import EQUATION_1, NORMAL_FORCE, FrictionModel, ground_parameters
 from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, innovations
 from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.drive import Drive, Excitation

@@ -14,8 +14,7 @@ import pandas as pd
 from capsule_id.experiments.base import About, Start, ValuesBySymbol, band
 from capsule_id.experiments.capsule_experiment import CapsuleForward, lag_of, stated_parameters
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.friction import ground_parameters
-from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, ground_parameters
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.experiments.progression.declaration import (
     AMPLITUDE,

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from capsule_id.experiments.base import Experiment, ValuesBySymbol
 from capsule_id.experiments.checks import autocorrelation, estimate, refit
 from capsule_id.experiments.context import Tension
-from capsule_id.experiments.friction_experiment import varies
+from capsule_id.experiments.friction import varies
 from capsule_id.inference.curvature import jacobian
 from capsule_id.inference.point_fit import residual_jacobian
 from capsule_id.inference.point_stage import BenchFit

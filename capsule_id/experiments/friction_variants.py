@@ -1,0 +1,292 @@
+"""Variants of the friction law, compared by their marginal likelihoods on the friction experiments, and their checks."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from scipy import optimize, special
+
+from capsule_id.experiments.checks import LEVEL
+from capsule_id.experiments.context import Fitted
+from capsule_id.experiments.friction import FrictionExperiment, check_one_surface
+from capsule_id.experiments.friction_model import CONSTANT, FrictionModel, Reversed, model_lines
+from capsule_id.experiments.misfit import LOG_2PI
+from capsule_id.parameters import QUANTILE_975, Parameter, Prior
+from capsule_id.physics.friction import CoulombStribeck
+from capsule_id.views import Finding, ResultTable
+
+# friction variants: Variants of the friction law, compared by their marginal likelihoods on the friction experiments.
+#
+# The readings are the paper's points, (speed, coefficient), with relative errors. Few points leave several modes, where
+# differences of maxima mislead. So each variant is integrated over its priors, by sequential Monte Carlo (Del Moral,
+# Doucet & Jasra 2006): particles move from the prior to the posterior through powers of the likelihood.
+# If the law in use is right, its marginal likelihood is ``FACTOR`` times smaller than another one's with probability at
+# most 1/FACTOR (Markov's inequality, for parameters drawn from the prior).
+
+
+#: Ratio of marginal likelihoods above which a variant is rejected, and above which data tell it from the best.
+FACTOR, TELLING = 100.0, 10.0
+#: Number of particles, Metropolis steps between two powers, and the part of the particles that a power must keep.
+PARTICLES, MOVES, KEPT = 1000, 6, 0.5
+#: Smallest relative error of a reading: rounding of equal readings.
+SMALLEST_ERROR = 1e-6
+#: Number of permutations of the runs test.
+PERMUTATIONS = 4000
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One friction law fitted to the friction experiments.
+
+    Attributes
+    ----------
+    line : what ``[model]`` of rig.toml must say
+    values, sds : posterior means and standard deviations of the law's parameters, SI, by symbol
+    log_likelihood : the largest of the sample
+    evidence : log marginal likelihood
+    bic : Schwarz's criterion
+    lack_of_fit : p-value of the residuals' order, see ``order_p``
+    """
+
+    model: FrictionModel
+    values: Mapping[str, float]
+    sds: Mapping[str, float]
+    log_likelihood: float
+    evidence: float
+    bic: float
+    lack_of_fit: float
+
+    @property
+    def line(self) -> str:
+        return model_lines(self.model)
+
+
+def candidates(experiments: Sequence[FrictionExperiment]) -> list[FrictionModel]:
+    """Return the laws that the experiments can tell apart, the law in use included, the simplest first."""
+    in_use = replace(experiments[0].friction, direction="both")
+    models = [FrictionModel(constant=True), FrictionModel(), FrictionModel(free=("ratio",))]
+    # A viscous part over a normal force of every row is refused, so it is not proposed either.
+    per_row = any("normal_force" in e.table.columns for e in experiments if e.role == "sliding")
+    if experiments[0].rig.m1 is not None and experiments[0].rig.m2 is not None and not per_row:
+        models += [FrictionModel(free=("viscous",), constant=True), FrictionModel(free=("ratio", "viscous"))]
+    if len({e.friction.direction for e in experiments}) > 1:
+        models += [replace(model, free=("mu_back", *model.free)) for model in models]
+    return sorted({in_use, *models}, key=lambda m: (len(m.parameters), not m.constant, m.free))
+
+
+class VariantPoints:
+    """The paper's points of all friction experiments, and their density under a law."""
+
+    def __init__(self, experiments: Sequence[FrictionExperiment]) -> None:
+        self.experiments = tuple(experiments)
+        points = [e.paper_points() for e in experiments]
+        self.speed = np.concatenate([speed for speed, _ in points])
+        self.logs = [np.log(coefficient) for _, coefficient in points]
+        self.errors = [e.point_errors() for e in experiments]
+        rig = experiments[0].rig
+        weighed = rig.m1 is not None and rig.m2 is not None
+        self.normal_forces = [e.stated_normal_force if weighed else np.nan for e in experiments]
+        self.priors = {name: stated.prior for name, stated in rig.priors.items()}
+
+    def rows(self, model: FrictionModel) -> list[Parameter]:
+        """The law's parameters, then the scatters, with the priors of the fit."""
+        scatters = {row.symbol: row for e in self.experiments for row in e.parameters if row.symbol == e.scatter.symbol}
+        rows = [*model.parameters, *scatters.values()]
+        return [row if row.name not in self.priors else row.named(row.of, self.priors[row.name]) for row in rows]
+
+    def scaled(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Differences of log-coefficients and their sd, (s, n) each, at ``theta``: (s,) by symbol."""
+        known = {row.symbol: theta[row.symbol] for row in model.parameters} | (CONSTANT if model.constant else {})
+        viscous = known.pop("viscous", None)
+        raw, sd = [], []
+        for e, logs, (reading, per_scatter), N in zip(
+            self.experiments, self.logs, self.errors, self.normal_forces, strict=True
+        ):
+            own = {**known, "viscous": 0.0 if viscous is None else viscous / N}
+            leaves = {name: value if np.ndim(value) == 0 else value[:, None, None] for name, value in own.items()}
+            law = CoulombStribeck(N=1.0, **leaves)
+            law = Reversed(law) if e.friction.direction == "backward" else law
+            scatter = theta[e.scatter.symbol][:, None] * per_scatter
+            raw.append(logs - np.log(e.paper_coefficient(law)))
+            sd.append(np.sqrt(reading**2 + scatter**2 + SMALLEST_ERROR**2) * np.ones(len(logs)))
+        return np.concatenate(raw, axis=1), np.concatenate(sd, axis=1)
+
+    def log_likelihood(self, model: FrictionModel, theta: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(s,) natural log-density of the log-coefficients."""
+        raw, sd = self.scaled(model, theta)
+        value = -0.5 * np.sum((raw / sd) ** 2 + LOG_2PI + 2.0 * np.log(sd), axis=1)
+        return np.where(np.isfinite(value), value, -np.inf)
+
+
+def fit_variant(points: VariantPoints, model: FrictionModel, seed: int, particles: int = PARTICLES) -> Variant:
+    """Fit one law; the same seed gives the same numbers."""
+    rows = points.rows(model)
+
+    def theta_of(z: np.ndarray) -> dict[str, np.ndarray]:
+        return {row.symbol: _from_normal(row, z[:, i]) for i, row in enumerate(rows)}
+
+    def density(z: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return points.log_likelihood(model, theta_of(z))
+
+    z, values, evidence = sequential_monte_carlo(density, len(rows), np.random.default_rng(seed), particles)
+    theta, best = theta_of(z), int(np.argmax(values))
+    raw, sd = points.scaled(model, {name: column[best : best + 1] for name, column in theta.items()})
+    own = {row.symbol: theta[row.symbol] for row in model.parameters}
+    # Readings at one speed have no order in speed; that of their rows is another check's.
+    order = np.lexsort((np.random.default_rng(seed).random(len(points.speed)), points.speed))
+    return Variant(
+        model,
+        {name: float(np.mean(column)) for name, column in own.items()},
+        {name: float(np.std(column)) for name, column in own.items()},
+        float(values[best]),
+        evidence,
+        len(rows) * float(np.log(len(points.speed))) - 2.0 * float(values[best]),
+        order_p((raw / sd)[0][order], np.random.default_rng(seed)),
+    )
+
+
+def sequential_monte_carlo(
+    density: Callable[[np.ndarray], np.ndarray], dimension: int, rng: np.random.Generator, particles: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Sample the posterior of a standard normal prior; return particles (s, d), log-likelihoods (s,), log evidence."""
+    z = rng.standard_normal((particles, dimension))
+    value, power, evidence = density(z), 0.0, 0.0
+    while power < 1.0:
+        step = _next_step(value, 1.0 - power)
+        weight = np.exp(step * (value - np.max(value)))
+        evidence += float(np.log(np.mean(weight)) + step * np.max(value))
+        power += step
+        mean = np.average(z, axis=0, weights=weight)
+        root = np.linalg.cholesky(
+            np.cov((z - mean).T, aweights=weight).reshape(dimension, dimension) + 1e-10 * np.eye(dimension)
+        )
+        position = (rng.random() + np.arange(particles)) / particles * np.sum(weight)
+        chosen = np.minimum(np.searchsorted(np.cumsum(weight), position), particles - 1)
+        z, value = _metropolis(density, (z[chosen], value[chosen]), power, root, rng)
+    return z, value, evidence
+
+
+def _metropolis(
+    density: Callable[[np.ndarray], np.ndarray],
+    particles: tuple[np.ndarray, np.ndarray],
+    power: float,
+    root: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move ``particles``, z (s, d) with their log-likelihoods (s,), by ``MOVES`` steps of the Metropolis rule.
+
+    root : (d, d) Cholesky factor of the covariance of z
+    """
+    z, value = particles
+    for scale in np.geomspace(1.0, 0.1, MOVES):
+        proposed = z + scale * 2.38 / np.sqrt(z.shape[1]) * rng.standard_normal(z.shape) @ root.T
+        new = density(proposed)
+        change = power * (new - value) - 0.5 * np.sum(proposed**2 - z**2, axis=1)
+        accepted = np.log(rng.random(len(z))) < change
+        z, value = np.where(accepted[:, None], proposed, z), np.where(accepted, new, value)
+    return z, value
+
+
+def order_p(residuals: np.ndarray, rng: np.random.Generator) -> float:
+    """Permutation p-value of the sum of products of neighbouring residuals (n,), in the order of speed.
+
+    Neighbours of one sign show a curve that misses the readings. The test is exact for exchangeable residuals.
+    """
+
+    def statistic(r: np.ndarray) -> np.ndarray:
+        return np.sum(r[..., 1:] * r[..., :-1], axis=-1)
+
+    shuffled = rng.permuted(np.tile(residuals, (PERMUTATIONS, 1)), axis=1)
+    return float((1 + np.sum(statistic(shuffled) >= statistic(residuals))) / (1 + PERMUTATIONS))
+
+
+def _next_step(value: np.ndarray, largest: float) -> float:
+    """Largest increase of the power that keeps ``KEPT`` of the particles effective."""
+
+    def effective(step: float) -> float:
+        weight = np.exp(step * (value - np.max(value)))
+        return float(np.sum(weight) ** 2 / np.sum(weight**2) / len(value))
+
+    if effective(largest) >= KEPT:
+        return largest
+    return max(float(np.asarray(optimize.brentq(lambda step: effective(step) - KEPT, 0.0, largest, xtol=1e-15))), 1e-9)
+
+
+def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:
+    """Values of a parameter whose prior is that of a standard normal ``z``."""
+    prior = row.prior if row.prior is not None else Prior("lognormal", 1.0, 10.0)
+    if prior.kind == "halfnormal":
+        return prior.spread * special.ndtri(0.5 * (1.0 + special.ndtr(z)))
+    return prior.location * np.exp(np.log(prior.spread) / QUANTILE_975 * z)
+
+
+# checks: Comparison with other laws, order of the residuals in speed.
+
+
+#: Smallest number of sliding readings for a comparison of laws, and seed of its sampler.
+FEWEST_SLIDES, SEED = 3, 0
+
+
+def check_variants(experiments: Sequence[FrictionExperiment], fit: Fitted) -> list[Finding]:
+    """Compare the friction law in use with other laws, and recommend the simplest that the readings allow.
+
+    The law in use fails where another one has a marginal likelihood ``FACTOR`` times larger, or where its residuals are
+    ordered by speed.
+    """
+    del fit
+    experiments = [e for e in experiments if e.speeds_known]
+    if not experiments:
+        return []
+    in_use = replace(experiments[0].friction, direction="both")
+    if in_use.law is not CoulombStribeck or sum(e.n for e in experiments if e.role != "static") < FEWEST_SLIDES:
+        return []
+    points = VariantPoints(experiments)
+    variants = [fit_variant(points, model, SEED) for model in candidates(experiments)]
+    highest = max(variant.evidence for variant in variants)
+    used = next(variant for variant in variants if variant.model == in_use)
+    simplest = next(variant for variant in variants if highest - variant.evidence < np.log(TELLING))
+    facts = {
+        "name": in_use.name,
+        "labels": ", ".join(e.label for e in experiments),
+        "count": len(variants),
+        "factor": float(np.exp(min(highest - used.evidence, 700.0))),
+        "simplest": simplest.model.name,
+        "line": simplest.line,
+        "p": used.lack_of_fit,
+        "variants": tuple(variants),
+    }
+    names = tuple(row.name for row in in_use.parameters)
+    rejected, ordered = facts["factor"] > FACTOR, used.lack_of_fit < LEVEL
+    return [
+        Finding("friction.variants", "fail" if rejected else "ok", facts, parameters=names),
+        Finding("friction.order", "fail" if ordered else "ok", facts, parameters=names),
+    ]
+
+
+def variant_table(experiments: Sequence[FrictionExperiment], fit: Fitted) -> list[ResultTable]:
+    """Show the laws of ``check_variants`` side by side."""
+    del experiments
+    variants = next((f.facts["variants"] for f in fit.findings if f.code == "friction.variants"), ())
+    if not variants:
+        return []
+    rows = [
+        {
+            "law": variant.model.name,
+            "parameters": "; ".join(
+                f"{name} = {value:.4g} ± {variant.sds[name]:.2g}" for name, value in variant.values.items()
+            ),
+            "log-likelihood": variant.log_likelihood,
+            "BIC": variant.bic - min(other.bic for other in variants),
+            "log marginal likelihood": variant.evidence - max(other.evidence for other in variants),
+            "order of residuals, p": variant.lack_of_fit,
+            "[model]": variant.line,
+        }
+        for variant in variants
+    ]
+    return [ResultTable("friction.variants", pd.DataFrame(rows).set_index("law"))]
+
+
+#: Checks and tables of friction experiments.
+CHECKS, TABLES = (check_one_surface, check_variants), (variant_table,)
