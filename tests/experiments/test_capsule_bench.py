@@ -113,6 +113,14 @@ def test_a_record_that_hits_the_spring_is_described() -> None:
     assert np.std(np.asarray(e.residuals(theta | {"k2": 0.0}, np))[: e.n]) > 3.0
 
 
+def test_a_decay_is_drawn_with_the_curve_of_the_capsule_model() -> None:
+    """Before: the design of the closed form, and no report."""
+    e = CapsuleDecay(decay(4e-3, "capsule"), bench.rig())
+    panel = e.comparison(TRUTH | {"x_start": 4e-3, "y_start": 0.0, "noise_sd": NOISE}, [])
+    (points,), (curve,) = panel.points, panel.curves
+    assert np.std(points.y - curve.y) == pytest.approx(NOISE, rel=0.1)
+
+
 @pytest.mark.full
 def test_a_ringing_rod_shortens_the_slide() -> None:
     """By 11 % at 0.1 m/s and 3 % at 0.2 m/s; a rod that is stiff to its capsule is a locked one."""

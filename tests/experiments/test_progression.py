@@ -1,6 +1,7 @@
 """Progressions: the likelihood against SciPy, sessions, the start on its own, faults of a folder with their remedies."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,7 +17,10 @@ from capsule_id.experiments.progression.declaration import KIND
 from capsule_id.experiments.progression.density import INNER, NODES
 from capsule_id.experiments.progression.experiment import Progression, check_discrepancy
 from capsule_id.experiments.progression.twin import ROBOT, RobotDesign, synthesize_robot
+from capsule_id.inference.checks.settings import SampledFit
 from capsule_id.inference.joint_fit import _rescaled
+from capsule_id.inference.result import PointFit
+from capsule_id.inference.tables import check_engine
 from capsule_id.inference.target import LogPosterior
 from capsule_id.physics.displacement import displacement
 from capsule_id.physics.drives import Pulses
@@ -99,6 +103,25 @@ def test_the_smoothed_engine_moves_the_trials_as_the_exact_one_does(folder: Path
     )
     assert 0.0 < np.max(np.abs(certified / X2 - 1.0)) < 0.02
     assert np.max(np.abs(wide / X2 - 1.0)) > 0.2
+
+
+@pytest.mark.full
+def test_a_progression_with_the_smoothed_engine_carries_a_bound_of_its_bias(folder: Path) -> None:
+    """The norm of the difference of the residuals, of the certified widths and of much wider ones."""
+    rig = read_rig(folder)
+    rig = replace(rig, model=replace(rig.model, engine="smooth"))
+    (e,) = make_experiments(rig)
+    bounds = []
+    for own in (e.with_smoothing(None), e, e.with_smoothing(Smoothing(velocity=0.1))):
+        target = LogPosterior(rig, [own])
+        u = target.unconstrain(np.array([THETA[name.split("[")[0]] for name in target.names]))
+        (found,) = check_engine(SampledFit(target, cast(PointFit, SimpleNamespace(u=u)), None, {}))
+        bounds.append(found.facts["largest"])
+        assert (found.level == "ok") == (found.parameters == ()) == (bounds[-1] <= 0.2)
+    assert bounds[0] == 0.0
+    assert 0.0 < bounds[1] < 1.0
+    assert found.level == "fail"
+    assert {"k1", "c", "mu"} <= set(found.parameters)
 
 
 @pytest.mark.full

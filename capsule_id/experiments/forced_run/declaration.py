@@ -61,8 +61,8 @@ def check_drive(rules: Sequence[DriveRule], entry: Entry[Any]) -> None:
 
 def _frequencies(settings: Any, columns: Mapping[str, Column]) -> str:
     """The stated frequencies, where there are both or none that is needed."""
-    stated = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
-    return "" if len(stated) == 1 or (settings.drive == BASE and not stated) else " and ".join(stated) or "none"
+    known = [key for key in ("Omega", "f") if getattr(settings, key) is not None]
+    return "" if len(known) == 1 or (settings.drive == BASE and not known) else " and ".join(known) or "none"
 
 
 def _uneven_base(settings: Any, columns: Mapping[str, Column]) -> str:
@@ -75,17 +75,17 @@ def _uneven_base(settings: Any, columns: Mapping[str, Column]) -> str:
     return ""
 
 
-def _present(*names: str) -> Callable[[Any, Mapping[str, Column]], str]:
+def present(*names: str) -> Callable[[Any, Mapping[str, Column]], str]:
     """Finds the columns of ``names`` that the entry has."""
     return lambda settings, columns: " and ".join(name for name in names if name in columns)
 
 
-def _stated(key: str) -> Callable[[Any, Mapping[str, Column]], bool]:
+def stated(key: str) -> Callable[[Any, Mapping[str, Column]], bool]:
     """Finds whether a setting is stated."""
     return lambda settings, columns: getattr(settings, key) is not None
 
 
-def _lacks(column: str, fewest: int = 0) -> Callable[[Any, Mapping[str, Column]], bool]:
+def lacks(column: str, fewest: int = 0) -> Callable[[Any, Mapping[str, Column]], bool]:
     """Finds whether the entry lacks ``column``, or has fewer columns than ``fewest``."""
     return lambda settings, columns: column not in columns or len(columns) < fewest
 
@@ -97,15 +97,15 @@ _IS_SETTLED = DriveRule(
 #: The rules on the drive of a forced run, in the order in which they are applied.
 DRIVE_RULES = (
     DriveRule(
-        FORCES, _present("x_base"), "", "x_base prescribes the motion of the rod", "a force",
+        FORCES, present("x_base"), "", "x_base prescribes the motion of the rod", "a force",
         'add drive = "base", or remove the column',
     ),
-    DriveRule((BASE,), _lacks("x_base"), "drive", 'drive = "base" needs a column x_base', "{columns}", "add it"),
+    DriveRule((BASE,), lacks("x_base"), "drive", 'drive = "base" needs a column x_base', "{columns}", "add it"),
     DriveRule(
-        (BASE,), _present("acceleration_rod", "current"), "drive",
+        (BASE,), present("acceleration_rod", "current"), "drive",
         "a run with a prescribed rod has x_capsule, x_rel or both, and no other channel", "{columns}", "remove {found}",
     ),
-    DriveRule((BASE,), _stated("P_d"), "P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True),
+    DriveRule((BASE,), stated("P_d"), "P_d", 'drive = "base" has no force P_d', "P_d", "remove P_d", of_key=True),
     _IS_SETTLED,
     DriveRule(
         (BASE,), _uneven_base, "", "the frequency of a base sampled unevenly must be stated", "{found}",
@@ -120,20 +120,20 @@ DRIVE_RULES = (
     ),
     *(
         DriveRule(
-            (HARMONIC, RECORDED), _stated(key), key, f'only drive = "pulses" has {key}', key, f"remove {key}", of_key=True
+            (HARMONIC, RECORDED), stated(key), key, f'only drive = "pulses" has {key}', key, f"remove {key}", of_key=True
         )
         for key in ("duty", "P_on", "lag")
     ),
     DriveRule(
-        (PULSES, RECORDED), _stated("P_d"), "P_d", 'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True
+        (PULSES, RECORDED), stated("P_d"), "P_d", 'drive = "{drive}" has no amplitude P_d', "P_d", "remove P_d", of_key=True
     ),
     _IS_SETTLED._replace(drives=(PULSES, RECORDED)),
     DriveRule(
-        (RECORDED,), _lacks("current", 3), "drive",
+        (RECORDED,), lacks("current", 3), "drive",
         'drive = "recorded" needs the column current and another channel', "{columns}", "add it",
     ),
     DriveRule(
-        (PULSES,), _present("current"), "drive", "pulses have no column current", "{columns}",
+        (PULSES,), present("current"), "drive", "pulses have no column current", "{columns}",
         'write drive = "recorded", or remove the column',
     ),
     *(
@@ -344,18 +344,14 @@ def _lint_feasibility(table: Table[RunSettings], rig: Rig, estimate: Estimate) -
     settings = table.settings
     if settings.drive != "harmonic" or settings.ground:
         return []
-    names = {symbol: symbol for symbol in ("k1", "c", "mu", "K")}
-    if settings.spring is not None:
-        names["k2"] = f"k2[{settings.spring}]"
-    if settings.P_d is not None:
-        del names["K"]
+    names = {symbol: symbol for symbol in ("k1", "c", "mu") + (("K",) if settings.P_d is None else ())}
+    names |= {} if settings.spring is None else {"k2": f"k2[{settings.spring}]"}
     values = {symbol: estimate(name) for symbol, name in names.items()}
     guessed = [names[symbol] for symbol, (_, measured) in values.items() if not measured]
     theta = {"m1": rig.mass("m1"), "m2": rig.mass("m2"), "g": rig.g.value}
     theta |= {symbol: value for symbol, (value, _) in values.items()}
-    stated = {} if settings.normal_force is None else {NORMAL_FORCE: settings.normal_force}
-    F_b = float(EQUATION_1.force({**theta, **stated}).forward(0.0))
-    findings = feasibility(table, theta, F_b)
+    normal = {} if settings.normal_force is None else {NORMAL_FORCE: settings.normal_force}
+    findings = feasibility(table, theta, float(EQUATION_1.force({**theta, **normal}).forward(0.0)))
     if findings and guessed:
         findings.append(Finding("runs.rough", "warn", {"names": ", ".join(guessed)}, table.label))
     return findings

@@ -184,7 +184,8 @@ class CapsuleRun(CapsuleForward):
         self.force = None if by_current or (P_d and P_d.sd > 0.0) else P_d and P_d.value
         self.normal_force = settings.normal_force
         self.coloured = coloured or settings.noise == "ar1"
-        rough = self.first_state(table).at_rate(capsule_rate)
+        rough = self.first_state(table)
+        rough = rough if capsule_rate is None else replace(rough, capsule_rate=capsule_rate)
         is_open = settings.start == "auto" or not leads
         start = rough.kind if is_open else settings.start
         self.settled, self.moves = start == "settled", float(start == "moving")
@@ -407,11 +408,29 @@ class CapsuleRun(CapsuleForward):
             parts.append(Misfit(xp.reshape(raw, (1,)), sd**2, 0.0, xp.zeros((1, 0))))
         return tuple(parts)
 
+    # -- whether one initial state predicts the record ----------------------------------------------------------------
+
     def predictable_parts(self, theta: ValuesBySymbol) -> "tuple[tuple[CapsuleRun, ...], list[Finding]]":
-        return predictable_parts(self, theta)
+        factor = 0.0 if self.settled else growth(self, theta)
+        if factor <= LARGEST_GROWTH:
+            return (self,), []
+        duration = float(self.time[-1] - self.time[0])
+        # Errors grow about ``PART_GROWTH`` times within a part.
+        length = duration * np.log(PART_GROWTH) / np.log(factor) if np.isfinite(factor) else 0.0
+        parts = self.parts(max(PART_PERIODS * 2.0 * np.pi / self.Omega, length))
+        facts = {"growth": factor, "parts": len(parts), "seconds": duration / len(parts)}
+        return parts, [Finding("runs.cut", "warn", facts, self.label)] if len(parts) > 1 else []
 
     def corrected_start(self, theta: ValuesBySymbol) -> "tuple[CapsuleRun, dict[str, float]] | None":
-        return corrected_start(self, theta)
+        # The initial state may be stated, and without x_capsule nothing decides.
+        may_change = self.about.start_is_open and "x_capsule" in self.names
+        better = better_start(self, theta) if may_change else None
+        if better is None:
+            return None
+        restarted = self.restarted(better["capsule_start"])
+        # A prescribed rod has no initial speed to sample, and a capsule at rest none either.
+        sampled = {row.symbol for row in restarted.parameters}
+        return restarted, {f"{symbol}[{self.label}]": value for symbol, value in better.items() if symbol in sampled}
 
 
 # state: The initial state of a run: whether it predicts the whole record, and whether the capsule rests in it.
@@ -463,37 +482,6 @@ def growth(run: CapsuleRun, theta: ValuesBySymbol) -> float:
     last = int(np.argmax(factors > MEASURABLE)) if np.any(factors > MEASURABLE) else INSTANTS - 1
     with np.errstate(over="ignore"):
         return float(factors[last] ** (INSTANTS / (last + 1)))
-
-
-def predictable_parts(run: CapsuleRun, theta: ValuesBySymbol) -> tuple[tuple[CapsuleRun, ...], list[Finding]]:
-    """Divide ``run`` where it amplifies errors of its initial state too much at ``theta``; also return findings."""
-    factor = 0.0 if run.settled else growth(run, theta)
-    if factor <= LARGEST_GROWTH:
-        return (run,), []
-    duration = float(run.time[-1] - run.time[0])
-    # Errors grow about ``PART_GROWTH`` times within a part.
-    length = duration * np.log(PART_GROWTH) / np.log(factor) if np.isfinite(factor) else 0.0
-    parts = run.parts(max(PART_PERIODS * 2.0 * np.pi / run.Omega, length))
-    if len(parts) == 1:
-        return parts, []
-    facts = {"growth": factor, "parts": len(parts), "seconds": duration / len(parts)}
-    return parts, [Finding("runs.cut", "warn", facts, run.label)]
-
-
-def corrected_start(run: CapsuleRun, theta: ValuesBySymbol) -> tuple[CapsuleRun, dict[str, float]] | None:
-    """Replace the kind of initial state of ``run``; also return values by name from which a fit continues.
-
-    None: the initial state is stated, x_capsule is not recorded, or no other initial state fits better.
-    """
-    if not run.about.start_is_open or "x_capsule" not in run.names:
-        return None
-    better = better_start(run, theta)
-    if better is None:
-        return None
-    restarted = run.restarted(better["capsule_start"])
-    # A prescribed rod has no initial speed to sample, and a capsule at rest none either.
-    sampled = {row.symbol for row in restarted.parameters}
-    return restarted, {f"{symbol}[{run.label}]": value for symbol, value in better.items() if symbol in sampled}
 
 
 def better_start(run: CapsuleRun, theta: ValuesBySymbol) -> dict[str, float] | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -101,15 +101,14 @@ class RunStart:
 
     Attributes
     ----------
-    kind : "moving" where the capsule moves significantly at the first sample, else "stuck"
-    x_rel, rate, capsule_rate : m, m/s, m/s at the first sample; 0 where the channel is missing
+    x_rel, rate, capsule_rate : m, m/s, m/s at the first sample; 0 where the channel is missing, and the speed of a
+        capsule that does not move significantly
     length : amplitude of the rod's motion, m
     amplitude : amplitude of the current, A (NaN where it is not recorded)
     phase : phase of the drive, rad, in (-pi, pi]
     noise : noise level by channel
     """
 
-    kind: Literal["stuck", "moving"]
     x_rel: float
     rate: float
     capsule_rate: float
@@ -118,11 +117,10 @@ class RunStart:
     phase: float
     noise: Mapping[str, float]
 
-    def at_rate(self, capsule_rate: float | None) -> "RunStart":
-        """The same values with another speed of the capsule, m/s, 0 for stuck; None: these."""
-        if capsule_rate is None:
-            return self
-        return replace(self, capsule_rate=capsule_rate, kind="stuck" if capsule_rate == 0.0 else "moving")
+    @property
+    def kind(self) -> str:
+        """Kind of the initial state."""
+        return "moving" if self.capsule_rate else "stuck"
 
 
 @dataclass(frozen=True)
@@ -173,12 +171,12 @@ def rough_start(time: np.ndarray, channels: Mapping[str, np.ndarray], Omega: flo
         length = max(float(np.ptp(channels["x_capsule"])), 1e-4)
     else:
         length = 1e-3
-    capsule_rate, kind = 0.0, "stuck"
+    capsule_rate = 0.0
     if "x_capsule" in channels:
         (_, slope), factor = _polynomial(time, channels["x_capsule"], LINE_SAMPLES, 1)
         if abs(slope) > MOVING * factor * noise["x_capsule"]:
-            capsule_rate, kind = slope, "moving"
-    return RunStart(kind, x_rel, rate, capsule_rate, length, amplitude, phase, noise)  # type: ignore[arg-type]
+            capsule_rate = slope
+    return RunStart(x_rel, rate, capsule_rate, length, amplitude, phase, noise)
 
 
 def _polynomial(time: np.ndarray, values: np.ndarray, samples: int, order: int) -> tuple[tuple[float, float], float]:

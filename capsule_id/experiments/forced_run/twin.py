@@ -1,7 +1,8 @@
 """Synthetic forced runs with known truth: samples of the exact model after its transient, with sensor errors."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -50,30 +51,17 @@ GAP_SD = 0.02e-3
 
 
 @dataclass(frozen=True)
-class RunTruth:
-    """True values of one run, SI; ``x_rel``, ``Y1``, ``Y2`` are the state at the first sample, where X2 = 0."""
-
-    spring: str
-    G: float
-    P_d: float
-    Omega: float
-    phase: float
-    current_amplitude: float
-    x_rel: float
-    Y1: float
-    Y2: float
-    offsets: dict[str, float]
-    noise_sd: dict[str, float]
-
-
-@dataclass(frozen=True)
 class SyntheticRun:
-    """A measured run: ``time`` and ``channels`` (n,) SI, the measured gap, and the truth."""
+    """A measured run: ``time`` and ``channels`` (n,) SI, the measured gap, and the truth.
+
+    ``truth`` has the true values, SI: spring, G, P_d, Omega, phase, current_amplitude, offsets and noise_sd by channel,
+    and x_rel, Y1, Y2, the state at the first sample, where X2 = 0.
+    """
 
     time: np.ndarray
     channels: dict[str, np.ndarray]
     stated_gap: float
-    truth: RunTruth
+    truth: SimpleNamespace
 
     def table(self) -> dict[str, np.ndarray]:
         """Columns of the file, in the order and units of its header, rounded to digits above the noise."""
@@ -101,7 +89,7 @@ def measure(values: Values, seed: int) -> Twin:
     """
     runs = {f"run_{number}": run for number, run in enumerate(make_runs(values, seed), start=1)}
     tables = tuple(TwinTable(f"{label}.csv", run.table(), run.settings()) for label, run in runs.items())
-    return Twin(tables, spring_priors(values, seed), {label: asdict(run.truth) for label, run in runs.items()})
+    return Twin(tables, spring_priors(values, seed), {label: vars(run.truth) for label, run in runs.items()})
 
 
 def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, ...] = RUNS) -> list[SyntheticRun]:
@@ -166,8 +154,10 @@ def _measure(
         name: values + offsets.get(name, 0.0) + NOISE_SD[name] * rng.standard_normal(len(time))
         for name, values in exact.items()
     }
-    first = (float(x_rel[0]), float(Y1[0]), float(Y2[0]))
-    truth = RunTruth(run.spring, run.G, run.P_d, run.Omega, phase, amplitude, *first, offsets, dict(NOISE_SD))
+    drive = {"spring": run.spring, "G": run.G, "P_d": run.P_d, "Omega": run.Omega, "phase": phase}
+    first = {"x_rel": float(x_rel[0]), "Y1": float(Y1[0]), "Y2": float(Y2[0])}
+    errors = {"offsets": offsets, "noise_sd": dict(NOISE_SD)}
+    truth = SimpleNamespace(**drive, current_amplitude=amplitude, **first, **errors)
     return SyntheticRun(time, channels, stated_gap, truth)
 
 

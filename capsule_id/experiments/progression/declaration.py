@@ -1,15 +1,17 @@
 """Progressions: columns, settings, sessions, rules, template and texts."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from capsule_id.experiments.forced_run.declaration import DriveRule, check_drive, lacks, present, stated
 from capsule_id.experiments.kind import Kind, made_by
 from capsule_id.parameters import Prior, nuisance, scatter
-from capsule_id.rig.model import Quantity, Rig, Table
+from capsule_id.rig.model import Column, Quantity, Rig, Table
 from capsule_id.rig.schema import ColumnRule, GroundSettings, QuantityRule
 from capsule_id.rig.tables import Entry
 from capsule_id.rig.toml import ANY, NOT_NEGATIVE, PERIODS, POSITIVE, SHARE
@@ -88,26 +90,49 @@ class ProgressionSettings(GroundSettings):
     tails: Literal["normal", "heavy"] = "normal"
 
 
-def _check_drive(entry: Entry[ProgressionSettings]) -> None:
-    """Require one amplitude that belongs to the drive, and a duty with pulses."""
-    settings, columns = entry.table.settings, entry.table.columns
-    own = AMPLITUDE[settings.drive]
-    other = next(name for name in AMPLITUDE.values() if name != own)
-    if getattr(settings, other) is not None or other in columns:
-        rule = f'drive = "{settings.drive}" has the amplitude {own}'
-        raise entry.error("drive", rule, other, f"rename {other} to {own}, or correct the drive")
-    if (settings.drive == "pulses") != ("duty" in columns):
-        rule = "pulses need a column duty, and a harmonic drive has none"
-        remedy = "add the column duty" if settings.drive == "pulses" else "remove the column duty"
-        raise entry.error("drive", rule, f"columns {' '.join(columns)}", remedy)
-    if settings.drive == "harmonic" and settings.lag is not None:
-        raise entry.error("lag", "only pulses have a lag", "lag", "remove lag", of_key=True)
-    stated = [name for name in (own, "current") if name in columns]
-    stated += [f"the setting {own}"] if getattr(settings, own) is not None else []
-    if len(stated) != 1:
-        rule = f"a progression must have one amplitude: a column {own} or current, or the setting {own}"
-        remedy = f'state {own} = {{ value = ..., sd = ..., unit = "N" }} and nothing else'
-        raise entry.error("", rule, " and ".join(stated) or "none", remedy)
+def _amplitudes(own: str) -> Callable[[Any, Mapping[str, Column]], str]:
+    """Finds the stated amplitudes of a drive, where there is not exactly one; ``own`` : name of the amplitude."""
+
+    def found(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
+        stated = [name for name in (own, "current") if name in columns]
+        stated += [f"the setting {own}"] if getattr(settings, own) is not None else []
+        return "" if len(stated) == 1 else " and ".join(stated) or "none"
+
+    return found
+
+
+def _crowded(settings: ProgressionSettings, columns: Mapping[str, Column]) -> str:
+    """The largest number of trials that share a setting, where any of them may be outlying and there are too many."""
+    most = int(np.max(np.unique(_settings(columns, "periods"), return_counts=True)[1]))
+    return f"{most} trials" if settings.tails == "heavy" and most > MOST_TRIALS else ""
+
+
+_DUTY = "pulses need a column duty, and a harmonic drive has none"
+#: One amplitude that belongs to the drive, a duty with pulses, and few trials that share a setting with heavy tails.
+DRIVE_RULES = (
+    *(
+        DriveRule(
+            (drive,), lambda settings, columns, other=other: getattr(settings, other) is not None or other in columns,
+            "drive", f'drive = "{drive}" has the amplitude {own}', other, f"rename {other} to {own}, or correct the drive",
+        )
+        for (drive, own), other in zip(AMPLITUDE.items(), reversed(AMPLITUDE.values()), strict=True)
+    ),
+    DriveRule(("pulses",), lacks("duty"), "drive", _DUTY, "{columns}", "add the column duty"),
+    DriveRule(("harmonic",), present("duty"), "drive", _DUTY, "{columns}", "remove the column duty"),
+    DriveRule(("harmonic",), stated("lag"), "lag", "only pulses have a lag", "lag", "remove lag", of_key=True),
+    *(
+        DriveRule(
+            (drive,), _amplitudes(own), "",
+            f"a progression must have one amplitude: a column {own} or current, or the setting {own}", "{found}",
+            f'state {own} = {{{{ value = ..., sd = ..., unit = "N" }}}} and nothing else',
+        )
+        for drive, own in AMPLITUDE.items()
+    ),
+)  # fmt: skip
+TAIL_RULE = DriveRule(
+    tuple(AMPLITUDE), _crowded, "tails", f"heavy tails need at most {MOST_TRIALS} trials at each setting", "{found}",
+    "remove tails; the fit names outlying rows", of_key=True,
+)  # fmt: skip
 
 
 def _check_periods(entry: Entry[ProgressionSettings]) -> None:
@@ -120,25 +145,16 @@ def _check_periods(entry: Entry[ProgressionSettings]) -> None:
         raise entry.file.error(row, "periods", "periods must be a whole number", value, "count whole periods")
 
 
-def _check_tails(entry: Entry[ProgressionSettings]) -> None:
-    """Bound the number of trials that share a setting where any of them may be outlying."""
-    count = np.unique(_settings(entry.table, "periods"), return_counts=True)[1]
-    if entry.table.settings.tails == "heavy" and np.max(count) > MOST_TRIALS:
-        rule = f"heavy tails need at most {MOST_TRIALS} trials at each setting"
-        remedy = "remove tails; the fit names outlying rows"
-        raise entry.error("tails", rule, f"{np.max(count)} trials", remedy, of_key=True)
-
-
-def _settings(table: Table[Any], *more: str) -> np.ndarray:
+def _settings(columns: Mapping[str, Column], *more: str) -> np.ndarray:
     """Index of the setting of the drive of every row, where columns ``more`` count too."""
-    drive = [name for name in ("period", "f", "duty", "P_on", "P_d", "current", *more) if name in table.columns]
-    return np.unique(np.stack([table[name] for name in drive], axis=1), axis=0, return_inverse=True)[1]
+    drive = [name for name in ("period", "f", "duty", "P_on", "P_d", "current", *more) if name in columns]
+    return np.unique(np.stack([columns[name].values for name in drive], axis=1), axis=0, return_inverse=True)[1]
 
 
 def _lint_settings(table: Table[Any], rig: Rig) -> Iterable[Finding]:
     """Warn where a table has few settings, or more sessions with several settings than there are parameters for."""
     del rig
-    setting = _settings(table)
+    setting = _settings(table.columns)
     settings = 1 + int(np.max(setting))
     if settings < FEWEST_SETTINGS:
         facts = {"settings": settings, "wanted": FEWEST_SETTINGS}
@@ -219,7 +235,7 @@ KIND = Kind(
     sets=(("period", "periods", "distance"), ("f", "periods", "distance")),
     optional=("duty", "P_on", "P_d", "current", "session"),
     settings=ProgressionSettings,
-    rules=(_check_drive, _check_periods, _check_tails),
+    rules=(partial(check_drive, DRIVE_RULES), _check_periods, partial(check_drive, (TAIL_RULE,))),
     masses=lambda table: ("m1", "m2"),
     parameters=(SESSION_SD, *SESSIONS, TRIAL_SCATTER, TRIAL_SD, DISCREPANCY),
     bench=False,
@@ -261,12 +277,3 @@ def sessions_of(table: Table, rows: np.ndarray) -> np.ndarray:
     else:
         index = np.cumsum(np.concatenate([[0], np.any(rows[1:] != rows[:-1], axis=1)]))
     return np.eye(int(np.max(index)) + 1)[index]
-
-
-def name_of(setting: np.ndarray, drive: str, amplitude_from: str) -> str:
-    """Name of one row of ``settings_of``: period, duty and amplitude where they may differ, number of periods."""
-    period, periods, duty, amplitude = setting
-    parts = [f"{1e3 * period:g} ms"]
-    parts += [f"duty {100.0 * duty:g} %"] if drive == "pulses" else []
-    parts += {"column": [f"{amplitude:g} N"], "current": [f"{amplitude:g} A"]}.get(amplitude_from, [])
-    return ", ".join([*parts, f"{periods:g} periods"])

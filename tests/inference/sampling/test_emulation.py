@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.emulator import Emulator, _cosine
-from capsule_id.experiments.progression.density import RunEmulator
+from capsule_id.experiments.progression.density import Emulator, RunEmulator, _cosine
 from capsule_id.experiments.progression.experiment import Progression
 from capsule_id.inference import moves
 from capsule_id.inference import sampling as emulation
