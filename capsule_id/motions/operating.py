@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from capsule_id.console import OnProgress
 from capsule_id.errors import InputError
 from capsule_id.motions.response import SETTLING, Settling
-from capsule_id.motions.sweep import MOTION_COLUMNS, SUMMARY, compute, grid_of, sweep_points
-from capsule_id.parameters import SWEPT
+from capsule_id.motions.sweep import SUMMARY, compute, dataset_of, grid_of, sweep_points
 from capsule_id.physics.batches import lanes_of
 from capsule_id.physics.drive import PeriodicDrive
 from capsule_id.physics.model import CapsuleParameters
@@ -64,17 +63,8 @@ def draws_diagram(
     p, e = jax.tree.map(lambda leaf: np.tile(leaf, n), drawn)
     points = sweep_points(p, e, {over: np.repeat(grid[over], draws)})
     seen = compute(points, settling, SUMMARY, progress=progress, store=store, client=client)
-    variables = {
-        name: (
-            (over, "draw"),
-            seen[name].reshape(n, draws),
-            {"units": MOTION_COLUMNS[name][0], "long_name": MOTION_COLUMNS[name][1]},
-        )
-        for name in SUMMARY
-    }
-    axis = (over, grid[over], {"units": SWEPT[over].unit, "long_name": SWEPT[over].meaning})
     about = {**asdict(settling), "method": "rest", "model": "exact", "semantics": "stick-slip"}
-    return xr.Dataset(variables, {over: axis, "draw": np.arange(draws)}, about)
+    return dataset_of(seen, grid, (over, "draw"), (n, draws), about).assign_coords(draw=np.arange(draws))
 
 
 def bands(seen: xr.Dataset, objective: str = "mean_velocity") -> xr.Dataset:

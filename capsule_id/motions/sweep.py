@@ -3,7 +3,7 @@
 import hashlib
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -78,9 +78,9 @@ class SweepPoints:
         """Number of points."""
         return len(np.asarray(self.p.m1))
 
-    def part(self, begin: int, end: int) -> "SweepPoints":
-        """The points begin .. end - 1."""
-        return SweepPoints(*jax.tree.map(lambda leaf: leaf[begin:end], (self.p, self.e, self.initial)))
+    def part(self, chosen: slice) -> "SweepPoints":
+        """The points of a slice."""
+        return SweepPoints(*jax.tree.map(lambda leaf: leaf[chosen], (self.p, self.e, self.initial)))
 
 
 def sweep_points(
@@ -217,16 +217,12 @@ def compute(
     begins = range(0, points.size, block)
     if store is not None:
         _check_store(store, points, settling, keep, block)
-    parts: dict[int, MotionColumns] = {}
-    for begin in begins:
-        finished = _saved_block(store, begin)
-        if finished is not None:
-            parts[begin] = finished
-    missing = [begin for begin in begins if begin not in parts]
-    make = _in_process if client is None else _on_cluster(client)
+    saved = ((begin, _saved_block(store, begin)) for begin in begins)
+    parts = {begin: part for begin, part in saved if part is not None}
+    missing = {begin: slice(begin, begin + block) for begin in begins if begin not in parts}
     done = sum(len(part["status"]) for part in parts.values())
     _report(progress, done, points.size)
-    for begin, part in make(points, settling, tuple(keep), missing, block):
+    for begin, part in _blocks(points, settling, tuple(keep), missing, client):
         parts[begin] = part
         _save_block(store, begin, part)
         done += len(part["status"])
@@ -240,27 +236,25 @@ def settled_block(points: SweepPoints, settling: Settling, keep: Sequence[str]) 
     return {name: seen[name] for name in dict.fromkeys((*keep, "status"))}
 
 
-def _in_process(
-    points: SweepPoints, settling: Settling, keep: Sequence[str], missing: list[int], block: int
+def _blocks(
+    points: SweepPoints,
+    settling: Settling,
+    keep: Sequence[str],
+    missing: Mapping[int, slice],
+    client: "Client | None",
 ) -> Iterator[tuple[int, MotionColumns]]:
-    for begin in missing:
-        yield begin, settled_block(points.part(begin, begin + block), settling, keep)
-
-
-def _on_cluster(client: "Client") -> Callable[..., Iterator[tuple[int, MotionColumns]]]:
+    """(begin, columns) of each missing block, from this process or from a cluster, as they are finished."""
+    if client is None:
+        yield from ((begin, settled_block(points.part(part), settling, keep)) for begin, part in missing.items())
+        return
     from distributed import as_completed
 
-    def run(
-        points: SweepPoints, settling: Settling, keep: Sequence[str], missing: list[int], block: int
-    ) -> Iterator[tuple[int, MotionColumns]]:
-        futures: dict[Any, int] = {}
-        for begin in missing:
-            task = client.submit(settled_block, points.part(begin, begin + block), settling, keep, pure=False)
-            futures[task] = begin
-        for future, part in as_completed(list(futures), with_results=True):
-            yield futures[future], part
-
-    return run
+    futures: dict[Any, int] = {
+        client.submit(settled_block, points.part(part), settling, keep, pure=False): begin
+        for begin, part in missing.items()
+    }
+    for future, columns in as_completed(list(futures), with_results=True):
+        yield futures[future], columns
 
 
 def _report(progress: OnProgress | None, done: int, total: int) -> None:

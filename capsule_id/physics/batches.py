@@ -154,7 +154,7 @@ def folded(run: Callable[..., Result]) -> Callable[..., Result]:
         @on_leaves.def_vmap
         def _(size: int, batched: list[bool], *leaves: jax.Array) -> tuple[Any, Any]:
             if not any(batched):
-                out = on_leaves(*leaves)
+                out = run(*jax.tree.unflatten(structure, leaves))
                 return out, jax.tree.map(lambda _: False, out)
             full = [
                 x if flag else jnp.broadcast_to(x, (size, *x.shape)) for x, flag in zip(leaves, batched, strict=True)

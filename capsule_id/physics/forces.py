@@ -243,6 +243,17 @@ def downhill(p: Any, mass: Any) -> Any:
     return mass * p.g * array_module(p.slope).sin(p.slope) if p.slope is not None else 0.0
 
 
+def weights_along(p: Any) -> tuple[Any, Any] | None:
+    """Weights of rod and capsule along the slope, N, towards -X; None on level ground."""
+    return None if p.slope is None else (downhill(p, p.m1), downhill(p, p.m2))
+
+
+def along_ground(f: Any, D: Any, reaction: Any, weights: tuple[Any, Any] | None) -> tuple[Any, Any]:
+    """Forces along +X on rod and capsule, N, but for friction: f, the drive D and its reaction, the weights."""
+    rod, capsule = D - f, f if reaction is None else f - reaction * D
+    return (rod, capsule) if weights is None else (rod - weights[0], capsule - weights[1])
+
+
 def equilibrium(p: Any) -> Any:
     """x_rel, m, of the rod at rest with the drive off and no contact: k1 r + k_cubic r^3 = -m1 g sin(slope)."""
     load = -downhill(p, p.m1)

@@ -36,6 +36,7 @@ from capsule_id.parameters import CAPSULE_LEAVES, TABLE
 from capsule_id.physics.batches import NumberOrBatch, is_traced, lanes_of, run_lanes
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.drive import Excitation as Excitation
+from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.forces import Force
 from capsule_id.physics.friction import CoulombStribeck, FrictionLaw, friction_law
 from capsule_id.precision import require_float64
@@ -308,6 +309,8 @@ def simulate(
     law = friction_law(p, friction)
     if not is_traced((p, e, law, grid)):
         _check_values(p, e, law, np.asarray(grid))
+    if isinstance(e, RodMotion):
+        initial = (*e.rod(grid[:, 0]), initial[2], initial[3])
     lanes = (p, e, law, initial)
     if model == "exact":
         from capsule_id.physics.exact import engine as exact

@@ -13,7 +13,6 @@ from jax.lax import stop_gradient
 
 from capsule_id.physics.batches import folded, is_traced
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.exact.dense import WIDTH, Samples, read_off, row_of, samples_at
 from capsule_id.physics.exact.taylor import (
     GAP,
@@ -28,14 +27,11 @@ from capsule_id.physics.exact.taylor import (
     StepSeries,
     advance,
     constants_of,
-    drive_at,
+    driven,
     first_event,
-    force_on_capsule,
     force_rate,
     mode_at,
     motion_at,
-    rod_force,
-    rod_rate,
     series,
     size,
     touching,
@@ -124,11 +120,10 @@ def correct(
 
     s, at : the located time and the state there, in the mode before the event
     """
-    spring_force, D = rod_force(constants, at, mode), drive_at(constants, at)
-    f = force_on_capsule(constants, spring_force, D)
+    f, rod_rate = driven(constants, at, mode)
     acceleration = (f - sliding_friction(constants.law, mode.sigma, at.v)) / constants.m2
     a2 = jnp.where(mode.sigma != 0.0, acceleration, 0.0)
-    w_rate = rod_rate(constants, spring_force, D) - a2
+    w_rate = rod_rate - a2
     level = jnp.where(kind == UPPER, -constants.F_forward, constants.F_backward)
     f_rates = [k * x for k, x in enumerate(step.f)][1:]
     braking = (jnp.abs(f) + jnp.maximum(constants.F_forward, constants.F_backward)) / constants.m2
@@ -283,8 +278,6 @@ def run(
     Seven arguments, because the engine's inputs are unpacked.
     """
     constants, t_end = constants_of(p, e, law), stop_gradient(t_end)
-    if isinstance(e, RodMotion):
-        initial = (*e.rod(times[:, 0]), *initial[2:])
     lanes = initial_lanes(p, constants, times[:, 0], t_end, initial)
     samples = samples_at(times, initial, lanes.status == Status.OK)
     n = times.shape[1]

@@ -9,7 +9,7 @@ from jax.experimental.jet import jet
 
 from capsule_id.errors import InputError
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.forces import Force, forces_of, total
+from capsule_id.physics.forces import Force, along_ground, forces_of, total, weights_along
 from capsule_id.physics.friction import (
     DEGREE,
     FrictionLaw,
@@ -218,12 +218,8 @@ def constants_of(p: CapsuleParameters, e: Drive, law: FrictionLaw) -> Constants:
     m1, m2 = jnp.asarray(p.m1), jnp.asarray(p.m2)
     still = jnp.zeros_like(m1)
     F_forward, F_backward = (jnp.broadcast_to(F, still.shape) for F in (law.forward(still), law.backward(still)))
-    downhill = None
-    if p.slope is not None:
-        along = jnp.asarray(p.g * jnp.sin(p.slope))
-        downhill = m1 * along, m2 * along
     forces = jax.tree.map(jnp.asarray, forces_of(p))
-    return Constants(m1, m2, forces, e, law, F_forward, F_backward, e.reaction, downhill)
+    return Constants(m1, m2, forces, e, law, F_forward, F_backward, e.reaction, weights_along(p))
 
 
 def step_rate(constants: Constants, state: CapsuleState, mode: Mode, friction_rate: jax.Array) -> jax.Array:
@@ -284,29 +280,18 @@ def touching(constants: Constants, mode: Mode, side: float) -> jax.Array:
     return closed
 
 
-def force_on_capsule(constants: Constants, f: Any, D: Any) -> Any:
-    """Force along the ground on the capsule, N, but for friction: f, the reaction of the drive D, the slope."""
-    if constants.reaction is not None:
-        f = f - constants.reaction * D
-    return f if constants.downhill is None else f - constants.downhill[1]
-
-
-def force_on_rod(constants: Constants, f: Any, D: Any) -> Any:
-    """Force along the ground on the rod, N: the drive D, -f, the slope."""
-    return D - f if constants.downhill is None else D - f - constants.downhill[0]
-
-
-def rod_rate(constants: Constants, f: jax.Array, D: jax.Array) -> jax.Array:
-    """Y1' in m/s^2; D is the drive's value."""
-    return D if constants.drive.prescribed else force_on_rod(constants, f, D) / constants.m1
+def driven(constants: Constants, state: CapsuleState, mode: Mode) -> tuple[jax.Array, jax.Array]:
+    """(force along the ground on the capsule but for friction, N; Y1', m/s^2), each (L,), in the mode."""
+    D = drive_at(constants, state)
+    rod, capsule = along_ground(rod_force(constants, state, mode), D, constants.reaction, constants.downhill)
+    return capsule, D if constants.drive.prescribed else rod / constants.m1
 
 
 def series(constants: Constants, state: CapsuleState, mode: Mode, left: jax.Array) -> StepSeries:
     """Series of degree DEGREE about the state, in the mode; left (L,) s bounds the step."""
     sliding = mode.sigma != 0.0
     friction = friction_series(constants.law, mode.sigma, state.v, (constants.F_forward, constants.F_backward))
-    f0, D0 = rod_force(constants, state, mode), drive_at(constants, state)
-    friction_rate = friction.rate((force_on_capsule(constants, f0, D0) - friction.start) / constants.m2, constants.m2)
+    friction_rate = friction.rate((driven(constants, state, mode)[0] - friction.start) / constants.m2, constants.m2)
     guess = step_rate(constants, state, mode, jnp.where(sliding, friction_rate, 0.0))
     rate, rate_left = jax.lax.stop_gradient((guess, 1.0 / left))
     h = 1.0 / jnp.maximum(rate, rate_left)
@@ -330,9 +315,9 @@ def series(constants: Constants, state: CapsuleState, mode: Mode, left: jax.Arra
         of(d, lambda k, side=force.side: side * r[k]) for force, d in zip(constants.contacts, state.gaps, strict=True)
     ]
     parts = [(on_series(force, d, w), acts) for force, d, acts in acting(constants, r, gaps, mode)]
-    f = of(f0, lambda k: total(jnp.where(acts, part[k], 0.0) for part, acts in parts))
-    D = of(D0, drive.__getitem__)
-    on_capsule, on_rod = force_on_capsule(constants, f, D), force_on_rod(constants, f, D)
+    f = of(rod_force(constants, state, mode), lambda k: total(jnp.where(acts, part[k], 0.0) for part, acts in parts))
+    D = of(drive[0], drive.__getitem__)
+    on_rod, on_capsule = along_ground(f, D, constants.reaction, constants.downhill)
     orders = [(w[k], v[k], r[k], on_capsule[k]) for k in range(DEGREE + 1)]
     return StepSeries(h, rate_left >= rate, *map(list, zip(*orders, strict=True)))
 
@@ -500,9 +485,7 @@ def motion_at(constants: Constants, state: CapsuleState, mode: Mode, kind: jax.A
 
     f is the force on the capsule but for friction.
     """
-    spring_force, D = rod_force(constants, state, mode), drive_at(constants, state)
-    f = force_on_capsule(constants, spring_force, D)
-    w_rate = rod_rate(constants, spring_force, D)
+    f, w_rate = driven(constants, state, mode)
     f_rate = force_rate(constants, state, mode, w_rate)
     onset = (kind == UPPER) | (kind == LOWER)
     side = jnp.where(onset, jnp.where(kind == UPPER, 1.0, -1.0), jnp.sign(f))
@@ -543,9 +526,8 @@ def mode_at(constants: Constants, state: CapsuleState) -> Mode:
     meeting = tuple((d > 0.0) | ((d == 0.0) & (rate > 0.0)) for d, rate, _ in inward)
     sigma = motion_at(constants, state, Mode(jnp.zeros_like(state.v), meeting), jnp.full(state.r.shape, NONE))
     free = Mode(sigma, tuple(map(jnp.zeros_like, meeting)))
-    spring_force, D = rod_force(constants, state, free), drive_at(constants, state)
-    f = force_on_capsule(constants, spring_force, D)
+    f, rod_rate = driven(constants, state, free)
     a2 = jnp.where(sigma != 0.0, (f - sliding_friction(constants.law, sigma, state.v)) / constants.m2, 0.0)
-    w_rate = rod_rate(constants, spring_force, D) - a2
+    w_rate = rod_rate - a2
     touching = ((d == 0.0) & (rate == 0.0) & (side * w_rate > 0.0) for d, rate, side in inward)
     return Mode(sigma, tuple(x | y for x, y in zip(meeting, touching, strict=True)))

@@ -3,22 +3,22 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
 from capsule_id.physics.drive import Drive
-from capsule_id.physics.drives import RodMotion
 from capsule_id.physics.forces import (
     Array,
-    downhill,
+    along_ground,
     forces_of,
     rod_on_capsule,
     smooth_abs,
     smooth_heaviside,
     smooth_ramp,
     total,
+    weights_along,
 )
 from capsule_id.physics.friction import FrictionLaw
 from capsule_id.physics.model import MAX_STEPS, CapsuleParameters, Initial, Trajectory, admissible
@@ -163,13 +163,12 @@ def _forces(
 ) -> Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
     """(t, r, w) -> (Y1', m/s^2; force on the capsule but for friction, N)."""
     p, e, _, widths = system
+    weights = weights_along(p)
 
     def forces(t: jax.Array, r: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        f, D = rod_on_capsule(p, r, w, widths.penetration), e.force_at(t, piece)
-        on_rod = D - f if p.slope is None else D - f - downhill(p, p.m1)
-        Y1_rate = D if e.prescribed else on_rod / p.m1
-        f = f if e.reaction is None else f - e.reaction * D
-        return Y1_rate, f if p.slope is None else f - downhill(p, p.m2)
+        D = e.force_at(t, piece)
+        rod, capsule = along_ground(rod_on_capsule(p, r, w, widths.penetration), D, e.reaction, weights)
+        return D if e.prescribed else rod / p.m1, capsule
 
     return forces
 
@@ -204,7 +203,7 @@ def _problem(system: System, semantics: Semantics) -> Problem:
     field = stick_slip_field if semantics == "stick-slip" else eq2_field
     return Problem(
         field=partial(field, system),
-        piece_end=partial(_piece_end, e),
+        drive=e,
         gaps=(_nearest(p, 1.0), _nearest(p, -1.0)),
         first=FIRST_STEP / fastest,
         longest=DRIVE_ANGLE / e.frequency(),
@@ -212,11 +211,6 @@ def _problem(system: System, semantics: Semantics) -> Problem:
         tolerance=jnp.asarray(widths.tolerance),
         valid=_valid(system),
     )
-
-
-def _piece_end(e: Drive, t: jax.Array) -> Any:
-    """(L,) s, the first switching time of the drive after t (L,); infinite without one."""
-    return (jnp.inf, *e.piece(t))[-1]
 
 
 @lru_cache(maxsize=32)
@@ -236,8 +230,6 @@ def _compiled(semantics: Semantics, max_steps: int) -> Callable[..., Trajectory]
         widths = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), shape), smoothing)
         system = (*jax.tree.map(lambda leaf: jnp.asarray(leaf, float), (p, e, law)), widths)
         times = jnp.asarray(times, float)
-        if isinstance(e, RodMotion):
-            initial = (*e.rod(times[:, 0]), *initial[2:])
         record = march(system, times, jnp.stack(initial))
         X1, Y1, X2, Y2 = record.samples
         none = jnp.zeros_like(record.steps)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from capsule_id.physics.batches import folded
+from capsule_id.physics.drive import Drive
 from capsule_id.physics.model import Status
 
 # rosenbrock: One step of RODAS3, the solver of the smoothed model: state, linear algebra, error estimate, step control.
@@ -106,7 +107,7 @@ class Problem(NamedTuple):
     """What a run is made of besides its inputs; every array is (L,) or ()."""
 
     field: Callable[..., Field]  # of a time (L,), s, or of nothing: the field on the drive's piece that holds there
-    piece_end: Callable[[jax.Array], Any]  # (L,) s -> (L,) s: the next time at which a step must end
+    drive: Drive  # the ends of its pieces end steps
     gaps: tuple[jax.Array, jax.Array]  # m: a closing is r - gap, or -r - back gap, turning from negative
     first: jax.Array  # s: length of the first step tried
     longest: jax.Array  # s: no step is longer (infinity: no bound)
@@ -151,7 +152,8 @@ def initial_lanes(problem: Problem, times: jax.Array, y: StateArray) -> MarchSta
     floors = [jnp.broadcast_to(floor, t.shape) for floor in problem.floors]
     speed, stretch = _grown(floors[0], floors[1], y)
     finite = jnp.all(jnp.isfinite(times), axis=1) & jnp.all(jnp.isfinite(y), axis=0)
-    status = jnp.where(finite & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
+    covered = problem.drive.covers(t, times[:, -1])
+    status = jnp.where(finite & covered & problem.valid, Status.OK, Status.INVALID).astype(jnp.int32)
     zero = jnp.zeros(t.shape, jnp.int32)
     return MarchState(t, y, jnp.broadcast_to(problem.first, t.shape), speed, stretch, zero, (zero, zero), status)
 
@@ -161,7 +163,7 @@ def _advance(problem: Problem, end: jax.Array, lanes: MarchState, max_steps: int
     t, y = lanes.t, lanes.y
     active = (t < end) & (lanes.status == Status.OK)
     h = jnp.minimum(lanes.h, problem.longest)
-    target = jnp.minimum(end, problem.piece_end(t))
+    target = jnp.minimum(end, (jnp.inf, *problem.drive.piece(t))[-1])
     # A rest shorter than a hundredth of a step is taken along, so that no sliver of a step is left at the end.
     last = h * 1.01 >= target - t
     h = jnp.where(active, jnp.where(last, target - t, h), 1.0)
