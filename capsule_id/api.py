@@ -37,7 +37,7 @@ from capsule_id.inference.result import Result
 from capsule_id.inference.sampling import DEFAULT_BUDGET, DEFAULT_ESS
 from capsule_id.inference.target import LogPosterior
 from capsule_id.output import check_directory, publish, work_in_progress
-from capsule_id.parameters import is_stated
+from capsule_id.parameters import by_index, is_stated
 from capsule_id.physics.drive import Drive
 from capsule_id.physics.forces import warn_of_far_gap
 from capsule_id.physics.friction import FrictionLaw
@@ -176,14 +176,15 @@ class Fit(Result):
             **(given or {}),
         }
         if spring is not None:
-            if f"k2[{spring}]" not in chosen:
-                known = ", ".join(name[3:-1] for name in chosen if name.startswith("k2["))
+            springs = by_index("k2", chosen)
+            if spring not in springs:
+                known = ", ".join(springs)
                 raise InputError("spring must be a fitted one", repr(spring), f"choose from {known or 'none'}")
             if np.any(np.isinf(values["G"])):
                 raise InputError(
                     "a support spring needs its gap", f"{spring!r} alone", "give gap=1e-3, in m, or spring=None"
                 )
-            values["k2"] = chosen[f"k2[{spring}]"]
+            values["k2"] = springs[spring]
         leaves = fields(CapsuleParameters)
         if missing := [leaf.name for leaf in leaves if leaf.default is MISSING and leaf.name not in values]:
             rule, remedy = "simulate needs every parameter of the capsule", f"state given={{{missing[0]!r}: ...}}, SI"

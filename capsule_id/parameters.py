@@ -8,9 +8,11 @@ in ``k2[soft]`` or ``noise_sd[free_vibration_1]``. Positive parameters are sampl
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
+
+Value = TypeVar("Value")
 
 #: A log-normal prior holds 95 % of its mass within median/factor .. median*factor.
 QUANTILE_975 = NormalDist().inv_cdf(0.975)
@@ -57,6 +59,28 @@ class Prior:
         return f"normal, {self.location:g} ± {self.spread:g}"
 
 
+class Name(NamedTuple):
+    """Name of a parameter in its parts, ``k2[soft]`` as text; ``of`` is the spring or record, "" for one of the rig."""
+
+    symbol: str
+    of: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.symbol}[{self.of}]" if self.of else self.symbol
+
+    @classmethod
+    def parse(cls, text: str) -> "Name":
+        """``k2[soft]`` -> ``Name("k2", "soft")``."""
+        symbol, _, of = text.partition("[")
+        return cls(symbol, of.removesuffix("]"))
+
+
+def by_index(symbol: str, values: Mapping[str, Value]) -> dict[str, Value]:
+    """Values of one symbol by spring or record: {"soft": 2420.0} of {"k2[soft]": 2420.0, "mu": 0.66}."""
+    names = {name: Name.parse(name) for name in values}
+    return {own.of: values[name] for name, own in names.items() if own.symbol == symbol and own.of}
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One row of the table.
@@ -93,7 +117,7 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        return f"{self.symbol}[{self.of}]" if self.of else self.symbol
+        return str(Name(self.symbol, self.of))
 
     @property
     def label(self) -> str:
@@ -276,7 +300,7 @@ def parameter(symbol: str, of: str = "", prior: Prior | None = None) -> Paramete
 
 def symbol_of(name: str) -> str:
     """``k2[soft]`` -> ``k2``."""
-    return name.split("[", 1)[0]
+    return Name.parse(name).symbol
 
 
 def is_stated(name: str) -> bool:

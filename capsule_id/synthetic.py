@@ -10,7 +10,7 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, Registry, default_registry
-from capsule_id.parameters import TABLE_1
+from capsule_id.parameters import TABLE_1, Name, by_index, symbol_of
 from capsule_id.rig.model import Rig
 from capsule_id.rig.toml import NAME_PATTERN
 
@@ -60,12 +60,12 @@ class Truth:
         """Values by parameter name."""
         values = asdict(self)
         springs, others = values.pop("k2"), values.pop("others")
-        return {**values, **{f"k2[{name}]": value for name, value in springs.items()}, **others}
+        return {**values, **{str(Name("k2", of)): value for of, value in springs.items()}, **others}
 
     def _replaced(self, values: Mapping[str, float]) -> "Truth":
         """A copy with these values, by name, changed or added."""
-        springs = {name[len("k2[") : -1]: value for name, value in values.items() if name.startswith("k2[")}
-        plain = {name: value for name, value in values.items() if not name.startswith("k2[")}
+        springs = by_index("k2", values)
+        plain = {name: value for name, value in values.items() if symbol_of(name) != "k2"}
         own = {name: plain.pop(name) for name in asdict(self) if name in plain}
         return replace(self, k2={**self.k2, **springs}, others={**self.others, **plain}, **own)
 

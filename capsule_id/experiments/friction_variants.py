@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy import optimize, special
+from scipy import special
 
 from capsule_id.experiments.checks import LEVEL
 from capsule_id.experiments.context import Fitted
@@ -209,9 +209,13 @@ def _next_step(value: np.ndarray, largest: float) -> float:
         weight = np.exp(step * (value - np.max(value)))
         return float(np.sum(weight) ** 2 / np.sum(weight**2) / len(value))
 
-    if effective(largest) >= KEPT:
-        return largest
-    return max(float(np.asarray(optimize.brentq(lambda step: effective(step) - KEPT, 0.0, largest, xtol=1e-15))), 1e-9)
+    low, high = 0.0, largest
+    if effective(high) >= KEPT:
+        return high
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if effective(middle) >= KEPT else (low, middle)
+    return max(low, 1e-9)
 
 
 def _from_normal(row: Parameter, z: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from capsule_id.rig.formats.text import WINDOWS
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, ColumnRule, GroundSettings, QuantityRule
 from capsule_id.rig.units import factor_to_si
-from capsule_id.views import Finding
+from capsule_id.views import Finding, Level
 
 # lint magnitudes: Findings on scales: numbers of a rig, and relations between them, that a wrong unit would make
 # unusual.
@@ -101,7 +101,6 @@ class Number:
     label: str = ""
     unit: str = ""
     to_display: float = 1.0
-    code: str = "readings.magnitude"
     shared: tuple[str, ...] = ()
 
     def unusual(self, rig: Rig) -> Iterable[Finding]:
@@ -118,7 +117,7 @@ class Number:
             "scales": self.scales,
             "meant": self._meant(),
         }
-        yield Finding(self.code, "warn", facts, self.label)
+        yield Finding("readings.magnitude", "warn", facts, self.label)
 
     def _meant(self) -> str:
         """The likeliest unit in which the written number would be usual; "" where there is none."""
@@ -238,23 +237,19 @@ def lint(rig: Rig, kinds: Mapping[str, Kind], tables: Sequence[Table[Any]]) -> t
     kinds : kinds of experiments of the rig
     tables : tables of ``rig`` that are fitted together
     """
-    masses = (("m1", rig.m1), ("m2", rig.m2))
-    exact = [name for name, mass in masses if mass is not None and mass.sd == 0.0]
+    exact = (name for name, mass in (("m1", rig.m1), ("m2", rig.m2)) if mass is not None and mass.sd == 0.0)
     findings = [Finding("masses.exact", "warn", {"name": name}) for name in exact]
     findings += (*lint_rig_quantities(rig), *lint_magnitudes(tables, kinds, rig))
     for table in tables:
         findings += lint_stated_sd(table, kinds[table.kind])
-        windows = {file: encoding for file, encoding in table.encodings.items() if encoding == WINDOWS}
         findings += [
             Finding("readings.encoding", "ok", {"file": file, "encoding": encoding}, table.label)
-            for file, encoding in windows.items()
+            for file, encoding in table.encodings.items()
+            if encoding == WINDOWS
         ]
-        if table.missing:
-            facts = {"file": table.file, "rows": table.missing, "used": len(table.rows)}
-            findings.append(Finding("readings.missing", "warn", facts, table.label))
-        if table.rejected:
-            facts = {"file": table.file, "rows": table.rejected, "used": len(table.rows)}
-            findings.append(Finding("readings.rejected", "warn", facts, table.label))
+        for code, rows in (("readings.missing", table.missing), ("readings.rejected", table.rejected)):
+            facts = {"file": table.file, "rows": rows, "used": len(table.rows)}
+            findings += [Finding(code, "warn", facts, table.label)] * bool(rows)
         for lint_table in kinds[table.kind].lint:
             findings += lint_table(table, rig)
     return (*with_line(findings, rig), *_same_files(rig, tables), *_repeated_blocks(rig, tables))
@@ -279,9 +274,8 @@ def _same_files(rig: Rig, tables: Sequence[Table[Any]]) -> Iterable[Finding]:
 
 def _content(rig: Rig, table: Table[Any]) -> tuple[object, ...]:
     """Equal for two tables with the same readings of the same file; column maps may read different ones."""
-    readings = []
-    for name, column in table.columns.items():
-        readings.append((name, hashlib.sha256(np.ascontiguousarray(column.values).data).digest()))
+    columns = ((name, np.ascontiguousarray(column.values).data) for name, column in table.columns.items())
+    readings = [(name, hashlib.sha256(data).digest()) for name, data in columns]
     return rig.files.get(table.file, table.label), *readings
 
 
@@ -352,6 +346,13 @@ def _cut(table: Table[Any], used: slice, key: str, time: float) -> str:
     return f"Add this line to the experiment in rig.toml: {line}" if decay else "Record again."
 
 
+def _fault(table: Table[Any], code: str, rows: np.ndarray, level: Level, **facts: object) -> Finding:
+    """A finding on ``rows`` of a record: file, line and time of the first one, and further facts."""
+    first = int(rows[0])
+    place = {"file": table.file, "line": int(table.rows[first]), "time": float(table["time"][first])}
+    return Finding(code, level, {**place, "rows": rows.tolist(), **facts}, table.label)
+
+
 def lint_times(table: Table[Any], used: slice) -> Iterable[Finding]:
     """Report gaps and rounded times.
 
@@ -362,17 +363,8 @@ def lint_times(table: Table[Any], used: slice) -> Iterable[Finding]:
     time = table["time"][used]
     gaps = find_gaps(time)
     if gaps is not None:
-        first = used.start + int(gaps.rows[0])
-        facts = {
-            "file": table.file,
-            "line": int(table.rows[first]),
-            "time": float(table["time"][first]),
-            "gaps": len(gaps.rows),
-            "lost": int(gaps.lost.sum()),
-            "step": gaps.step,
-            "rows": (used.start + gaps.rows).tolist(),
-        }
-        yield Finding("readings.gaps", "warn", facts, table.label)
+        counts = {"gaps": len(gaps.rows), "lost": int(gaps.lost.sum()), "step": gaps.step}
+        yield _fault(table, "readings.gaps", used.start + gaps.rows, "warn", **counts)
         return
     rounding = time_rounding(time)
     if rounding is not None:
@@ -394,32 +386,24 @@ def lint_channel(table: Table[Any], name: str, used: slice, period: float) -> It
         return
     values = values * unit if unit != 1.0 else values
     step = median_step(time[used])
-    where = {"file": table.file, "column": name, "unit": column.unit}
+    channel = {"column": name, "unit": column.unit}
     for clipped in clipped_samples(values, period / step):
         found = used.start + clipped.rows
-        facts = where | {
+        facts = channel | {
             "side": clipped.side,
             "level": clipped.level,
             "samples": len(found),
             "share": len(found) / len(values),
-            "line": int(table.rows[found[0]]),
             "time": float(time[found[-1]]),
             "cut": _cut(table, used, "start", float(time[min(found[-1] + 1, len(time) - 1)])),
-            "rows": found.tolist(),
         }
-        yield Finding("readings.clipped", "fail", facts, table.label)
+        yield _fault(table, "readings.clipped", found, "fail", **facts)
     for code, wrong in (("readings.dropouts", dropouts(values)), ("readings.frozen", frozen_samples(values))):
         if len(wrong):
             found = used.start + wrong
-            facts = where | {
-                "value": float(values[wrong[0]]),
-                "samples": len(found),
-                "line": int(table.rows[found[0]]),
-                "lines": " ".join(map(str, table.rows[found])),
-                "time": float(time[found[0]]),
-                "rows": found.tolist(),
-            }
-            yield Finding(code, "fail", facts, table.label)
+            lines = " ".join(map(str, table.rows[found]))
+            facts = channel | {"value": float(values[wrong[0]]), "samples": len(found), "lines": lines}
+            yield _fault(table, code, found, "fail", **facts)
             return
 
 
@@ -458,20 +442,16 @@ def lint_smooth(table: Table[Any], name: str, used: slice, period: float, alone:
             break
     else:
         spikes = index[:0]
-    code, row = ("readings.spike", spikes[0]) if len(spikes) else ("readings.jump", jump.row)
+    rows = spikes if len(spikes) else np.array([jump.row])
     early = jump.row < KEPT_PERIODS * period / step
     facts = {
-        "file": table.file,
         "column": name,
-        "time": float(time[row]),
-        "line": int(table.rows[used.start + row]),
         "lines": " ".join(map(str, table.rows[used.start + spikes])),
         "size": jump.size,
-        "cut": _cut(table, used, "start" if early else "stop", float(time[row - (not early)])),
+        "cut": _cut(table, used, "start" if early else "stop", float(time[rows[0] - (not early)])),
         "rule": f'{{ rule = "hampel", window = "{1e3 * float(f"{WINDOW * step:.6g}"):g} ms", n_sd = {n_sd:g} }}',
-        "rows": (used.start + (spikes if len(spikes) else np.array([row]))).tolist(),
     }
-    yield Finding(code, "fail", facts, table.label)
+    yield _fault(table, "readings.spike" if len(spikes) else "readings.jump", used.start + rows, "fail", **facts)
 
 
 def _burst(table: Table[Any], name: str, burst: slice, used: slice, early: bool) -> Finding:

@@ -26,7 +26,7 @@ from capsule_id.experiments.friction_model import (
 )
 from capsule_id.experiments.misfit import Misfit
 from capsule_id.parameters import Parameter, parameter
-from capsule_id.rig.model import Rig, Table
+from capsule_id.rig.model import Column, Rig, Table
 from capsule_id.rig.schema import GroundSettings
 from capsule_id.views import Comparison, Curve, Points
 
@@ -118,16 +118,17 @@ class PointTest(GroundExperiment):
         return {}
 
     def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
-        """Readings against the first other column; curves hold the further ones at their means."""
-        y, name = self.table.columns[self.reading], next(name for name in self.table.columns if name != self.reading)
-        column, x = self.table.columns[name], self.readings[name]
+        """Readings against the first other column, or in order; curves hold the further columns at their means."""
+        y, others = self.table.columns[self.reading], (c for c in self.table.columns.values() if c.name != self.reading)
+        column = next(others, Column("trial", "1", 1.0, np.arange(1.0, self.n + 1.0)))
+        x = column.values
         margin = MARGIN * np.ptp(x)
         along = np.linspace(np.min(x) - margin, np.max(x) + margin, CURVE)
         held = {name: np.mean(values) for name, values in self.readings.items()}
 
         def curve(values: ValuesBySymbol) -> np.ndarray:
             nuisances = self.design(CURVE, np) @ self.nuisance_mean(values)
-            return (np.asarray(self.predict(values, {**held, name: along})) + nuisances) * y.to_display
+            return (np.asarray(self.predict(values, {**held, column.name: along})) + nuisances) * y.to_display
 
         lower, upper = band(np.array([curve(draw) for draw in draws]))
         return Comparison(

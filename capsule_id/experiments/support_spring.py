@@ -12,7 +12,7 @@ from capsule_id.experiments.context import Fitted
 from capsule_id.experiments.kind import Kind, Twin, TwinTable, Values, made_by
 from capsule_id.experiments.line import MESSAGES as LINE_MESSAGES
 from capsule_id.experiments.line import Line, line_estimates, lint_line, refuse_idle_sd_ratio
-from capsule_id.parameters import Parameter, parameter
+from capsule_id.parameters import Parameter, by_index, parameter
 from capsule_id.rig.model import Quantity, Settings, Table
 from capsule_id.rig.schema import ColumnRule, NameRule, QuantityRule
 from capsule_id.views import Finding, Message
@@ -49,19 +49,17 @@ def _measure(values: Values, rng: np.random.Generator, seed: int) -> Twin:
     tables = []
     # A generator of their own: the readings of the other tests do not depend on these errors.
     errors = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**21,)))
-    for name, k2 in values.items():
-        if name.startswith("k2["):
-            spring = name[len("k2[") : -1]
-            length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
-            stated = f'length = {{ value = {1e3 * length:.2f}, sd = {1e3 * LENGTH_SD:g}, unit = "mm" }}'
-            columns = static_test(rng, k2, DEFLECTIONS, SPRING_NOISE)
-            columns["deflection [mm]"] += 1e3 * DEFLECTION_SD * errors.standard_normal(DEFLECTIONS.size)
-            known = (
-                f'deflection_sd = {{ value = {1e6 * DEFLECTION_SD:g}, unit = "um" }}',
-                f'force_sd = {{ value = {1e3 * SPRING_NOISE * k2 * DEFLECTIONS[-1]:.3g}, unit = "mN" }}',
-            )
-            settings = (f'spring = "{spring}"', stated, *known)
-            tables.append(TwinTable(f"support_spring_{spring}.csv", columns, settings))
+    for spring, k2 in by_index("k2", values).items():
+        length = LENGTH * (LENGTH_OF / k2) ** (1.0 / 3.0) + LENGTH_SD * rng.standard_normal()
+        columns = static_test(rng, k2, DEFLECTIONS, SPRING_NOISE)
+        columns["deflection [mm]"] += 1e3 * DEFLECTION_SD * errors.standard_normal(DEFLECTIONS.size)
+        settings = (
+            f'spring = "{spring}"',
+            f'length = {{ value = {1e3 * length:.2f}, sd = {1e3 * LENGTH_SD:g}, unit = "mm" }}',
+            f'deflection_sd = {{ value = {1e6 * DEFLECTION_SD:g}, unit = "um" }}',
+            f'force_sd = {{ value = {1e3 * SPRING_NOISE * k2 * DEFLECTIONS[-1]:.3g}, unit = "mN" }}',
+        )
+        tables.append(TwinTable(f"support_spring_{spring}.csv", columns, settings))
     return Twin(tuple(tables))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from capsule_id.experiments import select_tables
 from capsule_id.inference.result import STATED, Result
-from capsule_id.parameters import is_stated, symbol_of
+from capsule_id.parameters import Name, is_stated, symbol_of
 from capsule_id.report.columns import MISSING, skewed_names, table_rows
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.views import Finding
@@ -175,9 +175,9 @@ def latex_table(result: Result) -> str:
     """A tabular of symbol, unit, value and sd, and trust; needs no package."""
     lines = [r"\begin{tabular}{llll}", r"parameter & unit & value $\pm$ sd & trust \\", r"\hline"]
     for row in table_rows(result.summary):
-        known = result.registry.parameters.get(symbol_of(row.name))
-        label = row.name.partition("[")[2].removesuffix("]").translate(_ESCAPES)
-        symbol = f"${known.latex}$" if known else row.name.partition("[")[0].translate(_ESCAPES)
+        base, of = Name.parse(row.name)
+        known, label = result.registry.parameters.get(base), of.translate(_ESCAPES)
+        symbol = f"${known.latex}$" if known else base.translate(_ESCAPES)
         number = row.quoted.replace(MISSING, "-")
         number = re.sub(r"[-+.e\d]*\d", r"$\g<0>$", number) if row.skewed else f"${number}$".replace("±", r"\pm")
         unit = row.unit.replace("µ", r"\textmu ").replace("²", "$^2$").replace("^2", "$^2$")

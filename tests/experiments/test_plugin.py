@@ -6,7 +6,9 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,11 +19,16 @@ from capsule_id import experiments
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import kind as registry
+from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.kind import GROUP, Registry, default_registry
+from capsule_id.experiments.point_test import PointTest
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
+from capsule_id.parameters import Prior, scatter
 from capsule_id.physics.friction import FrictionLaw
+from capsule_id.rig.model import Settings, Table
 from tests import cli_tools
+from tests.experiments import bench
 from tests.experiments.test_foreign_law import TRUTH, Lorentzian
 
 #: The kinds without the package, made before a test installs it.
@@ -205,6 +212,29 @@ def test_the_kind_of_the_guide_follows_the_friction_law_by_name(
         assert float(e.log_likelihood(theta, xp)) == pytest.approx(expected, rel=1e-10)
     (panel,) = experiments.compare([e], theta, [theta, theta], towing)
     assert (panel.kind, len(panel.curves[0].y)) == ("towing", 60)
+
+
+class Balance(PointTest):
+    """A reading that has a table of its own, and a scatter with its unit."""
+
+    reading, reads, relative = "force", ("k1",), False
+    scatter = scatter("balance_sd", "N", "scatter of a balance", "s", Prior("halfnormal", 0.0, 0.1))
+
+    def predict(self, theta: ValuesBySymbol, x: Mapping[str, Any]) -> Any:
+        return theta["k1"] * 1e-3
+
+
+def test_a_table_with_one_column_is_a_test_too() -> None:
+    force = np.array([1.40, 1.45, 1.41])
+    columns = {"force": bench.column("force", force, 0.02)}
+    table = Table("balance", "balance", "balance.csv", columns, Settings(), np.arange(2, 5), True)
+    e = Balance(table, bench.rig(table))
+    theta = {"k1": 1420.0, "balance_sd": 0.03}
+    expected = np.sum(stats.norm.logpdf(force, 1.42, np.hypot(0.02, 0.03)))
+    assert float(e.log_likelihood(theta, np)) == pytest.approx(expected, rel=1e-12)
+    panel = e.comparison(theta, [])
+    assert (panel.x_label, panel.y_label) == ("trial [1]", "force [SI]")
+    assert panel.points[0].x.tolist() == [1.0, 2.0, 3.0]
 
 
 @pytest.mark.full

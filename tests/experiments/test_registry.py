@@ -14,7 +14,7 @@ from capsule_id.api import fit, read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import CHOICES, make_experiments, select_tables
 from capsule_id.experiments.kind import BUILT_IN, Kind, Registry, Twin, TwinTable, Values, default_registry
-from capsule_id.parameters import TABLE, scatter
+from capsule_id.parameters import TABLE, Name, by_index, scatter
 from capsule_id.report.messages import DATA_MESSAGES, FIT_MESSAGES, messages_of
 from capsule_id.rig.model import Settings
 from capsule_id.rig.schema import (
@@ -276,6 +276,12 @@ def test_a_bracket_in_a_symbol_is_refused() -> None:
     own = replace(KINDS["motor_current"], name="other", parameters=(scatter("sd[a]", "rad", "a scatter", "s"),))
     with pytest.raises(ValueError, match=r"symbol of parameter sd\[a\] of kind other must have no bracket"):
         Registry((own,))
+
+
+def test_a_name_is_a_symbol_and_a_spring_or_record() -> None:
+    values = {"k2[soft]": 2.0, "k2[a]b]": 3.0, "mu": 0.6, "k2": 1.0, "k2_back[soft]": 4.0}
+    assert by_index("k2", values) == {"soft": 2.0, "a]b": 3.0}
+    assert [str(Name.parse(name)) for name in values] == list(values)
 
 
 def test_two_contents_of_one_caption_or_message_are_refused() -> None:
