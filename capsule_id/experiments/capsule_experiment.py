@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import ModuleType
 from typing import Any, Self
 
@@ -14,8 +15,9 @@ from numpy.typing import ArrayLike
 from capsule_id.experiments.base import About, Experiment, Start, ValuesBySymbol, clock_parameters, no_design, stretch
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
-from capsule_id.experiments.free_vibration.experiment import DecayAbout, FreeVibration
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
+from capsule_id.experiments.free_vibration.record import DecayRecord
 from capsule_id.experiments.free_vibration.second_fit import starts_of_motion
 from capsule_id.experiments.friction import ground_of, ground_parameters
 from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, GroundExperiment, other_laws
@@ -190,7 +192,7 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     tables = ()
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        FreeVibration.__init__(self, table, rig, friction, DecayModel())
+        DecayRecord.__init__(self, table, rig, friction, DecayModel())
         self.smoothing, self.ground = None, ground_of(table)
         gap = table.settings.gap
         self.within_reach = gap is not None
@@ -201,10 +203,11 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
             rows.append(parameter("k2", table.settings.spring))
             if gap.sd > 0.0:
                 rows.append(parameter("G", table.label, Prior("positive_normal", gap.value, gap.sd)))
-        rows += self.motion_parameters(self.rough_decrement())
+        rows.append(parameter("x_start", table.label, Prior("normal", 0.0, self.width)))
+        rows.append(parameter("y_start", table.label, Prior("normal", 0.0, self.width * self.rough.Omega_o)))
         rows += [NOISE_SD.named(table.label, self.noise_prior()), *ground_parameters(table, rig)]
         rows += clock_parameters(table, rig)
-        self.about = DecayAbout(table, rig, tuple(rows))
+        self.about = replace(self.about, parameters=tuple(rows))
 
     @classmethod
     def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
@@ -222,15 +225,14 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         t = self.simulated(theta, p, OFF, times, initial)
         return t.X1 - t.X2
 
-    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
-        raw = self.values - xp.asarray(self.motion_of(theta))
-        return (Misfit(raw, self.reading_sd**2, 1.0, self.width * xp.ones((len(self.time), 1))),)
+    def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
+        return self.values - xp.asarray(self.motion_of(theta)), self.width * xp.ones((len(self.time), 1))
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         return Experiment.summaries(self, theta, xp)
 
     def starts(self) -> dict[str, Start]:
-        starts = super().starts() | starts_of_motion(self, self.rough_decrement())
+        starts = super().starts() | starts_of_motion(self, self.rough)
         if not self.gap_known:
             starts[f"G[{self.label}]"] = Start(self.gap, 0.5 * self.table.settings.gap.sd / self.gap)
         return starts
