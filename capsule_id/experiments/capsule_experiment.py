@@ -1,6 +1,7 @@
 """Experiments whose forward model is the capsule model: mixin, trials, and bench tests with ``forward = "capsule"``."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import ModuleType
 from typing import Any, Literal, Self
 
@@ -12,8 +13,9 @@ from numpy.typing import ArrayLike
 from capsule_id.experiments.base import Experiment, Start, ValuesBySymbol, clock_parameters, stretch
 from capsule_id.experiments.dynamic_friction import DynamicFriction
 from capsule_id.experiments.free_vibration.declaration import NOISE_SD
-from capsule_id.experiments.free_vibration.experiment import DecayAbout, FreeVibration
+from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.readings import DecayModel
+from capsule_id.experiments.free_vibration.record import DecayRecord
 from capsule_id.experiments.free_vibration.second_fit import starts_of_motion
 from capsule_id.experiments.friction_model import (
     EQUATION_1,
@@ -154,17 +156,18 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
     tables = ()
 
     def __init__(self, table: Table, rig: Rig, friction: FrictionModel = EQUATION_1) -> None:
-        FreeVibration.__init__(self, table, rig, friction, DecayModel())
+        DecayRecord.__init__(self, table, rig, friction, DecayModel())
         self.set_model(table, rig, friction)
         gap = table.settings.gap or Quantity(FAR)
         self.gap = gap.value if gap.sd == 0.0 else None
         rows = [parameter("k1"), parameter("c"), *friction.parameters]
         rows += [] if table.settings.gap is None else [parameter("k2", table.settings.spring)]
         rows += stated_parameters("G", gap, table.label)
-        rows += self.motion_parameters(self.rough_decrement())
+        rows.append(parameter("x_start", table.label, Prior("normal", 0.0, self.width)))
+        rows.append(parameter("y_start", table.label, Prior("normal", 0.0, self.width * self.rough.Omega_o)))
         rows += [NOISE_SD.named(table.label, self.noise_prior()), *ground_parameters(table, rig)]
         rows += clock_parameters(table, rig)
-        self.about = DecayAbout(table, rig, tuple(rows))
+        self.about = replace(self.about, parameters=tuple(rows))
 
     @classmethod
     def second_models(cls, records: Sequence[Any], readings: Sequence[Finding] = ()) -> tuple[list[Any], list[Finding]]:
@@ -179,13 +182,13 @@ class CapsuleDecay(CapsuleForward, FreeVibration):
         initial = (theta["x_start"], theta["y_start"], 0.0, 0.0)
         times = jnp.multiply.outer(stretch(self.clock_rate, theta), self.time)
         t = self.simulated(theta, p, OFF, times, initial)
-        return self.values - xp.asarray(t.X1 - t.X2), xp.ones((self.n, 1))
+        return self.values - xp.asarray(t.X1 - t.X2), self.width * xp.ones((self.n, 1))
 
     def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
         return Experiment.summaries(self, theta, xp)
 
     def starts(self) -> dict[str, Start]:
-        starts = super().starts() | starts_of_motion(self, self.rough_decrement())
+        starts = super().starts() | starts_of_motion(self, self.rough)
         return starts | stated_starts(self.label, G=self.table.settings.gap)
 
 

@@ -19,14 +19,8 @@ from capsule_id.records.faults import (
     noisy_stretch,
     time_rounding,
 )
-from capsule_id.rig.filters import (
-    TIMING_TOLERANCE,
-    dominant_frequency,
-    hampel_outliers,
-    largest_offset,
-    loudest_part,
-    median_step,
-)
+from capsule_id.records.tones import frequency_of
+from capsule_id.rig.filters import TIMING_TOLERANCE, hampel_outliers, largest_offset, median_step
 from capsule_id.rig.formats.text import WINDOWS
 from capsule_id.rig.model import Quantity, Rig, Table
 from capsule_id.rig.schema import RIG_QUANTITIES, ColumnRule, GroundSettings, QuantityRule
@@ -200,13 +194,6 @@ def _against_k1(table: Table[Any], rig: Rig) -> Iterable[Number]:
     ratio = float(np.ptp(table["force"]) / (np.ptp(table["deflection"]) or 1e-30)) / k1
     scales, shared = (f"{table.label}.force", f"{table.label}.deflection"), ("m1", f"{decay.label}.time")
     yield Number(f"k2 of {table.file} over k1", ratio, "1", STIFFNESSES, scales, table.label, shared=shared)
-
-
-def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
-    """Dominant frequency of a record that may be sampled unevenly, Hz."""
-    part = loudest_part(values)
-    even = np.linspace(time[part][0], time[part][-1], len(time[part]))
-    return dominant_frequency(even, np.interp(even, time[part], values[part]))
 
 
 def with_line(findings: Sequence[Finding], rig: Rig) -> Iterable[Finding]:

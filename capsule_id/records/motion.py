@@ -270,16 +270,13 @@ def find_contacts(cycle: Cycle) -> Contacts:
     counts = set(spikes + crossings)
     reason = ""
     if len(counts) > 1:
-        reason = f"contacts: spikes {_counts_text(spikes)}, crossings of the gap {_counts_text(crossings)}"
+        words = ["/".join(map(str, one)) or "not recorded" for one in (spikes, crossings)]
+        reason = f"contacts: spikes {words[0]}, crossings of the gap {words[1]}"
     elif 2 * agreeing <= cycles:
         reason = f"contacts: {agreeing} of {cycles} single periods show the {counts.pop()} of all together"
     count = None if reason else counts.pop()
     shortest = min((length for _, length in stretches), default=0) * cycle.period / len(z)
     return Contacts(count, spikes, crossings, seen, shortest or None, agreeing, cycles, reason)
-
-
-def _counts_text(counts: tuple[int, ...]) -> str:
-    return "/".join(str(n) for n in counts) or "not recorded"
 
 
 @dataclass(frozen=True)
@@ -462,17 +459,13 @@ def measured_motion(table: Table) -> MeasuredMotion:
     scatter = float(np.hypot(repeat.noise_sd, repeat.scatter)) if repeat else 0.0
     contacts = None
     if period and relative and table.settings.spring is not None:
-        contacts = find_contacts(_cycle(table, relative[0], Omega, period * T, scatter))
+        gap, acceleration = stated_gap(table), table["acceleration_rod"] if "acceleration_rod" in columns else None
+        cycle = Cycle(time, relative[0], acceleration, Omega, period * T, gap.value, gap.sd, scatter)
+        contacts = find_contacts(cycle)
     mean_velocity = velocity.velocity if velocity else float("nan")
     label, probability, reasons = _label(repeat, velocity, contacts)
     evidence = Evidence(drive, Omega, repeat, velocity, contacts, reasons)
     return MeasuredMotion(label, mean_velocity, evidence, probability)
-
-
-def _cycle(table: Table, x_rel: np.ndarray, Omega: float, period: float, noise_sd: float) -> Cycle:
-    gap = stated_gap(table)
-    acceleration = table["acceleration_rod"] if "acceleration_rod" in table.columns else None
-    return Cycle(table["time"], x_rel, acceleration, Omega, period, gap.value, gap.sd, noise_sd)
 
 
 def _label(

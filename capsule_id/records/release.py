@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from capsule_id.records.tones import noise_level
-from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part
+from capsule_id.records.tones import frequency_of, noise_level
+from capsule_id.rig.filters import PIECE, loudest_part
 
 #: Turning points differ by this fraction of the record's range, and by so many standard deviations of the noise.
 TURN, TURN_SDS = 0.12, 5.0
@@ -446,11 +446,8 @@ def shortened(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     if len(time) < 2 * PIECE:
         return time, values
     part = loudest_part(values)
-    grid = np.linspace(time[part][0], time[part][-1], len(time[part]))
-    period = 1.0 / dominant_frequency(grid, np.interp(grid, time[part], values[part]))
-    size = max(1, min(len(time) // PIECE, int(period / (grid[1] - grid[0]) / 32.0)))
-    count = len(time) // size
-    means = []
-    for column in (time, values):
-        means.append(column[: count * size].reshape(count, size).mean(axis=1))
-    return means[0], means[1]
+    step = float(np.ptp(time[part])) / (len(time[part]) - 1)
+    size = max(1, min(len(time) // PIECE, int(1.0 / frequency_of(time, values) / step / 32.0)))
+    count = len(time) // size * size
+    shorter = np.stack([time, values])[:, :count].reshape(2, -1, size).mean(axis=2)
+    return shorter[0], shorter[1]

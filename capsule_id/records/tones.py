@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
 from capsule_id.errors import InputError
-from capsule_id.rig.filters import PIECE, Record, dominant_frequency
+from capsule_id.rig.filters import PIECE, Record, dominant_frequency, loudest_part
 from capsule_id.rig.model import Quantity, Table
 
 # stated settings: Settings of a forced run as numbers.
@@ -47,6 +47,13 @@ def relative_position(table: Table) -> tuple[np.ndarray, float] | None:
         return None
     error = np.hypot(columns["x_base"].reading_sd, columns["x_capsule"].reading_sd)
     return table["x_base"] - table["x_capsule"], float(error)
+
+
+def frequency_of(time: np.ndarray, values: np.ndarray) -> float:
+    """Dominant frequency of the loudest part of a record that may be sampled unevenly, Hz."""
+    part = loudest_part(values)
+    even = np.linspace(time[part][0], time[part][-1], len(time[part]))
+    return dominant_frequency(even, np.interp(even, time[part], values[part]))
 
 
 # noise: Estimates the noise level of a record from its differences, and finds where a decay is all noise.

@@ -14,7 +14,6 @@ from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import Decrement, half_cycles, interpolate
-from capsule_id.experiments.free_vibration.noise import ReadingTimes, averaged_process, whiten_by_shape
 from capsule_id.experiments.free_vibration.readings import (
     Blocks,
     DecayModel,
@@ -22,6 +21,7 @@ from capsule_id.experiments.free_vibration.readings import (
     block_means,
     default_block_size,
 )
+from capsule_id.experiments.free_vibration.record import ReadingTimes, averaged_process, whiten_by_shape
 from capsule_id.experiments.free_vibration.second_fit import Screening
 from capsule_id.records import release
 from tests.capsule_cases import jit_quickly
@@ -205,7 +205,7 @@ def test_the_estimate_of_a_long_record_is_that_of_its_means(monkeypatch: pytest.
     assert means.k1 == pytest.approx(whole.k1, rel=2e-3)
     assert means.c == pytest.approx(whole.c, rel=1e-2)
     # Negative control: with four means a period the estimate is off.
-    every = "capsule_id.experiments.free_vibration.experiment.shortened"
+    every = "capsule_id.experiments.free_vibration.record.shortened"
     monkeypatch.setattr(every, lambda time, x: (time[::110], x[::110]))
     coarse = record.paper_decrement()
     assert coarse is None or abs(coarse.k1 / whole.k1 - 1.0) > 2e-3

@@ -14,11 +14,11 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.checks import check_drift, check_halves, check_positions, fast_rms
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.hidden_terms import whitened
 from capsule_id.experiments.free_vibration.lint import lint_decay
 from capsule_id.experiments.free_vibration.models import decay
 from capsule_id.experiments.free_vibration.readings import CHANNELS, DecayModel
-from capsule_id.experiments.free_vibration.second_fit import Screened, Screening, second_models
+from capsule_id.experiments.free_vibration.record import Screened
+from capsule_id.experiments.free_vibration.second_fit import Screening, second_models
 from capsule_id.experiments.kind import default_registry
 from capsule_id.report.messages import finding_text, messages_of
 from capsule_id.views import Finding
@@ -335,7 +335,7 @@ def test_values_of_a_screening_are_those_of_the_record_it_starts(model: DecayMod
     found = Screening(own).fit(model)[0]
     again = own.with_model(model, found)
     raw, design = again.unwhitened(found.values, np)
-    white, basis = (whitened(again, found.values, columns) for columns in (raw, design))
+    white, basis = (again.whitened(found.values, columns) for columns in (raw, design))
     left = white - basis @ np.linalg.lstsq(basis, white, rcond=None)[0]
     assert np.sqrt(np.mean(left**2)) == pytest.approx(found.noise, rel=2e-3)
     if model.drift == "gp":

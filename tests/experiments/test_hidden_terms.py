@@ -20,7 +20,8 @@ from capsule_id.experiments.checks import refit
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.hidden_terms import Hidden, check_hidden_terms, hidden_terms
 from capsule_id.experiments.free_vibration.lint import MESSAGES
-from capsule_id.experiments.free_vibration.second_fit import Screened, open_models, second_models
+from capsule_id.experiments.free_vibration.record import Screened
+from capsule_id.experiments.free_vibration.second_fit import open_models, second_models
 from capsule_id.inference.target import LogPosterior
 from capsule_id.parameters import Prior
 from capsule_id.rig.model import Quantity, Rig, Table

@@ -230,7 +230,7 @@ def test_ar1_innovations() -> None:
     experiment = record(UNIFORM, "viscous", noise="ar1")
     theta = {"k1": 1430.0, "c": 3.8, "noise_sd": 1e-3, "noise_time": 0.004, **MASSES}
     raw, design = experiment.unwhitened(theta, np)
-    e = raw - experiment.width * design @ experiment.nuisance_mean(theta)
+    e = raw - design @ experiment.nuisance_mean(theta)
     found = np.asarray(experiment.residuals(theta, np))[: len(e)]
     expected = e[1:] - np.exp(-1e-3 / 0.004) * e[:-1]
     np.testing.assert_allclose(found[1:] / found[1], expected / expected[0], rtol=1e-8)

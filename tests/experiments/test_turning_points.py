@@ -12,7 +12,7 @@ import capsule_id as cid
 from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
-from capsule_id.experiments.free_vibration.turning_points import TurningPoints, fitted, standard_errors
+from capsule_id.experiments.free_vibration.turning_points import TurningPoints, fitted, screened
 from capsule_id.experiments.kind import default_registry
 from capsule_id.inference.point_fit import point_fit
 from capsule_id.inference.target import LogPosterior
@@ -199,8 +199,9 @@ def test_a_force_that_is_missing_is_added_or_named(tmp_path: Path, extra: dict[s
     assert table.frame.index.tolist() == ["stated", "quoted"]
     assert table.frame["BIC"]["stated"] > 10.0 > table.frame["BIC"]["quoted"] == 0.0
     assert [each for make in own.tables for each in make([own], cast(Any, None))] == []
-    truth, theta, sd = FORCES | extra, fitted(second), standard_errors(second, fitted(second))
-    assert all(abs(theta[symbol] - truth[symbol]) < 4.0 * sd[symbol] for symbol in ("k1", "c", *extra))
+    truth, own_fit = FORCES | extra, screened(second, second.model)
+    for symbol in ("k1", "c", *extra):
+        assert abs(own_fit.values[symbol] - truth[symbol]) < 4.0 * own_fit.errors[symbol]
     # Words that are stated stay as they are.
     kept = table_of(True, extra, 2, tmp_path / "kept", 'damping = ["viscous"]\nstiffness = "linear"')
     assert TurningPoints.second_models([kept]) == ([kept], [])
@@ -276,7 +277,7 @@ def test_a_table_that_cannot_exclude_dry_friction_does_not_give_c(tmp_path: Path
     assert "F_dry" in found.facts["symbols"]
     assert found.facts["low"] < 0.03 < found.facts["high"]
     # The quoted value alone is wrong by many sds.
-    assert fitted(e)["c"] - 0.03 > 4.0 * standard_errors(e, fitted(e))["c"]
+    assert fitted(e)["c"] - 0.03 > 4.0 * screened(e, e.model).errors["c"]
 
 
 def test_turning_points_at_unequal_times_are_refused(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from capsule_id.experiments import make_experiments
 from capsule_id.experiments.free_vibration.checks import check_drift, check_zero
 from capsule_id.experiments.free_vibration.experiment import FreeVibration
 from capsule_id.experiments.free_vibration.hidden_terms import check_hidden_terms
-from capsule_id.experiments.free_vibration.second_fit import Screened, second_models
+from capsule_id.experiments.free_vibration.record import DecayRecord, Screened
+from capsule_id.experiments.free_vibration.second_fit import second_models
 from capsule_id.inference.result import Posterior
 from capsule_id.rig.model import Rig
 from tests.measured.folders import Entry, make_rig, note, quantity
@@ -38,7 +39,7 @@ def _rig(folder: Path, time: np.ndarray, angle: np.ndarray) -> Rig:
     return make_rig(folder, entry, head={"m1": quantity(1.0, "kg")})
 
 
-def _second_fit(folder: Path, entry: Entry) -> tuple[FreeVibration, SimpleNamespace]:
+def _second_fit(folder: Path, entry: Entry) -> tuple[DecayRecord, SimpleNamespace]:
     """The record under the model of its second fit, and the values of that, as the checks read them."""
     rig = make_rig(folder, entry, head={"m1": quantity(1.0, "kg")})
     ((record,), _) = second_models(cast(list[FreeVibration], make_experiments(rig)))

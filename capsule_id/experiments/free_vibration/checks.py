@@ -1,26 +1,27 @@
 """Checks of free decays: equal stiffness at every amplitude, equal halves, no slip, no contact, no error of the sensor."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, stats
 
+from capsule_id.experiments.base import ValuesBySymbol
 from capsule_id.experiments.checks import LEVEL, refit
-from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.free_vibration.hidden_terms import sensitivities, whitened, zero_jumps
+from capsule_id.experiments.context import Check, Fitted
+from capsule_id.experiments.free_vibration.hidden_terms import sensitivities, zero_jumps
 from capsule_id.experiments.free_vibration.models import equilibrium
-from capsule_id.experiments.free_vibration.noise import drift_by_shape
 from capsule_id.experiments.free_vibration.readings import EFFECTS, decay_window
+from capsule_id.experiments.free_vibration.record import Decay, DecayRecord, drift_by_shape
 from capsule_id.experiments.free_vibration.second_fit import Screening
 from capsule_id.parameters import parameter
 from capsule_id.records.duplicates import reading_step
 from capsule_id.records.faults import sampling
 from capsule_id.records.tones import length_of_motion
 from capsule_id.rig.filters import median_step
-from capsule_id.views import Facts, Finding
+from capsule_id.views import Facts, Finding, Level
 
 #: Joint sds apart from which halves of a record disagree, and from which that fails.
 HALVES_DISAGREE, HALVES_FAIL = 3.0, 4.0
@@ -44,11 +45,35 @@ JUMPING = 0.75
 #: Directions of the offsets that are shorter than this, relative to the longest one, are combinations of the others.
 UNSEEN = 1e-8
 
-if TYPE_CHECKING:
-    from capsule_id.experiments.free_vibration.experiment import FreeVibration
+
+#: A judge of one decay at its values by symbol: facts, and a level or a p-value; None where it cannot be judged.
+Judge = Callable[[Any, ValuesBySymbol], tuple[Facts, Level | float] | None]
 
 
-def check_stiffness(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+def each(code: str, judge: Judge, joined: bool = True) -> Check:
+    """Return the check that judges every decay; a p-value below ``LEVEL`` over the number of decays fails.
+
+    Parameters
+    ----------
+    joined : report those that pass in one finding, where all do, with their labels and their smallest p-value
+    """
+
+    def check(decays: Sequence[Decay], fit: Fitted) -> list[Finding]:
+        judged = [(e, *found) for e in decays if (found := judge(e, e.local(fit.values))) is not None]
+        findings = list[Finding]()
+        for e, facts, found in judged:
+            level = found if isinstance(found, str) else "fail" if found * len(judged) < LEVEL else "ok"
+            if level != "ok" or not joined:
+                findings.append(Finding(code, level, {"label": e.label, **facts}, e.label))
+        if judged and not findings:
+            least = {"p": min(facts["p"] for _, facts, _ in judged)} if "p" in judged[0][1] else {}
+            findings.append(Finding(code, "ok", {"labels": ", ".join(e.label for e, *_ in judged), **least}))
+        return findings
+
+    return check
+
+
+def check_stiffness(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     """Check that k1 of single records does not depend on amplitude (the paper's "linear near the working point")."""
     if len(records) < 2:
         return []
@@ -62,7 +87,7 @@ def check_stiffness(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fin
 
 
 def stiffness_by_record(
-    records: "Sequence[FreeVibration]", values: Mapping[str, float]
+    records: Sequence[DecayRecord], values: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Estimate k1, its standard error and the largest deflection of every record, (records,) SI."""
     estimates = [refit(e, e.local(values), [])["k1"] for e in records]
@@ -70,7 +95,7 @@ def stiffness_by_record(
     return k1, sd, np.array([e.largest_deflection for e in records])
 
 
-def check_free_decay(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+def check_free_decay(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     """Check that a free capsule does not slip and that the rod does not touch the support spring."""
     findings, theta = [], fit.values
     for e in records:
@@ -87,28 +112,37 @@ def check_free_decay(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Fi
     return findings
 
 
-def check_halves(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
-    """Check that both halves of every record give the same parameters, where they are long enough."""
-    compared, findings = [], []
-    for e in records:
-        halves = _halves(e)
-        if not halves:
-            continue
-        compared.append(e.label)
-        (first, first_sd), (second, second_sd) = (_estimates(half, e.local(fit.values)) for half in halves)
-        z = {name: (second[name] - first[name]) / np.hypot(first_sd[name], second_sd[name]) for name in first}
-        name = max(z, key=lambda name: abs(z[name]))
-        size = float(abs(z[name]))
-        if size > HALVES_DISAGREE:
-            facts = {"label": e.label, "name": name, "first": first[name], "second": second[name], "z": size}
-            facts |= {"unit": parameter(name).unit, "model": e.model_name, "stated": e.stated_words}
-            findings.append(Finding("decays.halves", "fail" if size > HALVES_FAIL else "warn", facts, e.label))
-    if compared and not findings:
-        findings.append(Finding("decays.halves", "ok", {"labels": ", ".join(compared)}))
-    return findings
+#: Value of each parameter in both halves, their difference over its sd, and whether that matters; {} for a short decay.
+Changes = Callable[[Any, ValuesBySymbol], Mapping[str, tuple[float, float, float, bool]]]
 
 
-def check_aliases(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+def halves(changes: Changes) -> Check:
+    """Return the check that both halves of every decay give the same parameters, where it is long enough."""
+
+    def judge(e: Decay, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
+        found = changes(e, theta)
+        if not found:
+            return None
+        name = max(found, key=lambda name: abs(found[name][2]))
+        first, second, z, matters = found[name]
+        facts = {"name": name, "first": first, "second": second, "z": abs(z), "unit": parameter(name).unit}
+        level = "ok" if abs(z) <= HALVES_DISAGREE else "fail" if abs(z) > HALVES_FAIL and matters else "warn"
+        return {**facts, "model": e.model_name, "stated": e.stated_words}, level
+
+    return each("decays.halves", judge)
+
+
+def changes_of_second_half(e: DecayRecord, theta: ValuesBySymbol) -> dict[str, tuple[float, float, float, bool]]:
+    """See ``Changes``: fits of both halves of a record."""
+    found = [_estimates(half, theta) for half in _halves(e)]
+    if not found:
+        return {}
+    (first, first_sd), (second, second_sd) = found
+    sd = {name: np.hypot(first_sd[name], second_sd[name]) for name in first}
+    return {name: (first[name], second[name], float((second[name] - first[name]) / sd[name]), True) for name in first}
+
+
+def check_aliases(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     """State the lowest alias of the records with even samples, which cannot exclude it."""
     found = ((e.label, *sampling(decay_window(e.table)[0])) for e in records)
     rates = {label: rate for label, rate, even in found if even}
@@ -119,26 +153,18 @@ def check_aliases(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Findi
     return [Finding("decays.alias", "ok", facts)]
 
 
-def check_positions(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
-    """Check that the residuals do not depend on the position of the rod and the direction of its motion."""
-    compared, findings = [], []
-    for e in records:
-        if e.order == 2 and "dry" in e.model.damping:
-            continue  # the acceleration jumps where the rod turns
-        if (found := position_test(e, e.local(fit.values))) is not None:
-            compared.append((*found, e))
-    for p, low, high, e in compared:
-        if p * len(compared) < LEVEL:
-            unit, scale = e.column.unit, e.column.to_display
-            facts = {"label": e.label, "p": p, "low": low * scale, "high": high * scale, "unit": unit, **later_start(e)}
-            findings.append(Finding("decays.position", "fail", facts, e.label))
-    if compared and not findings:
-        facts = {"labels": ", ".join(e.label for *_, e in compared), "p": min(p for p, *_ in compared)}
-        findings.append(Finding("decays.position", "ok", facts))
-    return findings
+def position(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | None:
+    """Judge whether the residuals depend on the position of the rod and the direction of its motion."""
+    if e.order == 2 and "dry" in e.model.damping:
+        return None  # the acceleration jumps where the rod turns
+    if (found := position_test(e, theta)) is None:
+        return None
+    p, low, high = found
+    scale = e.column.to_display
+    return {"p": p, "low": low * scale, "high": high * scale, "unit": e.column.unit, **later_start(e)}, p
 
 
-def check_found_forces(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
+def check_found_forces(records: Sequence[DecayRecord], fit: Fitted) -> list[Finding]:
     """Check that the forces that a second fit has chosen, and no setting states, are far from 0 in the sample."""
     findings = []
     found = {symbol: e for e in records if e.replaced for symbol in e.model.symbols}
@@ -151,90 +177,65 @@ def check_found_forces(records: "Sequence[FreeVibration]", fit: Fitted) -> list[
     return findings
 
 
-def check_drift(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
-    """Check that a Gaussian-process drift is slow: its part at the frequency of the decay hides errors of the model."""
-    findings = []
-    for e in records:
-        if e.model.drift == "gp" and (parts := fast_parts(e, e.local(fit.values))) is not None:
-            drift, motion, noise, larger = parts
-            level = "fail" if larger or drift > max(FAST_DRIFT * motion, FAST_NOISE * noise) else "ok"
-            facts = {
-                "larger": larger,
-                "label": e.label,
-                "share": drift / max(motion, FAST_NOISE * noise),
-                **later_start(e),
-            }
-            findings.append(Finding("decays.drift", level, facts, e.label))
-    return findings
+def drift(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
+    """Judge whether a Gaussian-process drift is slow: its part at the frequency of the decay hides errors of the model."""
+    if e.model.drift != "gp" or (parts := fast_parts(e, theta)) is None:
+        return None
+    fast, motion, noise, larger = parts
+    level = "fail" if larger or fast > max(FAST_DRIFT * motion, FAST_NOISE * noise) else "ok"
+    return {"larger": larger, "share": fast / max(motion, FAST_NOISE * noise), **later_start(e)}, level
 
 
-def check_zero(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
-    """Check that the zero of the sensor does not jump where the rod turns."""
-    compared, findings = [], []
-    for e in records:
-        if (found := zero_jumps(e, e.local(fit.values))) is None:
-            continue
-        compared.append(e.label)
-        if found.ratio < JUMPING:
-            facts = {"label": e.label, "jump": found.size * e.column.to_display, "unit": e.column.unit}
-            facts |= {"ratio": found.ratio, "half_swings": found.half_swings}
-            findings.append(Finding("decays.zero", "fail", facts, e.label))
-    if compared and not findings:
-        findings.append(Finding("decays.zero", "ok", {"labels": ", ".join(compared)}))
-    return findings
+def zero(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, Level] | None:
+    """Judge whether the zero of the sensor jumps where the rod turns."""
+    if (found := zero_jumps(e, theta)) is None:
+        return None
+    facts = {"jump": found.size * e.column.to_display, "unit": e.column.unit, "ratio": found.ratio}
+    return {**facts, "half_swings": found.half_swings}, "fail" if found.ratio < JUMPING else "ok"
 
 
-def check_size_of_residuals(records: "Sequence[FreeVibration]", fit: Fitted) -> list[Finding]:
-    """Check that the residuals are not larger where the motion is larger: fitted noise then holds an error of the model.
+def size_of_residuals(e: DecayRecord, theta: ValuesBySymbol) -> tuple[Facts, float] | None:
+    """Judge whether the residuals are larger where the motion is larger: fitted noise then holds an error of the model.
 
     Spearman's rank correlation of their sizes with the amplitude, before the motion is lost in the steps of the readings.
     """
-    compared, findings = [], []
-    for e in records:
-        size = np.abs(e.values - equilibrium(e.values))
-        moving = np.flatnonzero(size >= STEPS * reading_step(e.whole[1]))
-        n = int(moving[-1]) + 1 if len(moving) else 0
-        if n < FEWEST_SIZES:
-            continue
-        residuals = np.abs(np.asarray(e.residuals(e.local(fit.values), np))[:n])
-        period = 2.0 * np.pi / e.rough_decrement().Omega_o / median_step(e.time)
-        amplitude = ndimage.maximum_filter1d(size[:n], max(3, round(period)))
-        if np.ptp(amplitude) > 0.0 and np.ptp(residuals) > 0.0:
-            large = amplitude > np.median(amplitude)
-            large = large if large.any() else amplitude == np.max(amplitude)
-            ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
-            trend = stats.spearmanr(amplitude, residuals, alternative="greater")
-            p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)
-            compared.append((p, ratio, e))
-    for p, ratio, e in compared:
-        if p * len(compared) < LEVEL and ratio > LARGER:
-            facts = {"label": e.label, "ratio": ratio, "p": p, "stated": e.stated_words, **later_start(e)}
-            findings.append(Finding("decays.residuals", "fail", facts, e.label))
-    if compared and not findings:
-        facts = {"labels": ", ".join(e.label for *_, e in compared), "p": min(p for p, *_ in compared)}
-        findings.append(Finding("decays.residuals", "ok", facts))
-    return findings
+    size = np.abs(e.values - equilibrium(e.values))
+    moving = np.flatnonzero(size >= STEPS * reading_step(e.whole[1]))
+    n = int(moving[-1]) + 1 if len(moving) else 0
+    if n < FEWEST_SIZES:
+        return None
+    residuals = np.abs(np.asarray(e.residuals(theta, np))[:n])
+    period = 2.0 * np.pi / e.rough.Omega_o / median_step(e.time)
+    amplitude = ndimage.maximum_filter1d(size[:n], max(3, round(period)))
+    if np.ptp(amplitude) == 0.0 or np.ptp(residuals) == 0.0:
+        return None
+    large = amplitude > np.median(amplitude)
+    large = large if large.any() else amplitude == np.max(amplitude)
+    ratio = float(np.sqrt(np.mean(residuals[large] ** 2) / np.mean(residuals[~large] ** 2)))
+    trend = stats.spearmanr(amplitude, residuals, alternative="greater")
+    p = float(trend.pvalue)  # pyright: ignore[reportAttributeAccessIssue]  (SciPy types the result as a tuple)
+    return {"ratio": ratio, "p": p, "stated": e.stated_words, **later_start(e)}, p if ratio > LARGER else 1.0
 
 
-def later_start(e: "FreeVibration") -> Facts:
+def later_start(e: DecayRecord) -> Facts:
     """Time from which the amplitudes are below half the largest one: ``start``, s, None where too few swings are left."""
     size = np.abs(e.values - equilibrium(e.values))
     begin = int(np.flatnonzero(size > 0.5 * np.max(size))[-1]) + 1
     left = e.time[begin:][: length_of_motion(e.values[begin:])] if begin < len(e.time) else e.time[:0]
-    if len(left) == 0 or np.ptp(left) * e.rough_decrement().Omega_o / np.pi < FEWEST_HALF_CYCLES:
+    if len(left) == 0 or np.ptp(left) * e.rough.Omega_o / np.pi < FEWEST_HALF_CYCLES:
         return {"start": None}
     digits = max(0, int(np.ceil(-np.log10(median_step(e.time)))))
     return {"start": float(np.round(decay_window(e.table)[0][0] + e.time[begin], digits))}
 
 
-def fast_parts(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float, bool] | None:
+def fast_parts(e: DecayRecord, theta: Mapping[str, float]) -> tuple[float, float, float, bool] | None:
     """Rms of drift and motion at the frequency of the motion, SI, of the residuals left, and whether the drift is larger.
 
     None for a short record.
     """
     half = np.pi * np.sqrt(theta["m1"] / theta["k1"])
     raw, design = e.unwhitened(theta, np)
-    residuals = raw - design @ np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
+    residuals = raw - design @ np.linalg.lstsq(e.whitened(theta, design), e.whitened(theta, raw), rcond=None)[0]
     shape = {symbol: theta[symbol] for symbol in e.model.shapes}
     drift = np.asarray(drift_by_shape(e.times, np.asarray(residuals), e.model.noise, shape))
     curve = e.values - residuals
@@ -259,7 +260,7 @@ def fast_rms(time: np.ndarray, values: np.ndarray, half: float) -> float | None:
     return float(np.sqrt(np.mean(values[inside] ** 2)))
 
 
-def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float, float, float] | None:
+def position_test(e: DecayRecord, theta: Mapping[str, float]) -> tuple[float, float, float] | None:
     """p-value of the F test for offsets of the readings by interval of position and direction of the motion.
 
     Columns and residuals are whitened by the fitted noise, and the effects of the fitted parameters are projected out.
@@ -279,11 +280,11 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
         place = np.clip(np.searchsorted(edges, curve, side="right") - 1, 0, number - 1)
         offsets += [ahead & (place == i) for i in range(number)]
         limits += list(itertools.pairwise(edges))
-    known = whitened(e, theta, np.column_stack([design, *moved.values()]))
+    known = e.whitened(theta, np.column_stack([design, *moved.values()]))
     known = known[:, np.linalg.norm(known, axis=0) > 0.0]
     known = np.linalg.qr(known / np.linalg.norm(known, axis=0))[0]
     own, columns = (
-        x - known @ (known.T @ x) for x in (whitened(e, theta, left), whitened(e, theta, np.stack(offsets, axis=1)))
+        x - known @ (known.T @ x) for x in (e.whitened(theta, left), e.whitened(theta, np.stack(offsets, axis=1)))
     )
     basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     basis = basis[:, sizes > UNSEEN * sizes[0]]
@@ -297,7 +298,7 @@ def position_test(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[float
     return p, float(low), float(high)
 
 
-def _halves(e: "FreeVibration") -> "list[FreeVibration]":
+def _halves(e: DecayRecord) -> list[DecayRecord]:
     """The first and the second half of the part of ``e`` whose peaks exceed its noise; [] for a short one."""
     decrement = e.decrement()
     if decrement is None or len(decrement.times) < 2 * FEWEST_HALF_CYCLES:
@@ -315,7 +316,7 @@ def _halves(e: "FreeVibration") -> "list[FreeVibration]":
     return [type(e)(table, e.rig, e.friction, e.model) for table in tables]
 
 
-def _estimates(half: "FreeVibration", theta: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+def _estimates(half: DecayRecord, theta: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
     """Estimates and standard errors of the physical parameters from one half, from the values ``theta`` of the whole."""
     if half.closed and not half.model.whitened:
         pairs = refit(half, theta, [])
@@ -327,6 +328,11 @@ def _estimates(half: "FreeVibration", theta: Mapping[str, float]) -> tuple[dict[
 
 
 #: All checks of records of free decays but that on hidden forces, which needs the second fit.
+check_halves = halves(changes_of_second_half)
+check_positions = each("decays.position", position)
+check_size_of_residuals = each("decays.residuals", size_of_residuals)
+check_drift = each("decays.drift", drift, joined=False)
+check_zero = each("decays.zero", zero)
 CHECKS = (
     check_stiffness,
     check_free_decay,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -34,12 +34,6 @@ from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD, ColumnRule
 from capsule_id.rig.tables import Entry
 from capsule_id.views import counted
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.base import Experiment
-    from capsule_id.experiments.free_vibration.experiment import FreeVibration
-    from capsule_id.experiments.friction_model import FrictionModel
-
 
 # twin: Synthetic free decays.
 
@@ -215,7 +209,7 @@ def _check_turns(table: Table[DecaySettings]) -> None:
         )
 
 
-def _make(table: Table[DecaySettings], rig: Rig, friction: "FrictionModel") -> "tuple[Experiment, ...]":
+def _make(table: Table[DecaySettings], rig: Rig, friction: Any) -> tuple[Any, ...]:
     """Make the experiment of the class that the settings demand; its record begins with the release."""
     make = made_by(
         "capsule_id.experiments.free_vibration.experiment:FreeVibration",
@@ -245,13 +239,13 @@ def _masses(table: Table[DecaySettings]) -> tuple[str, ...]:
     return ("m1", "m2") if moves else ("m1",)
 
 
-def _paper(experiments: Sequence["FreeVibration"]) -> Values:
+def _paper(experiments: Sequence[Any]) -> Values:
     """Estimate k1 = m1 Omega_o^2 and c by logarithmic decrement after Savitzky–Golay, as in the paper; record means."""
     found = [d for d in (e.paper_decrement() for e in experiments) if d is not None]
     return {"k1": float(np.mean([d.k1 for d in found])), "c": float(np.mean([d.c for d in found]))} if found else {}
 
 
-def _rough(experiments: Sequence["FreeVibration"], rig: Rig) -> Values:
+def _rough(experiments: Sequence[Any], rig: Rig) -> Values:
     """Estimate k1 = m1 (Omega_o^2 + gamma^2) and c = 2 m1 gamma without bias; gamma = delta Omega_o / 2 pi."""
     decays = [e.paper_decrement() for e in experiments]
     found = [(d.Omega_o, d.delta * d.Omega_o / (2.0 * np.pi)) for d in decays if d is not None and d.delta > 0.0]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -10,61 +10,41 @@ from scipy.signal import lsim
 
 from capsule_id.experiments.base import ValuesBySymbol, stretch
 from capsule_id.experiments.context import Fitted
-from capsule_id.experiments.free_vibration.models import (
-    STRONGEST,
-    viscous_state,
-)
+from capsule_id.experiments.free_vibration.models import STRONGEST, viscous_state
 from capsule_id.experiments.free_vibration.readings import (
     DAMPING,
     FURTHER,
-    DecayModel,
-    DecaySettings,
     block_size,
     decay_window,
+    natural_units,
 )
+from capsule_id.experiments.free_vibration.record import Decay, DecayRecord
 from capsule_id.parameters import parameter
-from capsule_id.rig.model import Table
 from capsule_id.views import Facts, Finding
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.noise import whiten
 
 # sensitivities: Effects of the parameters on the readings of a decay, and of forces that the fitted model lacks.
 
 
-#: Step of difference quotients, in natural units of each parameter.
-SENSITIVITY_STEP = 1e-5
+#: Step of difference quotients, in natural units of each parameter; smallest unit of c, relative to sqrt(k1 m1).
+SENSITIVITY_STEP, SMALLEST_C = 1e-5, 0.01
 #: Points per period, and fewest points, of the responses to further forces.
 RESPONSE_POINTS, FEWEST_POINTS = 60, 200
 
 
-def whitened(e: "FreeVibration", theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
-    """Columns (n,) or (n, q) in the coordinates where noise and drift of ``e`` are white."""
-    table = np.reshape(columns, (e.n, -1))
-    if e.model.whitened:
-        table = np.asarray(whiten(e.times, table, e.model, theta))
-    else:
-        table = table / np.reshape(e.relative_sd, (-1, 1))
-    return np.reshape(table, columns.shape)
-
-
-def sensitivities(
-    e: "FreeVibration", theta: Mapping[str, float]
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def sensitivities(e: Decay, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Residuals (n,), design of the linear nuisances (n, p), and derivatives of the residuals by symbol, (n,) each."""
     raw, design = e.unwhitened(theta, np)
-    nuisances = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
+    nuisances = np.linalg.lstsq(e.whitened(theta, design), e.whitened(theta, raw), rcond=None)[0]
     left, units, moved = raw - design @ nuisances, _units(e, theta), {}
-    for name in ("k1", "c", *e.model.symbols, *(() if e.closed else ("amplitude", "turning_time"))):
+    for name in ("k1", "c", *e.model.symbols, *e.own_symbols):
         other, basis = e.unwhitened({**theta, name: theta[name] + SENSITIVITY_STEP * units[name]}, np)
         moved[name] = (other - basis @ nuisances - left) / (SENSITIVITY_STEP * units[name])
     return left, design, moved
 
 
-def further_sensitivities(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, np.ndarray]:
+def further_sensitivities(e: Decay, theta: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Derivatives (n,) of the residuals with respect to the forces that the model of ``e`` lacks, at zero force."""
-    if e.closed:
+    if isinstance(e, DecayRecord) and e.closed:
         return {name: -response for name, response in force_responses(e, theta).items()}
     full = e.with_model(replace(e.model, damping=tuple(DAMPING), cubic=True))
     names = e.model.absent
@@ -77,13 +57,13 @@ def further_sensitivities(e: "FreeVibration", theta: Mapping[str, float]) -> dic
     }
 
 
-def force_responses(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, np.ndarray]:
+def force_responses(e: DecayRecord, theta: Mapping[str, float]) -> dict[str, np.ndarray]:
     """Responses (n,) of the readings of a viscous decay to F_dry, c_q and k_cubic of unit size, SI, by symbol.
 
     They are linear, for small forces, and start at rest: the nuisances of the decay contain any other start.
     """
     raw, design = e.unwhitened(theta, np)
-    parts = np.linalg.lstsq(whitened(e, theta, design), whitened(e, theta, raw), rcond=None)[0]
+    parts = e.width * np.linalg.lstsq(e.whitened(theta, design), e.whitened(theta, raw), rcond=None)[0]
     m1, k1, c = theta["m1"], theta["k1"], theta["c"]
     time = e.time * stretch(e.clock_rate, theta)
     length = float(time[-1])
@@ -100,11 +80,12 @@ def force_responses(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str,
     return found
 
 
-def _units(e: "FreeVibration", theta: Mapping[str, float]) -> dict[str, float]:
+def _units(e: Decay, theta: Mapping[str, float]) -> dict[str, float]:
     """Natural units of the parameters of a decay, SI."""
     size, k1, m1 = e.largest_deflection, theta["k1"], theta["m1"]
-    units = {"k1": k1, "c": theta["c"], "F_dry": k1 * size, "c_q": m1 / size, "k_cubic": k1 / size**2}
-    return units | {"amplitude": size, "turning_time": float(np.sqrt(m1 / k1))}
+    c = max(theta["c"], SMALLEST_C * float(np.sqrt(k1 * m1)))
+    motion = {"amplitude": size, "turning_time": float(np.sqrt(m1 / k1))}
+    return {"k1": k1, "c": c, **natural_units(k1, m1, size), **motion}
 
 
 # zero: A zero of the sensor that jumps where the rod turns, as of an encoder that loses counts or of a loose sensor.
@@ -136,14 +117,14 @@ class Jumps(NamedTuple):
     half_swings: int
 
 
-def zero_jumps(e: "FreeVibration", theta: ValuesBySymbol) -> Jumps | None:
+def zero_jumps(e: DecayRecord, theta: ValuesBySymbol) -> Jumps | None:
     """Zeros of the half swings of a record; None for too few readings, and where the readings are no displacement.
 
     Three things are projected out of both descriptions: what the fitted parameters can take up, a zero for each direction
     of the motion (as of dry friction or hysteresis), and one in proportion to the amplitude.
     """
     time, values = e.whole
-    half = np.pi / e.rough_decrement().Omega_o
+    half = np.pi / e.rough.Omega_o
     end = MOST_HALF_SWINGS * half
     if e.order > 0 or np.count_nonzero(time <= end) < FEWEST_OF_ALL:
         return None
@@ -235,29 +216,6 @@ class Hidden:
         return 0.0, self.sd * (ratio + float(stats.norm.isf(beyond)))
 
 
-class Decay(Protocol):
-    """A record or the turning points of a decay."""
-
-    model: DecayModel
-
-    @property
-    def label(self) -> str: ...
-
-    @property
-    def table(self) -> Table[DecaySettings]: ...
-
-    def local(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Select values by symbol from values by name."""
-        ...
-
-    def reduced(self, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivatives (n, p) and (n, q), and residuals (n,), in units of the noise, without own nuisances.
-
-        Derivatives with respect to k1, c and ``model.symbols``, and to the forces that the model lacks.
-        """
-        ...
-
-
 def check_hidden_terms(records: Sequence[Decay], fit: Fitted) -> list[Finding]:
     """Check that viscous records exclude further forces that would change c or k1 by much, where the settings allow them."""
     groups: dict[Any, list[Decay]] = {}
@@ -312,7 +270,7 @@ def _change(name: str, value: float, terms: Mapping[str, Hidden]) -> Facts:
 
 def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[str, Hidden]:
     """Every force that the common model of ``records`` lacks, by symbol; ``values`` of the fit, SI."""
-    blocks = [e.reduced(e.local(values)) for e in records]
+    blocks = [reduced(e, e.local(values)) for e in records]
     known, further, left = (np.concatenate(part) for part in zip(*blocks, strict=True))
     model = records[0].model
     names = ("k1", "c", *model.symbols)
@@ -332,15 +290,18 @@ def hidden_terms(records: Sequence[Decay], values: Mapping[str, float]) -> dict[
     return found
 
 
-def reduced_record(e: "FreeVibration", theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``Decay.reduced`` of a record."""
+def reduced(e: Decay, theta: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives (n, p) and (n, q), and residuals (n,), in units of the noise, without the nuisances of ``e`` alone.
+
+    Derivatives with respect to k1, c and ``model.symbols``, and to the forces that the model lacks.
+    """
     left, design, moved = sensitivities(e, theta)
     further = further_sensitivities(e, theta)
     shared = np.column_stack([moved.pop(name) for name in ("k1", "c", *e.model.symbols)])
-    own = whitened(e, theta, np.column_stack([design, *moved.values()]))
+    own = e.whitened(theta, np.column_stack([design, *moved.values()]))
     own = np.linalg.qr(own / np.linalg.norm(own, axis=0))[0]
     parts = [
-        whitened(e, theta, part)
+        e.whitened(theta, part)
         for part in (shared, np.column_stack([further[s] for s in e.model.absent]), left[:, None])
     ]
     known, others, residuals = (part - own @ (own.T @ part) for part in parts)

@@ -8,8 +8,10 @@ import numpy as np
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.free_vibration.readings import (
+    CHANNELS,
     DAMPING,
     EFFECTS,
+    KINEMATIC_MESSAGES,
     MOST_PERIODS,
     DecayModel,
     DecaySettings,
@@ -21,13 +23,11 @@ from capsule_id.experiments.free_vibration.readings import (
     release_time,
     window_of,
 )
-from capsule_id.experiments.free_vibration.readings import KINEMATIC_MESSAGES as KINEMATICS_MESSAGES
 from capsule_id.experiments.lint import (
     ACCELERATIONS,
     PERIODS,
     WRONG_PREFIX,
     Number,
-    frequency_of,
     lint_channel,
     lint_rig_quantities,
     lint_smooth,
@@ -36,7 +36,7 @@ from capsule_id.experiments.lint import (
 from capsule_id.parameters import parameter
 from capsule_id.records.faults import aliases, sampling
 from capsule_id.records.release import FreeDecay, find_free_decay
-from capsule_id.records.tones import length_of_motion, other_tone
+from capsule_id.records.tones import frequency_of, length_of_motion, other_tone
 from capsule_id.rig.filters import loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Rig, Table
 from capsule_id.rig.schema import SHORTEST_RECORD
@@ -63,8 +63,6 @@ FEWEST_PERIODS = 2
 FEWEST_MEANS = 4
 #: Largest ratio of the frequencies of two decays of one rig; a stiffness that changes with amplitude gives less.
 LARGEST_RATIO = 1.3
-#: Time derivatives that lead from a channel to the acceleration.
-DERIVATIVES = {"x_rel": 2, "velocity": 1, "acceleration": 0}
 #: Ratios of units that are mistaken for each other.
 RATIOS = (("1000 (s and ms)", 1000.0), ("60 (min and s)", 60.0), ("2 pi (rad and cycles)", 2.0 * np.pi))
 
@@ -139,7 +137,7 @@ def _scales(table: Table[Any], rig: Rig, frequency: float, values: np.ndarray) -
         (label, column.unit, column.to_display, "decays.magnitude"),
     )
     yield from Number(period, 1.0 / frequency, "s", PERIODS, scales[:1], *written).unusual(rig)
-    size = 0.5 * float(np.ptp(values)) * (2.0 * np.pi * frequency) ** DERIVATIVES[channel]
+    size = 0.5 * float(np.ptp(values)) * (2.0 * np.pi * frequency) ** (2 - CHANNELS[channel].order)
     yield from Number(f"the acceleration in {table.file}", size, "m/s^2", ACCELERATIONS, scales, label).unusual(rig)
 
 
@@ -479,7 +477,7 @@ def _hidden(facts: Facts) -> str:
 
 MESSAGES = {
     **LINT_MESSAGES,
-    **KINEMATICS_MESSAGES,
+    **KINEMATIC_MESSAGES,
     "decays.hidden": Message(
         "further forces of a decay",
         ok="{labels}: no further force that the records allow changes c or k1 by much",

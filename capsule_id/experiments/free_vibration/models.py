@@ -329,6 +329,12 @@ class Decrement:
     k1: float
     c: float
 
+    @classmethod
+    def of(cls, times: np.ndarray, peaks: np.ndarray, Omega_o: float, delta: float, m1: float) -> "Decrement":
+        """The paper's estimates from frequency and decrement, of a rod of mass ``m1``, kg."""
+        k1 = m1 * Omega_o**2
+        return cls(times, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * m1)))
+
     @property
     def first_ratio(self) -> float:
         """Ratio of the first two amplitudes, at least 1; the mean of neighbouring peaks cancels the error of the rest."""
@@ -404,8 +410,7 @@ def logarithmic_decrement(
     index = np.arange(len(times))
     Omega_o = float(np.pi / np.polyfit(index, times, 1)[0])
     delta = float(-2.0 * np.polyfit(index, np.log(np.abs(peaks)), 1)[0])
-    k1 = m1 * Omega_o**2
-    return Decrement(times, peaks, Omega_o, delta, k1, delta / np.pi * float(np.sqrt(k1 * m1)))
+    return Decrement.of(times, peaks, Omega_o, delta, m1)
 
 
 class ViscousFit(NamedTuple):

@@ -1,16 +1,17 @@
 """Readings of free decays: channels, block means, settings, and the window that contains the decay."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from capsule_id.errors import InputError
-from capsule_id.parameters import Parameter, scatter
+from capsule_id.parameters import Parameter, Prior, parameter, scatter
 from capsule_id.records.faults import FEWEST_PERIODS, SIGN_ERRORS, derivative_ratio, phasor
 from capsule_id.records.release import FreeDecay, find_free_decay
-from capsule_id.rig.filters import PIECE, dominant_frequency, loudest_part, median_step, sampling_step
+from capsule_id.records.tones import frequency_of
+from capsule_id.rig.filters import PIECE, loudest_part, median_step, sampling_step
 from capsule_id.rig.model import Quantity, Table
 from capsule_id.rig.schema import COUNT, GroundSettings, NameRule, QuantityRule, WordsRule
 from capsule_id.rig.tables import Entry
@@ -191,14 +192,11 @@ def is_even(time: np.ndarray) -> bool:
 
 def block_size(time: np.ndarray, values: np.ndarray, per_period: float = READINGS_PER_PERIOD) -> int:
     """Samples per block that leave about ``per_period`` readings a period; 1 for a record that does not oscillate."""
-    part = loudest_part(values)
-    time, values = time[part], values[part]
-    grid = np.linspace(time[0], time[-1], len(time))
     try:
-        period = 1.0 / dominant_frequency(grid, np.interp(grid, time, values))
+        period = 1.0 / frequency_of(time, values)
     except (InputError, ZeroDivisionError):
         return 1
-    return max(1, int(period / per_period / median_step(time)))
+    return max(1, int(period / per_period / median_step(time[loudest_part(values)])))
 
 
 def default_block_size(time: np.ndarray, values: np.ndarray) -> int:
@@ -227,11 +225,34 @@ DAMPING = {"dry": "F_dry", "quadratic": "c_q"}
 FURTHER = (*DAMPING.values(), "k_cubic")
 #: What every parameter of a further force stands for, in words.
 EFFECTS = {"F_dry": "dry friction", "c_q": "quadratic damping", "k_cubic": "a cubic spring"}
+#: Keys of rig.toml that state a model, and log-normal priors of dry friction and quadratic damping: median relative to
+#: their natural units, and factor.
+CHOICES = ("damping", "stiffness", "drift", "noise")
+FURTHER_MEDIAN, FURTHER_FACTOR = 0.05, 100.0
 #: Periods of a record that a model with further forces, correlated noise or a Gaussian-process drift is fitted to, at most:
 #: its evaluations take milliseconds then.
 MOST_PERIODS = 250
 _DRIFTS = {"linear": "linear drift", "gp": "Gaussian-process drift"}
 _NOISES = {"ar1": "coloured noise (AR(1))", "arma": "white and coloured noise (ARMA)"}
+
+
+def natural_units(k1: Any, m1: Any, size: Any) -> dict[str, Any]:
+    """Parameters of the further forces that change a motion of this ``size``, m, by as much as itself, SI, by symbol."""
+    return {"F_dry": k1 * size, "c_q": m1 / size, "k_cubic": k1 / size**2}
+
+
+def further_parameters(symbols: Sequence[str], k1: float, m1: float, size: float) -> list[Parameter]:
+    """Rows of the forces in ``symbols``, SI, with priors relative to what the rod feels at its largest deflection ``size``.
+
+    A prior far below that would prefer the absence of a force that the record does not exclude, and the c beside it.
+    """
+    priors = {
+        symbol: Prior("lognormal", FURTHER_MEDIAN * unit, FURTHER_FACTOR)
+        if symbol in DAMPING.values()
+        else Prior("normal", 0.0, unit)
+        for symbol, unit in natural_units(k1, m1, size).items()
+    }
+    return [parameter(symbol, prior=priors[symbol]) for symbol in symbols]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,6 +276,11 @@ class DecaySettings(GroundSettings):
     spring: Annotated[str | None, NameRule()] = None
     gap: Annotated[Quantity | None, QuantityRule("m", NOT_NEGATIVE, has_sd=True)] = None
     forward: Literal["closed", "capsule"] = "closed"
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """What the words of ``CHOICES`` state; None where a second fit may choose."""
+        return self.damping, self.stiffness if self.offers_cubic else "linear", self.drift, self.noise
 
     @property
     def offers_cubic(self) -> bool:
@@ -330,6 +356,15 @@ class DecayModel:
     def symbols(self) -> tuple[str, ...]:
         """Symbols of the parameters besides k1 and c."""
         return (*(DAMPING[word] for word in self.damping), *(("k_cubic",) if self.cubic else ()))
+
+    def with_force(self, symbol: str) -> "DecayModel":
+        """Return the model with one further force."""
+        words = tuple(word for word, own in DAMPING.items() if own in (*self.symbols, symbol))
+        return replace(self, damping=words, cubic=self.cubic or symbol == "k_cubic")
+
+    def line_of(self, symbol: str) -> str:
+        """Line of ``rig.toml`` that states the force with this parameter."""
+        return self.stiffness_line if symbol == "k_cubic" else self.damping_line
 
     @property
     def absent(self) -> tuple[str, ...]:

@@ -1,10 +1,10 @@
 """Choice of the model of free decays where a record contradicts the stated one: starts, noise, hidden forces, ranking."""
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from capsule_id.console import stop_if_interrupted
 from capsule_id.experiments.base import Start
 from capsule_id.experiments.checks import LEVEL, ljung_box, refit
+from capsule_id.experiments.free_vibration.hidden_terms import force_responses
 from capsule_id.experiments.free_vibration.models import (
     STRONGEST,
     UNKNOWNS,
@@ -33,48 +34,36 @@ from capsule_id.experiments.free_vibration.readings import (
     block_means,
     block_size,
     first_periods,
+    natural_units,
 )
+from capsule_id.experiments.free_vibration.record import DecayRecord, ReadingTimes, Screened, whiten_by_shape
 from capsule_id.experiments.misfit import LOG_2PI
-from capsule_id.parameters import Parameter, Prior, parameter
 from capsule_id.physics.batches import pool
 from capsule_id.records.tones import noise_level
-from capsule_id.views import Finding
-
-if TYPE_CHECKING:
-    from capsule_id.experiments.free_vibration.experiment import FreeVibration
-from capsule_id.experiments.free_vibration.hidden_terms import force_responses
-from capsule_id.experiments.free_vibration.noise import ReadingTimes, whiten_by_shape
+from capsule_id.views import Facts, Finding
 
 # starts: Starting points of a fit of free decays.
 
 
-#: Latest first turning point after the first sample, in half periods.
-LATEST_TURNING_POINT = 0.1
-#: Log-normal priors of dry friction and quadratic damping: median relative to k1 x and m1/x, and factor.
-FURTHER_MEDIAN, FURTHER_FACTOR = 0.05, 100.0
 #: Start of a term that a simpler model lacks, relative to its usual start.
 ABSENT = 1e-4
 
 
-def further_parameters(symbols: Sequence[str], k1: float, m1: float, size: float) -> list[Parameter]:
-    """Rows of the forces in ``symbols``, SI, with priors relative to what the rod feels at its largest deflection ``size``.
-
-    A prior far below that would prefer the absence of a force that the record does not exclude, and the c beside it.
-    """
-    priors = {
-        "F_dry": Prior("lognormal", FURTHER_MEDIAN * k1 * size, FURTHER_FACTOR),
-        "c_q": Prior("lognormal", FURTHER_MEDIAN * m1 / size, FURTHER_FACTOR),
-        "k_cubic": Prior("normal", 0.0, k1 / size**2),
+def force_starts(rough: Decrement, c: float, size: float) -> dict[str, Start]:
+    """Rough starts of the further forces of a decay whose first turning point is ``size`` m, by symbol."""
+    return {
+        "F_dry": Start(0.02 * rough.k1 * size, 0.3),
+        "c_q": Start(0.5 * c / (rough.Omega_o * size), 0.3),
+        "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
     }
-    return [parameter(symbol, prior=priors[symbol]) for symbol in symbols]
 
 
-def decay_starts(e: "FreeVibration") -> dict[str, Start]:
+def decay_starts(e: DecayRecord) -> dict[str, Start]:
     """Start of every parameter of the record ``e``, from its paper's estimate or the values of a screening.
 
     A viscous decay without drift starts at its least-squares fit, whose residuals show the noise at any sampling rate.
     """
-    rough, noise = e.rough_decrement(), noise_level(e.values)
+    rough, noise = e.rough, noise_level(e.values)
     if e.about.screened is not None:
         noise = e.about.screened.noise / float(np.mean(e.relative_sd))
     elif e.closed and e.model.drift == "none":
@@ -90,13 +79,9 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
         e.channel.noise.named(e.label).name: Start(noise, 0.2),
     }
     if not e.closed:
-        time, peak = first_turning_point(e)
+        time, peak = e.first_turning_point()
         size = abs(peak)
-        forces = {
-            "F_dry": Start(0.02 * rough.k1 * size, 0.3),
-            "c_q": Start(0.5 * rough.c / (rough.Omega_o * size), 0.3),
-            "k_cubic": Start(0.0, 0.01 * rough.k1 / size**2),
-        }
+        forces = force_starts(rough, rough.c, size)
         rough_damping = e.rough_damping(e.model.symbols)
         forces |= {
             name: Start(max(rough_damping.get(name, 0.0), 0.2 * forces[name].centre), 0.2) for name in ("F_dry", "c_q")
@@ -116,7 +101,7 @@ def decay_starts(e: "FreeVibration") -> dict[str, Start]:
     return starts
 
 
-def nested_starts(e: "FreeVibration") -> list[dict[str, float]]:
+def nested_starts(e: DecayRecord) -> list[dict[str, float]]:
     """Values by name, SI, of the fits of simpler models of the record ``e``; an absent term is far below its usual start."""
     if e.about.screened is None:
         return []
@@ -131,19 +116,7 @@ def nested_starts(e: "FreeVibration") -> list[dict[str, float]]:
     ]
 
 
-def first_turning_point(e: "FreeVibration") -> tuple[float, float]:
-    """Rough time, s, and signed x_rel, m, of the last turning point before the record, or at its first samples."""
-    rough = e.rough_decrement()
-    half_period = np.pi / rough.Omega_o
-    # A velocity peaks a quarter of a period before the turning point.
-    first = float(rough.times[0]) + (0.5 * half_period if e.order == 1 else 0.0)
-    back = int(np.ceil(first / half_period - LATEST_TURNING_POINT))
-    growth = rough.first_ratio**back
-    peak = e.channel.deflection(rough.Omega_o) * float(rough.peaks[0])
-    return first - back * half_period, peak * (-1.0) ** back * growth
-
-
-def starts_of_motion(e: "FreeVibration", rough: Decrement) -> dict[str, Start]:
+def starts_of_motion(e: DecayRecord, rough: Decrement) -> dict[str, Start]:
     """Starts of x_rel and its rate at the first sample."""
     size = abs(float(rough.peaks[0]))
     rate = np.polyfit(e.time[:5], e.values[:5], 1)[0]
@@ -186,26 +159,8 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "drift_time": (0.0, 5.0),
 }
 NAMES = tuple(BOUNDS)
-
-
-@dataclass(frozen=True)
-class Screened:
-    """A fit of one thinned record.
-
-    Attributes
-    ----------
-    values, errors : estimates and standard errors of the free unknowns by symbol, SI; all values, fixed ones included
-    noise : innovation sd of the noise, m
-    residuals : (n,) whitened
-    nested : values of the fits of models that this one contains
-    """
-
-    bic: float
-    values: Mapping[str, float]
-    errors: Mapping[str, float]
-    noise: float
-    residuals: np.ndarray
-    nested: tuple[Mapping[str, float], ...] = ()
+#: Those that are no logarithms, and those of which every record has its own values.
+LINEAR, OWN = ("F_dry", "c_q", "k_cubic", "turning_time"), ("amplitude", "turning_time")
 
 
 def free_symbols(model: DecayModel) -> list[str]:
@@ -256,57 +211,49 @@ class Screening:
     ``k1`` is what the bounds of k1 lie about (default: a rough estimate, which few swings with dry friction mislead).
     """
 
-    def __init__(self, record: "FreeVibration", thin: int | None = None, k1: float | None = None) -> None:
-        rough = record.rough_decrement()
-        self.turning_time, peak = first_turning_point(record)
+    def __init__(self, record: DecayRecord, thin: int | None = None, k1: float | None = None) -> None:
+        rough = record.rough
+        self.turning_time, peak = record.first_turning_point()
         self.side, self.size = float(np.sign(peak)), abs(peak)
         self.m1, self.k1, self.c, self.omega = record.mass, k1 or rough.k1, rough.c, rough.Omega_o
-        period, length = 2.0 * np.pi / self.omega, float(record.time[-1])
+        self.period = 2.0 * np.pi / self.omega
         self.order = record.order
         blocks = block_means(*record.whole, thin or record.model.thin, by_sample=record.order > 0)
         self.values, self.nodes, self.weights = blocks.values, blocks.nodes, blocks.weights
         self.times = ReadingTimes.of(blocks)
         # The margin allows for a frequency 1.25 times the rough estimate.
-        self.number = int(2.5 * length / period) + 5
-        self.noise_time, self.drift_time = 0.1 * period, period
-        self.rough_damping, self.mean_peak = (
-            record.rough_damping,
-            record.deflection * float(np.mean(np.abs(rough.peaks))),
-        )
+        self.number = int(2.5 * float(record.time[-1]) / self.period) + 5
+        self.units = natural_units(self.k1, self.m1, self.size) | {
+            "k1": self.k1,
+            "c": self.c,
+            "amplitude": self.size,
+            "turning_time": 1.0 / self.omega,
+            "noise_time": 0.1 * self.period,
+            "white_ratio": 1.0,
+            "drift_ratio": 1.0,
+            "drift_time": self.period,
+        }
+        self.rough_damping = record.rough_damping
+        self.mean_peak = record.deflection * float(np.mean(np.abs(rough.peaks)))
 
     def theta(self, z: np.ndarray) -> dict[str, Any]:
         """Values by symbol, SI, of scaled unknowns (..., names)."""
         own = dict(zip(NAMES, np.moveaxis(z, -1, 0), strict=True))
-        k1 = self.k1 * np.exp(own["k1"])
+        values = {name: self.units[name] * (x if name in LINEAR else np.exp(x)) for name, x in own.items()}
+        values["turning_time"] = self.turning_time + values["turning_time"]
         # A drift counts in units of the noise, which is white where the ratio is beyond its bounds.
-        unit = np.where(own["white_ratio"] > BOUNDS["white_ratio"][1], WHITE, 1.0)
-        return {
-            "m1": np.broadcast_to(self.m1, k1.shape),
-            "k1": k1,
-            "c": self.c * np.exp(own["c"]),
-            "F_dry": self.k1 * self.size * own["F_dry"],
-            "c_q": self.m1 / self.size * own["c_q"],
-            "k_cubic": self.k1 / self.size**2 * own["k_cubic"],
-            "amplitude": self.size * np.exp(own["amplitude"]),
-            "turning_time": self.turning_time + own["turning_time"] / self.omega,
-            "noise_time": self.noise_time * np.exp(own["noise_time"]),
-            "white_ratio": np.where(own["white_ratio"] < BOUNDS["white_ratio"][0], 0.0, np.exp(own["white_ratio"])),
-            "drift_ratio": np.where(
-                own["drift_ratio"] < BOUNDS["drift_ratio"][0], 0.0, unit * np.exp(own["drift_ratio"])
-            ),
-            "drift_time": self.drift_time * np.exp(own["drift_time"]),
-        }
+        values["drift_ratio"] *= np.where(own["white_ratio"] > BOUNDS["white_ratio"][1], WHITE, 1.0)
+        for name in ("white_ratio", "drift_ratio"):
+            values[name] = np.where(own[name] < BOUNDS[name][0], 0.0, values[name])
+        return {"m1": np.broadcast_to(self.m1, values["k1"].shape), **values}
 
     def scaled(self, values: Mapping[str, float]) -> np.ndarray:
         """(names,) scaled unknowns at values by symbol, SI, of another fit; amplitude and time of this record's own."""
         z = np.zeros(len(NAMES))
-        units = {"F_dry": self.k1 * self.size, "c_q": self.m1 / self.size, "k_cubic": self.k1 / self.size**2}
-        logarithms = {"k1": self.k1, "c": self.c, "noise_time": self.noise_time, "drift_time": self.drift_time}
-        for name, unit in units.items():
-            z[NAMES.index(name)] = values.get(name, 0.0) / unit
-        for name, unit in {**logarithms, "white_ratio": 1.0, "drift_ratio": 1.0}.items():
-            if values.get(name, 0.0) > 0.0:
-                z[NAMES.index(name)] = np.log(values[name] / unit)
+        for i, name in enumerate(NAMES):
+            value = values.get(name, 0.0) / self.units[name]
+            if name not in OWN and (name in LINEAR or value > 0.0):
+                z[i] = value if name in LINEAR else np.log(value)
         return z
 
     def start(self, model: DecayModel, near: np.ndarray | None, absent: bool = False) -> np.ndarray:
@@ -339,11 +286,11 @@ class Screening:
         known = "F_dry" in self.rough_damping(("F_dry",))
         grid = found["F_dry"] * np.geomspace(0.5, 2.0, len(NAMES) + 1)
         if not known:
-            grid = self.k1 * self.size * np.geomspace(0.003, 0.45, len(NAMES) + 1)
+            grid = self.units["F_dry"] * np.geomspace(0.003, 0.45, len(NAMES) + 1)
         lost = (found["F_dry"] if known else 0.0) - grid
         c = np.maximum(found["c"] + lost * 4.0 / (np.pi * self.omega * self.mean_peak), 0.02 * self.c)
         starts = np.tile(start, (len(grid), 1))
-        starts[:, i], starts[:, j] = grid / (self.k1 * self.size), np.log(c / self.c)
+        starts[:, i], starts[:, j] = grid / self.units["F_dry"], np.log(c / self.c)
         moved = np.repeat(starts[None], DRY_ROUNDS, axis=0)
         rng = np.random.default_rng(0)
         for name, spread in DRY_SPREADS.items():
@@ -422,11 +369,11 @@ class Screening:
         """Range of the mean over one period of measured minus predicted readings, SI, at scaled unknowns (names,)."""
         raw = self.values - self.motions(np.tile(z, (len(NAMES) + 1, 1)))[1][0]
         time = self.times.time
-        window = 2.0 * np.pi / self.omega
-        first, last = np.searchsorted(time, time - 0.5 * window), np.searchsorted(time, time + 0.5 * window)
+        half = 0.5 * self.period
+        first, last = np.searchsorted(time, time - half), np.searchsorted(time, time + half)
         total = np.concatenate([[0.0], np.cumsum(raw)])
         means = (total[last] - total[first]) / (last - first)
-        whole = means[(time > 0.5 * window) & (time < time[-1] - 0.5 * window)]
+        whole = means[(time > half) & (time < time[-1] - half)]
         return float(np.ptp(whole)) if len(whole) else 0.0
 
     def _summary(
@@ -480,7 +427,7 @@ SHORTEST = 40
 WHITENESS = 0.01
 
 
-def open_models(record: "FreeVibration") -> tuple[list[DecayModel], list[DecayModel]]:
+def open_models(record: DecayRecord) -> tuple[list[DecayModel], list[DecayModel]]:
     """Return the sums of forces that the settings leave open, and the pairs of drift and noise."""
     settings, stated = record.table.settings, record.model
     damping = [
@@ -500,12 +447,12 @@ def open_models(record: "FreeVibration") -> tuple[list[DecayModel], list[DecayMo
     return forces, others
 
 
-def demands_another(record: "FreeVibration", level: float) -> bool:
+def demands_another(record: DecayRecord, level: float) -> bool:
     """Whether ``record`` contradicts its model at this false-alarm rate: residuals, or responses to further forces.
 
     A decay beyond ``STRONGEST`` damping keeps its model, because no other one is offered.
     """
-    rough = record.rough_decrement()
+    rough = record.rough
     if rough.c > 2.0 * STRONGEST * np.sqrt(rough.k1 * record.mass):
         return False
     if not record.closed or record.model.whitened:
@@ -518,7 +465,7 @@ def demands_another(record: "FreeVibration", level: float) -> bool:
     return ljung_box(residuals)[1] < level or response_p(record, theta) < level
 
 
-def response_p(record: "FreeVibration", theta: Mapping[str, float]) -> float:
+def response_p(record: DecayRecord, theta: Mapping[str, float]) -> float:
     """p-value of the F test for the responses of the rod to further forces and for a drift, at a viscous fit."""
     raw, design = record.unwhitened(theta, np)
     parts = np.linalg.lstsq(design, raw, rcond=None)[0]
@@ -539,7 +486,7 @@ def response_p(record: "FreeVibration", theta: Mapping[str, float]) -> float:
     return float(stats.f.sf((own - further) / extra.shape[1] * freedom / further, extra.shape[1], freedom))
 
 
-def thinning(record: "FreeVibration", per_period: float) -> int:
+def thinning(record: DecayRecord, per_period: float) -> int:
     """Return the block size that leaves about ``per_period`` readings; no less than that of the record."""
     return max(record.model.thin, block_size(*record.whole, per_period))
 
@@ -591,7 +538,7 @@ def simplest(ranked: Sequence[Ranking]) -> Ranking:
     return min(near, key=lambda one: len(one.model.symbols))
 
 
-def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
+def demanded_model(records: Sequence[DecayRecord]) -> Ranking:
     """Return the model with the lowest BIC of all ``records`` together, thinned until its residuals are white.
 
     The forces are chosen first on thinned records, with the richest noise that the settings leave open, then drift and
@@ -613,7 +560,7 @@ def demanded_model(records: Sequence["FreeVibration"]) -> Ranking:
 
 
 def _with_noise(
-    records: Sequence["FreeVibration"], ranked: list[Ranking], others: Sequence[DecayModel], coarse: int
+    records: Sequence[DecayRecord], ranked: list[Ranking], others: Sequence[DecayModel], coarse: int
 ) -> Ranking:
     """Choose drift and noise, from the ranking of all of them on records thinned by ``coarse``.
 
@@ -636,50 +583,80 @@ def _with_noise(
     return replace(best, model=replace(best.model, thin=coarse))
 
 
+class Demanded(NamedTuple):
+    """What some decays demand: labels of those that contradict their model, all of them under the new one, and facts."""
+
+    contradicting: Sequence[str]
+    decays: Sequence[Any]
+    facts: Facts
+
+
+def replaced(
+    decays: Sequence[Any], judged: Iterable[int], demanded: Callable[[list[Any]], Demanded]
+) -> tuple[list[Any], list[Finding]]:
+    """Return ``decays`` under the models that they demand, and findings that name these models.
+
+    Decays with the same stated words share their parameters, and so their model.
+
+    Parameters
+    ----------
+    judged : indices of the decays that may have another model
+    demanded : what the decays of one group demand
+    """
+    chosen, findings = list(decays), list[Finding]()
+    groups: dict[Any, list[int]] = {}
+    for i in judged:
+        stated = decays[i].table.settings.choices
+        if None in stated:
+            groups.setdefault(stated, []).append(i)
+    for members in groups.values():
+        labels, others, facts = demanded([decays[i] for i in members])
+        first, second = decays[members[0]].model, others[0].model
+        if labels and second != first:
+            facts = {"labels": labels, "first": first.name, "second": second.name, "drift": "", **facts}
+            findings.append(Finding("decays.second_fit", "warn", {"lines": others[0].lines, **facts}, labels[0]))
+            for i, other in zip(members, others, strict=True):
+                chosen[i] = other
+    return chosen, findings
+
+
 def second_models(
-    records: Sequence["FreeVibration"], readings: Sequence[Finding] = ()
-) -> tuple[list["FreeVibration"], list[Finding]]:
+    records: Sequence[DecayRecord], readings: Sequence[Finding] = ()
+) -> tuple[list[DecayRecord], list[Finding]]:
     """Return ``records`` under the model that they demand, and findings that name it.
 
     Records with more than a free decay according to ``readings``, the findings on the readings, keep their model. Their
     fit fails in any case, so long ones are thinned.
     """
-    level = LEVEL / len(records)
-    chosen, findings = list(records), list[Finding]()
-    groups: dict[Any, list[int]] = {}
+    kept, findings = list(records), list[Finding]()
     no_decay = {f.experiment for f in readings if f.level == "fail" and f.code in ("decays.release", "decays.second")}
     for i, record in enumerate(records):
         settings = record.table.settings
-        stiffness = settings.stiffness if settings.offers_cubic else "linear"
-        stated = settings.damping, stiffness, settings.drift, settings.noise
-        if record.label not in no_decay:
-            groups.setdefault(stated, []).append(i)
-        elif None in stated:
+        if record.label in no_decay and None in settings.choices:
             thin = settings.thin or max(1, len(record.whole[0]) // LONGEST_UNCUT)
-            chosen[i] = record.with_model(replace(record.model, thin=thin))
+            kept[i] = record.with_model(replace(record.model, thin=thin))
             findings.append(Finding("decays.first_fit", "warn", {"record": record.label, "thin": thin}, record.label))
-    for stated, members in groups.items():
-        own = [records[i] for i in members]
-        if None not in stated:
-            continue
-        contradicting = [e.label for e in own if e.n >= SHORTEST and demands_another(e, level)]
-        if not contradicting:
-            continue
-        own = [e.with_table(first_periods(e.table)) for e in own]
-        ranking = demanded_model(own)
-        model = ranking.model
-        if model != own[0].model:
-            facts = {"labels": contradicting, "first": own[0].model.name, "second": model.name, "lines": model.lines}
-            facts["drift"] = _drift_text(own, ranking)
-            if model.slow and any(part.n < records[i].n for i, part in zip(members, own, strict=True)):
-                facts["drift"] += f" The second fit uses the first {MOST_PERIODS} periods of each record."
-            findings.append(Finding("decays.second_fit", "warn", facts, contradicting[0]))
-            for i, part, (screened, _) in zip(members, own, ranking.fits, strict=True):
-                chosen[i] = (part if model.slow else records[i]).with_model(model, screened)
-    return chosen, findings
+    judged = (i for i, record in enumerate(records) if record.label not in no_decay)
+    chosen, named = replaced(kept, judged, partial(_demanded, level=LEVEL / len(records)))
+    return chosen, findings + named
 
 
-def _drift_text(records: Sequence["FreeVibration"], ranking: Ranking) -> str:
+def _demanded(records: list[DecayRecord], level: float) -> Demanded:
+    """What ``records`` demand: they share the model with the lowest BIC where one of them contradicts the stated one."""
+    contradicting = [e.label for e in records if e.n >= SHORTEST and demands_another(e, level)]
+    if not contradicting:
+        return Demanded((), records, {})
+    own = [e.with_table(first_periods(e.table)) for e in records]
+    ranking = demanded_model(own)
+    text = _drift_text(own, ranking)
+    if ranking.model.slow and any(part.n < whole.n for part, whole in zip(own, records, strict=True)):
+        text += f" The second fit uses the first {MOST_PERIODS} periods of each record."
+    kept = own if ranking.model.slow else records
+    others = [e.with_model(ranking.model, fit) for e, (fit, _) in zip(kept, ranking.fits, strict=True)]
+    return Demanded(contradicting, others, {"drift": text})
+
+
+def _drift_text(records: Sequence[DecayRecord], ranking: Ranking) -> str:
     """A sentence on the size of the drift in every record; "" without a drift."""
     if ranking.model.drift == "none":
         return ""

@@ -1,0 +1,574 @@
+"""The readings of a free decay under one model: their noise, their likelihood, and the paper's estimate from them."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import ModuleType
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tinygp.kernels.quasisep import Matern32
+from tinygp.solvers.quasisep.core import DiagQSM, StrictLowerTriQSM, SymmQSM
+
+from capsule_id.experiments.base import (
+    About,
+    ValuesBySymbol,
+    axis_label,
+    band,
+    clock_parameters,
+    stated_rate,
+    stretch,
+)
+from capsule_id.experiments.checks import autocorrelation
+from capsule_id.experiments.free_vibration.declaration import (
+    AMPLITUDE,
+    DRIFT_RATIO,
+    DRIFT_TIME,
+    NOISE_TIME,
+    TURNING_TIME,
+    WHITE_RATIO,
+)
+from capsule_id.experiments.free_vibration.models import (
+    UNKNOWNS,
+    Decrement,
+    damping_of_peaks,
+    decay,
+    decay_moments,
+    equilibrium,
+    fold,
+    logarithmic_decrement,
+    rates,
+    steps_of,
+    trend,
+    uniform_step,
+    viscous_basis,
+    viscous_fit,
+)
+from capsule_id.experiments.free_vibration.readings import (
+    CHANNELS,
+    CHOICES,
+    Blocks,
+    Channel,
+    DecayModel,
+    block_mean,
+    block_means,
+    channel_of,
+    decay_window,
+    further_parameters,
+    is_even,
+    stated_model,
+)
+from capsule_id.experiments.friction_model import EQUATION_1, FrictionModel, SurfaceExperiment
+from capsule_id.experiments.misfit import NUISANCE_WIDTH, Misfit, Moments
+from capsule_id.parameters import Parameter, Prior, parameter
+from capsule_id.records.release import shortened
+from capsule_id.records.tones import noise_level
+from capsule_id.rig.filters import choose_window, savitzky_golay
+from capsule_id.rig.model import Column, Rig, Table
+from capsule_id.views import Comparison, Curve, Facts, Points
+
+# noise: Coloured noise and drift of a record, at any sampling, whitened in linear time.
+#
+# The noise is a continuous-time process: an Ornstein–Uhlenbeck process, alone or with white noise. Sampled evenly
+# the first is AR(1) and the sum is ARMA(1, 1). A drift is a Matérn-3/2 process. tinygp factorises the covariance of
+# such sums in linear time (quasiseparable matrices: D. Foreman-Mackey et al., AJ 154, 220 (2017)).
+#
+# Block means of the first process have exactly such a covariance again, where the readings of a block are evenly
+# spaced.
+# A drift changes little within a block, so its value at the middle stands for its mean.
+
+
+class ReadingTimes(eqx.Module):
+    """Times of the readings of N blocks.
+
+    Attributes
+    ----------
+    time, first, last : (N,) s, as in ``Blocks``
+    count : (1,) readings of every block, or (N,)
+    step : (1,) or (N,) s between the readings of a block
+    longest : largest count
+    """
+
+    time: Any
+    first: Any
+    last: Any
+    count: Any
+    step: Any
+    longest: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, blocks: Blocks) -> "ReadingTimes":
+        """Times of the readings of ``blocks``; equal blocks share count and step."""
+        count, step = blocks.count, (blocks.last - blocks.first) / np.maximum(blocks.count - 1.0, 1.0)
+        if np.ptp(count) == 0.0 and np.ptp(step) <= 0.01 * np.max(step):
+            count, step = count[:1], np.mean(step, keepdims=True)
+        return cls(blocks.time, blocks.first, blocks.last, count, step, int(np.max(count)))
+
+
+def noise_parameters(model: DecayModel, time: np.ndarray, period: float, of: str) -> list[Parameter]:
+    """Return the shape parameters of noise and drift of the record ``of``, sampled at ``time`` (n,), s.
+
+    The noise's correlation time lies between the sampling step and the record's length, the drift's between the period
+    (s) of the decay and the square of the record's length over it.
+    """
+    length = float(np.ptp(time))
+    between = Prior("lognormal", float(length / np.sqrt(len(time))), float(np.sqrt(len(time))))
+    slow = Prior("lognormal", 0.3 * length, max(3.0, 0.3 * length / period))
+    rows = [NOISE_TIME.named(of, between)] if model.noise != "white" else []
+    rows += [WHITE_RATIO.named(of)] if model.noise == "arma" else []
+    return rows + ([DRIFT_RATIO.named(of), DRIFT_TIME.named(of, slow)] if model.drift == "gp" else [])
+
+
+def whiten(times: ReadingTimes, columns: Any, model: DecayModel, theta: ValuesBySymbol) -> Any:
+    """Map columns (n, q) to the coordinates where noise and drift are white with the noise's innovation sd; (n, q).
+
+    The map has determinant 1: the density of the readings is that of the whitened readings.
+    """
+    shape = {symbol: theta[symbol] for symbol in model.shapes}
+    return whiten_by_shape(times, jnp.asarray(columns), model.noise, shape)
+
+
+@partial(jax.jit, static_argnames="noise")
+def whiten_by_shape(times: ReadingTimes, columns: Any, noise: str, shape: ValuesBySymbol) -> Any:
+    """Whiten as ``whiten``, with the shape parameters of ``noise`` and, where it has some, of the drift."""
+    factor = _covariance(times, noise, shape)[0].cholesky()
+    return factor.solve(columns) * jnp.exp(jnp.mean(jnp.log(factor.diag.d)))
+
+
+@partial(jax.jit, static_argnames="noise")
+def drift_by_shape(times: ReadingTimes, residuals: Any, noise: str, shape: ValuesBySymbol) -> Any:
+    """Expectation (n,) of a Gaussian-process drift, given the ``residuals`` (n,) that it is a part of."""
+    total, drift = _covariance(times, noise, shape)
+    factor = total.cholesky()
+    return drift @ factor.transpose().solve(factor.solve(residuals[:, None]))[:, 0]
+
+
+def _covariance(times: ReadingTimes, noise: str, shape: ValuesBySymbol) -> tuple[Any, Any]:
+    """Covariances of all noise with the drift, and of the drift alone; of unit innovation variance."""
+    parts: list[Any] = [averaged_process(times, shape["noise_time"])] if noise != "white" else []
+    if "drift_time" in shape:
+        parts.append(Matern32(scale=shape["drift_time"], sigma=shape["drift_ratio"]).to_symm_qsm(times.time))
+    white = {"white": 1.0, "ar1": 0.0, "arma": shape.get("white_ratio", 0.0) ** 2}[noise] / times.count
+    correlated: Any = sum(parts[1:], parts[0])
+    return correlated + DiagQSM(d=jnp.broadcast_to(white, times.time.shape)), parts[-1]
+
+
+def averaged_process(times: ReadingTimes, correlation_time: Any) -> SymmQSM:
+    """Covariance of the block means of an Ornstein–Uhlenbeck process of unit variance; (N, N).
+
+    The mean of a block is its readings' mean decay from their first or to their last one. Between two blocks the
+    process decays over the time between the nearest readings.
+    """
+    lags = jnp.arange(times.longest)[None]
+    count = times.count[:, None]
+    decay = jnp.exp(-lags * times.step[:, None] / correlation_time)
+    inside = lags < count
+    reach = jnp.sum(decay * inside, axis=1) / times.count
+    pairs = jnp.where(inside, jnp.where(lags == 0, 1.0, 2.0) * (count - lags), 0.0)
+    variance = jnp.sum(pairs * decay, axis=1) / times.count**2
+    n, reach = times.time.shape[0], jnp.broadcast_to(reach, times.time.shape)
+    gap = jnp.concatenate([jnp.ones(1), jnp.exp(-(times.first[1:] - times.last[:-1]) / correlation_time)])
+    ends = jnp.concatenate([jnp.ones(1), jnp.exp(-jnp.diff(times.last) / correlation_time)])
+    lower = StrictLowerTriQSM(p=(reach * gap)[:, None], q=reach[:, None], a=ends[:, None, None])
+    return SymmQSM(diag=DiagQSM(d=jnp.broadcast_to(variance, (n,))), lower=lower)
+
+
+# decay: What the records and the turning points of a decay have in common, and one record.
+
+
+#: Default prior of a record's noise, without reading error: log-normal, median 1 % of its range, factor 100.
+NOISE_MEDIAN, NOISE_FACTOR = 0.01, 100.0
+#: Twice the damping ratio up to which an even record is summed in closed form.
+UNIFORM = 0.6
+#: Polynomial order of the Savitzky–Golay filter in the paper's estimator.
+SMOOTHING_ORDER = 3
+#: Latest first turning point after the first sample, in half periods.
+LATEST_TURNING_POINT = 0.1
+#: A rough viscous fit whose residuals are this many times the noise misses a force.
+MISFIT = 3.0
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A fit of one thinned record.
+
+    Attributes
+    ----------
+    values, errors : estimates and standard errors of the free unknowns by symbol, SI; all values, fixed ones included
+    noise : innovation sd of the noise, m
+    residuals : (n,) whitened
+    nested : values of the fits of models that this one contains
+    """
+
+    bic: float
+    values: Mapping[str, float]
+    errors: Mapping[str, float]
+    noise: float
+    residuals: np.ndarray
+    nested: tuple[Mapping[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class DecayAbout(About):
+    """Further inputs of a decay.
+
+    Attributes
+    ----------
+    screened : a fit of the record by a screening of models; it gives the starting point of a fit
+    rough : the paper's estimate, or that of a least-squares fit where there are too few peaks
+    """
+
+    screened: Screened | None = field(default=None, compare=False)
+    rough: Decrement | None = field(default=None, compare=False)
+
+
+class Decay(SurfaceExperiment):
+    """The readings of a decay, with a model of its forces.
+
+    ``time`` (n,), s, and ``values`` (n,), SI, of its first channel; ``reading_sd``, SI, of its readings.
+    """
+
+    time: np.ndarray
+    values: np.ndarray
+    reading_sd: float
+    clock_rate: float | None
+    about: DecayAbout = eqx.field(static=True)
+    model: DecayModel = eqx.field(static=True)
+
+    #: Words of the title of its panel.
+    title: ClassVar[str]
+
+    @abstractmethod
+    def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
+        """Measured minus predicted (m,), SI, and its design (m, p) of the linear nuisances."""
+
+    @abstractmethod
+    def whitened(self, theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
+        """Columns (m,) or (m, q) in the coordinates where the noise, and a drift, are white."""
+
+    @abstractmethod
+    def with_model(self, model: DecayModel, screened: Screened | None = None) -> Self:
+        """Return the same readings with another model; its fit ``screened`` gives the starting point."""
+
+    @property
+    @abstractmethod
+    def largest_deflection(self) -> float:
+        """Largest distance of a reading from the rest position, m."""
+
+    @property
+    def rough(self) -> Decrement:
+        """The paper's estimate, or that of a least-squares fit where there are too few peaks."""
+        assert self.about.rough is not None, "the constructor sets it"
+        return self.about.rough
+
+    @property
+    def own_symbols(self) -> tuple[str, ...]:
+        """Symbols of the unknowns of the motion besides its forces."""
+        return ("amplitude",)
+
+    @property
+    def masses(self) -> tuple[str, ...]:
+        return ("m1",)
+
+    @property
+    def mass(self) -> float:
+        """Measured mass of the rod, kg."""
+        return self.rig.mass("m1")
+
+    @property
+    def column(self) -> Column:
+        return self.table.columns[channel_of(self.table)]
+
+    @property
+    def model_name(self) -> str:
+        """Name for the legend."""
+        return self.model.name
+
+    @property
+    def lines(self) -> str:
+        """Lines of ``rig.toml`` that state the model."""
+        return self.model.lines
+
+    @property
+    def replaced(self) -> bool:
+        """Whether a second fit has chosen the model."""
+        return self.about.screened is not None
+
+    @property
+    def stated_words(self) -> tuple[str, ...]:
+        """Keys of the model that the entry states; a second fit leaves them as they are."""
+        return tuple(word for word in CHOICES if getattr(self.table.settings, word) is not None)
+
+    def comparison(self, theta: ValuesBySymbol, draws: list[ValuesBySymbol]) -> Comparison:
+        def curve(values: ValuesBySymbol) -> np.ndarray:
+            raw, design = self.unwhitened(values, np)
+            return (self.observed - raw + design @ self.nuisance_mean(values))[: len(self.time)]
+
+        unit, time = self.column.to_display, self.time + float(decay_window(self.table)[0][0])
+        lower, upper = band(np.array([curve(draw) for draw in draws[:50]]) * unit)
+        residuals = np.asarray(self.residuals(theta, np))[: len(time)]
+        return Comparison(
+            self.kind,
+            self.label,
+            f"{self.label}: {self.title}",
+            "time [s]",
+            axis_label(self.column),
+            (Points(self.label, time, self.values * unit),),
+            (Curve(f"this fit, {self.model_name}", time, curve(theta) * unit, lower, upper),),
+            time,
+            residuals,
+            autocorrelation(residuals, min(60, self.n // 4)) if self.time_series else None,
+            1.96 / float(np.sqrt(self.n)) if self.time_series else None,
+        )
+
+
+class DecayRecord(Decay):
+    """One channel of one raw record; all records share k1, c and the parameters of further forces.
+
+    For viscous damping and a linear spring the two solutions enter linearly and are integrated out. Any other decay
+    starts at its last turning point before the record, which is sampled. Offset and linear drift are integrated out.
+
+    The readings are block means of the record (``capsule_id.experiments.free_vibration.readings``), at ``time``
+    (n,); ``relative_sd`` is the sd of one over that of a sample, () or (n,).
+    """
+
+    times: ReadingTimes
+    nodes: np.ndarray
+    weights: np.ndarray
+    relative_sd: np.ndarray
+    width: float
+    side: float
+    folded: np.ndarray
+    step: float
+    half_cycles: int = eqx.field(static=True)
+    uniform: bool = eqx.field(static=True)
+    #: Order of the time derivative of x_rel that the readings are.
+    order: int = eqx.field(static=True)
+
+    time_series = True
+    title = "free decay"
+
+    def __init__(
+        self,
+        table: Table,
+        rig: Rig,
+        friction: FrictionModel = EQUATION_1,
+        model: DecayModel | None = None,
+        screened: Screened | None = None,
+    ) -> None:
+        """Make one record; ``model`` None: as stated in the settings; ``screened`` gives starts."""
+        self.friction = friction
+        self.model = model or stated_model(table)
+        self.order = CHANNELS[channel_of(table)].order
+        time, values = decay_window(table)
+        blocks = block_means(time - float(time[0]), values, self.model.thin, by_sample=self.order > 0)
+        self.time, self.values, self.nodes, self.weights = blocks.time, blocks.values, blocks.nodes, blocks.weights
+        self.times = ReadingTimes.of(blocks)
+        self.relative_sd = np.squeeze(1.0 / np.sqrt(self.times.count))
+        self.width = NUISANCE_WIDTH * float(np.ptp(self.values))
+        self.reading_sd = table.columns[channel_of(table)].reading_sd
+        self.about = DecayAbout(table, rig, (), screened)
+        self.about = replace(self.about, rough=self._rough())
+        step = uniform_step(self.time)
+        linear = self.model == DecayModel(thin=self.model.thin) and self.relative_sd.ndim == 0
+        # The sums over an even record have no values at critical damping and beyond.
+        self.uniform = step is not None and linear and bool(self.rough.c < UNIFORM * np.sqrt(self.rough.k1 * self.mass))
+        if self.uniform:
+            # Means of equal blocks of a viscous decay are such a decay, sampled at their middles.
+            self.nodes, self.weights = self.time[:, None], np.ones((len(self.time), 1))
+        self.step = step or 0.0
+        self.folded = fold(self.values) if self.uniform else np.zeros((0, 0))
+        self.side = float(np.sign(self.first_turning_point()[1]))
+        # The margin allows for a frequency 1.25 times the rough estimate.
+        self.half_cycles = 0 if self.closed else int(1.25 * self.rough.Omega_o * float(self.time[-1]) / np.pi) + 5
+        self.clock_rate = stated_rate(table)
+        self.about = replace(self.about, parameters=(*self._rows(), *clock_parameters(table, rig)))
+
+    def _rows(self) -> list[Parameter]:
+        """Its parameters, without the drift of its clock."""
+        label = self.table.label
+        rows = [parameter("k1"), parameter("c"), self.channel.noise.named(label, self.noise_prior())]
+        if self.model.whitened:
+            rows += noise_parameters(self.model, self.time, 2.0 * np.pi / self.rough.Omega_o, label)
+        if not self.closed:
+            rows += further_parameters(self.model.symbols, self.rough.k1, self.mass, self.largest_deflection)
+            size = self.deflection * float(np.ptp(self.values))
+            rows.append(AMPLITUDE.named(label, Prior("lognormal", size, NUISANCE_WIDTH)))
+            rows.append(TURNING_TIME.named(label, Prior("normal", 0.0, float(self.time[-1]))))
+        return rows
+
+    def with_table(self, table: Table) -> Self:
+        """Return the record of another part of its table, with the same model."""
+        return self if table is self.table else type(self)(table, self.rig, self.friction, self.model)
+
+    def with_model(self, model: DecayModel, screened: Screened | None = None) -> Self:
+        return type(self)(self.table, self.rig, self.friction, model, screened)
+
+    @property
+    def explains_trend(self) -> bool:
+        return self.model.drift == "gp"
+
+    @property
+    def closed(self) -> bool:
+        """Whether the solution is closed and linear in its initial conditions."""
+        return not self.model.symbols
+
+    @property
+    def own_symbols(self) -> tuple[str, ...]:
+        return () if self.closed else ("amplitude", "turning_time")
+
+    def noise_prior(self) -> Prior:
+        """Default prior of the record's noise sd, m."""
+        return Prior("lognormal", NOISE_MEDIAN * float(np.ptp(self.values)), NOISE_FACTOR)
+
+    @property
+    def scatters(self) -> tuple[str]:
+        return (self.channel.noise.symbol,)
+
+    @property
+    def channel(self) -> Channel:
+        """The recorded quantity."""
+        return tuple(CHANNELS.values())[self.order]
+
+    @property
+    def deflection(self) -> float:
+        """x_rel over the magnitude of the channel, at the rough frequency; SI."""
+        return 1.0 if self.order == 0 else abs(self.channel.deflection(self.rough.Omega_o))
+
+    @property
+    def observed(self) -> np.ndarray:
+        return self.values
+
+    @property
+    def work(self) -> int:
+        # A step of a half cycle takes as long as twelve readings, correlated noise of a reading as three.
+        steps = 0 if self.closed else self.half_cycles * steps_of(self.half_cycles)
+        return self.n * (4 if self.model.whitened else 1) + 12 * steps
+
+    def unwhitened(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Any, Any]:
+        trend = xp.ones((self.n, 1))
+        if self.model.drift == "linear":
+            trend = xp.stack([xp.ones(self.n), xp.asarray(self.time) / self.time[-1] - 0.5], axis=1)
+        nodes = xp.asarray(self.nodes).ravel() * stretch(self.clock_rate, theta)
+        if self.closed:
+            basis = viscous_basis(nodes, theta["k1"], theta["c"], theta["m1"], xp)
+            basis = block_mean(basis, self.weights, xp)
+            return self.values, self.width * xp.concatenate([basis, trend], axis=1)
+        forces = {symbol: theta[symbol] for symbol in ("k1", "c", "m1", *self.model.symbols)}
+        motion = decay(nodes, forces, theta["amplitude"], theta["turning_time"], self.half_cycles)
+        predicted = self.side * block_mean(xp.asarray(motion[self.order]), self.weights, xp)
+        return self.values - predicted, self.width * trend
+
+    def whitened(self, theta: Mapping[str, float], columns: np.ndarray) -> np.ndarray:
+        table = np.reshape(columns, (self.n, -1))
+        if self.model.whitened:
+            table = np.asarray(whiten(self.times, table, self.model, theta))
+        else:
+            table = table / np.reshape(self.relative_sd, (-1, 1))
+        return np.reshape(table, columns.shape)
+
+    def misfits(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit]:
+        raw, design = self.unwhitened(theta, xp)
+        if not self.model.whitened:
+            return (Misfit(raw, (self.reading_sd * self.relative_sd) ** 2, self.relative_sd, design),)
+        columns = xp.concatenate([xp.reshape(raw, (-1, 1)), design], axis=1)
+        white = xp.asarray(whiten(self.times, columns, self.model, theta))
+        return (Misfit(white[:, 0], 0.0, 1.0, white[:, 1:]),)
+
+    def summaries(self, theta: ValuesBySymbol, xp: ModuleType = jnp) -> tuple[Misfit | Moments, ...]:
+        if not self.uniform or xp is np:
+            return super().summaries(theta, xp)
+        gamma, omega = (rate * stretch(self.clock_rate, theta) for rate in rates(theta["k1"], theta["c"], theta["m1"]))
+        yy, ay, aa = decay_moments(self.folded, self.n, self.step, gamma, omega)
+        variance = (self.reading_sd * self.relative_sd) ** 2
+        return (Moments(yy, self.width * ay, self.width**2 * aa, self.n, variance, self.relative_sd),)
+
+    # -- the paper's estimator and starts ---------------------------------------------------------------------------
+
+    @property
+    def whole(self) -> tuple[np.ndarray, np.ndarray]:
+        """Time, s from the first sample, and the channel, SI, of every sample, thinned or not."""
+        time, values = decay_window(self.table)
+        return time - time[0], values
+
+    @property
+    def condensed(self) -> tuple[np.ndarray, np.ndarray]:
+        """As ``whole``; of a long record block means, for the paper's estimate. Their times start at the first mean."""
+        time, values = shortened(*decay_window(self.table))
+        return time - time[0], values
+
+    @property
+    def even(self) -> bool:
+        """Whether the record is evenly sampled, as the paper's filter requires."""
+        return is_even(self.condensed[0])
+
+    def smoothed(self) -> np.ndarray:
+        """The condensed record after Savitzky–Golay, m; raw for a record sampled unevenly, which the filter rejects."""
+        time, values = self.condensed
+        if not self.even:
+            return values
+        window = self.table.settings.smoothing_window or choose_window(time, values, SMOOTHING_ORDER)
+        return savitzky_golay(time, values, window, SMOOTHING_ORDER)
+
+    def decrement(self, smooth: bool = True) -> Decrement | None:
+        """Return peaks and logarithmic decrement, from the smoothed or the raw record; None with too few peaks."""
+        (time, values), smoothed = self.condensed, self.smoothed()
+        return logarithmic_decrement(time, smoothed if smooth else values, self.mass, smoothed, jumps=self.order == 2)
+
+    def paper_decrement(self, smooth: bool = True) -> Decrement | None:
+        """Estimate k1 and c of this record as in the paper; None also for a record sampled unevenly."""
+        return self.decrement(smooth) if self.even else None
+
+    def _rough(self) -> Decrement:
+        decrement = self.decrement()
+        if decrement is not None and decrement.delta > 0.0:
+            return decrement
+        found = viscous_fit(self.time, self.values)
+        if self.order == 0 and np.std(found.left) > MISFIT * noise_level(self.values):
+            # Dry friction is a constant force up to the first turning point, where the rest of the record misleads.
+            period = int(np.sum(self.time - self.time[0] < 2.0 * np.pi / found.omega))
+            turn = int(np.argmax(np.abs(self.values[:period] - self.values[0])))
+            if turn >= 2 * UNKNOWNS:
+                found = viscous_fit(self.time[:turn], self.values[:turn])
+                found = found._replace(gamma=max(found.gamma, 0.01 * found.omega))  # a stroke tells little of it
+        return found.decrement(self.mass)
+
+    def rough_damping(self, symbols: Sequence[str]) -> dict[str, float]:
+        """Rough c, and those of F_dry and c_q in ``symbols``, SI, from the peaks; {} with too few of them."""
+        decrement = self.decrement()
+        return {} if decrement is None else damping_of_peaks(decrement, self.mass, self.deflection, symbols)
+
+    def first_turning_point(self) -> tuple[float, float]:
+        """Rough time, s, and signed x_rel, m, of the last turning point before the record, or at its first samples."""
+        half_period = np.pi / self.rough.Omega_o
+        # A velocity peaks a quarter of a period before the turning point.
+        first = float(self.rough.times[0]) + (0.5 * half_period if self.order == 1 else 0.0)
+        back = int(np.ceil(first / half_period - LATEST_TURNING_POINT))
+        growth = self.rough.first_ratio**back
+        peak = self.channel.deflection(self.rough.Omega_o) * float(self.rough.peaks[0])
+        return first - back * half_period, peak * (-1.0) ** back * growth
+
+    @property
+    def largest_deflection(self) -> float:
+        return self.deflection * float(np.max(np.abs(self.values - equilibrium(self.values))))
+
+    @property
+    def cycles(self) -> np.ndarray:
+        return self.time * self.rough.Omega_o / (2.0 * np.pi)
+
+    def damping_trend(self) -> Facts:
+        """Drift of damping and frequency of the peaks with amplitude, see ``trend``; empty without drift."""
+        decrement = self.decrement()
+        facts = {} if decrement is None else trend(decrement, noise_level(self.values))
+        return facts and {**facts, "amplitude": tuple(self.deflection * size for size in facts["amplitude"])}
+
+    def largest_force(self, theta: ValuesBySymbol) -> float:
+        """Largest |f| over the record, N; f = k1 x_rel + c d(x_rel)/dt."""
+        if self.order > 0:
+            return float(theta["k1"]) * self.largest_deflection
+        x = self.smoothed() - equilibrium(self.values)
+        return float(np.max(np.abs(theta["k1"] * x + theta["c"] * np.gradient(x, self.condensed[0]))))
