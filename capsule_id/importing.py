@@ -5,7 +5,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from capsule_id.records.release import find_free_decay
 from capsule_id.records.tones import estimate_clock
 from capsule_id.rig.filters import clock_starts, dominant_frequency
 from capsule_id.rig.formats.layouts import delimiter_of
+from capsule_id.rig.formats.raw import Layout
 from capsule_id.rig.formats.text import TextFile
 from capsule_id.rig.guess import (
     FEWEST_SAMPLES,
@@ -30,7 +30,6 @@ from capsule_id.rig.guess import (
     fits_name,
     increases,
     is_constant,
-    name_and_unit,
     readings_of,
     score_of,
     source_of,
@@ -128,7 +127,7 @@ def _doubt(
     stated = {rule.si for rule in kind.setting_rules.values() if isinstance(rule, QuantityRule)}
     dimensions = {rule.si for each in kinds.values() for rule in each.columns.values()} - known
     for index in sorted(set(found.columns) - used) if len(chosen.columns) < MANY else ():
-        text = name_and_unit(found.names[index], sorted(dimensions))[1] or found.units[index]
+        text = found.header(index, sorted(dimensions))[1]
         others = sorted(dimensions - stated if is_constant(found, index) else dimensions)
         # A number of a trial is no reading, nor is a mass, or a percentage.
         label = found.columns[index] == np.clip(np.rint(found.columns[index]), 0, len(found.columns[index]))
@@ -168,8 +167,7 @@ def _angle(found: FoundLayout, kind: Kind, name: str) -> tuple[str, ColumnGuess]
         return None
     remedy = "multiply scale by the arm in m, or enter the moment of inertia in kg m^2 as the mass in kg"
     for index in found.columns:
-        stem, text = name_and_unit(found.names[index], [*ANGULAR, *ANGULAR.values()])
-        text = (text if text is not None else found.units[index]).strip()
+        stem, text = found.header(index, [*ANGULAR, *ANGULAR.values()])
         unit = unit_of(text, [ANGULAR[si]])
         known = max(fits_name(stem, name), fits_name(stem, "angle") if name == "x_rel" else 0) > 0
         if known and unit is not None:
@@ -241,7 +239,7 @@ def _first_with_unit(
     found: FoundLayout, index: int, names: list[str], kind: Kind, dimensions: list[str]
 ) -> tuple[str, str] | None:
     """The first of the ``names`` that the unit in the file allows, and that unit."""
-    text = name_and_unit(found.names[index], dimensions)[1] or found.units[index]
+    text = found.header(index, dimensions)[1]
     unknown = None if unit_of(text, dimensions) else UNKNOWN
     units = ((name, unit_of(text, [kind.columns[name].si]) or unknown) for name in names)
     return next(((name, unit) for name, unit in units if unit is not None), None)
@@ -250,8 +248,8 @@ def _first_with_unit(
 def disordered_times(found: FoundLayout) -> tuple[str, int] | None:
     """Header of a column of times that do not increase, and the first line where they do not; None without one."""
     for index, values in found.columns.items():
-        name, text = name_and_unit(found.names[index], ["s"])
-        if fits_name(name, TIME) > 0 and unit_of(text or found.units[index], ["s"]) is not None:
+        name, text = found.header(index, ["s"])
+        if fits_name(name, TIME) > 0 and unit_of(text, ["s"]) is not None:
             for row in np.flatnonzero(np.diff(values) <= 0.0):
                 return found.names[index], int(found.export.lines[row + 1])
     return None
@@ -281,6 +279,10 @@ def free_part(time: np.ndarray, values: np.ndarray) -> tuple[float, float | None
 
 #: Columns of a tilt, which is its own slope.
 TILT = {"angle", "height"}
+_DECIMALS = {
+    ".": "the header has a name for every number between commas",
+    ",": "one column with a comma in every number",
+}
 _SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", None: "spaces"}
 
 
@@ -313,8 +315,12 @@ def read_file(path: Path) -> bytes:
     """
     try:
         if not path.is_file():
-            found = "a directory" if path.is_dir() else "no such file"
-            raise InputError("FILE must be a regular file", found, "correct the name", path)
+            raise InputError(
+                "FILE must be a regular file",
+                "a directory" if path.is_dir() else "no such file",
+                "correct the name",
+                path,
+            )
         return path.read_bytes()
     except OSError as error:
         raise InputError("FILE must be readable", str(error.strerror), "check its permissions", path) from None
@@ -371,8 +377,7 @@ def entry_of(content: bytes, path: Path, file: str, kinds: Mapping[str, Kind]) -
 def _unread_lines(found: FoundLayout, dimensions: Sequence[str]) -> Iterable[str]:
     """A comment on every column with the unit of a reading, or the name of a time, whose cells are not all numbers."""
     for index, error in found.unread.items():
-        name, text = name_and_unit(found.names[index], dimensions)
-        text = text or found.units[index]
+        name, text = found.header(index, dimensions)
         if fits_name(name, TIME) <= 0 and (not text or unit_of(text, dimensions) is None):
             continue
         remedy = "Correct the cell or delete the row, or list its text in missing."
@@ -396,24 +401,18 @@ def _description(found: FoundLayout, content: bytes) -> str:
     return f"{text}, {_SEPARATORS[delimiter_of(line, found.layout)]} between the cells"
 
 
-def _layout_lines(found: FoundLayout, used: Any) -> Iterable[str]:
+def _layout_lines(found: FoundLayout, used: Layout) -> Iterable[str]:
     """The keys of the layout that differ from the default."""
-    if used.data_from_line is not None:
-        yield _commented(f"data_from_line = {used.data_from_line}", "sure", "the first row of readings")
-    if used.data_to_line is not None:
-        reason = "the last row of readings"
-        if len(found.blocks) > 1:
-            blocks = ", ".join(f"{first} to {last}" for first, last in found.blocks)
-            reason = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
-        yield _commented(f"data_to_line = {used.data_to_line}", "likely", reason)
-    if used.decimal is not None:
-        reason = "one column with a comma in every number"
-        if used.decimal == ".":
-            reason = "the header has a name for every number between commas"
-        yield _commented(f'decimal = "{used.decimal}"', "likely", reason)
-    if used.missing:
-        texts = json.dumps(list(used.missing), ensure_ascii=False)
-        yield _commented(f"missing = {texts}", "likely", "texts of cells without a reading; their rows are not used")
+    blocks = ", ".join(f"{first} to {last}" for first, last in found.blocks)
+    longest = f"the end of the longest of {len(found.blocks)} blocks of readings, lines {blocks}"
+    for key, value, confidence, reason in (
+        ("data_from_line", used.data_from_line, "sure", "the first row of readings"),
+        ("data_to_line", used.data_to_line, "likely", longest if len(found.blocks) > 1 else "the last row of readings"),
+        ("decimal", used.decimal, "likely", _DECIMALS.get(used.decimal or "", "")),
+        ("missing", list(used.missing) or None, "likely", "texts of cells without a reading; their rows are not used"),
+    ):
+        if value is not None:
+            yield _commented(f"{key} = {json.dumps(value, ensure_ascii=False)}", confidence, reason)
 
 
 def _setting_lines(found: FoundLayout, guessed: Guess, kind: Kind, file: str) -> Iterable[str]:
@@ -462,8 +461,8 @@ def _constant_settings(found: FoundLayout, guessed: Guess, kind: Kind) -> dict[s
             and is_constant(found, index)
             and not (key == "slope" and TILT & set(guessed.columns))
         ):
-            name, text = name_and_unit(found.names[index], [rule.si])
-            unit = unit_of(text or found.units[index], [rule.si])
+            name, text = found.header(index, [rule.si])
+            unit = unit_of(text, [rule.si])
             if unit is not None and fits_name(name, key) > 0:
                 lines[key] = _commented(
                     f'{key} = {{ value = {np.nanmax(found.columns[index]):.10g}, unit = "{unit}" }}',
@@ -549,8 +548,12 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
         If a file has no times or no such header, or the signals are not the same.
     """
     if len(files) < 2:
-        rule, remedy = "--clock-of must name another file", "name the file of the other logger"
-        raise InputError(rule, "the same file twice", remedy, next(iter(files)))
+        raise InputError(
+            "--clock-of must name another file",
+            "the same file twice",
+            "name the file of the other logger",
+            next(iter(files)),
+        )
     records = []
     for path, content in files.items():
         found = find_layout(content, path, dimensions_of(kinds))
@@ -559,8 +562,12 @@ def clock_line(files: Mapping[Path, bytes], common: str, kinds: Mapping[str, Kin
             raise InputError("a file must hold times with their unit", "none", "head them `time [s]`", path)
         index = next((index for index in found.columns if found.names[index] == common), None)
         if index is None:
-            known = ", ".join(found.names[index] for index in found.columns)
-            raise InputError(f"a file must have the column {common}", known, "name a column of both files", path)
+            raise InputError(
+                f"a file must have the column {common}",
+                ", ".join(found.names[index] for index in found.columns),
+                "name a column of both files",
+                path,
+            )
         records += [times_of_guess(found, guessed), found.columns[index]]
     clock = estimate_clock(*records)
     offset = f'{{ value = {clock.offset:.9g}, sd = {clock.offset_sd:.2g}, unit = "s" }}'
@@ -587,10 +594,10 @@ def _channel(found: FoundLayout, index: int, dimensions: tuple[str, ...], record
     """Range, reading step and faults of one column."""
     values = found.columns[index]
     missing, values = int(np.sum(np.isnan(values))), values[np.isfinite(values)]
-    name, text = name_and_unit(found.names[index], dimensions)
+    name, text = found.header(index, dimensions)
     # A lone g is a mass, unless the header says acceleration.
     masses = () if fits_name(name, "acceleration") > 0 else ("kg",)
-    unit = unit_of(text or found.units[index], (*masses, *dimensions, *ANGULAR.values())) or "unit unknown"
+    unit = unit_of(text, (*masses, *dimensions, *ANGULAR.values())) or "unit unknown"
     step = reading_step(values)
     line = f"column {index + 1} {name or 'without name'} [{unit}]: {values.min():.6g} to {values.max():.6g}"
     line += f", reading step {step:.3g}" if step else ""

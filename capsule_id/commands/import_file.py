@@ -27,8 +27,12 @@ def run(args: argparse.Namespace) -> int:
         If the file cannot be read.
     """
     if (args.clock_of is None) != (args.common is None):
-        rule, remedy = "--clock-of and --common must stand together", "name the other file and the common signal"
-        raise InputError(rule, "one of them", remedy, args.file)
+        raise InputError(
+            "--clock-of and --common must stand together",
+            "one of them",
+            "name the other file and the common signal",
+            args.file,
+        )
     if args.clock_of is not None:
         files = {path: read_file(path) for path in (args.clock_of, args.file)}
         say(clock_line(files, args.common, default_registry()))

@@ -61,10 +61,10 @@ def overlay(
         """The fitted value, the paper's estimate, or the stated prior: TOLERANCE_SDS sds are its 95 % range."""
         value, measured = (fitted[name], True) if name in fitted else estimate(name)
         prior = rig.priors.get(name)
-        if measured or prior is None or prior.factor is None:
+        if measured or prior is None or prior.kind != "lognormal":
             # A default prior (factor 1000) is too broad for a comparison.
             return Quantity(value if measured else np.nan)
-        return Quantity(value, value * float(np.log(prior.factor)) / TOLERANCE_SDS)
+        return Quantity(value, value * float(np.log(prior.spread)) / TOLERANCE_SDS)
 
     motions, left_out = [], []
     for table in rig.tables:

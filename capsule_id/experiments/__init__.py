@@ -117,8 +117,8 @@ def rough_values(rig: Rig, registry: Registry | None = None) -> Estimate:
         if value > 0.0:
             return value, True
         stated = rig.priors.get(name)
-        if stated is not None and stated.median is not None:
-            return stated.median, False
+        if stated is not None and stated.kind == "lognormal":
+            return stated.location, False
         default = kinds.parameters[symbol_of(name)].prior
         assert default is not None, f"{name} has a default prior"
         return default.location, False

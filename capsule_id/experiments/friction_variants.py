@@ -87,7 +87,7 @@ class VariantPoints:
         rig = experiments[0].rig
         weighed = rig.m1 is not None and rig.m2 is not None
         self.normal_forces = [e.stated_normal_force if weighed else np.nan for e in experiments]
-        self.priors = {name: stated.prior for name, stated in rig.priors.items()}
+        self.priors = rig.priors
 
     def rows(self, model: FrictionModel) -> list[Parameter]:
         """The law's parameters, then the scatters, with the priors of the fit."""

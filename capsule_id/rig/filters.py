@@ -55,8 +55,9 @@ def savitzky_golay(
         If the samples are unevenly spaced, or the window holds too few or too many samples.
     """
     if not 0 <= derivative <= order:
-        rule, value = "derivative must lie between 0 and the order of the filter", f"{derivative} of {order}"
-        raise InputError(rule, value, "raise the order")
+        raise InputError(
+            "derivative must lie between 0 and the order of the filter", f"{derivative} of {order}", "raise the order"
+        )
     step = sampling_step(time)
     samples = window_samples(window, step)
     _check_window(samples, order, len(time))
@@ -120,8 +121,11 @@ def sampling_step(time: Record) -> float:
     offset = largest_offset(time, step)
     if not offset <= TIMING_TOLERANCE * step:
         steps = np.diff(time)
-        value = f"steps from {steps.min():g} to {steps.max():g} s"
-        raise InputError("a filter needs evenly spaced samples", value, "resample the record evenly, or export it raw")
+        raise InputError(
+            "a filter needs evenly spaced samples",
+            f"steps from {steps.min():g} to {steps.max():g} s",
+            "resample the record evenly, or export it raw",
+        )
     return step
 
 
@@ -242,13 +246,15 @@ def _least_squares(samples: int, order: int, derivative: int) -> tuple[np.ndarra
 def _check_window(samples: int, order: int, available: int) -> None:
     """Refuse a window with no more samples than ``order``, or longer than the record."""
     if samples <= order:
-        value = f"{counted(samples, 'sample')} for order {order}"
         raise InputError(
-            "the window must hold more samples than the order", value, "widen the window or lower the order"
+            "the window must hold more samples than the order",
+            f"{counted(samples, 'sample')} for order {order}",
+            "widen the window or lower the order",
         )
     if samples > available:
-        value = f"{counted(samples, 'sample')} of {available}"
-        raise InputError("the window must fit into the record", value, "shorten the window")
+        raise InputError(
+            "the window must fit into the record", f"{counted(samples, 'sample')} of {available}", "shorten the window"
+        )
 
 
 def hampel_outliers(values: Record, samples: int, n_sd: float) -> np.ndarray:

@@ -218,6 +218,11 @@ class FoundLayout:
     rate: float | None
     blocks: tuple[tuple[int, int], ...] = ()
 
+    def header(self, index: int, dimensions: Sequence[str]) -> tuple[str, str]:
+        """Name of a column, and the text of its unit: that of its header, else that of the row of units, or ""."""
+        name, text = name_and_unit(self.names[index], dimensions)
+        return name, (text or self.units[index]).strip()
+
 
 def find_layout(content: bytes, path: Path, dimensions: Sequence[str]) -> FoundLayout:
     """The layout of a file of a known format.
@@ -532,8 +537,8 @@ def increases(values: np.ndarray) -> bool:
 
 def times_of(found: FoundLayout) -> list[int]:
     """Columns that are named as times and increase from row to row."""
-    named = ((index, name_and_unit(found.names[index], ["s"])[0]) for index in found.columns)
-    return [index for index, name in named if fits_name(name, TIME) > 0 and increases(found.columns[index])]
+    named = (index for index in found.columns if fits_name(found.header(index, ["s"])[0], TIME) > 0)
+    return [index for index in named if increases(found.columns[index])]
 
 
 def is_constant(found: FoundLayout, index: int) -> bool:
@@ -565,8 +570,7 @@ def _with_rivals(
 def score_of(found: FoundLayout, index: int, name: str, kind: KindRule) -> tuple[float, ColumnGuess] | None:
     """How well a column of the file fits the column ``name`` of a kind; None where it cannot be."""
     rule = kind.columns[name]
-    stem, text = name_and_unit(found.names[index], sorted({each.si for each in kind.columns.values()}))
-    text = (text if text is not None else found.units[index]).strip()
+    stem, text = found.header(index, sorted({each.si for each in kind.columns.values()}))
     unit = unit_of(text, [rule.si]) if text else None
     constant = is_constant(found, index)
     named, meant = fits_name(stem, name), meaning(stem, name, kind.meant)

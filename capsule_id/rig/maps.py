@@ -56,8 +56,9 @@ def read_clock(entry: Node) -> StatedClock | None:
     ):
         for word, number in ((key, quantity.value), (f"sd of {key}", quantity.sd)):
             if abs(number) > largest:
-                rule = f"{word} must lie between -{largest:g}{unit} and {largest:g}{unit}"
-                raise node[key].error(rule, f"{number:g}{unit}", remedy)
+                raise node[key].error(
+                    f"{word} must lie between -{largest:g}{unit} and {largest:g}{unit}", f"{number:g}{unit}", remedy
+                )
     return clock
 
 
@@ -70,8 +71,7 @@ def on_reference(entry: Node, raw: RawTable, clock: StatedClock) -> RawTable:
         If the table has no times.
     """
     if "time" not in raw.names:
-        value = " ".join(raw.names)
-        raise entry["clock"].error("clock needs a record with times", value, "remove clock", of_key=True)
+        raise entry["clock"].error("clock needs a record with times", " ".join(raw.names), "remove clock", of_key=True)
     index = raw.names.index("time")
     try:
         factor = factor_to_si(raw.units[index], "s")
@@ -175,13 +175,13 @@ def read_map(entry: Node, kind: KindRule, propose: Callable[[Layout], str]) -> C
     layout = Layout(**{**stated, "missing": tuple(stated.get("missing", ()))})
     first, last = layout.data_from_line, layout.data_to_line
     if first is not None and last is not None and last < first:
-        rule = f"data_to_line must not be above data_from_line = {first}"
-        raise entry["data_to_line"].error(rule, str(last), "exchange them")
+        raise entry["data_to_line"].error(
+            f"data_to_line must not be above data_from_line = {first}", str(last), "exchange them"
+        )
     if "columns" not in entry:
         for key in MAP_KEYS[1:]:
             if key in entry:
-                rule, remedy = f"{key} needs a column map", f"add {propose(layout)}"
-                raise entry[key].error(rule, "no columns", remedy, of_key=True)
+                raise entry[key].error(f"{key} needs a column map", "no columns", f"add {propose(layout)}", of_key=True)
         return None
     node = entry["columns"]
     if not isinstance(node.value, dict) or not node.value:
@@ -219,8 +219,9 @@ def _source(node: Node, rule: ColumnRule) -> Source:
     node.unit(rule.si)
     scale, offset = (float(NUMBER.read(node.get(key, zero))) for key, zero in (("scale", 1.0), ("offset", 0.0)))
     if scale == offset == 0.0:
-        remedy = "write 1, or -1 for the other sign; for a constant, state it as offset"
-        raise node["scale"].error("scale must not be 0", "0", remedy)
+        raise node["scale"].error(
+            "scale must not be 0", "0", "write 1, or -1 for the other sign; for a constant, state it as offset"
+        )
     return Source(header, _header(node["minus"]) if "minus" in node else None, node.value["unit"], scale, offset)
 
 
@@ -339,9 +340,11 @@ class _Part:
             self._require_rows(node, header, same.size)
             scale = float(np.nanmax(np.abs(values), initial=0.0))
             if not np.allclose(same, values, rtol=0.0, atol=ROUNDING * scale, equal_nan=True):
-                rule = f"{shown(header)} must be the same in {first.path.name} and {export.path.name}"
-                value = f"a difference of {np.nanmax(np.abs(same - values)):.3g}"
-                raise node.error(rule, value, "name files that were recorded together")
+                raise node.error(
+                    f"{shown(header)} must be the same in {first.path.name} and {export.path.name}",
+                    f"a difference of {np.nanmax(np.abs(same - values)):.3g}",
+                    "name files that were recorded together",
+                )
         return values, lambda row: first.place(row, column)
 
     def words(self, node: Node, header: Header) -> np.ndarray:
@@ -349,23 +352,30 @@ class _Part:
         found: list[np.ndarray] = []
         for export, column in self._columns(node, header):
             if export.words is None:
-                rule = f"where takes numbers for a {export.path.suffix} file"
-                raise node.error(rule, "a text", "write a number, or export the file as CSV")
+                raise node.error(
+                    f"where takes numbers for a {export.path.suffix} file",
+                    "a text",
+                    "write a number, or export the file as CSV",
+                )
             found.append(export.words(column))
             self._require_rows(node, header, len(found[-1]))
             if differ := np.flatnonzero(found[-1] != found[0]).tolist():
                 rule, row = f"{shown(header)} must be the same in all files that have it", differ[0]
-                value = f"{shown(str(found[0][row]))} and {shown(str(found[-1][row]))}"
-                raise node.error(rule, value, "name files that were recorded together")
+                raise node.error(
+                    rule,
+                    f"{shown(str(found[0][row]))} and {shown(str(found[-1][row]))}",
+                    "name files that were recorded together",
+                )
         return found[0]
 
     def _require_rows(self, node: Node, header: Header, rows: int) -> None:
         """Refuse a column with another number of rows than those found before."""
         self._rows.append(rows)
         if rows != self.rows:
-            rule, value = f"columns must have equal lengths ({self.rows})", f"{shown(header)}: {rows}"
             raise node.error(
-                rule, value, "map columns of equal length, or make an experiment of each file, with a clock"
+                f"columns must have equal lengths ({self.rows})",
+                f"{shown(header)}: {rows}",
+                "map columns of equal length, or make an experiment of each file, with a clock",
             )
 
     def _columns(self, node: Node, header: Header) -> list[tuple[Export, int]]:
@@ -374,9 +384,11 @@ class _Part:
         if not found:
             known = [name for export in self.exports for row in export.headers for name in row if name]
             close = closest(str(header), known)
-            remedy = f'write "{close}"' if close else "write the number of the column, counted from 1"
-            value = f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}"
-            raise node.error(f"{node.key} must be a header of the file", value, remedy)
+            raise node.error(
+                f"{node.key} must be a header of the file",
+                f"{shown(header)}; headers: {shown(' '.join(known)) if known else 'none'}",
+                f'write "{close}"' if close else "write the number of the column, counted from 1",
+            )
         return found
 
     def _column(self, node: Node, export: Export, header: Header) -> list[int]:
@@ -397,8 +409,12 @@ class _Part:
         if len(numbers) > 1:
             value = f"{shown(header)} in columns {' '.join(str(index + 1) for index in numbers)}"
             where = node.path[-2] == "where"
-            remedy = f"write its number, {f'{numbers[0] + 1} = ...' if where else f'{node.key} = {numbers[0] + 1}'}"
-            raise node.error("a header must be unique", value, remedy, of_key=where)
+            raise node.error(
+                "a header must be unique",
+                value,
+                f"write its number, {f'{numbers[0] + 1} = ...' if where else f'{node.key} = {numbers[0] + 1}'}",
+                of_key=where,
+            )
         return numbers
 
 

@@ -87,10 +87,11 @@ def outlying_rows(node: Node, raw: RawTable, time: np.ndarray, rejection: Reject
     step = median_step(time) if len(time) > 1 else np.inf
     half = rejection.window / step / 2.0
     if not 1.0 - 1e-9 <= half <= len(time) / 2.0:
-        rule = "the window must hold two sampling steps or more, and fit into the record"
-        value = f"{rejection.window:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s"
-        remedy = "write a window of about 10 steps"
-        raise node.error(rule, value, remedy)
+        raise node.error(
+            "the window must hold two sampling steps or more, and fit into the record",
+            f"{rejection.window:g} s; the record has {counted(len(time), 'sample')}, a step is {step:.4g} s",
+            "write a window of about 10 steps",
+        )
     samples = 2 * round(half) + 1
     found = np.zeros(len(time), bool)
     for name, values in zip(raw.names, raw.columns, strict=True):
@@ -148,9 +149,12 @@ def read_plateaus(entry: Node, kind: KindRule) -> Plateaus | None:
     left = [[name for name in columns if name not in mapped] for columns in kind.sets if "time" not in columns]
     names = next((names for names in left if len(names) == 1), None)
     if names is None or "time" not in mapped:
-        rule = f"plateaus of {kind.name} need a map of time and of all its columns but one"
-        remedy = f"map time and {' or '.join(sorted({name for columns in kind.sets for name in columns}))} in columns"
-        raise node.error(rule, " ".join(sorted(mapped)) or "no columns", remedy, of_key=True)
+        raise node.error(
+            f"plateaus of {kind.name} need a map of time and of all its columns but one",
+            " ".join(sorted(mapped)) or "no columns",
+            f"map time and {' or '.join(sorted({name for columns in kind.sets for name in columns}))} in columns",
+            of_key=True,
+        )
     levels = node.table(_EXAMPLE, ("levels", "unit", "guard")).get("levels", None)
     stated = levels.value if isinstance(levels.value, list) and all(map(is_number, levels.value)) else []
     rule, remedy = "be a list of numbers, two or more different ones", "write a level for each plateau, in order"
@@ -188,16 +192,20 @@ def readings_of_plateaus(node: Node, raw: RawTable, time: np.ndarray, plateaus: 
         part = np.flatnonzero((time >= begins) & (time <= ends) & (np.arange(len(time)) >= first))
         parts.append(part[part < last])
         if len(parts[-1]) < FEWEST_SAMPLES:
-            rule = f"a plateau must have {FEWEST_SAMPLES} samples beside the guard"
-            value = f"{len(parts[-1])} from {time[first]:.4g} to {time[last - 1]:.4g} s"
-            raise node.error(rule, value, "shorten guard, or state a level for each plateau of the trace")
+            raise node.error(
+                f"a plateau must have {FEWEST_SAMPLES} samples beside the guard",
+                f"{len(parts[-1])} from {time[first]:.4g} to {time[last - 1]:.4g} s",
+                "shorten guard, or state a level for each plateau of the trace",
+            )
     means = np.array([trace[part].mean(axis=0) for part in parts])
     correlation = abs(float(np.corrcoef(plateaus.levels, means[:, 0])[0, 1]))
     _check_order(node["levels"], plateaus.levels, means[:, 0])
     if not correlation >= SMALLEST_CORRELATION:
-        rule = f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)"
-        value = f"{correlation:.2g}; means {' '.join(f'{mean:.4g}' for mean in means[:, 0])}"
-        raise node["levels"].error(rule, value, "state a level for each plateau, in the order of time")
+        raise node["levels"].error(
+            f"the readings must follow the levels (correlation {SMALLEST_CORRELATION} or more)",
+            f"{correlation:.2g}; means {' '.join(f'{mean:.4g}' for mean in means[:, 0])}",
+            "state a level for each plateau, in the order of time",
+        )
     _check_constant(node["levels"], trace, parts, means)
     starts = np.array([part[0] for part in parts])
     names = (*(raw.names[index] for index in channels), plateaus.name)
@@ -220,10 +228,11 @@ def _check_order(node: Node, levels: np.ndarray, means: np.ndarray) -> None:
     """
     stated, reversed_ = (float(np.corrcoef(order, means)[0, 1]) for order in (levels, levels[::-1]))
     if reversed_ > stated and 1.0 - reversed_ < CLEARLY_LESS * (1.0 - stated):
-        rule = "the levels must stand in the order of time, and the readings must increase with them"
-        value = f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order"
-        remedy = "reverse the levels, or state scale = -1 for a sensor of the other sign"
-        raise node.error(rule, value, remedy)
+        raise node.error(
+            "the levels must stand in the order of time, and the readings must increase with them",
+            f"correlation {stated:.4g} as stated, {reversed_:.4g} in reverse order",
+            "reverse the levels, or state scale = -1 for a sensor of the other sign",
+        )
 
 
 def _check_constant(node: Node, trace: np.ndarray, parts: list[np.ndarray], means: np.ndarray) -> None:
@@ -246,9 +255,11 @@ def _check_constant(node: Node, trace: np.ndarray, parts: list[np.ndarray], mean
         if min(len(one), len(other)) < LEAST_SHARE * len(part):
             continue
         if abs(one.mean() - other.mean()) > LARGEST_INNER_STEP * step:
-            rule = "the trace must be constant on each plateau"
-            value = f"{one.mean():.4g} and {other.mean():.4g} on one of {len(parts)} plateaus"
-            raise node.error(rule, value, "state a level for each plateau of the trace")
+            raise node.error(
+                "the trace must be constant on each plateau",
+                f"{one.mean():.4g} and {other.mean():.4g} on one of {len(parts)} plateaus",
+                "state a level for each plateau of the trace",
+            )
 
 
 def find_steps(trace: np.ndarray, count: int) -> tuple[np.ndarray, int]:

@@ -106,11 +106,21 @@ def _read_document(folder: Path) -> tuple[Node, str]:
     path = folder / "rig.toml"
     try:
         if not folder.is_dir():
-            value = "a file" if folder.is_file() else "no such folder"
-            raise InputError("the rig must be a folder", value, "name a folder with a rig.toml", folder)
+            raise InputError(
+                "the rig must be a folder",
+                "a file" if folder.is_file() else "no such folder",
+                "name a folder with a rig.toml",
+                folder,
+            )
         if not path.is_file():
-            remedy = "run `capsule-id init DIR` for a commented one"
-            raise InputError("a rig folder must contain a file rig.toml", "none", remedy, path, 1, 1)
+            raise InputError(
+                "a rig folder must contain a file rig.toml",
+                "none",
+                "run `capsule-id init DIR` for a commented one",
+                path,
+                1,
+                1,
+            )
         if not path.resolve().is_relative_to(folder.resolve()):
             raise InputError(
                 "rig.toml must lie inside the folder, links followed", "a link", "copy the file here", path, 1, 1
@@ -132,8 +142,12 @@ def _read_priors(root: Node, tables: Sequence[Table], parameters: Sequence[Param
     for key in entries.value:
         node, spring = entries[key], re.fullmatch(rf"k2\[({NAME_PATTERN})\]", key)
         if spring and spring[1] not in springs:
-            remedy = f"write {' or '.join(f'k2[{name}]' for name in springs)}" if springs else "remove it"
-            raise node.error("a prior of k2 must name a spring of an experiment", spring[1], remedy, of_key=True)
+            raise node.error(
+                "a prior of k2 must name a spring of an experiment",
+                spring[1],
+                f"write {' or '.join(f'k2[{name}]' for name in springs)}" if springs else "remove it",
+                of_key=True,
+            )
         if not spring:
             replace(entries, value={key: node.value}).refuse_unknown(known)
         row = rows["k2" if spring else key]
@@ -148,8 +162,11 @@ def _read_experiments(
     """Every ``[[experiment]]``, and the sha256 of every file read; the first error of each is appended to ``faults``."""
     entries = root.get("experiment", [])
     if not isinstance(entries.value, list) or not entries.value:
-        remedy = 'add [[experiment]] with kind = "..." and file = "..."'
-        raise entries.error("a rig must have at least one [[experiment]]", shown(entries.value), remedy)
+        raise entries.error(
+            "a rig must have at least one [[experiment]]",
+            shown(entries.value),
+            'add [[experiment]] with kind = "..." and file = "..."',
+        )
     tables: list[Table] = []
     files: dict[str, str] = {}
     for index, label in enumerate(_default_labels(entries.value)):
@@ -159,8 +176,9 @@ def _read_experiments(
             table, sha256 = _read_experiment(entry.table("[[experiment]]"), kinds, ground, label)
             if table.label in [other.label for other in tables]:
                 place = next(key for key in ("label", "file", "files") if key in entry)
-                remedy = 'give one of them a label of its own: label = "..."'
-                raise entry[place].error("labels must be unique", shown(table.label), remedy)
+                raise entry[place].error(
+                    "labels must be unique", shown(table.label), 'give one of them a label of its own: label = "..."'
+                )
             tables.append(table)
             files |= sha256
     return tuple(tables), files
@@ -187,8 +205,9 @@ def _read_experiment(
     word = entry["kind"].text()
     if word not in kinds:
         close = closest(word, kinds)
-        remedy = f'write "{close}"' if close else f"write one of {' '.join(kinds)}"
-        raise entry["kind"].error("unknown kind", shown(word), remedy)
+        raise entry["kind"].error(
+            "unknown kind", shown(word), f'write "{close}"' if close else f"write one of {' '.join(kinds)}"
+        )
     kind = kinds[word]
     rules, errors = kind.setting_rules, [column + suffix for column in kind.columns for suffix in _READING_ERRORS]
     entry.refuse_unknown(("kind", "file", "label", "reject", "clock", *MAP_KEYS, *rules, *errors), TABLE_KEYS)
@@ -202,14 +221,15 @@ def _read_experiment(
     columns = {key: _with_reading_error(entry, column, kind) for key, column in file.columns.items()}
     for key in errors:
         if key in entry and (column := key.rsplit("_", 1)[0]) not in columns:
-            value = f"columns {' '.join(columns)}"
-            raise entry[key].error(f"{key} needs a column {column}", value, "remove it", of_key=True)
+            raise entry[key].error(
+                f"{key} needs a column {column}", f"columns {' '.join(columns)}", "remove it", of_key=True
+            )
     raw = file.raw
     dropped = raw.missing, raw.other, raw.rejected, file.encodings, file.drift
     name = next(iter(file.sha256))
     table = Table(word, label, name, MappingProxyType(columns), settings, raw.rows, kind.bench, *dropped)
     for rule in kind.rules:
-        rule(Entry(table, entry, file))
+        rule(Entry(table, entry, raw))
     return table, file.sha256
 
 
@@ -220,7 +240,10 @@ def _with_reading_error(entry: Node, column: Column, kind: KindRule) -> Column:
     for key in (column.name + suffix for suffix in _READING_ERRORS):
         size = entry[key].quantity(kind.columns[column.name].si).value if key in entry else None
         if size is not None and size < smallest:
-            rule = f"{key} must not be below {SMALLEST_RELATIVE_ERROR:g} of the largest reading ({smallest:.1g} in SI units)"
-            raise entry[key].error(rule, f"{size:g}", "correct the value or its unit, or remove it")
+            raise entry[key].error(
+                f"{key} must not be below {SMALLEST_RELATIVE_ERROR:g} of the largest reading ({smallest:.1g} in SI units)",
+                f"{size:g}",
+                "correct the value or its unit, or remove it",
+            )
         stated.append(size)
     return replace(column, sd=stated[0], resolution=stated[1])

@@ -309,8 +309,11 @@ def read_model(root: Node) -> ModelChoices:
     if twice := [word for index, word in enumerate(free) if word in free[:index]]:
         raise node.error("free must name each parameter once", shown(twice[0]), "remove the second one")
     if choices["friction"] == "constant" and "ratio" in free:
-        remedy = 'remove "ratio" from free, or remove friction = "constant"'
-        raise node.error("constant friction has no ratio", shown("ratio"), remedy)
+        raise node.error(
+            "constant friction has no ratio",
+            shown("ratio"),
+            'remove "ratio" from free, or remove friction = "constant"',
+        )
     in_order = tuple(symbol for symbol in OPTIONAL if symbol in free)
     return ModelChoices(free=in_order, **choices)  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 
@@ -373,8 +376,9 @@ def check_masses(
     ]
     for node, mass, rule, other in needs:
         if mass not in stated:
-            remedy = f'add {mass} = {{ value = ..., sd = ..., unit = "kg" }} to [rig]{other}'
-            raise node.error(rule, f"no {mass} in [rig]", remedy)
+            raise node.error(
+                rule, f"no {mass} in [rig]", f'add {mass} = {{ value = ..., sd = ..., unit = "kg" }} to [rig]{other}'
+            )
 
 
 def node_of_ground(entry: Node, key: str) -> Node:

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any, Generic
@@ -76,26 +76,22 @@ _A_TRIAL = "a row per trial"
 
 @dataclass(frozen=True)
 class TableFile:
-    """A table in SI, with the raw table for the places of cells.
+    """The table of an experiment.
 
     Attributes
     ----------
     sha256 : of the bytes read, by name in ``rig.toml``, the first file first
-    raw : the numbers as written, until they are converted
-    columns : by name, still without reading errors
+    raw : the table as written, without its numbers
+    columns : SI, by name, still without reading errors
     encodings : of the texts, by name in ``rig.toml``
     drift : of the clock, 1
     """
 
     sha256: Mapping[str, str]
     raw: RawTable
-    columns: Mapping[str, Column] = field(default_factory=dict)
-    encodings: Mapping[str, str] = field(default_factory=dict)
-    drift: Quantity = NO_DRIFT
-
-    def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
-        """The error about a cell, or about the header of a column if ``row`` is None."""
-        return InputError(rule, value, remedy, *self.raw.place(row, self.raw.names.index(name)))
+    columns: Mapping[str, Column]
+    encodings: Mapping[str, str]
+    drift: Quantity
 
 
 def table_path(node: Node) -> Path:
@@ -148,8 +144,9 @@ def read_experiment_files(entry: Node, kind: KindRule) -> TableFile:
             with file.open("rb") as opened:
                 files[name], hashes[name] = file, hashlib.file_digest(opened, "sha256").hexdigest()
         except OSError as error:
-            value = f"{shown(name)} ({error.strerror})"
-            raise node.error("file must be readable", value, "check its permissions") from None
+            raise node.error(
+                "file must be readable", f"{shown(name)} ({error.strerror})", "check its permissions"
+            ) from None
     first = files[nodes[0].value]
     rejection, plateaus = read_rejection(entry), read_plateaus(entry, kind)
     column_map = read_map(entry, kind, partial(_proposal, first, kind))
@@ -171,8 +168,12 @@ def read_experiment_files(entry: Node, kind: KindRule) -> TableFile:
         raw, drift = on_reference(entry, raw, clock), clock.drift
     if rejection is not None:
         if "time" not in raw.names:
-            value, remedy = " ".join(raw.names), "remove reject, and correct or delete the rows"
-            raise entry["reject"].error("reject needs a record with times", value, remedy, of_key=True)
+            raise entry["reject"].error(
+                "reject needs a record with times",
+                " ".join(raw.names),
+                "remove reject, and correct or delete the rows",
+                of_key=True,
+            )
         raw = _with_rows(raw, ~outlying_rows(entry["reject"]["window"], raw, _times(raw), rejection))
     if plateaus is not None:
         raw = readings_of_plateaus(entry["plateaus"], raw, _times(raw), plateaus)
@@ -190,18 +191,12 @@ def read_settings(path: Path, kind: KindRule, without: str) -> dict[str, Column]
         At a place in the file.
     """
     if not path.is_file() or path.suffix.lower() not in READERS:
-        remedy = f"name a file of {' '.join(READERS)}"
-        raise InputError("the settings must be a table", "no such table", remedy, path)
+        raise InputError("the settings must be a table", "no such table", f"name a file of {' '.join(READERS)}", path)
     columns = {name: rule for name, rule in kind.columns.items() if name != without}
     sets = tuple(tuple(name for name in names if name != without) for names in kind.sets)
     raw = READERS[path.suffix.lower()](path, path)
-    _check_names(raw.names, replace(kind, columns=columns, sets=sets), partial(_error_at, raw, None))
+    _check_names(raw.names, replace(kind, columns=columns, sets=sets), partial(raw.error, None))
     return {name: _to_si(raw, index, columns[name]) for index, name in enumerate(raw.names)}
-
-
-def _error_at(raw: RawTable, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
-    """The error about a cell, or about the header of a column if ``row`` is None."""
-    return InputError(rule, value, remedy, *raw.place(row, raw.names.index(name)))
 
 
 def _file_nodes(entry: Node) -> list[Node]:
@@ -225,11 +220,10 @@ def _read_plain(node: Node, file: Path, kind: KindRule) -> RawTable:
     """A file with the column names of the kind; an error about its header proposes a column map."""
     suffix = suffix_of(file)
     if suffix not in READERS:
-        remedy = f"add {_proposal(file, kind, Layout())}"
-        raise node.error(f"a {suffix} file needs a column map", "no columns", remedy)
+        raise node.error(f"a {suffix} file needs a column map", "no columns", f"add {_proposal(file, kind, Layout())}")
     try:
         raw = READERS[suffix](file, file)
-        _check_names(raw.names, kind, partial(_error_at, raw, None))
+        _check_names(raw.names, kind, partial(raw.error, None))
     except InputError as error:
         own = _own_map(file, kind)
         if isinstance(error, MissingCellsError) and own:
@@ -295,10 +289,12 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
         if name not in kind.columns:
             if name == "time":
                 sets = ", or ".join(" and ".join(columns) for columns in kind.sets)
-                remedy = (
-                    f"read {sets} off the record, {_A_TRIAL}, and repeat the trial; plateaus reads steps of one record"
+                raise error(
+                    name,
+                    f"{kind.name} must be a table of trials",
+                    "a record against time",
+                    f"read {sets} off the record, {_A_TRIAL}, and repeat the trial; plateaus reads steps of one record",
                 )
-                raise error(name, f"{kind.name} must be a table of trials", "a record against time", remedy)
             close = closest(name, kind.columns)
             remedy = f"rename it to {close}" if close else "remove it"
             known = " ".join(kind.columns)
@@ -306,12 +302,17 @@ def _check_names(names: Sequence[str], kind: KindRule, error: Callable[[str, str
     stated = {name for name in names if name not in (*kind.channels, *kind.optional)}
     if stated not in [set(columns) for columns in kind.sets]:
         wanted = ", or ".join(" and ".join(columns) for columns in kind.sets)
-        value = " and ".join(names)
-        raise error(names[0], f"{kind.name} must have the columns {wanted}", value, "add or remove columns")
+        raise error(
+            names[0], f"{kind.name} must have the columns {wanted}", " and ".join(names), "add or remove columns"
+        )
     if kind.channels and not set(kind.channels).intersection(names):
         wanted = " ".join(kind.channels)
-        rule = f"{kind.name} must have a channel beside {' and '.join(sorted(stated))}"
-        raise error(names[0], rule, " ".join(names), f"add one of {wanted}")
+        raise error(
+            names[0],
+            f"{kind.name} must have a channel beside {' and '.join(sorted(stated))}",
+            " ".join(names),
+            f"add one of {wanted}",
+        )
 
 
 def _to_si(raw: RawTable, index: int, rule: ColumnRule) -> Column:
@@ -320,7 +321,7 @@ def _to_si(raw: RawTable, index: int, rule: ColumnRule) -> Column:
     try:
         factor = factor_to_si(unit, rule.si)
     except UnitError as error:
-        raise _error_at(raw, None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
+        raise raw.error(None, name, f"{name}: {error.rule}", shown(unit), error.remedy) from None
     with np.errstate(over="ignore"):
         values = written if factor == 1.0 else scale(written, factor)
     _check_values(raw, index, rule, values)
@@ -335,7 +336,7 @@ def _to_si(raw: RawTable, index: int, rule: ColumnRule) -> Column:
                 "check the sensor and the export",
             )
         )
-        raise _error_at(raw, 0 if one else None, name, *text)
+        raise raw.error(0 if one else None, name, *text)
     values.flags.writeable = False
     return Column(name, unit, 1.0 / factor, values)
 
@@ -365,7 +366,7 @@ def _check_values(raw: RawTable, index: int, rule: ColumnRule, values: np.ndarra
                 same = raw.place(row, index)[0] == raw.place(row - 1, index)[0]
                 in_files = "name the files in the order of time, or make an experiment of each"
                 remedy = remedy_of_order(raw, index) if same else in_files
-            raise _error_at(raw, row, name, f"{name} must {text}", f"{raw.columns[index][row]:g} {unit}", remedy)
+            raise raw.error(row, name, f"{name} must {text}", f"{raw.columns[index][row]:g} {unit}", remedy)
 
 
 # entry: One ``[[experiment]]`` during its check: its table, and the places for error lines.
@@ -384,7 +385,7 @@ class Entry(Generic[S]):
 
     table: Table[S]
     node: Node
-    file: TableFile
+    file: RawTable
 
     def error(self, key: str, rule: str, value: str, remedy: str, of_key: bool = False) -> InputError:
         """The error about a setting, at its value or key; ``key`` "" means the whole entry."""
@@ -401,9 +402,11 @@ class Entry(Generic[S]):
         settings: Any = self.table.settings
         if stated := settings.ground.get(key):
             unit = "deg" if key == "slope" else "N"
-            remedy = f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it'
-            value = f"{stated.value:.3g}{f' ± {stated.sd:.3g}' if stated.sd else ''} in SI units"
-            raise node_of_ground(self.node, key).error(rule, value, remedy)
+            raise node_of_ground(self.node, key).error(
+                rule,
+                f"{stated.value:.3g}{f' ± {stated.sd:.3g}' if stated.sd else ''} in SI units",
+                f'state {key} = {{ value = 0, unit = "{unit}" }} in this experiment, if that is true of it',
+            )
 
     def check_spring_with_gap(self) -> None:
         """Require a gap where a spring is within reach.
@@ -416,8 +419,13 @@ class Entry(Generic[S]):
         settings: Any = self.table.settings
         if (settings.spring is None) != (settings.gap is None):
             one, other = ("spring", "gap") if settings.gap is None else ("gap", "spring")
-            remedy = f"add {other}, or remove {one} where the support spring is out of reach"
-            raise self.error(one, "spring and gap must stand together", f"{one} alone", remedy, of_key=True)
+            raise self.error(
+                one,
+                "spring and gap must stand together",
+                f"{one} alone",
+                f"add {other}, or remove {one} where the support spring is out of reach",
+                of_key=True,
+            )
 
     def check_length(self) -> None:
         """Refuse a record that is too short to fit.
@@ -429,6 +437,10 @@ class Entry(Generic[S]):
         """
         samples = len(self.table.rows)
         if samples < SHORTEST_RECORD:
-            rule = f"a record must have at least {SHORTEST_RECORD} samples"
-            remedy = f"record {self.table.kind} for longer or faster"
-            raise self.file.error(samples - 1, "time", rule, counted(samples, "sample"), remedy)
+            raise self.file.error(
+                samples - 1,
+                "time",
+                f"a record must have at least {SHORTEST_RECORD} samples",
+                counted(samples, "sample"),
+                f"record {self.table.kind} for longer or faster",
+            )

@@ -116,11 +116,14 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         If it is not TOML 1.0, at the place that tomllib names.
     """
     if len(text) > LARGEST_TEXT:
-        rule, remedy = (
+        raise InputError(
             f"the file must hold at most {LARGEST_TEXT} characters",
+            str(len(text)),
             "write readings into tables of their own",
+            path,
+            1,
+            1,
         )
-        raise InputError(rule, str(len(text)), remedy, path, 1, 1)
     try:
         data = tomllib.loads(text)
         scanner = _Scanner(text)
@@ -131,8 +134,9 @@ def parse_toml(text: str, path: Path) -> TomlDocument:
         message = str(error)
         found = re.search(r"\(at line (\d+), column (\d+)\)", message)
         line, column = (int(found[1]), int(found[2])) if found else _line_and_column(text, len(text))
-        what = message.split(" (at ")[0]
-        raise InputError("the file must be valid TOML", what, "correct this line", path, line, column) from None
+        raise InputError(
+            "the file must be valid TOML", message.split(" (at ")[0], "correct this line", path, line, column
+        ) from None
     deepest = max(scanner.keys, key=len, default=())
     if len(deepest) > DEEPEST_KEY:
         place = _line_and_column(text, scanner.keys[deepest])

@@ -150,7 +150,7 @@ def _frequency(table: Table[Any], rig: Rig, time: np.ndarray, values: np.ndarray
     if rig.m1 is None:
         return
     stated = rig.priors.get("k1")
-    middle, factor = USUAL_K1 if stated is None else (stated.prior.location, stated.prior.spread)
+    middle, factor = USUAL_K1 if stated is None else (stated.location, stated.spread)
     low, high = middle / factor, middle * factor
     k1 = rig.m1.value * (2.0 * np.pi * frequency) ** 2
     # Of aliased records one in ten seems to have more samples per period: 18 Hz sampled at 17 Hz shows sixteen.

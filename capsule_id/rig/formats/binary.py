@@ -162,8 +162,9 @@ def _variables(content: bytes, path: Path) -> dict[str, np.ndarray]:
     except InputError:
         raise
     except (ValueError, struct.error, zlib.error) as error:
-        remedy = "save it again by save(..., '-v7')"
-        raise InputError("a MATLAB file must be complete", str(error), remedy, path) from None
+        raise InputError(
+            "a MATLAB file must be complete", str(error), "save it again by save(..., '-v7')", path
+        ) from None
 
 
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -272,8 +273,12 @@ def _columns(content: bytes, path: Path) -> Named:
     # pyarrow makes room for the rows that a row group states.
     rows = [file.metadata.row_group(k).num_rows for k in range(file.metadata.num_row_groups)]
     if min(rows, default=0) < 0 or sum(rows) != file.metadata.num_rows:
-        value = f"row groups of {sum(rows)} rows in a table of {file.metadata.num_rows}"
-        raise InputError("a .parquet file must be complete", value, "write it again", path)
+        raise InputError(
+            "a .parquet file must be complete",
+            f"row groups of {sum(rows)} rows in a table of {file.metadata.num_rows}",
+            "write it again",
+            path,
+        )
     refuse_large(8 * file.metadata.num_rows * len(numeric), path)
     table = file.read(columns=numeric, use_threads=False)
     yield from ((name, table.column(name).to_numpy(), "") for name in table.column_names)
@@ -366,9 +371,9 @@ def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
             refuse_large(sum(member.file_size for member in archive.infolist()), path)
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True, keep_links=False)
         sheets = (_rows(sheet, path) for sheet in book.worksheets)
-        rows = next((rows for rows in sheets if any(isinstance(cell, float) for row in rows for cell in row)), [])
-    width = max((k + 1 for row in rows for k, cell in enumerate(row) if cell != ""), default=0)
-    lines = ["" if not any(row) else "\t".join((*_texts(row, width), "")) for row in rows]
+        rows = next((rows for rows, numbers in sheets if numbers), [])
+    width = max((k + 1 for row in rows for k, cell in enumerate(row) if cell), default=0)
+    lines = ["\t".join([*row[:width], *[""] * (width - len(row)), ""]) if any(row) else "" for row in rows]
     try:
         export = read_text("\n".join(lines).encode(), path, layout)
     except InputError as error:
@@ -383,33 +388,23 @@ def read_xlsx(content: Content, path: Path, layout: Layout) -> Export:
     return replace(export, values=values, place=lambda row, column: (*export.place(row, column)[:2], column + 1))
 
 
-def _rows(sheet: Any, path: Path) -> list[list[float | str]]:
-    """The cells of a sheet; numbers as float, empty cells as ""."""
+def _rows(sheet: Any, path: Path) -> tuple[list[list[str]], bool]:
+    """The cells of a sheet as text, each in one line, and whether one of them is a number."""
+    rows, cells, numbers = [], 0, False
     if not hasattr(sheet, "reset_dimensions"):  # a sheet that holds only a chart
-        return []
+        return rows, numbers
     sheet.reset_dimensions()  # the stated size of a sheet can be far larger than the sheet
-    rows, cells = [], 0
     for row in sheet.iter_rows(values_only=True):
         cells += len(row)
         if cells > MOST_CELLS:
             raise InputError(
                 f"a sheet must have at most {MOST_CELLS} cells", "more", "export the record as CSV or Parquet", path
             )
-        rows.append([_cell(cell) for cell in row])
-    return rows
-
-
-def _cell(cell: object) -> float | str:
-    """A number as float; anything else as one line of text."""
-    if isinstance(cell, int | float) and not isinstance(cell, bool):
-        return float(cell)
-    return "" if cell is None else " ".join(str(cell).split())
-
-
-def _texts(row: list[float | str], width: int) -> list[str]:
-    """The cells of a row as text, ``width`` of them."""
-    texts = [repr(cell) if isinstance(cell, float) else str(cell) for cell in row[:width]]
-    return texts + [""] * (width - len(texts))
+        real = [isinstance(cell, int | float) and not isinstance(cell, bool) for cell in row]
+        numbers = numbers or any(real)
+        texts = zip(row, real, strict=True)
+        rows.append([repr(float(c)) if n else "" if c is None else " ".join(str(c).split()) for c, n in texts])
+    return rows, numbers
 
 
 def _in_sheet(error: InputError, lines: list[str]) -> InputError:

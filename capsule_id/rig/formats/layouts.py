@@ -96,11 +96,14 @@ def _file(content: Content, path: Path, layout: Layout) -> TextFile:
         return whole
     number = sum(occurrences("\n", text) for _, text in whole.blocks())
     if last > number:
-        rule, remedy = (
+        raise InputError(
             f"data_to_line must be a line of the file, which has {number}",
+            str(last),
             "state the line of the last reading",
+            path,
+            max(number, 1),
+            1,
         )
-        raise InputError(rule, str(last), remedy, path, max(number, 1), 1)
     return TextFile(content, path, last)
 
 
@@ -133,20 +136,40 @@ def _head(file: TextFile, layout: Layout) -> list[str]:
         if begun is not None and all(not cell or _is_reading(cell, layout) for cell in cells) and any(cells):
             if i == begun:
                 return lines
-            remedy = f"state data_from_line = {i + 1}, or the line of the first reading"
-            rule = "the first line with a number must be a row of readings"
-            raise InputError(rule, shown_cell(lines[begun].strip()), remedy, file.path, begun + 1, 1)
+            raise InputError(
+                "the first line with a number must be a row of readings",
+                shown_cell(lines[begun].strip()),
+                f"state data_from_line = {i + 1}, or the line of the first reading",
+                file.path,
+                begun + 1,
+                1,
+            )
     if layout.data_from_line is not None and layout.data_from_line > len(lines):
-        rule = f"data_from_line must be a line of the file, which has {len(lines)}"
-        remedy = "state the line of the first reading"
-        raise InputError(rule, str(layout.data_from_line), remedy, file.path, max(len(lines), 1), 1)
+        raise InputError(
+            f"data_from_line must be a line of the file, which has {len(lines)}",
+            str(layout.data_from_line),
+            "state the line of the first reading",
+            file.path,
+            max(len(lines), 1),
+            1,
+        )
     if begun is None:
-        line = 1 if layout.data_from_line is None else len(lines)
-        remedy = "export the readings as text"
-        raise InputError("a table must have rows of numbers", "none", remedy, file.path, line, 1)
-    remedy = f"state data_from_line = {begun + 1}, or the line of the first reading"
-    rule = "data_from_line must be stated where no row has numbers only"
-    raise InputError(rule, shown_cell(lines[begun].strip()), remedy, file.path, begun + 1, 1)
+        raise InputError(
+            "a table must have rows of numbers",
+            "none",
+            "export the readings as text",
+            file.path,
+            1 if layout.data_from_line is None else len(lines),
+            1,
+        )
+    raise InputError(
+        "data_from_line must be stated where no row has numbers only",
+        shown_cell(lines[begun].strip()),
+        f"state data_from_line = {begun + 1}, or the line of the first reading",
+        file.path,
+        begun + 1,
+        1,
+    )
 
 
 def _mapped(cells: list[str], lines: list[str], layout: Layout) -> list[str]:
@@ -205,9 +228,14 @@ def _refuse_separator_in_quotes(file: TextFile, first: int, row: str, delimiter:
     """Refuse rows such as ``"10,2","1,5"``: the separator would cut quoted numbers in two."""
     for cell, position in cells_of(row, delimiter):
         if cell.count('"') % 2:
-            rule = "a cell in quotation marks must not hold the separator of the cells"
-            remedy = "export with a decimal point, or with semicolons between the cells"
-            raise InputError(rule, shown_cell(row.strip()), remedy, file.path, first + 1, position)
+            raise InputError(
+                "a cell in quotation marks must not hold the separator of the cells",
+                shown_cell(row.strip()),
+                "export with a decimal point, or with semicolons between the cells",
+                file.path,
+                first + 1,
+                position,
+            )
 
 
 def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, layout: Layout) -> None:
@@ -228,9 +256,14 @@ def _refuse_ambiguous_comma(file: TextFile, first: int, delimiter: str | None, l
         rows, before, increasing = rows + 1, whole, increasing and before < whole
     if rows >= _MANY_ROWS and increasing:
         return
-    rule = "a comma between digits must be stated as a separator or a decimal mark"
-    remedy = 'state decimal = "," for one column of numbers, decimal = "." for two'
-    raise InputError(rule, shown_cell(file.line(first).strip()), remedy, file.path, first + 1, 1)
+    raise InputError(
+        "a comma between digits must be stated as a separator or a decimal mark",
+        shown_cell(file.line(first).strip()),
+        'state decimal = "," for one column of numbers, decimal = "." for two',
+        file.path,
+        first + 1,
+        1,
+    )
 
 
 def is_number(cell: str) -> bool:
@@ -308,8 +341,14 @@ class _File:
             cells = [([*segment.keys.get(key, []), *[""] * channel])[channel - 1] for key in ("X0", "Delta_X")]
             start, step = (number_in(cell, self.decimal or ".") for cell in cells)
             if start is None or step is None or not np.isfinite([start, step]).all() or step <= 0.0:
-                rule = "a file without times must state X0 and a positive Delta_X for every channel"
-                raise InputError(rule, shown_cell(" ".join(cells)), _REMEDY, self.path, segment.lines[0] + 1, 1)
+                raise InputError(
+                    "a file without times must state X0 and a positive Delta_X for every channel",
+                    shown_cell(" ".join(cells)),
+                    _REMEDY,
+                    self.path,
+                    segment.lines[0] + 1,
+                    1,
+                )
             found.append((start, step))
         return found
 
@@ -401,11 +440,14 @@ def _one_plain_segment(text: TextFile, path: Path, layout: Layout) -> "tuple[_Fi
 def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File:
     """Headers and segments of a file."""
     if not any(line.strip().startswith(_END) for line in lines):
-        rule, remedy = (
+        raise InputError(
             f"a .lvm file must have a header that ends with {_END}",
+            "none",
             "rename a file of plain columns to .txt, or export the record again",
+            path,
+            1,
+            1,
         )
-        raise InputError(rule, "none", remedy, path, 1, 1)
     word = "Separator"
     stated = next((line for line in lines if line.startswith(word)), word + "\t")
     separator = "," if stated[len(word) :].startswith(",") else "\t"
@@ -417,8 +459,9 @@ def _take_apart(lines: list[str], path: Path, missing: tuple[str, ...]) -> _File
         if not segment.lines:
             raise InputError("a segment must have rows", "none", _REMEDY, path, min(first + 1, len(lines)), 1)
         if segments and segment.names != segments[0].names:
-            value = shown_cell(" ".join(segment.names))
-            raise InputError("segments must have the same columns", value, _REMEDY, path, first + 1, 1)
+            raise InputError(
+                "segments must have the same columns", shown_cell(" ".join(segment.names)), _REMEDY, path, first + 1, 1
+            )
         segments.append(segment)
     if not segments:
         raise InputError("a LabVIEW measurement file must have a segment", "none", _REMEDY, path, len(lines), 1)

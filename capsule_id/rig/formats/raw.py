@@ -29,8 +29,12 @@ def refuse_large(size: int, path: Path) -> None:
         Naming the size.
     """
     if size > LARGEST_CONTENT:
-        rule = f"a {path.suffix} file must hold at most {LARGEST_CONTENT >> 20} MiB, decompressed"
-        raise InputError(rule, f"{size >> 20} MiB", "export a part of the record, or fewer channels", path)
+        raise InputError(
+            f"a {path.suffix} file must hold at most {LARGEST_CONTENT >> 20} MiB, decompressed",
+            f"{size >> 20} MiB",
+            "export a part of the record, or fewer channels",
+            path,
+        )
 
 
 def require(package: str, path: Path) -> None:
@@ -44,8 +48,12 @@ def require(package: str, path: Path) -> None:
     try:
         import_module(package.lower())
     except ModuleNotFoundError:
-        rule, remedy = f"a {path.suffix} file needs the package {package}", 'run pip install "capsule-id[formats]"'
-        raise InputError(rule, "not installed", remedy, path) from None
+        raise InputError(
+            f"a {path.suffix} file needs the package {package}",
+            "not installed",
+            'run pip install "capsule-id[formats]"',
+            path,
+        ) from None
 
 
 def whole(content: Content) -> bytes:
@@ -109,6 +117,10 @@ class RawTable:
     def values(self) -> np.ndarray:
         """A copy of the numbers, (rows, columns)."""
         return np.column_stack(self.columns)
+
+    def error(self, row: int | None, name: str, rule: str, value: str, remedy: str) -> InputError:
+        """The error about a cell, or about the header of a column if ``row`` is None."""
+        return InputError(rule, value, remedy, *self.place(row, self.names.index(name)))
 
 
 # export: A table of any layout, as a logger or a program exports it; a column map of ``rig.toml`` selects its columns.
@@ -224,8 +236,12 @@ def export_of_arrays(
         refused = ~np.isfinite(found) & ~(np.isnan(found) & ("NaN" in layout.missing))
         if refused.any():
             row = int(np.argmax(refused))
-            remedy = 'add "NaN" to missing = [...] to drop its row' if np.isnan(found[row]) else "correct the value"
-            raise InputError(f"{names[column]} must be finite", f"{found[row]}", remedy, *place(row, column))
+            raise InputError(
+                f"{names[column]} must be finite",
+                f"{found[row]}",
+                'add "NaN" to missing = [...] to drop its row' if np.isnan(found[row]) else "correct the value",
+                *place(row, column),
+            )
         return found
 
     def place(row: int | None, column: int) -> Place:

@@ -71,17 +71,28 @@ def read_number(cell: str, decimal: str, path: Path, line: int, column: int) -> 
         At ``line`` and ``column`` if it is no number.
     """
     if not cell:
-        remedy = "write a number or delete the row"
-        raise InputError("a cell must not be empty", "nothing", remedy, path, line, column)
+        raise InputError("a cell must not be empty", "nothing", "write a number or delete the row", path, line, column)
     value = number_in(cell, decimal)
     if value is None:
         if cell.lower().lstrip("+-") in ("nan", "inf", "infinity"):
             raise InputError("a cell must be a finite number", cell, "delete the row", path, line, column)
-        remedy = "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file"
-        raise InputError("a cell must be a number", shown_cell(cell), remedy, path, line, column)
+        raise InputError(
+            "a cell must be a number",
+            shown_cell(cell),
+            "write a plain number such as 1.25 or 3e-4, with one decimal mark throughout the file",
+            path,
+            line,
+            column,
+        )
     if not np.isfinite(value):
-        remedy = "write a smaller number: float64 ends at 1.8e308"
-        raise InputError("a cell must be a finite number", shown_cell(cell), remedy, path, line, column)
+        raise InputError(
+            "a cell must be a finite number",
+            shown_cell(cell),
+            "write a smaller number: float64 ends at 1.8e308",
+            path,
+            line,
+            column,
+        )
     return value
 
 
@@ -123,10 +134,12 @@ def read_column(
             continue
         value = number_in(text, mark)
         if value is None:
-            remedy = (
-                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row"
+            raise InputError(
+                "a cell must be a number",
+                shown_cell(text),
+                f"correct the cell, or add {json.dumps(text, ensure_ascii=False)} to missing = [...] to drop its row",
+                *place(k),
             )
-            raise InputError("a cell must be a number", shown_cell(text), remedy, *place(k))
         values[k] = value if np.isfinite(value) else read_number(text, mark, *place(k))
     return values
 
@@ -244,9 +257,12 @@ def _encoding(raw: bytes, path: Path) -> str:
     if wrong is None and (found := _NOT_WINDOWS.search(raw)):
         wrong = found.start()
     if wrong is not None:
-        value = f"byte 0x{raw[wrong : wrong + 1].hex()}"
         raise InputError(
-            "the file must be UTF-8 text", value, "save it as UTF-8", path, *place_of_byte(raw[:wrong], codec)
+            "the file must be UTF-8 text",
+            f"byte 0x{raw[wrong : wrong + 1].hex()}",
+            "save it as UTF-8",
+            path,
+            *place_of_byte(raw[:wrong], codec),
         )
     return WINDOWS
 
@@ -470,12 +486,15 @@ def _cells(line: int, text: str, shape: Shape, path: Path) -> list[str]:
     cells = [cell for cell, _ in cells_of(text, shape.delimiter)]
     cells = cells[:-1] if shape.trailing else cells
     if len(cells) != shape.width:
-        rule = f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has"
-        remedy = (
+        raise InputError(
+            f"a row must have {counted(shape.width, 'cell')}, as line {shape.first + 1} has",
+            counted(len(cells), "cell"),
             f"correct the row, or state data_to_line = {line} if the readings end above it, or data_from_line = {line + 1} if "
-            f"they begin here"
+            f"they begin here",
+            path,
+            line + 1,
+            1,
         )
-        raise InputError(rule, counted(len(cells), "cell"), remedy, path, line + 1, 1)
     return cells
 
 
@@ -536,10 +555,22 @@ def read_csv(content: Content, path: Path) -> RawTable:
 def _refuse_blank(file: TextFile) -> None:
     """Raise where the first line is blank."""
     if not any(line.strip() for line in file.lines()):
-        remedy = "write a header `name [unit]` per column and one row per reading"
-        raise InputError("a table must not be empty", "no text at all", remedy, file.path, 1, 1)
-    rule, remedy = "lines between the first and the last must not be blank", "put the header on the first line"
-    raise InputError(rule, "a blank line", remedy, file.path, 1, 1)
+        raise InputError(
+            "a table must not be empty",
+            "no text at all",
+            "write a header `name [unit]` per column and one row per reading",
+            file.path,
+            1,
+            1,
+        )
+    raise InputError(
+        "lines between the first and the last must not be blank",
+        "a blank line",
+        "put the header on the first line",
+        file.path,
+        1,
+        1,
+    )
 
 
 def _header(line: str, delimiter: str, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -572,19 +603,31 @@ def _read_cells(file: TextFile, shape: Shape) -> tuple[np.ndarray, ...]:
             blank = blank or line
             continue
         if blank is not None:
-            rule = "lines between the first and the last must not be blank"
-            raise InputError(rule, "a blank line", "remove the line", path, blank, 1)
+            raise InputError(
+                "lines between the first and the last must not be blank",
+                "a blank line",
+                "remove the line",
+                path,
+                blank,
+                1,
+            )
         cells = cells_of(text, shape.delimiter)
         if text.lstrip().startswith("#"):
-            remedy = "remove comments from the table"
-            raise InputError("a row must be numbers", shown_cell(text.strip()), remedy, path, line, 1)
+            raise InputError(
+                "a row must be numbers", shown_cell(text.strip()), "remove comments from the table", path, line, 1
+            )
         if len(cells) != columns:
             remedy = "give every row one cell per header"
             if shape.delimiter == "," and len(cells) == 2 * columns:
                 remedy += " (a decimal comma needs semicolons or tabs between the cells)"
-            place = cells[columns][1] if len(cells) > columns else len(text) + 1
-            rule = f"a row must have {counted(columns, 'cell')}"
-            raise InputError(rule, counted(len(cells), "cell"), remedy, path, line, place)
+            raise InputError(
+                f"a row must have {counted(columns, 'cell')}",
+                counted(len(cells), "cell"),
+                remedy,
+                path,
+                line,
+                cells[columns][1] if len(cells) > columns else len(text) + 1,
+            )
         for (cell, column), numbers in zip(cells, values, strict=True):
             try:
                 numbers.append(read_number(cell, shape.decimal or ".", path, line, column))

@@ -8,8 +8,10 @@ import pytest
 
 import capsule_id
 from capsule_id.errors import InputError
+from capsule_id.rig.formats import EXPORTS
+from capsule_id.rig.formats.raw import Layout
 from capsule_id.rig.model import Table
-from tests.rig.formats.writers import WRITERS, lvm, mat_5, tdms
+from tests.rig.formats.writers import WRITERS, lvm, mat_5, tdms, xlsx
 
 RUN = capsule_id.read_rig(Path(__file__).parents[3] / "data").tables[-4]
 #: The run in the units of its file; times as LabVIEW makes them, from a rate.
@@ -58,6 +60,13 @@ def test_round_trip(tmp_path: Path, name: str) -> None:
     time = {".lvm": "X_Value", ".tdms": "wf_time"}.get(suffix, "time")
     multi = name == "LabVIEW text, times of each channel"
     assert_same(read(tmp_path, f"run{suffix}", write(COLUMNS), 1 if multi else time))
+
+
+def test_a_row_of_zeros_of_a_sheet_is_a_row() -> None:
+    numbers = np.array([0.0, 1.0, 2.0, 0.0])
+    export = EXPORTS[".xlsx"](xlsx({"x": numbers, "y": 3.0 * numbers}), Path("f.xlsx"), Layout())
+    np.testing.assert_array_equal(export.values(1), 3.0 * numbers)
+    assert export.lines.tolist() == [4, 5, 6, 7]
 
 
 def test_tdms_without_waveform_properties_needs_a_rate(tmp_path: Path) -> None:
