@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, Registry, default_registry
@@ -98,7 +99,8 @@ def synthesize(
     behind = {label: known for _, twin in twins for label, known in twin.truth.items()}
     folder.mkdir(parents=True, exist_ok=True)
     for table in (table for _, twin in twins for table in twin.tables):
-        _write_csv(folder / table.file, table.columns)
+        rows = pd.DataFrame(table.columns)
+        rows.to_csv(folder / table.file, index=False, float_format="%.9g", na_rep="nan", lineterminator="\n")
     (folder / "rig.toml").write_text(
         _rig_toml(name, seed, truth["g"], masses, priors, entries), encoding="utf-8", newline="\n"
     )
@@ -121,12 +123,6 @@ def truth_beside(rig: Rig) -> dict[str, float]:
 
 def _truth_file(folder: Path) -> Path:
     return folder.resolve().with_name(folder.resolve().name + ".truth.json")
-
-
-def _write_csv(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    rows = zip(*columns.values(), strict=True)
-    lines = [",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in rows)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
 def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], priors: list[str], entries: list[str]) -> str:

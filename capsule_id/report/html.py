@@ -221,7 +221,7 @@ _WORDS: Mapping[Level, str] = {"ok": "✓ ok", "warn": "! warning", "fail": "✗
 
 
 def render(result: Result, pictures: Sequence[Picture]) -> str:
-    """The page for ``result``; ``pictures`` as ``gallery.pictures`` draws them. The same input gives the same text."""
+    """The page for ``result``; ``pictures`` as ``pictures`` draws them. The same input gives the same text."""
     messages = messages_of(result.registry)
     stated_last = sorted(table_rows(result.summary), key=lambda row: is_stated(row.name))
     worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
