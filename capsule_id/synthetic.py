@@ -3,71 +3,49 @@
 import json
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from capsule_id.errors import InputError
 from capsule_id.experiments.kind import Kind, Registry, default_registry
-from capsule_id.parameters import TABLE_1, Name, by_index, symbol_of
+from capsule_id.parameters import TABLE_1
 from capsule_id.rig.model import Rig
 from capsule_id.rig.toml import NAME_PATTERN
 
+#: Table 1 and three springs of the paper, SI by name.
+PAPER: Mapping[str, float] = {
+    **{name: TABLE_1[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "K", "g")},
+    **{"k2[soft]": 2420.0, "k2[medium]": 18960.0, "k2[stiff]": 56410.0},
+}
 
-@dataclass(frozen=True)
-class Truth:
-    """The true parameters of a synthetic rig, SI. The defaults are Table 1 and three springs of the paper."""
 
-    m1: float = TABLE_1["m1"]
-    m2: float = TABLE_1["m2"]
-    k1: float = TABLE_1["k1"]
-    c: float = TABLE_1["c"]
-    mu: float = TABLE_1["mu"]
-    v_s: float = TABLE_1["v_s"]
-    K: float = TABLE_1["K"]
-    g: float = TABLE_1["g"]
-    k2: Mapping[str, float] = field(default_factory=lambda: {"soft": 2420.0, "medium": 18960.0, "stiff": 56410.0})
-    #: Values of the kinds of installed packages, by name.
-    others: Mapping[str, float] = field(default_factory=dict)
+class Truth(dict[str, float]):
+    """The true parameters of a synthetic rig by name (``k1``, ``k2[soft]``), SI; by default those of the paper."""
+
+    def __init__(self, values: Mapping[str, float] = PAPER) -> None:
+        super().__init__(values)
 
     def with_values(self, values: Mapping[str, float]) -> "Truth":
-        """A copy with other values, by name (``k1``, ``k2[soft]``).
+        """A copy with other values.
 
         Raises
         ------
         InputError
             If a name is not a parameter of the twin, or a value is not positive.
         """
-        known = self.flat()
         for name, value in values.items():
-            if name not in known:
-                raise InputError("--set takes a parameter of the twin", name, f"choose from {', '.join(known)}")
+            if name not in self:
+                raise InputError("--set takes a parameter of the twin", name, f"choose from {', '.join(self)}")
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(f"{name} must be positive and finite", f"{value:g}", "give an SI value above 0")
-        return self._replaced(values)
+        return Truth({**self, **values})
 
     def with_kinds(self, kinds: Iterable[Kind]) -> "Truth":
         """A copy with the additional values of ``kinds``; present values stay."""
-        known = self.flat()
-        return self._replaced({n: value for kind in kinds for n, value in kind.truth.items() if n not in known})
-
-    def with_runs(self) -> "Truth":
-        """A copy with the springs that occur only in forced runs."""
-        return self.with_kinds(kind for kind in default_registry().values() if not kind.bench)
-
-    def flat(self) -> dict[str, float]:
-        """Values by parameter name."""
-        values = asdict(self)
-        springs, others = values.pop("k2"), values.pop("others")
-        return {**values, **{str(Name("k2", of)): value for of, value in springs.items()}, **others}
-
-    def _replaced(self, values: Mapping[str, float]) -> "Truth":
-        """A copy with these values, by name, changed or added."""
-        springs = by_index("k2", values)
-        plain = {name: value for name, value in values.items() if symbol_of(name) != "k2"}
-        own = {name: plain.pop(name) for name in asdict(self) if name in plain}
-        return replace(self, k2={**self.k2, **springs}, others={**self.others, **plain}, **own)
+        others = {name: value for kind in kinds for name, value in kind.truth.items() if name not in self}
+        return Truth({**self, **others})
 
 
 #: Standard deviations of the weighings, kg.
@@ -108,11 +86,10 @@ def synthesize(
     if not re.fullmatch(NAME_PATTERN, name):
         raise InputError(f"the name of a rig matches {NAME_PATTERN}", name, "choose another with --name")
     rng = np.random.default_rng(seed)
-    values = truth.flat()
     of_runs = {name for kind in known_kinds if not kind.bench for name in kind.truth}
-    on_bench = {name: value for name, value in values.items() if name not in of_runs}
-    twins = [(k, k.twin(on_bench if k.bench else values, rng, seed)) for k in kinds if k.twin is not None]
-    masses = {symbol: getattr(truth, symbol) + sd * rng.standard_normal() for symbol, sd in MASS_SD.items()}
+    on_bench = {name: value for name, value in truth.items() if name not in of_runs}
+    twins = [(k, k.twin(on_bench if k.bench else dict(truth), rng, seed)) for k in kinds if k.twin is not None]
+    masses = {symbol: truth[symbol] + sd * rng.standard_normal() for symbol, sd in MASS_SD.items()}
     entries = [
         "\n".join(["[[experiment]]", f'kind = "{kind.name}"', f'file = "{table.file}"', *table.settings, ""])
         for kind, twin in twins
@@ -122,12 +99,13 @@ def synthesize(
     behind = {label: known for _, twin in twins for label, known in twin.truth.items()}
     folder.mkdir(parents=True, exist_ok=True)
     for table in (table for _, twin in twins for table in twin.tables):
-        _write_csv(folder / table.file, table.columns)
+        rows = pd.DataFrame(table.columns)
+        rows.to_csv(folder / table.file, index=False, float_format="%.9g", na_rep="nan", lineterminator="\n")
     (folder / "rig.toml").write_text(
-        _rig_toml(name, seed, truth.g, masses, priors, entries), encoding="utf-8", newline="\n"
+        _rig_toml(name, seed, truth["g"], masses, priors, entries), encoding="utf-8", newline="\n"
     )
     beside = _truth_file(folder)
-    known = {"seed": seed, "parameters": values, **({"runs": behind} if behind else {})}
+    known = {"seed": seed, "parameters": truth, **({"runs": behind} if behind else {})}
     beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")
     return truth
 
@@ -145,12 +123,6 @@ def truth_beside(rig: Rig) -> dict[str, float]:
 
 def _truth_file(folder: Path) -> Path:
     return folder.resolve().with_name(folder.resolve().name + ".truth.json")
-
-
-def _write_csv(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    rows = zip(*columns.values(), strict=True)
-    lines = [",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in rows)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
 def _rig_toml(name: str, seed: int, g: float, masses: dict[str, float], priors: list[str], entries: list[str]) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from capsule_id.experiments.forced_run.drives import ForcedRun
 from capsule_id.experiments.forced_run.twin import RUNS, STEP, SyntheticRun, make_runs
 from capsule_id.experiments.forced_run.twin import SAMPLES as RECORDED
+from capsule_id.experiments.kind import default_registry
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.rig.model import Quantity, Table
@@ -16,7 +17,7 @@ from tests.experiments import bench
 
 SAMPLES = 120
 NOISE = {"noise_x_rel": 1.1e-5, "noise_x_capsule": 5.2e-6, "noise_acceleration_rod": 0.9, "noise_current": 4.8e-3}
-TRUTH = Truth().with_runs().flat()
+TRUTH = Truth().with_kinds([default_registry()["forced_run"]])
 
 
 @cache

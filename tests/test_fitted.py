@@ -322,7 +322,7 @@ def test_replicates_scatter_as_the_readings(capsule: Fit) -> None:
 def test_the_truth_lies_beside_a_synthetic_rig(tmp_path: Path) -> None:
     truth = cid.synthesize(tmp_path / "rig", seed=1)
     rig = cid.read_rig(tmp_path / "rig")
-    assert truth_beside(rig)["k1"] == truth.k1
+    assert truth_beside(rig)["k1"] == truth["k1"]
     assert truth_beside(dataclasses.replace(rig, synthetic=False)) == {}
     (tmp_path / "rig.truth.json").write_text("[]", encoding="utf-8")
     assert truth_beside(rig) == {}

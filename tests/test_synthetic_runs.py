@@ -11,6 +11,7 @@ from capsule_id.api import read_rig
 from capsule_id.errors import InputError
 from capsule_id.experiments import make_experiments
 from capsule_id.experiments.forced_run.twin import NOISE_SD, RUNS
+from capsule_id.experiments.kind import default_registry
 from capsule_id.physics.drive import Excitation
 from capsule_id.physics.model import CapsuleParameters, simulate
 from capsule_id.rig.model import Table
@@ -24,7 +25,9 @@ SEED = 3
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rig with runs, with true values other than the paper's."""
     folder = tmp_path_factory.mktemp("rigs") / "runs"
-    truth = Truth().with_runs().with_values({"k1": 1500.0, "K": 2.2, "k2[hard]": 50e3})
+    truth = (
+        Truth().with_kinds([default_registry()["forced_run"]]).with_values({"k1": 1500.0, "K": 2.2, "k2[hard]": 50e3})
+    )
     synthesize(folder, SEED, truth, name="rig", runs=True)
     return folder
 

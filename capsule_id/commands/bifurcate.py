@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 # sweep output: Writes a sweep: FILE.nc and FILE.png, each complete or absent; FILE.nc.partial holds finished blocks.
 
 
-STORE_FILE = "points.json"  # in every store, see motions/blocks.py
+STORE_FILE = "points.json"  # in every store, see motions/sweep.py
 
 
 def prepare_store(out: Path, resume: bool) -> Path:
@@ -312,7 +312,7 @@ def _dataset(
 
 def _measured_points(
     args: argparse.Namespace, rig: Rig, axes: Sequence[Axis], values: dict[str, float]
-) -> "tuple[MeasuredPoint, ...]":
+) -> "Sequence[MeasuredPoint]":
     """The forced runs with the settings of a diagram. Standard error lists the omitted runs."""
     from capsule_id.commands.measured_runs import Span, overlay
 
@@ -321,9 +321,10 @@ def _measured_points(
         return ()
     x = axes[0].values()
     by_name = args.spring if args.k2 is None else None
-    found = overlay(rig, Span(axes[0].name, x[0], x[-1]), values, fitted_values(args.result), by_name)
-    print(found.sentence(), file=sys.stderr, flush=True)
-    return found.motions
+    span = Span(axes[0].name, x[0], x[-1])
+    motions, sentence = overlay(rig, span, values, fitted_values(args.result), by_name)
+    print(sentence, file=sys.stderr, flush=True)
+    return motions
 
 
 def _axes(args: argparse.Namespace) -> tuple[Axis, ...]:

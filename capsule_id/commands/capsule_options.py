@@ -73,28 +73,21 @@ def capsule_values(
             raise InputError(
                 f"{name} ({leaf.meaning}) must be given", "it is missing", f"add --{name} X, in {leaf.unit}"
             )
-        _check_sign(name, value, f"--{name}" if text is not None else "the value")
+        if not leaf.admits(value):
+            rule = f"must be {leaf.sign}" if leaf.sign == "positive" else "must not be negative"
+            remedy = {
+                "positive": "give a value above 0",
+                "not negative": "give 0 or more",
+                "any": "give a finite value",
+            }
+            place = f"--{name}" if text is not None else "the value"
+            raise InputError(f"{name} {rule}", f"{place} {value:g}", remedy[leaf.sign])
         values[name] = value
     fit = args.result or getattr(args, "posterior", None)
     if args.spring is not None and (fit is None or values["G"] == math.inf):
         remedy = "give --result DIR and --G X, in m, or remove --spring"
         raise InputError("--spring needs the result that it is of, and a gap", "none", remedy)
     return values
-
-
-def _check_sign(name: str, value: float, place: str) -> None:
-    """Refuse a value that the model does not admit (``Status.INVALID``).
-
-    Raises
-    ------
-    InputError
-        If the value is too small; ``place`` names its source.
-    """
-    row = LEAVES[name]
-    if not row.admits(value):
-        remedy = {"positive": "give a value above 0", "not negative": "give 0 or more", "any": "give a finite value"}
-        rule = f"must be {row.sign}" if row.sign == "positive" else "must not be negative"
-        raise InputError(f"{name} {rule}", f"{place} {value:g}", remedy[row.sign])
 
 
 def capsule_and_drive(values: Mapping[str, Any], drive: str) -> "tuple[CapsuleParameters, Excitation | Pulses]":

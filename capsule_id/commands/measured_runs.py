@@ -1,7 +1,6 @@
 """Selects the measured forced runs of a rig for a diagram of the model: those with the settings of the diagram."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,23 +27,10 @@ class Span(NamedTuple):
     high: float
 
 
-@dataclass(frozen=True)
-class Overlay:
-    """Runs with the settings of a diagram, and a reason for each other run."""
-
-    motions: tuple[MeasuredPoint, ...]
-    left_out: tuple[str, ...]
-
-    def sentence(self) -> str:
-        """Number of shown runs, and the other runs with reasons, in one line."""
-        count = f"{len(self.motions)} of {counted(len(self.motions) + len(self.left_out), 'measured run')} overlaid"
-        return f"{count}; omitted: {'; '.join(self.left_out)}" if self.left_out else count
-
-
 def overlay(
     rig: Rig, span: Span, values: Mapping[str, float], fitted: Mapping[str, float], spring: str | None = None
-) -> Overlay:
-    """The forced runs of ``rig`` on a diagram over ``span``.
+) -> tuple[list[MeasuredPoint], str]:
+    """The forced runs of ``rig`` on a diagram over ``span``, and a line with their number and the reasons for the others.
 
     Parameters
     ----------
@@ -68,16 +54,18 @@ def overlay(
 
     motions, left_out = [], []
     for table in rig.tables:
-        if isinstance(table.settings, RunSettings):
-            if table.settings.drive == "base" or table.settings.spring is None:
-                left_out.append(f"{table.label} (no harmonic force, or no support spring)")
-                continue
+        if not isinstance(table.settings, RunSettings):
+            continue
+        if table.settings.drive == "base" or table.settings.spring is None:
+            found = "no harmonic force, or no support spring"
+        else:
             found = _point_or_reason(table, _settings(table, known), span, values, spring)
-            if isinstance(found, MeasuredPoint):
-                motions.append(found)
-            else:
-                left_out.append(f"{table.label} ({found})")
-    return Overlay(tuple(motions), tuple(left_out))
+        if isinstance(found, str):
+            left_out.append(f"{table.label} ({found})")
+        else:
+            motions.append(found)
+    said = f"{len(motions)} of {counted(len(motions) + len(left_out), 'measured run')} overlaid"
+    return motions, f"{said}; omitted: {'; '.join(left_out)}" if left_out else said
 
 
 def _point_or_reason(
@@ -113,20 +101,11 @@ def _point_or_reason(
 
 def _settings(table: Table[RunSettings], known: Callable[[str], Quantity]) -> dict[str, Quantity]:
     """k2, G, P_d and Omega of a run, SI; NaN for an unknown value."""
+    P_d = table.settings.P_d
+    if P_d is None:
+        drive = recorded_drive(table)
+        assert drive is not None, "the reader requires P_d or the current"
+        K = known("K")
+        P_d = Quantity(K.value * drive.amplitude, K.sd * drive.amplitude)
     k2 = known(f"k2[{table.settings.spring}]")
-    return {
-        "k2": k2,
-        "G": stated_gap(table),
-        "P_d": _drive_amplitude(table, known),
-        "Omega": Quantity(stated_Omega(table)),
-    }
-
-
-def _drive_amplitude(table: Table[RunSettings], known: Callable[[str], Quantity]) -> Quantity:
-    """P_d of a run, N."""
-    drive = recorded_drive(table)
-    if table.settings.P_d is not None:
-        return table.settings.P_d
-    assert drive is not None, "the reader requires P_d or the current"
-    K = known("K")
-    return Quantity(K.value * drive.amplitude, K.sd * drive.amplitude)
+    return {"k2": k2, "G": stated_gap(table), "P_d": P_d, "Omega": Quantity(stated_Omega(table))}

@@ -181,11 +181,17 @@ class Row:
 
 def table_rows(frame: pd.DataFrame) -> list[Row]:
     """The rows of ``frame`` in their order. Those of a symbol share the unit of the largest."""
-    rows = {str(name): values for name, values in frame.to_dict("index").items()}
+    values_of = {str(name): values for name, values in frame.to_dict("index").items()}
     largest: defaultdict[str, float] = defaultdict(float)
-    for name, values in rows.items():
+    for name, values in values_of.items():
         largest[symbol_of(name)] = max(largest[symbol_of(name)], magnitude(values))
-    return [_row(name, values, largest[symbol_of(name)]) for name, values in rows.items()]
+    rows = []
+    for name, values in values_of.items():
+        scale, unit = prefix_for(str(values["unit"]), largest[symbol_of(name)])
+        sample, point = (decimals_for(float(values[column]) * scale) for column in ("sd", "standard_error"))
+        decimals = point if sample is None else sample
+        rows.append(Row(name, values, scale, unit, decimals, decimals if point is None else point))
+    return rows
 
 
 def magnitude(values: Mapping[Hashable, Any]) -> float:
@@ -199,13 +205,6 @@ def magnitude(values: Mapping[Hashable, Any]) -> float:
 def skewed_names(frame: pd.DataFrame) -> list[str]:
     """Names of the parameters whose interval is to be quoted."""
     return [row.name for row in table_rows(frame) if row.skewed]
-
-
-def _row(name: str, values: Mapping[Hashable, Any], largest: float) -> Row:
-    scale, unit = prefix_for(str(values["unit"]), largest)
-    sample, point = (decimals_for(float(values[column]) * scale) for column in ("sd", "standard_error"))
-    decimals = point if sample is None else sample
-    return Row(name, values, scale, unit, decimals, decimals if point is None else point)
 
 
 def _ends(values: Mapping[Hashable, Any], suffix: str = "") -> list[float] | None:
@@ -334,7 +333,8 @@ def table_text(summary: pd.DataFrame, *, synthetic: bool, width: int | None = No
     shown = len(widths)
     while shown > 1 + KEPT and sum(widths[:shown]) + len(_GAP) * (shown - 1) > width:
         shown -= 1
-    lines = [_line(cells[:shown], widths[:shown]) for cells in table]
+    aligned = [f"{'>' if i > 1 else '<'}{longest}" for i, longest in enumerate(widths[:shown])]
+    lines = [_GAP.join(map(format, cells[:shown], aligned)).rstrip() for cells in table]
     rule = "-" * max(map(len, lines))
     left_out = ", ".join(table[0][shown:])
     more = wrapped([f"in a wider terminal and in report.html: {left_out}"] if left_out else [], width)
@@ -361,12 +361,6 @@ def verdict_text(trust: Trust, findings: Sequence[tuple[Level, str]]) -> str:
         found += ", but not every number could be checked"
     warned = [level for level, _ in findings].count("warn")
     return f"verdict: {trust}; {found}" + (f"; {counted(warned, 'warning')}" if warned else "")
-
-
-def _line(cells: list[str], widths: list[int]) -> str:
-    words = [cells[0].ljust(widths[0]), cells[1].ljust(widths[1])]
-    words += [cell.rjust(width) for cell, width in zip(cells[2:], widths[2:], strict=True)]
-    return _GAP.join(words).rstrip()
 
 
 # sampled parameters: The sampled physical parameters as columns, in display units: what corner plot and traces have

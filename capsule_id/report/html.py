@@ -35,7 +35,7 @@ from capsule_id.report.columns import (
 from capsule_id.report.figures import fits as figures
 from capsule_id.report.figures.style import figure_of, mark, new_axes, new_figure, png
 from capsule_id.report.messages import OF_A_SAMPLE, TERMS, caption_of, finding_text, messages_of, title_of
-from capsule_id.report.sentences import AUTHORS, PUBLISHED, TITLE, bibtex, latex_table, methods_paragraph, next_steps
+from capsule_id.report.sentences import NAMES, PUBLISHED, TITLE, bibtex, latex_table, methods_paragraph, next_steps
 from capsule_id.views import Comparison, Finding, Level, Message, ResultTable, after_number, counted
 
 # gallery: All pictures of a result, drawn once: the page embeds the same bytes as in ``figures/``.
@@ -221,7 +221,7 @@ _WORDS: Mapping[Level, str] = {"ok": "✓ ok", "warn": "! warning", "fail": "✗
 
 
 def render(result: Result, pictures: Sequence[Picture]) -> str:
-    """The page for ``result``; ``pictures`` as ``gallery.pictures`` draws them. The same input gives the same text."""
+    """The page for ``result``; ``pictures`` as ``pictures`` draws them. The same input gives the same text."""
     messages = messages_of(result.registry)
     stated_last = sorted(table_rows(result.summary), key=lambda row: is_stated(row.name))
     worst_first = sorted(result.findings, key=lambda finding: _WORST_FIRST.index(finding.level))
@@ -246,7 +246,7 @@ def render(result: Result, pictures: Sequence[Picture]) -> str:
             notes=[_note(note, messages) for note in result.notes],
             terms={term: TERMS[term] for term in TERMS if result.posterior or term not in OF_A_SAMPLE},
             missing=MISSING,
-            authors=AUTHORS,
+            names=NAMES,
             title=TITLE,
             published=PUBLISHED,
             copies=(

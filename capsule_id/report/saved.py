@@ -85,7 +85,8 @@ def _encode(value: object, arrays: dict[str, np.ndarray]) -> Any:
         case pd.DataFrame():
             index = None if isinstance(value.index, pd.RangeIndex) else inner(value.index.tolist())
             columns = [[inner(name), str(column.dtype), inner(column.tolist())] for name, column in value.items()]
-            return {"frame": [index, inner(value.index.name), len(value), columns]}
+            rest = {"name": inner(value.index.name), "rows": len(value), "columns": columns}
+            return {"frame": {"index": index, **rest}}
         case type():
             return {"class": [value.__module__, value.__qualname__]}
         case _ if is_dataclass(value):
@@ -121,7 +122,7 @@ def _decode(node: Any, arrays: Mapping[str, np.ndarray], roots: set[str]) -> Any
             return values
         case {"path": path}:
             return Path(path)
-        case {"frame": [index, name, rows, columns]}:
+        case {"frame": {"index": index, "name": name, "rows": rows, "columns": columns}}:
             labels = pd.RangeIndex(rows) if index is None else pd.Index(inner(index))
             read = {inner(key): pd.Series(inner(values), labels, dtype) for key, dtype, values in columns}
             return pd.DataFrame(read, labels).rename_axis(inner(name))

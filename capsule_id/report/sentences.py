@@ -10,7 +10,6 @@ from capsule_id.inference.result import STATED, Result
 from capsule_id.parameters import Name, is_stated, symbol_of
 from capsule_id.report.columns import MISSING, skewed_names, table_rows
 from capsule_id.report.messages import finding_text, messages_of
-from capsule_id.views import Finding
 
 # advice: What would improve a result: the steps that the first screen of the report lists.
 
@@ -32,13 +31,8 @@ def _faults(result: Result) -> Iterator[tuple[str, str]]:
     for level, heading in (("fail", "Correct"), ("warn", "Look at")):
         for finding in result.findings:
             if finding.level == level and (level == "fail" or finding.parameters):
-                yield f"{heading} {_place(finding)}", finding_text(finding, messages)
-
-
-def _place(finding: Finding) -> str:
-    if finding.experiment:
-        return f"experiment {finding.experiment}"
-    return ", ".join(finding.parameters) or "the whole fit"
+                place = f"experiment {finding.experiment}" if finding.experiment else ", ".join(finding.parameters)
+                yield f"{heading} {place or 'the whole fit'}", finding_text(finding, messages)
 
 
 def _missing(result: Result) -> Iterator[tuple[str, str]]:
@@ -52,8 +46,10 @@ def _missing(result: Result) -> Iterator[tuple[str, str]]:
     for name in names:
         # NaN for an exact constant: nothing is to be measured.
         if f"{result.summary.at[name, 'informed']}" == "False":
-            kinds = " or ".join(_kinds(result, name)) or "another test"
-            yield f"Measure {name}", f"The data hardly narrow the prior of {name}. Add a table of {kinds}."
+            # Kinds of bench tests that inform it, by the symbols that they list.
+            symbol = re.compile(rf"\b{re.escape(symbol_of(name))}\b")
+            kinds = [kind.name for kind in result.registry.kinds if symbol.search(kind.informs)] or ["another test"]
+            yield f"Measure {name}", f"The data hardly narrow the prior of {name}. Add a table of {' or '.join(kinds)}."
 
 
 def _inputs(result: Result) -> Iterator[tuple[str, str]]:
@@ -109,12 +105,6 @@ def _factor(remaining: float) -> str:
     return f"{max(remaining, 1e-4) ** -0.5:.2g}"
 
 
-def _kinds(result: Result, name: str) -> list[str]:
-    """Kinds of bench tests that inform a parameter, by the symbols that they list."""
-    symbol = re.escape(symbol_of(name))
-    return [kind.name for kind in result.registry.kinds if re.search(rf"\b{symbol}\b", kind.informs)]
-
-
 # citation: What a paper or a thesis takes over from a result: methods paragraph, BibTeX entries, LaTeX table.
 
 
@@ -123,6 +113,7 @@ AUTHORS = ("Yang Liu", "Ekaterina Pavlovskaia", "Marian Wiercigroch")
 TITLE = "Experimental verification of the vibro-impact capsule model"
 JOURNAL, VOLUME, YEAR, PAGES = "Nonlinear Dynamics", 83, 2016, (1029, 1041)
 PUBLISHED = f"{JOURNAL} {VOLUME} ({YEAR}) {PAGES[0]}–{PAGES[1]}"
+NAMES = f"{', '.join(AUTHORS[:-1])} and {AUTHORS[-1]}"
 _ESCAPES = str.maketrans({"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"})
 
 
@@ -135,7 +126,7 @@ def methods_paragraph(result: Result) -> str:
     tests = ", ".join(f"{number} x {kind}" for kind, number in kinds.items()) or "the experiments listed in this report"
     data = "Synthetic data were used. " if result.rig.synthetic else ""
     sentences = [
-        f"{data}The parameters of the vibro-impact capsule model of {_names()} ({TITLE}, {PUBLISHED}) were "
+        f"{data}The parameters of the vibro-impact capsule model of {NAMES} ({TITLE}, {PUBLISHED}) were "
         f"identified with capsule-id {version} from {tests}.",
         "All experiments share one set of parameters, with proper priors, and one likelihood of the raw readings.",
     ]
@@ -152,10 +143,6 @@ def methods_paragraph(result: Result) -> str:
         "No check of the data failed." if result.clean else "At least one check of the data failed; see the findings."
     )
     return " ".join([*sentences, verdict])
-
-
-def _names() -> str:
-    return f"{', '.join(AUTHORS[:-1])} and {AUTHORS[-1]}"
 
 
 def bibtex(result: Result) -> str:

@@ -22,7 +22,7 @@ def rig_of(folder: Path, seed: int) -> Rig:
     """A synthetic bench whose stiffness, damping, friction and mass differ from seed to seed."""
     rng = np.random.default_rng(seed)
     usual = {"k1": 0.3, "c": 0.3, "mu": 0.15, "m1": 0.2, "K": 0.3}
-    truth = Truth().with_values({k: Truth().flat()[k] * np.exp(sd * rng.standard_normal()) for k, sd in usual.items()})
+    truth = Truth().with_values({k: Truth()[k] * np.exp(sd * rng.standard_normal()) for k, sd in usual.items()})
     synthesize(folder / f"rig{seed}", seed, truth)
     return read_rig(folder / f"rig{seed}", KINDS)
 

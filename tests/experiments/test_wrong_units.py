@@ -117,7 +117,7 @@ def heavy_and_light(folder: Path) -> Iterator[Rig]:
     """
     for m1 in (0.01, 1.0, 10.0):
         for seed in range(10):
-            rng, known = np.random.default_rng([38, seed]), Truth().flat()
+            rng, known = np.random.default_rng([38, seed]), Truth()
             values = {name: value * np.exp(0.3 * rng.standard_normal()) for name, value in known.items() if name != "g"}
             grow = {name: value * m1 / known["m1"] for name, value in values.items() if name not in ("mu", "v_s")}
             own = folder / f"{m1:g}_{seed}"

@@ -51,7 +51,7 @@ class Calibration:
 
 def random_truth(rng: np.random.Generator) -> Truth:
     """Table 1 with every parameter of ``VARIED`` moved by a factor, log-uniform in 1/RANGE .. RANGE."""
-    table = Truth().flat()
+    table = Truth()
     factors = np.exp(np.log(RANGE) * rng.uniform(-1.0, 1.0, len(VARIED)))
     return Truth().with_values({name: table[name] * f for name, f in zip(VARIED, factors, strict=True)})
 
@@ -65,7 +65,7 @@ def normal_score(posterior: Posterior, name: str, truth: float) -> float:
 
 def outcome_of(result: Result, truth: Truth) -> Outcome:
     """Scores of all physical parameters that were sampled, and the checks that failed."""
-    known, posterior = truth.flat(), cast(Posterior, result.posterior)
+    known, posterior = truth, cast(Posterior, result.posterior)
     z = {name: normal_score(posterior, name, known[name]) for name in result.summary.index}
     return Outcome(z, tuple((f.code, f.experiment) for f in result.findings if f.level == "fail"))
 

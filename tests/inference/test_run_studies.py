@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_clean_rig_is_recovered_and_nothing_is_named(folder: Path) -> None:
     stage = small(folder)
     assert named_by(stage) == ""
-    sd, truth = np.sqrt(np.diag(stage.fit.covariance)), Truth().flat()
+    sd, truth = np.sqrt(np.diag(stage.fit.covariance)), Truth()
     z = {
         name: np.log(value / truth[name]) / sd[stage.fit.names.index(name)]
         for name, value in stage.fit.values.items()

@@ -1,1 +1,1 @@
-"""Figures, a function ``(data, ax) -> ax`` each."""
+"""Figures; a panel is a function ``(data, ax)``."""

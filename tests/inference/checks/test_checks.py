@@ -51,9 +51,9 @@ def outlier(folder: Path) -> None:
 def dry_friction(folder: Path) -> None:
     """The second record rubs."""
     header, values = read(folder / "free_vibration_2.csv")
-    clean = decay(np.random.default_rng(0), TRUTH.k1, TRUTH.c, TRUTH.m1, RELEASES[1], 0.0)
+    clean = decay(np.random.default_rng(0), TRUTH["k1"], TRUTH["c"], TRUTH["m1"], RELEASES[1], 0.0)
     time = clean["time [s]"]
-    forces = {"k1": TRUTH.k1, "c": TRUTH.c, "m1": TRUTH.m1, "F_dry": DRY_FORCE}
+    forces = {"k1": TRUTH["k1"], "c": TRUTH["c"], "m1": TRUTH["m1"], "F_dry": DRY_FORCE}
     rubbed = rubbed_decay(time, forces, RELEASES[1], 0.0, 40).x_rel
     noise = DECAY_NOISE * RELEASES[1] * np.random.default_rng(SEED).standard_normal(len(time))
     write(folder / "free_vibration_2.csv", header, np.stack([time, 1e3 * (np.asarray(rubbed) + noise)], axis=1))
@@ -68,7 +68,7 @@ def bent_line(folder: Path) -> None:
 
 
 def other_surface(folder: Path) -> None:
-    tilts = tilted(np.random.default_rng(SEED), TRUTH.mu - OTHER_SURFACE)
+    tilts = tilted(np.random.default_rng(SEED), TRUTH["mu"] - OTHER_SURFACE)
     write(folder / "static_friction.csv", "angle [deg]", tilts["angle [deg]"][:, None])
 
 
@@ -136,7 +136,7 @@ def lines(seed: int, folder: Path) -> list[Line]:
 
 def at_truth(line: Line) -> dict[str, float]:
     scatter = 0.002 * float(np.max(line.y))
-    return {line.slope.symbol: TRUTH.flat()[line.slope.name], "scatter": scatter, "m1": 0.11, "m2": 0.53, "g": 9.81}
+    return {line.slope.symbol: TRUTH[line.slope.name], "scatter": scatter, "m1": 0.11, "m2": 0.53, "g": 9.81}
 
 
 @pytest.mark.full

@@ -25,10 +25,10 @@ def table(kind: str, *columns: Column) -> Table:
     return Table(kind, kind, f"{kind}.csv", {c.name: c for c in columns}, default_registry()[kind].settings(), rows)
 
 
-def p_value(seed: int, tilted_mu: float = TRUTH.mu) -> float:
+def p_value(seed: int, tilted_mu: float = TRUTH["mu"]) -> float:
     """Of a surface measured by the twin's protocol; the tilts on one of ``tilted_mu``."""
     rng = np.random.default_rng(seed)
-    tilted, pushed = tilts(rng, tilted_mu), pushes(rng, TRUTH.mu, TRUTH.v_s, TRUTH.g)
+    tilted, pushed = tilts(rng, tilted_mu), pushes(rng, TRUTH["mu"], TRUTH["v_s"], TRUTH["g"])
     tables = (
         table("static_friction", column("angle", np.deg2rad(tilted["angle [deg]"]))),
         table(
@@ -37,7 +37,9 @@ def p_value(seed: int, tilted_mu: float = TRUTH.mu) -> float:
             column("distance", 1e-3 * pushed["distance [mm]"], DISTANCE_SD),
         ),
     )
-    rig = Rig("bench", True, Quantity(TRUTH.m1), Quantity(TRUTH.m2), Quantity(TRUTH.g), {}, tables, {}, Path("bench"))
+    rig = Rig(
+        "bench", True, Quantity(TRUTH["m1"]), Quantity(TRUTH["m2"]), Quantity(TRUTH["g"]), {}, tables, {}, Path("bench")
+    )
     tilt, push = make_experiments(rig)
     return tension(rig, [tilt], [push]).p
 
@@ -53,4 +55,4 @@ def test_false_alarms_and_power(rigs: int, apart: int) -> None:
     agreeing = np.array([p_value(seed) for seed in range(rigs)])
     assert np.mean(agreeing < 0.2) < 0.2 + 3.0 * np.sqrt(0.2 * 0.8 / 25)
     assert agreeing.min() > 0.002
-    assert np.mean([p_value(seed, TRUTH.mu - 0.25) < 0.002 for seed in range(apart)]) > 0.8
+    assert np.mean([p_value(seed, TRUTH["mu"] - 0.25) < 0.002 for seed in range(apart)]) > 0.8

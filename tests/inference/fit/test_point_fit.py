@@ -64,7 +64,7 @@ def test_springs_against_scipy(twin: LogPosterior, fit: PointFit) -> None:
 
 
 def test_truth_is_within_reach(fit: PointFit) -> None:
-    for name, truth in Truth().flat().items():
+    for name, truth in Truth().items():
         if name in fit.values:
             assert abs(fit.values[name] - truth) < 4.0 * fit.standard_errors[name], name
 

@@ -145,7 +145,7 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> tuple[LogPosterior, tuple[
 
 def at_truth(target: LogPosterior, factor: float = 1.0) -> np.ndarray:
     """u at the truth of the twin, noise at plausible values that differ from record to record."""
-    known = Truth().flat() | {"tilt_sd": 0.009, "push_scatter": 0.02}
+    known = Truth() | {"tilt_sd": 0.009, "push_scatter": 0.02}
     known |= {f"noise_sd[free_vibration_{i}]": s for i, s in ((1, 1.5e-5), (2, 2.1e-5), (3, 2.4e-5))}
     known |= {f"scatter[support_spring_{s}]": v for s, v in (("soft", 0.005), ("medium", 0.04), ("stiff", 0.1))}
     return target.unconstrain(np.array([known[name] * factor for name in target.names]))

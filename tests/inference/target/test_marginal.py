@@ -95,7 +95,7 @@ def twin(folder: Path, seed: int) -> tuple[LogPosterior, dict[str, float]]:
     synthesize(folder, seed)
     rig = read_rig(folder)
     target = LogPosterior(rig, make_experiments(rig))
-    known = Truth().flat() | ROUGH
+    known = Truth() | ROUGH
     known |= {f"noise_sd[free_vibration_{i}]": s for i, s in ((1, 2e-5), (2, 3e-5), (3, 1e-5))}
     known |= {f"scatter[support_spring_{s}]": v for s, v in (("soft", 0.005), ("medium", 0.04), ("stiff", 0.1))}
     return target, known
