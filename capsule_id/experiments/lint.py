@@ -85,6 +85,7 @@ class Number:
     shared : further ones, those of all relations of its kind
     label : of its experiment
     unit, to_display : as written; "" for ``si``
+    code : of the finding
     """
 
     name: str
@@ -95,6 +96,7 @@ class Number:
     label: str = ""
     unit: str = ""
     to_display: float = 1.0
+    code: str = "readings.magnitude"
     shared: tuple[str, ...] = ()
 
     def unusual(self, rig: Rig) -> Iterable[Finding]:
@@ -111,7 +113,7 @@ class Number:
             "scales": self.scales,
             "meant": self._meant(),
         }
-        yield Finding("readings.magnitude", "warn", facts, self.label)
+        yield Finding(self.code, "warn", facts, self.label)
 
     def _meant(self) -> str:
         """The likeliest unit in which the written number would be usual; "" where there is none."""

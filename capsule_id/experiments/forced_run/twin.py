@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -125,7 +126,7 @@ def make_runs(parameters: Mapping[str, float], seed: int, runs: tuple[RunSetup, 
 
 
 def _capsule(parameters: Mapping[str, float], k2: float | np.ndarray, G: float | np.ndarray) -> CapsuleParameters:
-    shared = {name: parameters[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
+    shared: dict[str, Any] = {name: parameters[name] for name in ("m1", "m2", "k1", "c", "mu", "v_s", "g")}
     return CapsuleParameters(**shared, k2=k2, G=G)
 
 

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,9 @@ def robot_progression(seed: int, design: RobotDesign, values: Mapping[str, float
     period, duty, session = design.period[order], design.duty[order], session[order]
     count = np.maximum(np.round(DURATION / period), 1.0)
     s = design.session_sd * rng.standard_normal(design.sessions)
-    own = {name: value for name, value in values.items() if name in TABLE and TABLE[name].leaf == "capsule"}
+    own: dict[str, Any] = {
+        name: value for name, value in values.items() if name in TABLE and TABLE[name].leaf == "capsule"
+    }
     p = CapsuleParameters(**{"k2": 0.0, "G": np.inf, **own})
     drive = Pulses(values["P_on"], period, duty, lag=values["lag"], reaction=values["reaction"])
     X2 = np.asarray(displacement(p, drive, scaled(friction_law(p), np.exp(s[session])), period, count).X2)
